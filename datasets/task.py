@@ -1,0 +1,59 @@
+"""What a task is: the state, the sensors, and how a trajectory is shown again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from beliefscope.datasets.errors import one_of
+from beliefscope.datasets.episode import Episode
+
+Unit = Literal["m", "rad"]
+
+
+@dataclass(frozen=True)
+class Component:
+    """One component of the state; those in rad are angles."""
+
+    name: str
+    unit: Unit
+
+
+@dataclass(frozen=True)
+class Task:
+    """A state-estimation task.
+
+    Attributes:
+        name: key in ``TASKS``.
+        components: of the state, in order; n of them.
+        observations: observation key -> shape of one step, e.g. ``{"image": (32, 32), "force": (3,)}``.
+        modalities: modality -> its observation keys. A modality is either one picture or vectors to be joined.
+        control_size: length of the control vector.
+        dt: seconds a step.
+        map_components: the two components that span the likelihood map (x to the right, y up).
+        map_half_width: half the side of the map, m.
+        replay: builds the ``mujoco.MjModel`` of an episode, whose ``qpos`` it replays; None where there is no replay.
+    """
+
+    name: str
+    components: tuple[Component, ...]
+    observations: Mapping[str, tuple[int, ...]]
+    modalities: Mapping[str, tuple[str, ...]]
+    control_size: int
+    dt: float
+    map_components: tuple[str, str]
+    map_half_width: float
+    replay: Callable[[Episode], Any] | None = None
+
+    def index(self, component: str) -> int:
+        """Position of a component in the state vector. Raises BadInput for an unknown name."""
+        names = [c.name for c in self.components]
+        if component not in names:
+            raise one_of(f"component of task {self.name!r}", component, names)
+        return names.index(component)
+
+    @property
+    def map_indices(self) -> tuple[int, int]:
+        """Positions of the two map components in the state vector."""
+        return self.index(self.map_components[0]), self.index(self.map_components[1])
