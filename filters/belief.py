@@ -1,13 +1,14 @@
-"""Beliefs and what one step of a filter knew. All in standardised units, batched over N trajectories.
+"""Beliefs, evidence, and what one step of a filter knew. All in standardised units, batched over N trajectories.
 
-Steps are pure: ``step(belief, control, evidence, generator) -> (belief, StepTrace)``. No belief is kept on a module.
+Steps are pure: ``step(belief, evidence, generator) -> (belief, StepTrace)``. No belief is kept on a module.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 
+import torch
 from torch import Tensor
 
 
@@ -26,35 +27,77 @@ class Particles:
     states: Tensor
     log_weights: Tensor
 
+    def moments(self) -> Gaussian:
+        """Weighted mean (N, n) and covariance (N, n, n)."""
+        return moments(self.states, self.log_weights)
+
 
 Belief = Gaussian | Particles
 
 
+def moments(states: Tensor, log_weights: Tensor) -> Gaussian:
+    """Mean (..., n) and covariance (..., n, n) of particles (..., M, n) with normalised log-weights (..., M)."""
+    weights = log_weights.exp().unsqueeze(-2)
+    mean = weights @ states
+    deviation = states - mean
+    covariance = (weights.transpose(-1, -2) * deviation).transpose(-1, -2) @ deviation
+    return Gaussian(mean.squeeze(-2), covariance)
+
+
 @dataclass(frozen=True)
-class StepTrace:
-    """Everything one step knew. K modalities in the filter's order; W is n for weights per component, 1 for scalars.
+class Evidence:
+    """What the observations and controls say, computed once for all T x N before the time recursion starts.
+
+    K is the number of measurement models, u the width of the networks. ``evidence[t]`` is step t; ``evidence[a:b]`` a slice.
 
     Attributes:
-        predicted: belief after the dynamics and before the observation (EKF bank: (N, K, n); PF: particles with their
-            prior weights).
-        posterior: fused belief after the observation and, for a PF, before resampling: Gaussian (N, n) or Particles.
-        estimate: Gaussian (N, n), (N, n, n): posterior mean and covariance; what is reported as the estimate.
-        modality: Gaussian (N, K, n), (N, K, n, n): what each modality alone believes after this step (EKF: its own
-            filter's posterior; PF: the predicted particles weighted by its likelihood alone).
-        observation: EKF only: the virtual sensors' z and R, Gaussian (N, K, n).
-        log_likelihood: PF only: modality -> (N, M), of each predicted particle, not normalised.
-        weights: (N, K, W) beta as the weight model gave it, or None where a filter has none.
-        acting: (N, K, W) share of each modality in the fused result as it acted; sums to one over K. EKF: beta / sum of
-            betas; PF: sum over particles of prior weight x beta x likelihood of that modality, over that of all.
-        ancestors: PF only: (N, M) int64 index of the particle each resampled one came from.
+        control: (T, N, u) the controls' part of the dynamics model.
+        observation: EKF: (T, N, K, n) virtual observations z. PF: (T, N, K, u) observations' part of the likelihood.
+        noise: EKF: (T, N, K, n) standard deviations of z, the square root of R's diagonal. PF: None.
+        log_weights: (T, N, K, W) log beta, W = n for weights per component, 1 for scalars; None without a weight model.
+    """
+
+    control: Tensor
+    observation: Tensor
+    noise: Tensor | None
+    log_weights: Tensor | None
+
+    def __getitem__(self, index: int | slice) -> Evidence:
+        return self._map(lambda tensor: tensor[index])
+
+    def __len__(self) -> int:
+        return len(self.control)
+
+    def _map(self, function: Callable[[Tensor], Tensor]) -> Evidence:
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Evidence(**{name: None if v is None else function(v) for name, v in values.items()})
+
+    def only(self, k: int) -> Evidence:
+        """The same evidence with beta one-hot on measurement model k: the filter on that modality alone."""
+        if self.log_weights is None:
+            return self
+        log_weights = torch.full_like(self.log_weights, -torch.inf)
+        log_weights[..., k, :] = 0.0
+        return Evidence(self.control, self.observation, self.noise, log_weights)
+
+
+@dataclass(frozen=True)
+class StepTrace:
+    """Everything one step knew and could not be computed later from the rest.
+
+    Attributes:
+        predicted: belief after the dynamics and before the observation. EKF: bank (N, K, n); PF: particles with their
+            prior weights.
+        posterior: fused belief after the observation and, for a PF, before resampling. EKF: Gaussian (N, n).
+        estimate: Gaussian (N, n), (N, n, n): mean and covariance of the posterior, which the filter reports.
+        modality: EKF only: each unimodal filter's own posterior, Gaussian (N, K, n).
+        log_likelihood: PF only: (N, K, M) of each predicted particle, not normalised.
+        ancestors: PF only: (N, M) int64, index of the particle each resampled one came from.
     """
 
     predicted: Belief
     posterior: Belief
     estimate: Gaussian
-    modality: Gaussian
-    observation: Gaussian | None
-    log_likelihood: Mapping[str, Tensor] | None
-    weights: Tensor | None
-    acting: Tensor | None
-    ancestors: Tensor | None
+    modality: Gaussian | None = None
+    log_likelihood: Tensor | None = None
+    ancestors: Tensor | None = None

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.batch import Steps, black_out
+from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, moments
+from beliefscope.filters.checkpoint import Checkpoint, write_atomically
+from beliefscope.filters.filter import Filter
+from beliefscope.filters.rollout import rollout, start_at_truth
 
 Array = NDArray[np.float32]
+FORMAT = 1
 
 
 @dataclass(frozen=True)
@@ -25,17 +38,23 @@ class Trace:
         episode: what was filtered: truth, contact, observations as the filter saw them, replay.
         modalities: the K modalities' names, in the order of every K axis.
         kind: ``ekf`` or ``pf``.
+        filter: its name.
         estimate_mean, estimate_covariance: (T, n), (T, n, n) fused posterior.
-        modality_mean, modality_covariance: (T, K, n), (T, K, n, n): each modality's own belief (see ``StepTrace``).
-        weights: (T, K, W) beta as the network gave it; W is n (per component) or 1. acting: (T, K, W) share as it acted.
-        predicted_mean, predicted_covariance: EKF: (T, K, n), (T, K, n, n).
-        observation_mean, observation_covariance: EKF: (T, K, n), (T, K, n, n): virtual sensors' z and R.
-        particles: PF: (T, M, n) predicted particles. prior_log_weights, log_weights: (T, M) before and after the
-            observation, both normalised. log_likelihood: (T, K, M), not normalised. ancestors: (T, M) int32.
+        modality_mean, modality_covariance: (T, K, n), (T, K, n, n): what each modality alone believes after the step.
+            EKF: its own filter's posterior; PF: the predicted particles weighted by its likelihood alone.
         start_mean, start_covariance: (n,), (n, n) belief before the first step.
+        weights: (T, K, W) beta as the network gave it; W is n (per component) or 1.
+        acting: (T, K, W) share of each modality in the fused result as it acted; sums to one over K. EKF: beta over the
+            sum of betas; PF: prior weight x beta x likelihood of that modality over that of all, summed over particles.
+        predicted_mean, predicted_covariance: EKF: (T, K, n), (T, K, n, n): before the observation.
+        observation_mean, observation_covariance: EKF: (T, K, n), (T, K, n, n): the virtual sensors' z and R.
+        particles: PF: (T, M, n) predicted particles.
+        prior_log_weights, log_weights: PF: (T, M) before and after the observation, both normalised.
+        log_likelihood: PF: (T, K, M), not normalised.
+        ancestors: PF: (T, M) int32: the particle each resampled one came from.
         checkpoint_hash, data_hash: SHA-256 of the checkpoint's file and of the episode (``Episode.digest``).
-        episode_index: index in its data set. filter: its name. seed: of the filter's randomness.
-        settings: JSON values: particles, options, versions.
+        episode_index: index in its data set. seed: of the filter's randomness.
+        settings: JSON values: particles, blackout, versions.
     """
 
     episode: Episode
@@ -67,3 +86,194 @@ class Trace:
 
     def __len__(self) -> int:
         return len(self.estimate_mean)
+
+
+ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type))
+"""Names of the array fields of a trace."""
+
+
+@torch.no_grad()
+def trace(
+    checkpoint: Checkpoint,
+    episode: Episode,
+    episode_index: int = 0,
+    seed: int = 0,
+    particles: int = 300,
+    blackout: float = 0.0,
+    progress: Callable[[float], None] | None = None,
+) -> Trace:
+    """Runs a filter over an episode, started at the true state with covariance 0.1 I (standardised), and keeps everything.
+
+    The estimates are bit-identical to those of the untraced run with the same seed: the same steps are taken, and what
+    a step knew is kept instead of dropped.
+
+    Args:
+        blackout: chance that a picture is black; the trace's episode then holds the pictures as the filter saw them.
+        progress: called with the share done, 0..1.
+
+    Raises:
+        BadInput: the episode does not fit the checkpoint's task, or a setting is out of range.
+    """
+    if particles < 1:
+        raise BadInput(f"particles must be at least 1, not {particles}")
+    if not 0.0 <= blackout <= 1.0:
+        raise BadInput(f"blackout must be a chance between 0 and 1, not {blackout}")
+    if episode.task != checkpoint.task.name:
+        raise BadInput(
+            f"filter {checkpoint.name!r} is for task {checkpoint.task.name!r}, the episode is of {episode.task!r}"
+        )
+    filter_ = checkpoint.filter
+    data_hash = episode.digest()
+    steps = Steps.of(filter_.task, [episode])
+    batch = steps.episode(0)
+    if blackout:
+        batch = black_out(batch, torch.tensor(blackout), torch.Generator().manual_seed(seed))
+        episode = _as_seen(episode, filter_, batch.observations)
+    evidence = filter_.encode(batch)
+    start = start_at_truth(filter_, batch)
+    result = rollout(
+        filter_, evidence, start, torch.Generator().manual_seed(seed), particles, keep=True, progress=progress
+    )
+    si = filter_.statistics
+    arrays = (
+        _ekf_arrays(filter_, result.steps, evidence)
+        if checkpoint.kind == "ekf"
+        else _pf_arrays(filter_, result.steps, evidence)
+    )
+    arrays |= {
+        "estimate_mean": si.state_to_si(result.estimate.mean[:, 0]),
+        "estimate_covariance": si.covariance_to_si(result.estimate.covariance[:, 0]),
+        "start_mean": si.state_to_si(start.mean[0]),
+        "start_covariance": si.covariance_to_si(start.covariance[0]),
+    }
+    if evidence.log_weights is not None:
+        arrays["weights"] = evidence.log_weights[:, 0].exp()
+    return Trace(
+        episode=episode,
+        modalities=filter_.names,
+        kind=checkpoint.kind,
+        filter=checkpoint.name,
+        checkpoint_hash=checkpoint.hash,
+        data_hash=data_hash,
+        episode_index=episode_index,
+        seed=seed,
+        settings={"particles": particles, "blackout": blackout, "torch": torch.__version__},
+        **{name: np.ascontiguousarray(value.numpy()) for name, value in arrays.items()},
+    )
+
+
+def _as_seen(episode: Episode, filter_: Filter, observations: Mapping[str, Tensor]) -> Episode:
+    """The episode with its pictures as the filter saw them."""
+    seen = dict(episode.observations)
+    for modality, keys in filter_.task.modalities.items():
+        if observations[modality].dtype == torch.uint8:
+            seen[keys[0]] = observations[modality][:, 0].numpy()
+    return Episode(**{f.name: getattr(episode, f.name) for f in fields(Episode)} | {"observations": seen})
+
+
+def _stack(filter_: Filter, beliefs: list[Gaussian]) -> tuple[Tensor, Tensor]:
+    """Means (T, K, n) and covariances (T, K, n, n) in SI units of T banks with N = 1."""
+    si = filter_.statistics
+    mean = torch.cat([belief.mean for belief in beliefs])
+    return si.state_to_si(mean), si.covariance_to_si(torch.cat([belief.covariance for belief in beliefs]))
+
+
+def _ekf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+    assert evidence.noise is not None
+    predicted = [s.predicted for s in steps if isinstance(s.predicted, Gaussian)]
+    modality = [s.modality for s in steps if s.modality is not None]
+    arrays: dict[str, Tensor] = {}
+    arrays["predicted_mean"], arrays["predicted_covariance"] = _stack(filter_, predicted)
+    arrays["modality_mean"], arrays["modality_covariance"] = _stack(filter_, modality)
+    z = Gaussian(evidence.observation[:, 0], torch.diag_embed(evidence.noise[:, 0] ** 2))
+    arrays["observation_mean"], arrays["observation_covariance"] = _stack(filter_, [z])
+    if evidence.log_weights is not None:
+        arrays["acting"] = torch.softmax(evidence.log_weights[:, 0], dim=1)
+    return arrays
+
+
+def _pf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+    predicted = [s.predicted for s in steps if isinstance(s.predicted, Particles)]
+    states = torch.cat([p.states for p in predicted])
+    prior = torch.cat([p.log_weights for p in predicted])
+    posterior = torch.cat([s.posterior.log_weights for s in steps if isinstance(s.posterior, Particles)])
+    log_likelihood = torch.cat([s.log_likelihood for s in steps if s.log_likelihood is not None])
+    alone = torch.log_softmax(prior.unsqueeze(1) + log_likelihood, dim=-1)
+    modality = moments(states.unsqueeze(1), alone)
+    si = filter_.statistics
+    arrays = {
+        "particles": si.state_to_si(states),
+        "prior_log_weights": prior,
+        "log_weights": posterior,
+        "log_likelihood": log_likelihood,
+        "ancestors": torch.cat([s.ancestors for s in steps if s.ancestors is not None]).int(),
+        "modality_mean": si.state_to_si(modality.mean),
+        "modality_covariance": si.covariance_to_si(modality.covariance),
+    }
+    evidence_of_each = torch.logsumexp(prior.unsqueeze(1) + log_likelihood, dim=-1, keepdim=True)
+    if evidence.log_weights is not None:
+        evidence_of_each = evidence_of_each + evidence.log_weights[:, 0]
+    arrays["acting"] = torch.softmax(evidence_of_each, dim=1)
+    return arrays
+
+
+def save_trace(trace: Trace, path: Path) -> None:
+    """Writes a trace atomically as safetensors with a JSON header. Raises BadInput when the folder does not exist."""
+    episode = trace.episode
+    arrays: dict[str, NDArray[Any]] = {
+        name: getattr(trace, name) for name in ARRAYS if getattr(trace, name) is not None
+    }
+    arrays |= {
+        f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")
+    }
+    arrays |= {f"episode/observations/{key}": value for key, value in episode.observations.items()}
+    header = {
+        "format": FORMAT,
+        **{
+            f.name: getattr(trace, f.name)
+            for f in fields(Trace)
+            if f.name not in (*ARRAYS, "episode", "settings")
+        },
+        "settings": dict(trace.settings),
+        "episode": {
+            "task": episode.task,
+            "dt": episode.dt,
+            "seed": episode.seed,
+            "split": episode.split,
+            "provenance": dict(episode.provenance),
+        },
+    }
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    write_atomically(
+        path, save(contiguous, metadata={"beliefscope-trace": json.dumps(header, sort_keys=True)})
+    )
+
+
+def load_trace(path: Path) -> Trace:
+    """Reads a trace without loss. Raises BadInput when it is missing, truncated, or not a trace."""
+    path = Path(path)
+    if not path.is_file():
+        raise BadInput(f"trace {str(path)!r} does not exist")
+    try:
+        with safe_open(path, framework="np") as file:
+            metadata = file.metadata() or {}
+            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+        header = json.loads(metadata.get("beliefscope-trace", "null"))
+    except (SafetensorError, OSError, ValueError) as error:
+        raise BadInput(f"{str(path)!r} is not a readable trace: {error}") from None
+    if not isinstance(header, dict):
+        raise BadInput(f"{str(path)!r} is a safetensors file, but not a trace of Beliefscope")
+    if header.pop("format", None) != FORMAT:
+        raise BadInput(f"{str(path)!r} is a trace of another format; this version reads format {FORMAT}")
+    prefix = "episode/observations/"
+    try:
+        episode = Episode(
+            **header.pop("episode"),
+            **{name: arrays.pop(f"episode/{name}") for name in ("states", "controls", "contact", "qpos")},
+            observations={
+                key.removeprefix(prefix): arrays.pop(key) for key in list(arrays) if key.startswith(prefix)
+            },
+        )
+        return Trace(**{**header, "modalities": tuple(header["modalities"])}, episode=episode, **arrays)
+    except (KeyError, TypeError) as error:
+        raise BadInput(f"{str(path)!r} is not a whole trace: {error}") from None

@@ -1,0 +1,186 @@
+"""Episodes as tensors, and the statistics that standardise them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
+
+SMALLEST_STD = 1e-6
+"""A channel that never moved is divided by 1 instead of by less than this."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """T steps of N trajectories in SI units; pictures stay uint8 until they are encoded.
+
+    Attributes:
+        observations: modality -> (T, N, H, W) uint8 or (T, N, d) float32.
+        controls: (T, N, c). states: (T, N, n). contact: (T, N) bool.
+        previous: (N, n) true state one step before the first (that of step 0 where the trajectory starts there).
+    """
+
+    observations: Mapping[str, Tensor]
+    controls: Tensor
+    states: Tensor
+    contact: Tensor
+    previous: Tensor
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """All steps of a set of episodes end to end, from which windows are cut.
+
+    Attributes: as in ``Batch`` but (S, ...), S steps in all. first: (E,) index of each episode's step 0. length: (E,).
+    """
+
+    observations: Mapping[str, Tensor]
+    controls: Tensor
+    states: Tensor
+    contact: Tensor
+    first: Tensor
+    length: Tensor
+
+    @classmethod
+    def of(cls, task: Task, episodes: Sequence[Episode], device: torch.device | str = "cpu") -> Steps:
+        """Raises BadInput where there is no episode or an array does not have the task's shape."""
+        if not episodes:
+            raise BadInput("no episode to work on: the data set's split is empty")
+        for number, episode in enumerate(episodes):
+            check_shapes(task, episode, f"episode {number}")
+        observations = {
+            modality: _join([_modality(episode, keys) for episode in episodes], device)
+            for modality, keys in task.modalities.items()
+        }
+        length = torch.tensor([len(episode) for episode in episodes], device=device)
+        return cls(
+            observations=observations,
+            controls=_join([e.controls for e in episodes], device),
+            states=_join([e.states for e in episodes], device),
+            contact=_join([e.contact for e in episodes], device),
+            first=length.cumsum(0) - length,
+            length=length,
+        )
+
+    def windows(self, starts: Tensor, steps: int) -> Batch:
+        """Windows of ``steps`` steps that begin at the given steps (N,), as a Batch."""
+        index = starts + torch.arange(steps, device=starts.device)[:, None]
+        at_start = torch.isin(starts, self.first)
+        return Batch(
+            observations={m: values[index] for m, values in self.observations.items()},
+            controls=self.controls[index],
+            states=self.states[index],
+            contact=self.contact[index],
+            previous=self.states[torch.where(at_start, starts, starts - 1)],
+        )
+
+    def sample(self, count: int, steps: int, generator: torch.Generator) -> Batch:
+        """``count`` windows drawn uniformly over all that fit. Raises BadInput where none does."""
+        room = (self.length - steps + 1).clamp_min(0)
+        ends = room.cumsum(0)
+        if int(ends[-1]) == 0:
+            raise BadInput(f"no episode has {steps} steps: the longest has {int(self.length.max())}")
+        draw = torch.randint(int(ends[-1]), (count,), generator=generator).to(ends.device)
+        episode = torch.searchsorted(ends, draw, right=True)
+        return self.windows(self.first[episode] + draw - (ends - room)[episode], steps)
+
+    def episode(self, number: int) -> Batch:
+        """One whole episode, N = 1."""
+        return self.windows(self.first[number : number + 1], int(self.length[number]))
+
+
+def check_shapes(task: Task, episode: Episode, where: str) -> None:
+    """Raises BadInput, naming the array, where an episode does not fit its task."""
+    expected = {"states": (len(task.components),), "controls": (task.control_size,)}
+    arrays = {"states": episode.states, "controls": episode.controls}
+    expected |= dict(task.observations)
+    for key in task.observations:
+        if key not in episode.observations:
+            raise BadInput(f"{where} has no observation {key!r}, which task {task.name!r} needs")
+        arrays[key] = episode.observations[key]
+    for key, shape in expected.items():
+        if arrays[key].shape != (len(episode), *shape):
+            raise BadInput(f"{where}: {key!r} has shape {arrays[key].shape}, not {(len(episode), *shape)}")
+
+
+def _modality(episode: Episode, keys: Sequence[str]) -> np.ndarray:
+    arrays = [episode.observations[key] for key in keys]
+    return arrays[0] if arrays[0].ndim == 3 else np.concatenate(arrays, axis=1).astype(np.float32)
+
+
+def _join(arrays: Sequence[np.ndarray], device: torch.device | str) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(np.concatenate(arrays))).to(device)
+
+
+class Statistics(nn.Module):
+    """Means and standard deviations of the training set, kept as buffers so that they travel with the weights.
+
+    Vectors are standardised per channel, pictures (0..255) by one mean and deviation for all pixels.
+    """
+
+    def __init__(self, task: Task) -> None:
+        super().__init__()
+        self.modalities = tuple(task.modalities)
+        sizes = {"state": len(task.components), "control": task.control_size}
+        for modality, keys in task.modalities.items():
+            shapes = [task.observations[key] for key in keys]
+            sizes[modality] = 1 if len(shapes[0]) == 2 else sum(shape[0] for shape in shapes)
+        for name, size in sizes.items():
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+
+    def mean_std(self, name: str) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of ``state``, ``control`` or a modality."""
+        return self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
+
+    def fit(self, steps: Steps) -> None:
+        """Takes the statistics of these steps."""
+        values = {"state": steps.states, "control": steps.controls, **steps.observations}
+        for name, array in values.items():
+            flat = array.flatten()[:, None] if array.dtype == torch.uint8 else array
+            mean, std = self.mean_std(name)
+            mean.copy_(flat.double().mean(0))
+            deviation = flat.double().std(0)
+            std.copy_(torch.where(deviation > SMALLEST_STD, deviation, torch.ones_like(deviation)))
+
+    def standardise(self, name: str, values: Tensor) -> Tensor:
+        """(..., d) in SI units (or 0..255) to zero mean and unit deviation, float32."""
+        mean, std = self.mean_std(name)
+        return (values.to(mean.dtype) - mean) / std
+
+    def standardise_observations(self, observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {m: self.standardise(m, observations[m]) for m in self.modalities}
+
+    def state_to_si(self, mean: Tensor) -> Tensor:
+        """Standardised states (..., n) to m and rad."""
+        return mean * self.get_buffer("state_std") + self.get_buffer("state_mean")
+
+    def covariance_to_si(self, covariance: Tensor) -> Tensor:
+        """Standardised covariances (..., n, n) to m^2, m rad, rad^2."""
+        std = self.get_buffer("state_std")
+        return covariance * std * std[:, None]
+
+
+def black_out(batch: Batch, probability: Tensor, generator: torch.Generator) -> Batch:
+    """The batch with pictures turned black (all zero), each step on its own.
+
+    Args:
+        probability: (N,) or () chance of a black picture. generator: on the CPU.
+    """
+    shape = batch.states.shape[:2]
+    black = (torch.rand(shape, generator=generator) < probability).to(batch.states.device)
+    observations = {
+        m: values.masked_fill(black[..., None, None], 0) if values.dtype == torch.uint8 else values
+        for m, values in batch.observations.items()
+    }
+    return replace(batch, observations=observations)

@@ -1,0 +1,139 @@
+"""Checkpoints: safetensors with one JSON document in the header. Never pickle.
+
+The header's key ``beliefscope`` holds ``{"format", "name", "architecture", "record"}``; the tensors are the filter's state
+dictionary, statistics of the training set included. A checkpoint's hash is the SHA-256 of its file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.task import Task
+from beliefscope.filters.catalog import FILTERS, build
+from beliefscope.filters.filter import Architecture, Filter
+
+FORMAT = 1
+PRETRAINED = Path(__file__).parent / "pretrained"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A trained filter and where it came from.
+
+    Attributes:
+        filter: in evaluation mode, on the CPU. name: of the filter, e.g. ``crossmodal-pf``. hash: SHA-256 of the file.
+        record: JSON: training command, seed, data hash, metrics, versions.
+    """
+
+    filter: Filter
+    name: str
+    hash: str
+    record: Mapping[str, Any]
+
+    @property
+    def task(self) -> Task:
+        return self.filter.task
+
+    @property
+    def kind(self) -> str:
+        return self.filter.architecture.kind
+
+
+def save_checkpoint(filter_: Filter, name: str, record: Mapping[str, Any], path: Path) -> str:
+    """Writes the checkpoint atomically and returns its hash. Raises BadInput when the folder does not exist."""
+    header = {
+        "format": FORMAT,
+        "name": name,
+        "architecture": filter_.architecture.to_json(),
+        "record": dict(record),
+    }
+    tensors = {key: value.detach().cpu().contiguous() for key, value in filter_.state_dict().items()}
+    data = save(tensors, metadata={"beliefscope": json.dumps(header, sort_keys=True)})
+    write_atomically(path, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Reads a checkpoint. Raises BadInput when it is missing, truncated, or not one of ours."""
+    path = Path(path)
+    if not path.is_file():
+        raise BadInput(f"checkpoint {str(path)!r} does not exist")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise BadInput(f"{str(path)!r} is not a readable safetensors file: {error}") from None
+    header = _header(path, metadata)
+    architecture = Architecture.from_json(header["architecture"])
+    filter_ = build(architecture)
+    expected = {key: tuple(value.shape) for key, value in filter_.state_dict().items()}
+    found = {key: tuple(value.shape) for key, value in tensors.items()}
+    if expected != found:
+        key = min(expected.items() ^ found.items())[0]
+        raise BadInput(
+            f"{str(path)!r}: tensor {key!r} is {found.get(key, 'missing')}, but this architecture has "
+            f"{expected.get(key, 'no such tensor')}"
+        )
+    filter_.load_state_dict(tensors)
+    filter_.eval().requires_grad_(False)
+    return Checkpoint(
+        filter_, header["name"], hashlib.sha256(path.read_bytes()).hexdigest(), header["record"]
+    )
+
+
+def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    if "beliefscope" not in metadata:
+        raise BadInput(f"{str(path)!r} is a safetensors file, but not a checkpoint of Beliefscope")
+    try:
+        header = json.loads(metadata["beliefscope"])
+    except json.JSONDecodeError as error:
+        raise BadInput(f"{str(path)!r} has a damaged header: {error}") from None
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        found = header.get("format") if isinstance(header, dict) else header
+        raise BadInput(f"{str(path)!r} has checkpoint format {found!r}; this version reads format {FORMAT}")
+    missing = {"name", "architecture", "record"} - header.keys()
+    if missing:
+        raise BadInput(f"{str(path)!r} lacks {', '.join(sorted(missing))} in its header")
+    return header
+
+
+def shipped(task: str, name: str) -> Path:
+    """The checkpoint that ships for a task and filter. Raises BadInput where none does."""
+    if name not in FILTERS:
+        raise one_of("filter", name, FILTERS)
+    path = PRETRAINED / f"{task}-{name}.safetensors"
+    if not path.is_file():
+        raise BadInput(
+            f"no trained {name!r} ships for task {task!r}; train one: beliefscope train {task} --filter {name}"
+        )
+    return path
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """The old file or the new one, never half of it. Raises BadInput when the folder does not exist."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise BadInput(f"folder {str(path.parent)!r} does not exist")
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise

@@ -1,0 +1,146 @@
+"""What every filter of this package is: networks that weigh evidence, and a pure step over beliefs."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import torch
+from beliefscope.datasets.catalog import find_task
+from torch import Tensor, nn
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
+from beliefscope.filters.batch import Batch, Statistics
+from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
+from beliefscope.filters.dynamics import Dynamics
+from beliefscope.filters.fusion import CovarianceRule
+from beliefscope.filters.networks import Encoders, Residual, Stack
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Everything that fixes a filter's modules and equations; travels inside the checkpoint as JSON.
+
+    Attributes:
+        task: name in ``TASKS``.
+        kind: ``ekf`` or ``pf``.
+        fusion: how the measurement models' results are fused: ``crossmodal`` (learned weights beta), ``unimodal`` (product
+            of experts for an EKF, sum of likelihoods for a PF), or ``none`` (there is only one).
+        models: one measurement model each: the modalities that it sees, joined by ``+``.
+        units: width of all fully connected layers. image_stride: of the first convolution.
+        covariance: EKF: rule of the fused covariance. feedback: EKF: hand the fused belief back to every unimodal filter
+            (the paper's text leaves them independent).
+    """
+
+    task: str
+    kind: Literal["ekf", "pf"]
+    fusion: Literal["crossmodal", "unimodal", "none"] = "crossmodal"
+    models: tuple[str, ...] = ("image", "haptics")
+    units: int = 64
+    image_stride: int = 2
+    covariance: CovarianceRule = "paper"
+    feedback: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self) | {"models": list(self.models)}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Architecture:
+        """Raises BadInput when a name is unknown or missing."""
+        try:
+            return cls(**{**values, "models": tuple(values["models"])})
+        except (KeyError, TypeError) as error:
+            raise BadInput(f"not an architecture of this version: {error}") from None
+
+
+class Filter(nn.Module, ABC):
+    """A differentiable filter: ``encode`` once, then ``step`` through time. Standardised units throughout."""
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        task = find_task(architecture.task)
+        self.architecture = architecture
+        self.task = task
+        self.n = len(task.components)
+        self.statistics = Statistics(task)
+        self.dynamics = Dynamics(self.n, task.control_size, architecture.units)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The measurement models' names, in the order of every K axis: ``image``, ``haptics``."""
+        return self.architecture.models
+
+    def index(self, name: str) -> int:
+        """Position of a measurement model. Raises BadInput for an unknown name."""
+        if name not in self.names:
+            raise BadInput(f"Modality {name!r} is not in this filter. Available: {', '.join(self.names)}.")
+        return self.names.index(name)
+
+    def weights_part(self, batch: Batch) -> Tensor | None:
+        """(T, N, K, W) log beta, or None where nothing is weighed by a network."""
+        if self.architecture.fusion != "crossmodal":
+            return None
+        log_weights: Tensor = self.weight_model(self.observations(batch))
+        return log_weights
+
+    def observations(self, batch: Batch) -> dict[str, Tensor]:
+        """Observations by modality, standardised, float32."""
+        return self.statistics.standardise_observations(batch.observations)
+
+    @abstractmethod
+    def encode(self, batch: Batch) -> Evidence:
+        """All that can be computed without the belief, for all T x N at once."""
+
+    @abstractmethod
+    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
+        """The first belief from a Gaussian (N, n), (N, n, n)."""
+
+    @abstractmethod
+    def step(
+        self, belief: Belief, evidence: Evidence, generator: torch.Generator
+    ) -> tuple[Belief, StepTrace]:
+        """One prediction and update. ``evidence`` is one step's: leading axis N. Draws only from ``generator``."""
+
+
+def model_shapes(task: Task, model: str) -> dict[str, tuple[int, ...]]:
+    """Input shapes by modality of a measurement model such as ``image`` or ``image+haptics``."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for modality in model.split("+"):
+        if modality not in task.modalities:
+            raise BadInput(
+                f"Modality {modality!r} is not in task {task.name!r}. Available: {', '.join(task.modalities)}."
+            )
+        shapes[modality] = modality_shape(task, modality)
+    return shapes
+
+
+def modality_shape(task: Task, modality: str) -> tuple[int, ...]:
+    """(H, W) of a picture, or (d,) of joined vectors."""
+    keys = [task.observations[key] for key in task.modalities[modality]]
+    return keys[0] if len(keys[0]) == 2 else (sum(shape[0] for shape in keys),)
+
+
+class WeightModel(nn.Module):
+    """Crossmodal weights: every modality through an encoder of its own, joined, to log beta (T, N, K, W).
+
+    A softmax over K makes the weights positive and sum to one in each component.
+    """
+
+    def __init__(
+        self, task: Task, models: tuple[str, ...], width: int, units: int, image_stride: int
+    ) -> None:
+        super().__init__()
+        modalities = list(dict.fromkeys(m for model in models for m in model.split("+")))
+        self.shape = (len(models), width)
+        self.encoders = Encoders({m: modality_shape(task, m) for m in modalities}, units, image_stride)
+        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(), Residual(units))
+        self.output = nn.Linear(units, len(models) * width)
+        nn.init.normal_(self.output.weight, std=1e-2)
+        nn.init.zeros_(self.output.bias)
+
+    def forward(self, observations: Mapping[str, Tensor]) -> Tensor:
+        logits = self.output(self.trunk(self.encoders(observations))).unflatten(-1, self.shape)
+        return torch.log_softmax(logits, dim=-2)

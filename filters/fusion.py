@@ -1,0 +1,75 @@
+"""Ways to fuse K unimodal beliefs or likelihoods. Pure functions; the modality axis is said in each."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from beliefscope.filters.belief import Gaussian
+
+CovarianceRule = Literal["paper", "moments"]
+
+
+def product_of_experts(bank: Gaussian) -> Gaussian:
+    """Product of K Gaussians (N, K, n): ``S = (sum S_k^-1)^-1``, ``m = S sum S_k^-1 m_k`` (Lee et al., eq. 10, 11)."""
+    precision = torch.linalg.inv(bank.covariance)
+    covariance = symmetric(torch.linalg.inv(precision.sum(-3)))
+    information = (precision @ bank.mean.unsqueeze(-1)).sum(-3)
+    return Gaussian((covariance @ information).squeeze(-1), covariance)
+
+
+def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule = "paper") -> Gaussian:
+    """Crossmodal weights per component: ``m = sum b_k * m_k / sum b_k`` (Lee et al., eq. 12, 13).
+
+    ``paper``: ``S = sum B_k * S_k / sum B_k``, all elementwise, ``B_k = n b_k b_k^T``. Taken literally the result need not be
+    positive definite, since each entry is averaged with weights of its own; where it is not, its correlations are
+    limited to what always is. It also ignores that the modalities disagree.
+    ``moments``: the covariance of the mixture that has these weights: adds the spread of the means; always definite.
+
+    Args:
+        bank: mean (N, K, n), covariance (N, K, n, n). log_weights: (N, K, n), log beta.
+    """
+    beta = torch.softmax(log_weights, dim=-2)
+    mean = (beta * bank.mean).sum(-2)
+    if rule == "moments":
+        root = beta.sqrt()
+        spread = bank.mean - mean.unsqueeze(-2)
+        inner = bank.covariance + spread.unsqueeze(-1) * spread.unsqueeze(-2)
+        return Gaussian(mean, symmetric((root.unsqueeze(-1) * root.unsqueeze(-2) * inner).sum(-3)))
+    # Logs keep the ratio finite where two one-hot weights differ between components (0 / 0 otherwise).
+    log_beta = torch.log_softmax(log_weights, dim=-2).clamp_min(-40.0)
+    share = torch.softmax(log_beta.unsqueeze(-1) + log_beta.unsqueeze(-2), dim=-3)
+    return Gaussian(mean, positive_definite(symmetric((share * bank.covariance).sum(-3))))
+
+
+def mixture(log_likelihood: Tensor, log_weights: Tensor | None) -> Tensor:
+    """``log sum_k b_k p_k``: log-likelihoods (..., K, M) and log beta (..., K, 1) to (..., M) (Lee et al., eq. 14, 15)."""
+    if log_weights is None:
+        return torch.logsumexp(log_likelihood, dim=-2)
+    return torch.logsumexp(log_likelihood + log_weights, dim=-2)
+
+
+def symmetric(matrix: Tensor) -> Tensor:
+    """The symmetric part of (..., n, n)."""
+    return 0.5 * (matrix + matrix.transpose(-1, -2))
+
+
+def positive_definite(covariance: Tensor) -> Tensor:
+    """Matrices (..., n, n) that are positive definite stay; in others correlations are clipped to 0.95 / (n - 1).
+
+    A matrix with unit diagonal and off-diagonal entries below 1 / (n - 1) is diagonally dominant, hence definite.
+    """
+    n = covariance.shape[-1]
+    if n == 1:
+        return covariance
+    bad = torch.linalg.cholesky_ex(covariance.detach()).info > 0
+    if not bool(bad.any()):
+        return covariance
+    scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).sqrt()
+    outer = scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    limit = 0.95 / (n - 1)
+    diagonal = torch.eye(n, dtype=torch.bool, device=covariance.device)
+    clipped = torch.where(diagonal, covariance, (covariance / outer).clamp(-limit, limit) * outer)
+    return torch.where(bad[..., None, None], clipped, covariance)

@@ -1,0 +1,124 @@
+"""Building blocks of all networks: residual layers, encoders, and forward-mode derivatives through them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+PICTURES_AT_ONCE = 1024
+"""Pictures encoded in one go: enough to keep the cores busy, few enough to stay in the caches."""
+
+
+class Residual(nn.Module):
+    """``relu(x + W2 relu(W1 x + b1) + b2)``, two layers of ``units``."""
+
+    def __init__(self, units: int) -> None:
+        super().__init__()
+        self.first = nn.Linear(units, units)
+        self.second = nn.Linear(units, units)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.relu(x + self.second(functional.relu(self.first(x))))
+
+    def dual(self, x: Tensor) -> Tensor:
+        return dual_relu(x + dual_linear(self.second, dual_relu(dual_linear(self.first, x))))
+
+
+def dual_linear(layer: nn.Linear, x: Tensor) -> Tensor:
+    """A linear layer on dual numbers: (..., 1 + n, d), row 0 the value and row i its derivative by input i."""
+    y = functional.linear(x, layer.weight)
+    if layer.bias is None:
+        return y
+    is_value = torch.zeros(x.shape[-2], 1, dtype=x.dtype, device=x.device)
+    is_value[0] = 1.0
+    return y + is_value * layer.bias
+
+
+def dual_relu(x: Tensor) -> Tensor:
+    """ReLU on dual numbers."""
+    return x * (x[..., :1, :] > 0)
+
+
+class Stack(nn.Sequential):
+    """Linear, ReLU and Residual layers in a row, on values or on dual numbers."""
+
+    def dual(self, x: Tensor) -> Tensor:
+        """Values and derivatives (..., 1 + n, d) through the stack."""
+        for layer in self:
+            if isinstance(layer, nn.Linear):
+                x = dual_linear(layer, x)
+            elif isinstance(layer, nn.ReLU):
+                x = dual_relu(x)
+            else:
+                x = layer.dual(x)
+        return x
+
+
+def vector_stack(inputs: int, units: int) -> Stack:
+    """Three layers from ``inputs`` to ``units``."""
+    return Stack(nn.Linear(inputs, units), nn.ReLU(), Residual(units))
+
+
+class ResidualConvolution(nn.Module):
+    """Residual block of two 3x3 convolutions."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.relu(x + self.second(functional.relu(self.first(x))))
+
+
+class ImageEncoder(nn.Module):
+    """Pictures (B, H, W), standardised, to features (B, units); the convolutions' output is flattened.
+
+    The first layer has stride 2: a fifth of the time of full resolution at like accuracy (docs/filters.md).
+    """
+
+    def __init__(self, shape: tuple[int, int], units: int, stride: int = 2) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(1, 32, 5, stride=stride, padding=2),
+            nn.ReLU(),
+            ResidualConvolution(32),
+            nn.Conv2d(32, 16, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(16, 8, 3, padding=1),
+            nn.ReLU(),
+        )
+        cells = -(-shape[0] // stride) * -(-shape[1] // stride)
+        self.output = Stack(nn.Linear(8 * cells, units), nn.ReLU(), Residual(units))
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        features: Tensor = self.output(self.convolutions(pictures.unsqueeze(1)).flatten(1))
+        return features
+
+
+class Encoders(nn.Module):
+    """One encoder a modality; their features joined: observations (T, N, ...) to (T, N, units x modalities)."""
+
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]], units: int, image_stride: int) -> None:
+        super().__init__()
+        self.by_modality = nn.ModuleDict()
+        for modality, shape in shapes.items():
+            if len(shape) == 2:
+                self.by_modality[modality] = ImageEncoder((shape[0], shape[1]), units, image_stride)
+            else:
+                self.by_modality[modality] = vector_stack(shape[0], units)
+        self.size = units * len(shapes)
+
+    def forward(self, observations: Mapping[str, Tensor]) -> Tensor:
+        features = []
+        for modality, encoder in self.by_modality.items():
+            observed = observations[modality]
+            if isinstance(encoder, ImageEncoder):
+                parts = [encoder(part) for part in observed.flatten(0, 1).split(PICTURES_AT_ONCE)]
+                features.append(torch.cat(parts).unflatten(0, observed.shape[:2]))
+            else:
+                features.append(encoder(observed))
+        return torch.cat(features, dim=-1)

@@ -1,0 +1,115 @@
+"""Particle filters with learned likelihoods, fused as a mixture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from beliefscope.datasets.task import Task
+from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Belief, Evidence, Gaussian, Particles, StepTrace
+from beliefscope.filters.filter import Architecture, Filter, WeightModel, model_shapes
+from beliefscope.filters.fusion import mixture
+from beliefscope.filters.networks import Encoders, Residual, Stack, vector_stack
+from beliefscope.filters.resample import systematic
+
+
+class MeasurementModel(nn.Module):
+    """log p(observation | state) up to a constant, from observations and the state of each particle.
+
+    The first layer that sees both is kept as two summands: ``observation_part`` is computed once a step, ``state_part`` once
+    a particle, and ``log_likelihood`` needs only their sum.
+    """
+
+    def __init__(self, task: Task, model: str, units: int, image_stride: int) -> None:
+        super().__init__()
+        self.encoders = Encoders(model_shapes(task, model), units, image_stride)
+        self.join_observation = nn.Linear(self.encoders.size, units)
+        self.state_encoder = vector_stack(len(task.components), units)
+        self.join_state = nn.Linear(units, units, bias=False)
+        self.head = Stack(nn.ReLU(), Residual(units), nn.Linear(units, 1))
+
+    def observation_part(self, observations: Mapping[str, Tensor]) -> Tensor:
+        """(T, N, units)."""
+        part: Tensor = self.join_observation(self.encoders(observations))
+        return part
+
+    def state_part(self, states: Tensor) -> Tensor:
+        """States (..., n), standardised, to (..., units)."""
+        part: Tensor = self.join_state(self.state_encoder(states))
+        return part
+
+    def log_likelihood(self, observation_part: Tensor, state_part: Tensor) -> Tensor:
+        """Two parts that broadcast against each other, (..., units), to (...)."""
+        value: Tensor = self.head(observation_part + state_part)
+        return value.squeeze(-1)
+
+
+class ParticleFilter(Filter):
+    """Sampling importance resampling with ``w_i = sum_k beta_k p_k(z | x_i)``; systematic resampling at every step."""
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__(architecture)
+        size = (architecture.units, architecture.image_stride)
+        self.measurement_models = nn.ModuleDict(
+            {m: MeasurementModel(self.task, m, *size) for m in self.names}
+        )
+        if architecture.fusion == "crossmodal":
+            self.weight_model = WeightModel(self.task, self.names, 1, *size)
+
+    def measurement_model(self, name: str) -> MeasurementModel:
+        """The model of one modality, typed."""
+        model = self.measurement_models[name]
+        assert isinstance(model, MeasurementModel)
+        return model
+
+    def encode(self, batch: Batch) -> Evidence:
+        observations = self.observations(batch)
+        parts = [self.measurement_model(m).observation_part(observations) for m in self.names]
+        return Evidence(
+            control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
+            observation=torch.stack(parts, dim=2),
+            noise=None,
+            log_weights=self.weights_part(batch),
+        )
+
+    def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
+        """Of each modality, for particles (N, M, n) at one step: (N, K, M), not normalised."""
+        values = [
+            model.log_likelihood(evidence.observation[:, k, None], model.state_part(states))
+            for k, model in enumerate(self.measurement_model(m) for m in self.names)
+        ]
+        return torch.stack(values, dim=1)
+
+    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Particles:
+        factor = torch.linalg.cholesky(belief.covariance)
+        shape = (len(belief.mean), particles, self.n)
+        unit = torch.randn(shape, generator=generator, device=belief.mean.device)
+        states = belief.mean.unsqueeze(1) + unit @ factor.transpose(-1, -2)
+        return Particles(states, torch.full(shape[:2], -math.log(particles), device=states.device))
+
+    def step(
+        self, belief: Belief, evidence: Evidence, generator: torch.Generator
+    ) -> tuple[Particles, StepTrace]:
+        assert isinstance(belief, Particles)
+        moved = self.dynamics(belief.states, evidence.control.unsqueeze(1))
+        unit = torch.randn(moved.shape, generator=generator, device=moved.device)
+        predicted = Particles(moved + unit * self.dynamics.noise, belief.log_weights)
+        log_likelihood = self.log_likelihood(evidence, predicted.states)
+        log_weights = predicted.log_weights + mixture(log_likelihood, evidence.log_weights)
+        posterior = Particles(predicted.states, torch.log_softmax(log_weights, dim=-1))
+        ancestors = systematic(posterior.log_weights.detach(), generator)
+        resampled = Particles(
+            posterior.states.gather(1, ancestors.unsqueeze(-1).expand_as(posterior.states)),
+            torch.full_like(posterior.log_weights, -math.log(ancestors.shape[-1])),
+        )
+        return resampled, StepTrace(
+            predicted=predicted,
+            posterior=posterior,
+            estimate=posterior.moments(),
+            log_likelihood=log_likelihood,
+            ancestors=ancestors,
+        )

@@ -1,0 +1,54 @@
+"""Running a filter through time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
+from beliefscope.filters.filter import Filter
+
+START_VARIANCE = 0.1
+"""Of the first belief around the true state, in standardised units, as in the paper's evaluation."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """estimate: Gaussian (T, N, n), (T, N, n, n), standardised. steps: the T step traces where they were kept."""
+
+    estimate: Gaussian
+    steps: list[StepTrace]
+
+
+def start_at_truth(filter_: Filter, batch: Batch) -> Gaussian:
+    """The first belief: the true state before step 0 with covariance 0.1 I, standardised; (N, n), (N, n, n)."""
+    mean = filter_.statistics.standardise("state", batch.previous)
+    eye = torch.eye(filter_.n, device=mean.device)
+    return Gaussian(mean, (START_VARIANCE * eye).expand(len(mean), -1, -1))
+
+
+def rollout(
+    filter_: Filter,
+    evidence: Evidence,
+    start: Gaussian,
+    generator: torch.Generator,
+    particles: int = 300,
+    keep: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Rollout:
+    """All T steps of ``evidence``. Keeping the step traces changes no number: the same steps are taken either way."""
+    belief = filter_.start(start, particles, generator)
+    estimates: list[Gaussian] = []
+    steps: list[StepTrace] = []
+    for t in range(len(evidence)):
+        belief, trace = filter_.step(belief, evidence[t], generator)
+        estimates.append(trace.estimate)
+        if keep:
+            steps.append(trace)
+        if progress is not None:
+            progress((t + 1) / len(evidence))
+    mean = torch.stack([e.mean for e in estimates])
+    return Rollout(Gaussian(mean, torch.stack([e.covariance for e in estimates])), steps)
