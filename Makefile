@@ -1,0 +1,63 @@
+# Everything runs in .venv, which is made when it is missing or when the requirements have changed.
+#   PYTHON=...     the interpreter to make .venv with (3.11 or newer)
+#   PIP_FLAGS=...  more flags for pip, such as another package index
+#   ARGS=...       more arguments for the command: make serve ARGS="--port 9000"
+
+PYTHON    ?= $(shell command -v python3.11 || command -v python3)
+PIP_FLAGS ?=
+ARGS      ?=
+
+VENV := .venv
+BIN  := $(VENV)/bin
+# Compiling every module of every package would add half a minute to the first start; Python compiles what it imports.
+PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_FLAGS)
+
+.DEFAULT_GOAL := help
+.PHONY: help install serve test lint check check-all bench clean
+
+help:
+	@echo "make serve      set up what is missing and serve the page on http://127.0.0.1:8000"
+	@echo "make test       run the tests (those of the page need Chromium and are skipped without it)"
+	@echo "make check      lint, formatting, types and the tests"
+	@echo "make check-all  the same with the tests that take minutes"
+	@echo "make bench      measure the filters, the maps, the recordings and the page"
+	@echo "make install    only set up .venv, with the tools for development"
+	@echo "make clean      remove .venv and what the tools left behind"
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "Beliefscope needs Python 3.11 or newer; '$(PYTHON)' is not. Name one: make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@echo "Setting up $(VENV): about a minute, and downloads of about 600 MB the first time."
+	@"$(PYTHON)" -m venv $(VENV)
+	@$(PIP) pip
+	@$(PIP) -e .
+	@touch $@
+
+$(VENV)/installed-dev: $(VENV)/installed
+	@echo "Adding the tools for development to $(VENV)."
+	@$(PIP) -e '.[dev]'
+	@touch $@
+
+install: $(VENV)/installed-dev
+
+serve: $(VENV)/installed
+	@$(BIN)/beliefscope serve $(ARGS)
+
+test: install
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: install
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy src/beliefscope
+
+check: lint test
+
+check-all: lint
+	@$(BIN)/python -m pytest -m "" $(ARGS)
+
+bench: install
+	@$(BIN)/python bench/run.py $(ARGS)
+
+clean:
+	rm -rf $(VENV) build dist src/beliefscope.egg-info .pytest_cache .mypy_cache .ruff_cache
