@@ -101,7 +101,7 @@ class Steps:
 
 def check_shapes(task: Task, episode: Episode, where: str) -> None:
     """Raises BadInput, naming the array, where an episode does not fit its task."""
-    expected = {"states": (len(task.components),), "controls": (task.control_size,)}
+    expected: dict[str, tuple[int, ...]] = {"states": (len(task.components),), "controls": (task.control_size,)}
     arrays = {"states": episode.states, "controls": episode.controls}
     expected |= dict(task.observations)
     for key in task.observations:

@@ -6,7 +6,7 @@ Steps are pure: ``step(belief, evidence, generator) -> (belief, StepTrace)``. No
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -48,7 +48,8 @@ def moments(states: Tensor, log_weights: Tensor) -> Gaussian:
 class Evidence:
     """What the observations and controls say, computed once for all T x N before the time recursion starts.
 
-    K is the number of measurement models, u the width of the networks. ``evidence[t]`` is step t; ``evidence[a:b]`` a slice.
+    K is the number of measurement models, u the width of the networks. ``evidence[t]`` is step t; ``evidence[a:b]``
+    a slice.
 
     Attributes:
         control: (T, N, u) the controls' part of the dynamics model.
@@ -69,8 +70,12 @@ class Evidence:
         return len(self.control)
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Evidence:
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Evidence(**{name: None if v is None else function(v) for name, v in values.items()})
+        return Evidence(
+            control=function(self.control),
+            observation=function(self.observation),
+            noise=None if self.noise is None else function(self.noise),
+            log_weights=None if self.log_weights is None else function(self.log_weights),
+        )
 
     def only(self, k: int) -> Evidence:
         """The same evidence with beta one-hot on measurement model k: the filter on that modality alone."""

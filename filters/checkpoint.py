@@ -1,7 +1,7 @@
 """Checkpoints: safetensors with one JSON document in the header. Never pickle.
 
-The header's key ``beliefscope`` holds ``{"format", "name", "architecture", "record"}``; the tensors are the filter's state
-dictionary, statistics of the training set included. A checkpoint's hash is the SHA-256 of its file.
+The header's key ``beliefscope`` holds ``{"format", "name", "architecture", "record"}``; the tensors are the
+filter's state dictionary, statistics of the training set included. A checkpoint's hash is the SHA-256 of its file.
 """
 
 from __future__ import annotations
@@ -88,9 +88,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         )
     filter_.load_state_dict(tensors)
     filter_.eval().requires_grad_(False)
-    return Checkpoint(
-        filter_, header["name"], hashlib.sha256(path.read_bytes()).hexdigest(), header["record"]
-    )
+    return Checkpoint(filter_, header["name"], hashlib.sha256(path.read_bytes()).hexdigest(), header["record"])
 
 
 def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

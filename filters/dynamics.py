@@ -9,7 +9,7 @@ from beliefscope.filters.networks import Residual, Stack, dual_linear, vector_st
 
 
 class Dynamics(nn.Module):
-    """``x_t = x_{t-1} + f1(x_{t-1}, u_t) * sigmoid(f2(x_{t-1}, u_t))`` with process noise of covariance Q (Lee et al., sec. V).
+    """``x_t = x_{t-1} + f1(x_{t-1}, u_t) * sigmoid(f2(x_{t-1}, u_t))`` plus process noise (Lee et al., sec. V).
 
     f1 is a vector, f2 a scalar gate, so that direction and size of the change are learned apart. State and control go
     through three layers each; the seven that follow are shared. The first of these is kept as two summands, so that the
@@ -46,7 +46,7 @@ class Dynamics(nn.Module):
         return states + change * torch.sigmoid(gate)
 
     def with_jacobian(self, states: Tensor, control_part: Tensor) -> tuple[Tensor, Tensor]:
-        """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one forward pass of dual numbers."""
+        """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass of dual numbers."""
         identity = torch.eye(self.n, dtype=states.dtype, device=states.device)
         tangents = identity.expand(*states.shape[:-1], self.n, self.n)
         x = torch.cat([states.unsqueeze(-2), tangents], dim=-2)

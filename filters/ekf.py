@@ -28,7 +28,8 @@ def predict(belief: Gaussian, mean: Tensor, jacobian: Tensor, noise: Tensor) -> 
 def update(belief: Gaussian, observation: Tensor, noise: Tensor) -> Gaussian:
     """Update with an observation of the whole state, H = I: ``K = S (S + R)^-1`` (Lee et al., eq. 7-9).
 
-    The covariance ``(I - K) S`` is computed as the equal ``(I - K) S (I - K)^T + K R K^T``, which rounding leaves positive.
+    The covariance ``(I - K) S`` is computed as the equal ``(I - K) S (I - K)^T + K R K^T``, which rounding leaves
+    positive.
 
     Args:
         observation: (..., n) z. noise: (..., n) square root of R's diagonal.
@@ -62,8 +63,8 @@ class VirtualSensor(nn.Module):
 class ExtendedKalmanFilter(Filter):
     """A bank of K unimodal EKFs that share the dynamics model, fused after every step.
 
-    The belief passed between steps is the bank, Gaussian (N, K, n): the unimodal filters run on alone, as in the paper's
-    text, unless ``architecture.feedback`` hands each the fused belief.
+    The belief passed between steps is the bank, Gaussian (N, K, n): the unimodal filters run on alone, as in the
+    paper's text, unless ``architecture.feedback`` hands each the fused belief.
     """
 
     def __init__(self, architecture: Architecture) -> None:
@@ -88,9 +89,7 @@ class ExtendedKalmanFilter(Filter):
         mean = belief.mean.unsqueeze(1).expand(-1, k, -1)
         return Gaussian(mean, belief.covariance.unsqueeze(1).expand(-1, k, -1, -1))
 
-    def step(
-        self, belief: Belief, evidence: Evidence, generator: torch.Generator
-    ) -> tuple[Gaussian, StepTrace]:
+    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Gaussian, StepTrace]:
         assert isinstance(belief, Gaussian)
         assert evidence.noise is not None
         mean, jacobian = self.dynamics.with_jacobian(belief.mean, evidence.control.unsqueeze(1))

@@ -27,12 +27,12 @@ class Architecture:
     Attributes:
         task: name in ``TASKS``.
         kind: ``ekf`` or ``pf``.
-        fusion: how the measurement models' results are fused: ``crossmodal`` (learned weights beta), ``unimodal`` (product
-            of experts for an EKF, sum of likelihoods for a PF), or ``none`` (there is only one).
+        fusion: how the measurement models' results are fused: ``crossmodal`` (learned weights beta), ``unimodal``
+            (product of experts for an EKF, sum of likelihoods for a PF), or ``none`` (there is only one).
         models: one measurement model each: the modalities that it sees, joined by ``+``.
         units: width of all fully connected layers. image_stride: of the first convolution.
-        covariance: EKF: rule of the fused covariance. feedback: EKF: hand the fused belief back to every unimodal filter
-            (the paper's text leaves them independent).
+        covariance: EKF: rule of the fused covariance. feedback: EKF: hand the fused belief back to every unimodal
+            filter (the paper's text leaves them independent).
     """
 
     task: str
@@ -83,8 +83,7 @@ class Filter(nn.Module, ABC):
         """(T, N, K, W) log beta, or None where nothing is weighed by a network."""
         if self.architecture.fusion != "crossmodal":
             return None
-        log_weights: Tensor = self.weight_model(self.observations(batch))
-        return log_weights
+        return self.get_submodule("weight_model")(self.observations(batch))
 
     def observations(self, batch: Batch) -> dict[str, Tensor]:
         """Observations by modality, standardised, float32."""
@@ -99,9 +98,7 @@ class Filter(nn.Module, ABC):
         """The first belief from a Gaussian (N, n), (N, n, n)."""
 
     @abstractmethod
-    def step(
-        self, belief: Belief, evidence: Evidence, generator: torch.Generator
-    ) -> tuple[Belief, StepTrace]:
+    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         """One prediction and update. ``evidence`` is one step's: leading axis N. Draws only from ``generator``."""
 
 
@@ -129,9 +126,7 @@ class WeightModel(nn.Module):
     A softmax over K makes the weights positive and sum to one in each component.
     """
 
-    def __init__(
-        self, task: Task, models: tuple[str, ...], width: int, units: int, image_stride: int
-    ) -> None:
+    def __init__(self, task: Task, models: tuple[str, ...], width: int, units: int, image_stride: int) -> None:
         super().__init__()
         modalities = list(dict.fromkeys(m for model in models for m in model.split("+")))
         self.shape = (len(models), width)

@@ -23,7 +23,8 @@ def product_of_experts(bank: Gaussian) -> Gaussian:
 def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule = "paper") -> Gaussian:
     """Crossmodal weights per component: ``m = sum b_k * m_k / sum b_k`` (Lee et al., eq. 12, 13).
 
-    ``paper``: ``S = sum B_k * S_k / sum B_k``, all elementwise, ``B_k = n b_k b_k^T``. Taken literally the result need not be
+    ``paper``: ``S = sum B_k * S_k / sum B_k``, all elementwise, ``B_k = n b_k b_k^T``. Taken literally the result
+    need not be
     positive definite, since each entry is averaged with weights of its own; where it is not, its correlations are
     limited to what always is. It also ignores that the modalities disagree.
     ``moments``: the covariance of the mixture that has these weights: adds the spread of the means; always definite.
@@ -45,7 +46,7 @@ def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule =
 
 
 def mixture(log_likelihood: Tensor, log_weights: Tensor | None) -> Tensor:
-    """``log sum_k b_k p_k``: log-likelihoods (..., K, M) and log beta (..., K, 1) to (..., M) (Lee et al., eq. 14, 15)."""
+    """``log sum_k b_k p_k``: log-likelihoods (..., K, M) and log beta (..., K, 1) to (..., M); eq. 14, 15 of the paper."""
     if log_weights is None:
         return torch.logsumexp(log_likelihood, dim=-2)
     return torch.logsumexp(log_likelihood + log_weights, dim=-2)

@@ -53,6 +53,7 @@ class Stack(nn.Sequential):
             elif isinstance(layer, nn.ReLU):
                 x = dual_relu(x)
             else:
+                assert isinstance(layer, Residual)
                 x = layer.dual(x)
         return x
 

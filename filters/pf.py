@@ -20,7 +20,8 @@ from beliefscope.filters.resample import systematic
 class MeasurementModel(nn.Module):
     """log p(observation | state) up to a constant, from observations and the state of each particle.
 
-    The first layer that sees both is kept as two summands: ``observation_part`` is computed once a step, ``state_part`` once
+    The first layer that sees both is kept as two summands: ``observation_part`` is computed once a step,
+        ``state_part`` once
     a particle, and ``log_likelihood`` needs only their sum.
     """
 
@@ -54,9 +55,7 @@ class ParticleFilter(Filter):
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
         size = (architecture.units, architecture.image_stride)
-        self.measurement_models = nn.ModuleDict(
-            {m: MeasurementModel(self.task, m, *size) for m in self.names}
-        )
+        self.measurement_models = nn.ModuleDict({m: MeasurementModel(self.task, m, *size) for m in self.names})
         if architecture.fusion == "crossmodal":
             self.weight_model = WeightModel(self.task, self.names, 1, *size)
 
@@ -91,9 +90,7 @@ class ParticleFilter(Filter):
         states = belief.mean.unsqueeze(1) + unit @ factor.transpose(-1, -2)
         return Particles(states, torch.full(shape[:2], -math.log(particles), device=states.device))
 
-    def step(
-        self, belief: Belief, evidence: Evidence, generator: torch.Generator
-    ) -> tuple[Particles, StepTrace]:
+    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Particles, StepTrace]:
         assert isinstance(belief, Particles)
         moved = self.dynamics(belief.states, evidence.control.unsqueeze(1))
         unit = torch.randn(moved.shape, generator=generator, device=moved.device)

@@ -58,16 +58,14 @@ class Plan:
 
 PLANS = {
     "cpu": Plan(),
-    "full": Plan(
-        dynamics=2000, measurement=8000, alone=1500, weights=1500, together=(1500, 1500, 4000), batch=64
-    ),
+    "full": Plan(dynamics=2000, measurement=8000, alone=1500, weights=1500, together=(1500, 1500, 4000), batch=64),
     "smoke": Plan(dynamics=2, measurement=2, alone=1, weights=1, together=(1,), lengths=(4,), batch=4),
 }
 
 
 @dataclass(frozen=True)
 class Trained:
-    """filter: in evaluation mode. record: JSON for the checkpoint: plan, seed, data hash, metrics, versions, seconds."""
+    """filter: in evaluation mode. record: JSON for the checkpoint: plan, seed, data hash, metrics, seconds."""
 
     filter: Filter
     record: dict[str, Any]
@@ -129,8 +127,7 @@ def measure(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, Any]:
         names += filter_.names
     return {
         f"{blackout:g}": {
-            name or "fused": evaluate(filter_, episodes, blackout=blackout, only=name).to_dict()
-            for name in names
+            name or "fused": evaluate(filter_, episodes, blackout=blackout, only=name).to_dict() for name in names
         }
         for blackout in BLACKOUTS
     }
@@ -164,13 +161,9 @@ class Trainer:
             self.pretrain_measurement(name)
         crossmodal = self.filter.architecture.fusion == "crossmodal"
         if crossmodal:
-            everything_else = [
-                p for n, p in self.filter.named_parameters() if not n.startswith("weight_model.")
-            ]
+            everything_else = [p for n, p in self.filter.named_parameters() if not n.startswith("weight_model.")]
             for k, name in enumerate(self.filter.names):
-                self.end_to_end(
-                    f"{name} alone", everything_else, self.plan.alone, self.plan.lengths[0], only=k
-                )
+                self.end_to_end(f"{name} alone", everything_else, self.plan.alone, self.plan.lengths[0], only=k)
             weights = self.filter.get_submodule("weight_model").parameters()
             self.end_to_end("weights", list(weights), self.plan.weights, self.plan.lengths[0])
         parameters = list(self.filter.parameters())

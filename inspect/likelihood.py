@@ -38,7 +38,8 @@ class LikelihoodMap:
     Attributes:
         step: of the trace. angle: value of the one component that is held fixed (rad), NaN where there is none.
         layers: names: the modalities, then ``fused``; L of them.
-        offsets_x, offsets_y: (S,) m, cell centres, increasing, relative to ``centre``. centre: (2,) m, the true position.
+        offsets_x, offsets_y: (S,) m, cell centres, increasing, relative to ``centre``. centre: (2,) m, the true
+            position.
         log_likelihood: (L, S, S) natural log, not normalised; [l, iy, ix] belongs to offsets_y[iy], offsets_x[ix].
     """
 
@@ -126,11 +127,7 @@ class MapEngine:
             angle = float(truth[self.fixed]) if angle is None else angle
             states = states.clone()
             states[:, self.fixed] = angle
-        values = (
-            self._particle_filter(step, states)
-            if self.evidence is not None
-            else self._gaussians(step, states)
-        )
+        values = self._particle_filter(step, states) if self.evidence is not None else self._gaussians(step, states)
         return LikelihoodMap(
             step=step,
             angle=angle,

@@ -102,7 +102,7 @@ def trace(
     blackout: float = 0.0,
     progress: Callable[[float], None] | None = None,
 ) -> Trace:
-    """Runs a filter over an episode, started at the true state with covariance 0.1 I (standardised), and keeps everything.
+    """Runs a filter over an episode from the true state, covariance 0.1 I (standardised), and keeps everything.
 
     The estimates are bit-identical to those of the untraced run with the same seed: the same steps are taken, and what
     a step knew is kept instead of dropped.
@@ -223,17 +223,11 @@ def save_trace(trace: Trace, path: Path) -> None:
     arrays: dict[str, NDArray[Any]] = {
         name: getattr(trace, name) for name in ARRAYS if getattr(trace, name) is not None
     }
-    arrays |= {
-        f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")
-    }
+    arrays |= {f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")}
     arrays |= {f"episode/observations/{key}": value for key, value in episode.observations.items()}
     header = {
         "format": FORMAT,
-        **{
-            f.name: getattr(trace, f.name)
-            for f in fields(Trace)
-            if f.name not in (*ARRAYS, "episode", "settings")
-        },
+        **{f.name: getattr(trace, f.name) for f in fields(Trace) if f.name not in (*ARRAYS, "episode", "settings")},
         "settings": dict(trace.settings),
         "episode": {
             "task": episode.task,
@@ -244,9 +238,7 @@ def save_trace(trace: Trace, path: Path) -> None:
         },
     }
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    write_atomically(
-        path, save(contiguous, metadata={"beliefscope-trace": json.dumps(header, sort_keys=True)})
-    )
+    write_atomically(path, save(contiguous, metadata={"beliefscope-trace": json.dumps(header, sort_keys=True)}))
 
 
 def load_trace(path: Path) -> Trace:
@@ -270,9 +262,7 @@ def load_trace(path: Path) -> Trace:
         episode = Episode(
             **header.pop("episode"),
             **{name: arrays.pop(f"episode/{name}") for name in ("states", "controls", "contact", "qpos")},
-            observations={
-                key.removeprefix(prefix): arrays.pop(key) for key in list(arrays) if key.startswith(prefix)
-            },
+            observations={key.removeprefix(prefix): arrays.pop(key) for key in list(arrays) if key.startswith(prefix)},
         )
         return Trace(**{**header, "modalities": tuple(header["modalities"])}, episode=episode, **arrays)
     except (KeyError, TypeError) as error:
