@@ -1,0 +1,176 @@
+"""The page's interface (docs/api.md): catalog, traces, recordings, views."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import re
+import threading
+import time
+from concurrent.futures import TimeoutError as NotYet
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, HTTPException, Request, WebSocket
+from fastapi.responses import FileResponse, JSONResponse, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from beliefscope import __version__
+from beliefscope.app.library import Library, Selection, Traced
+from beliefscope.app.proxy import CLIENT_PAGE
+from beliefscope.app.session import Views
+from beliefscope.app.vendor import cached_file
+from beliefscope.app.wire import header
+from beliefscope.datasets.catalog import TASKS
+from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.write import write_recording
+
+RECORDING = re.compile(r"(?P<task>.+)-(?P<filter>.+)-episode(?P<episode>\d+)-[0-9a-f]{8}")
+PATIENCE = 0.25  # s that a request for a trace waits before it says how far the trace is
+
+
+class RecordingRequest(BaseModel):
+    """Body of ``POST /api/recordings``; maps at every ``maps``-th step, none for 0."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    task: str
+    filter: str
+    episode: int
+    maps: Annotated[int, Field(ge=0)] = 0
+
+
+class ViewRequest(BaseModel):
+    """Body of ``POST /api/views``."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    dark: bool = False
+
+
+def routes(library: Library, views: Views) -> APIRouter:
+    """Every route under ``/api``, ``/scene`` and ``/healthz``. What blocks runs in worker threads (plain ``def``)."""
+    router = APIRouter()
+    recordings = library.settings.workspace / "recordings"
+    writing = threading.Lock()
+
+    @router.get("/healthz")
+    async def health() -> dict[str, str]:
+        return {"status": "ok", "version": __version__}
+
+    @router.get("/api/catalog")
+    def catalog() -> dict[str, Any]:
+        return {"version": __version__, **library.catalog()}
+
+    @router.get("/api/trace/{task}/{filter}/{episode}")
+    def trace_header(task: str, filter: str, episode: int) -> Response:
+        traced = library.traced(Selection(task, filter, episode))
+        try:
+            trace = traced.done.result(timeout=PATIENCE)
+        except NotYet:
+            return JSONResponse({"progress": traced.progress}, status_code=202)
+        components = [{"name": c.name, "unit": c.unit} for c in traced.checkpoint.task.components]
+        return JSONResponse(header(trace, traced.columns[0], components) | {"filter": filter})
+
+    @router.get("/api/trace/{task}/{filter}/{episode}/columns")
+    def trace_columns(task: str, filter: str, episode: int, request: Request) -> Response:
+        traced = library.traced(Selection(task, filter, episode))
+        return _immutable(request, traced, "columns", lambda: traced.columns[1])
+
+    @router.get("/api/trace/{task}/{filter}/{episode}/images")
+    def trace_images(task: str, filter: str, episode: int, request: Request) -> Response:
+        traced = library.traced(Selection(task, filter, episode))
+        if "image" not in traced.trace.episode.observations:
+            raise HTTPException(404, f"Task {task!r} has no pictures.")
+        return _immutable(request, traced, "images", traced.trace.episode.observations["image"].tobytes)
+
+    @router.get("/api/recordings")
+    def list_recordings() -> list[dict[str, Any]]:
+        paths = recordings.glob("*.rrd") if recordings.is_dir() else ()
+        return [_listed(path) for path in sorted(paths, key=lambda p: -p.stat().st_mtime)]
+
+    @router.post("/api/recordings", status_code=201)
+    def record(wanted: RecordingRequest) -> dict[str, Any]:
+        started = time.perf_counter()
+        traced = library.traced(Selection(wanted.task, wanted.filter, wanted.episode))
+        trace = traced.trace
+        parts = hashlib.sha256(f"{traced.key} maps {wanted.maps}".encode()).hexdigest()[:8]
+        path = recordings / f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}.rrd"
+        steps = range(0, len(trace), wanted.maps) if wanted.maps else ()
+        with writing:
+            recordings.mkdir(parents=True, exist_ok=True)
+            write_recording(trace, path, maps=traced.maps(steps) if steps else None)
+        seconds = time.perf_counter() - started
+        return {
+            "name": path.name,
+            "url": f"/api/recordings/{path.name}",
+            "bytes": path.stat().st_size,
+            "seconds": seconds,
+        }
+
+    @router.get("/api/recordings/{name}.rrd")
+    def recording(name: str) -> Response:
+        path = recordings / f"{name}.rrd"
+        if not RECORDING.fullmatch(name) or "/" in name or not path.is_file():
+            raise HTTPException(404, f"Recording {name + '.rrd'!r} does not exist.")
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    @router.post("/api/views", status_code=201)
+    async def open_view(wanted: Annotated[ViewRequest, Body()] = ViewRequest()) -> dict[str, str]:
+        name = (await views.open(wanted.dark)).name
+        return {"view": name, "scene": f"/scene/{name}/", "socket": f"/api/views/{name}"}
+
+    @router.websocket("/api/views/{name}")
+    async def view_socket(websocket: WebSocket, name: str) -> None:
+        try:
+            view = views[name]
+        except KeyError:
+            await _no_view(websocket, name)
+        else:
+            await view.attend(websocket)
+
+    @router.get("/scene/{name}/")
+    async def scene_page(name: str, request: Request) -> Response:
+        try:
+            views[name]
+        except KeyError:
+            raise HTTPException(404, f"View {name!r} is not open.") from None
+        return cached_file(request, CLIENT_PAGE, "text/html; charset=utf-8", {})
+
+    @router.websocket("/scene/{name}")
+    async def scene_socket(websocket: WebSocket, name: str) -> None:
+        try:
+            view = views[name]
+        except KeyError:
+            await _no_view(websocket, name)
+        else:
+            await view.scene.viser.connect(websocket)
+
+    return router
+
+
+def _immutable(request: Request, traced: Traced, part: str, content: Any) -> Response:
+    """A part of a trace: its key says all that it depends on, so it can be an ETag."""
+    traced.trace  # noqa: B018 - wait for it, or raise what it raised, before anything is answered
+    headers = {"etag": f'"{traced.key[:24]}-{part}"', "cache-control": "no-cache"}
+    if headers["etag"] in request.headers.get("if-none-match", ""):
+        return Response(status_code=304, headers=headers)
+    return Response(content(), media_type="application/octet-stream", headers=headers)
+
+
+def _listed(path: Path) -> dict[str, Any]:
+    status = path.stat()
+    modified = datetime.fromtimestamp(status.st_mtime, UTC).isoformat(timespec="seconds")
+    entry: dict[str, Any] = {"name": path.name, "bytes": status.st_size, "modified": modified}
+    # A task's name may hold a dash, as a filter's does: the known tasks say where it ends.
+    task = max((t for t in TASKS if path.name.startswith(f"{t}-")), key=len, default=None)
+    match = RECORDING.fullmatch(path.stem)
+    if task is None or match is None:
+        return entry | {"task": None, "filter": None, "episode": None}
+    rest = path.stem[len(task) + 1 :].rsplit("-episode", 1)[0]
+    return entry | {"task": task, "filter": rest, "episode": int(match["episode"])}
+
+
+async def _no_view(websocket: WebSocket, name: str) -> None:
+    body = json.dumps({"error": f"View {name!r} is not open."}).encode()
+    await websocket.send_denial_response(Response(body, 404, media_type="application/json"))

@@ -1,0 +1,188 @@
+"""The server: one port and one origin for the page, its data, the 3D scene and Rerun's viewer."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import uvicorn
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from starlette.exceptions import HTTPException
+from starlette.staticfiles import StaticFiles
+
+from beliefscope.app.api import routes
+from beliefscope.app.library import Library, Settings
+from beliefscope.app.security import Guard
+from beliefscope.app.session import Views
+from beliefscope.app.vendor import UPLOT_FILES, RerunViewer, cached_file, installed
+from beliefscope.datasets.errors import BadInput
+
+__all__ = ["Settings", "create_app", "serve"]
+
+PAGE = Path(__file__).parent / "page"
+log = logging.getLogger("beliefscope.app")
+
+
+def create_app(settings: Settings, warm: bool = True) -> FastAPI:
+    """The application; it starts no thread before its lifespan begins and leaves none behind when that ends.
+
+    Args:
+        settings: what to show and where to keep things.
+        warm: prepare the first page's trace and Rerun's viewer in the background at the start.
+    """
+    library = Library(settings)
+    views = Views(library)
+    rerun = RerunViewer(settings.workspace / "cache")
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        tidying = asyncio.create_task(views.tidy())
+        if warm:
+            threading.Thread(target=_warm, args=(library, rerun), name="warming", daemon=True).start()
+        yield
+        tidying.cancel()
+        await views.close()
+        await asyncio.to_thread(library.close)
+
+    app = FastAPI(title="Beliefscope", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
+    app.include_router(routes(library, views))
+    _add_files(app, rerun)
+    app.add_middleware(Guard, hosts=settings.hosts)
+    app.add_exception_handler(BadInput, _say(400))
+    app.add_exception_handler(RequestValidationError, _say(422))
+    app.add_exception_handler(HTTPException, _say(None))
+    app.add_exception_handler(Exception, _say(500))
+    return app
+
+
+def serve(
+    settings: Settings,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    listening: Callable[[str], None] | None = None,
+) -> None:
+    """Serve until SIGINT or SIGTERM, on one port.
+
+    Args:
+        settings: see ``create_app``.
+        host, port: address to listen on; port 0 takes any free one.
+        listening: called with the URL once connections are accepted; the default prints it.
+
+    Raises BadInput when the address cannot be had.
+    """
+    if listening is None:
+        listening = _print_url
+    with _bound(host, port) as listener:
+        shown = f"[{host}]" if ":" in host else host
+        url = f"http://{shown}:{listener.getsockname()[1]}/"
+        config = uvicorn.Config(
+            create_app(settings),
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            ws_per_message_deflate=False,  # deflate takes binary messages from 300 to 12 MB/s
+            timeout_graceful_shutdown=3,
+        )
+        with _signals_end_in_peace():
+            _Server(config, lambda: listening(url)).run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    def __init__(self, config: uvicorn.Config, listening: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._listening = listening
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        if self.started:
+            self._listening()
+
+
+def _add_files(app: FastAPI, rerun: RerunViewer) -> None:
+    app.mount("/static", StaticFiles(directory=PAGE, check_dir=False), name="static")
+    uplot = installed("uplot") / "static"
+
+    @app.get("/")
+    def page(request: Request) -> Response:
+        return cached_file(request, PAGE / "index.html", "text/html; charset=utf-8", {})
+
+    @app.get("/vendor/rerun/viewer.js")
+    def rerun_script() -> Response:
+        return Response(rerun.script(), media_type="text/javascript")
+
+    @app.get("/vendor/rerun/viewer.wasm")
+    @app.get("/vendor/rerun/re_viewer_bg.wasm")  # the name by which viewer.js asks for it
+    def rerun_wasm(request: Request) -> Response:
+        return rerun.wasm(request)
+
+    @app.get("/vendor/uplot/{name}")
+    def uplot_file(name: str, request: Request) -> Response:
+        if name not in UPLOT_FILES:
+            raise HTTPException(404, f"{name!r} is not served. Available: {', '.join(UPLOT_FILES)}.")
+        media_type = "text/css" if name.endswith(".css") else "text/javascript"
+        return cached_file(request, uplot / name, media_type, {})
+
+
+def _warm(library: Library, rerun: RerunViewer) -> None:
+    """Have ready what the first page asks for. What goes wrong here is told to the page that asks for it."""
+    try:
+        library.traced(library.default()).trace  # noqa: B018 - waits
+        rerun.prepare()
+    except Exception as error:
+        log.warning("Could not prepare the first page: %s", error)
+
+
+def _say(status: int | None) -> Callable[[Request, Exception], JSONResponse]:
+    def handler(_: Request, error: Exception) -> JSONResponse:
+        if isinstance(error, HTTPException):
+            return JSONResponse({"error": error.detail}, error.status_code, headers=error.headers)
+        if isinstance(error, RequestValidationError):
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            return JSONResponse({"error": f"{where}: {first['msg']}"}, 422)
+        return JSONResponse({"error": str(error)}, status or 500)
+
+    return handler
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    """A listening socket. Raises BadInput in one line when the address cannot be had."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(128)
+    except (OSError, OverflowError) as error:
+        listener.close()
+        reason = getattr(error, "strerror", None) or str(error)
+        raise BadInput(
+            f"Cannot listen on {host} port {port}: {reason}. Choose another --port (0: any free one)."
+        ) from None
+    return listener
+
+
+@contextlib.contextmanager
+def _signals_end_in_peace() -> AsyncIterator[None]:
+    """uvicorn raises the signal that stopped it once more when it is done; a stop that was asked for is no error."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _print_url(url: str) -> None:
+    print(f"Beliefscope is at {url} (Ctrl+C stops it)", flush=True)

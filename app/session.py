@@ -1,0 +1,190 @@
+"""Views: one browser's own cursor and 3D scene, and the socket on which the two sides tell each other."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import secrets
+import time
+from typing import Any
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from beliefscope.app.library import Library, Selection, Traced
+from beliefscope.app.scene import Scene
+from beliefscope.app.wire import Cursor, cursor, maps_message
+from beliefscope.datasets.errors import BadInput
+
+log = logging.getLogger("beliefscope.app")
+
+
+class View:
+    """One page's scene, and the newest cursor it sent.
+
+    The page owns the cursor and may move it faster than it can be drawn: a cursor waits in one place, where a newer one
+    takes its place unanswered. Each that is taken up is answered with maps first, then the scene is moved.
+
+    Attributes:
+        name: unguessable; part of the view's addresses. idle_since: monotonic s when its page went, None while there.
+    """
+
+    def __init__(self, library: Library, dark: bool) -> None:
+        """Blocks for some 50 ms while the scene's server starts."""
+        self.name = secrets.token_urlsafe(12)
+        self.scene = Scene(self._moved_in_scene, dark)
+        self.idle_since: float | None = time.monotonic()
+        self._library = library
+        self._waiting: Cursor | None = None
+        self._arrived = asyncio.Event()
+        self._socket: WebSocket | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    async def attend(self, websocket: WebSocket) -> None:
+        """Serve the page's socket until it closes. A second page on the same view takes the first one's place."""
+        await websocket.accept()
+        before, self._socket = self._socket, websocket
+        self._loop, self.idle_since = asyncio.get_running_loop(), None
+        if before is not None:
+            await _quietly(before.close(4000, "The view was opened by another page."))
+        answering = asyncio.create_task(self._answer(websocket))
+        try:
+            while True:
+                await self._heard(websocket, await websocket.receive_text())
+        except (WebSocketDisconnect, KeyError):  # KeyError: a binary message, which has no text
+            await _quietly(websocket.close(1003))
+        finally:
+            answering.cancel()
+            if self._socket is websocket:
+                self._socket, self.idle_since = None, time.monotonic()
+
+    async def _heard(self, websocket: WebSocket, text: str) -> None:
+        serial = None
+        try:
+            message = json.loads(text)
+            if not isinstance(message, dict):
+                raise BadInput("A message is a JSON object.")
+            serial = message.get("serial")
+            match message.get("type"):
+                case "cursor":
+                    self._waiting = cursor(message)
+                    self._arrived.set()
+                case "theme":
+                    await asyncio.to_thread(self.scene.set_dark, message.get("dark") is True)
+                case other:
+                    raise BadInput(f"Message type {other!r} does not exist. Available: cursor, theme.")
+        except json.JSONDecodeError as error:
+            await _tell_error(websocket, serial, f"Not JSON: {error}.")
+        except BadInput as error:
+            await _tell_error(websocket, serial, str(error))
+
+    async def _answer(self, websocket: WebSocket) -> None:
+        while True:
+            await self._arrived.wait()
+            self._arrived.clear()
+            wanted = self._waiting
+            assert wanted is not None
+            try:
+                await self._answer_one(websocket, wanted)
+            except BadInput as error:
+                await _tell_error(websocket, wanted.serial, str(error))
+            except (WebSocketDisconnect, RuntimeError) as error:
+                if websocket is not self._socket:
+                    return
+                log.exception("The cursor could not be drawn")
+                await _tell_error(websocket, wanted.serial, f"The server failed: {error}")
+            except Exception as error:
+                log.exception("The cursor could not be drawn")
+                await _tell_error(websocket, wanted.serial, f"The server failed: {error}")
+
+    async def _answer_one(self, websocket: WebSocket, wanted: Cursor) -> None:
+        traced = await asyncio.to_thread(self._library.traced, Selection(wanted.task, wanted.filter, wanted.episode))
+        if not await self._ready_before_newer(traced):
+            return
+        trace = traced.trace
+        if wanted.step >= len(trace):
+            raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(trace) - 1}.")
+        maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)
+        await websocket.send_bytes(maps_message(wanted.serial, trace, maps))
+        await asyncio.to_thread(self.scene.show, traced, wanted.step, maps)
+        await websocket.send_json({"type": "drawn", "serial": wanted.serial, "step": wanted.step})
+
+    async def _ready_before_newer(self, traced: Traced) -> bool:
+        """Wait for the trace, but no longer than until a newer cursor comes. Raises what computing it raised."""
+        ready = asyncio.wrap_future(traced.done)
+        newer = asyncio.ensure_future(self._arrived.wait())
+        try:
+            await asyncio.wait({ready, newer}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            newer.cancel()
+        if ready.done():
+            ready.result()
+        return ready.done()
+
+    def _moved_in_scene(self, step: int) -> None:
+        """Called in a thread of viser's."""
+        socket, loop = self._socket, self._loop
+        if socket is not None and loop is not None and not loop.is_closed():
+            message = {"type": "cursor", "step": step, "origin": "scene"}
+            asyncio.run_coroutine_threadsafe(_quietly(socket.send_json(message)), loop)
+
+
+class Views:
+    """The open views, a bounded number of them.
+
+    Args:
+        limit: most views at a time: each is a thread and some MB. patience: s a view outlives its page, to allow a reload.
+    """
+
+    def __init__(self, library: Library, limit: int = 16, patience: float = 30.0) -> None:
+        self._library = library
+        self._limit = limit
+        self._patience = patience
+        self._views: dict[str, View] = {}
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, name: str) -> View:
+        """Raises KeyError for a view that is not, or no longer, open."""
+        return self._views[name]
+
+    async def open(self, dark: bool) -> View:
+        """A new view. Closes the one that has been idle longest if there are too many; BadInput if all are in use."""
+        await self._close_idle(keep=self._limit - 1)
+        if len(self._views) >= self._limit:
+            raise BadInput(f"{self._limit} pages are open already; close one and reload.")
+        view = await asyncio.to_thread(View, self._library, dark)
+        self._views[view.name] = view
+        return view
+
+    async def tidy(self) -> None:
+        """Close views whose page has gone for longer than the patience. Runs until cancelled."""
+        while True:
+            await asyncio.sleep(self._patience / 4)
+            await self._close_idle(keep=0, idle_for=self._patience)
+
+    async def _close_idle(self, keep: int, idle_for: float = 0.0) -> None:
+        before = time.monotonic() - idle_for
+        idle = [v for v in self._views.values() if v.idle_since is not None and v.idle_since <= before]
+        idle.sort(key=lambda v: v.idle_since or 0.0)
+        for view in idle[: max(0, len(self._views) - keep)]:
+            del self._views[view.name]
+            await asyncio.to_thread(view.scene.close)
+
+    async def close(self) -> None:
+        """Close every view and its threads."""
+        views, self._views = list(self._views.values()), {}
+        await asyncio.gather(*(asyncio.to_thread(view.scene.close) for view in views))
+
+
+async def _quietly(sending: Any) -> None:
+    """Await something sent to a socket that may have gone."""
+    try:
+        await sending
+    except (WebSocketDisconnect, RuntimeError):
+        pass
+
+
+async def _tell_error(websocket: WebSocket, serial: Any, error: str) -> None:
+    await _quietly(websocket.send_json({"type": "error", "serial": serial, "error": error}))

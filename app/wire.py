@@ -1,0 +1,142 @@
+"""How traces, maps and cursors travel between the server and the page (docs/api.md). Binary is little-endian."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.trace import Trace
+
+MAP_SIZES = (41, 135)  # cells a side: what a drag shows, and the fine one that follows
+SENSORS = ("effector_position", "force")
+
+
+@dataclass(frozen=True)
+class Cursor:
+    """The page's whole selection, as one message of it says. Serial: the page's own count of its cursors."""
+
+    serial: int
+    task: str
+    filter: str
+    episode: int
+    step: int
+    angle: float | None
+    size: int
+
+
+def cursor(message: dict[str, Any]) -> Cursor:
+    """Reads a ``cursor`` message. Raises BadInput where a field is missing, of another type, or out of its range."""
+    integers = {key: _integer(message, key) for key in ("serial", "episode", "step")}
+    for key in ("task", "filter"):
+        if not isinstance(message.get(key), str):
+            raise BadInput(f"cursor needs {key!r}, a name; got {message.get(key)!r}.")
+    angle = message.get("angle")
+    if angle is not None and (
+        isinstance(angle, bool) or not isinstance(angle, int | float) or not math.isfinite(angle)
+    ):
+        raise BadInput(f"cursor's 'angle' is a number of radians or null; got {angle!r}.")
+    size = message.get("size", MAP_SIZES[0])
+    if size not in MAP_SIZES:
+        raise BadInput(f"cursor's 'size' is {' or '.join(map(str, MAP_SIZES))}; got {size!r}.")
+    return Cursor(task=message["task"], filter=message["filter"], angle=angle, size=size, **integers)
+
+
+def _integer(message: dict[str, Any], key: str) -> int:
+    value = message.get(key)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise BadInput(f"cursor needs {key!r}, an integer from 0; got {value!r}.")
+    return value
+
+
+def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
+    """A trace's numbers for the charts, time first.
+
+    Returns:
+        descriptions ``{"name", "shape", "offset"}`` (offset in bytes) and one buffer of float32 that they point into.
+    """
+    arrays: dict[str, NDArray[Any] | None] = {
+        "truth": trace.episode.states,
+        "estimate_mean": trace.estimate_mean,
+        "estimate_sigma": _sigma(trace.estimate_covariance),
+        "modality_mean": trace.modality_mean,
+        "modality_sigma": _sigma(trace.modality_covariance),
+        "weights": trace.weights,
+        "acting": trace.acting,
+        "contact": trace.episode.contact,
+        "effective_sample_size": effective_sample_size(trace),
+    }
+    arrays |= {key: trace.episode.observations.get(key) for key in SENSORS}
+    described: list[dict[str, Any]] = []
+    buffers: list[bytes] = []
+    offset = 0
+    for name, array in arrays.items():
+        if array is not None:
+            described.append({"name": name, "shape": list(array.shape), "offset": offset})
+            buffers.append(np.ascontiguousarray(array, dtype="<f4").tobytes())
+            offset += len(buffers[-1])
+    return described, b"".join(buffers)
+
+
+def effective_sample_size(trace: Trace) -> NDArray[np.float32] | None:
+    """(T,): 1 / sum of the squared posterior weights, between 1 and M; None for a filter without particles."""
+    if trace.log_weights is None:
+        return None
+    return np.asarray(np.exp(-np.logaddexp.reduce(2.0 * trace.log_weights, axis=1)), dtype=np.float32)
+
+
+def header(trace: Trace, described: list[dict[str, Any]], components: list[dict[str, str]]) -> dict[str, Any]:
+    """What the page must know of a trace before it reads its columns."""
+    return {
+        "steps": len(trace),
+        "dt": trace.episode.dt,
+        "kind": trace.kind,
+        "filter": trace.filter,
+        "episode": trace.episode_index,
+        "components": components,
+        "modalities": list(trace.modalities),
+        "weight_width": 0 if trace.weights is None else trace.weights.shape[-1],
+        "checkpoint_hash": trace.checkpoint_hash,
+        "data_hash": trace.data_hash,
+        "seed": trace.seed,
+        "settings": dict(trace.settings),
+        "columns": described,
+    }
+
+
+def maps_message(serial: int, trace: Trace, maps: LikelihoodMap) -> bytes:
+    """One step's maps: header's length, JSON header, padding to a multiple of 4, then the layers as uint8."""
+    effector = trace.episode.observations.get("effector_position")
+    description = {
+        "type": "maps",
+        "serial": serial,
+        "step": maps.step,
+        "size": len(maps.offsets_x),
+        "angle": None if math.isnan(maps.angle) else float(maps.angle),
+        "layers": list(maps.layers),
+        "half_width": float(-maps.offsets_x[0] + 0.5 * (maps.offsets_x[1] - maps.offsets_x[0])),
+        "centre": maps.centre.tolist(),
+        "truth": _numbers(trace.episode.states[maps.step]),
+        "estimate": _numbers(trace.estimate_mean[maps.step]),
+        "log_max": _numbers(maps.log_likelihood.max(axis=(1, 2))),
+        "peak": maps.peaks().tolist(),
+        "effector": None if effector is None else effector[maps.step, :2].tolist(),
+    }
+    text = json.dumps(description).encode()
+    return len(text).to_bytes(4, "little") + text + b"\0" * (-len(text) % 4) + maps.normalised().tobytes()
+
+
+def _numbers(array: NDArray[np.float32]) -> list[float | None]:
+    """JSON knows neither NaN nor infinity: null."""
+    return [float(value) if math.isfinite(value) else None for value in array]
+
+
+def _sigma(covariance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(..., n, n) -> (..., n): standard deviations."""
+    return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

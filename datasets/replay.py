@@ -1,0 +1,44 @@
+"""Where every body of an episode's model was, from the recorded joint positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.task import Task
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One episode's model and the poses of its B bodies (body 0 is the world).
+
+    Attributes:
+        model: ``mujoco.MjModel`` of its own, which whoever draws it may change.
+        positions: (T, B, 3) m, world. rotations: (T, B, 3, 3), body to world.
+    """
+
+    model: Any
+    positions: Array
+    rotations: Array
+
+
+def replay(task: Task, episode: Episode) -> Replay | None:
+    """The whole replay of an episode (some 10 ms for 800 steps), or None where the task or the episode has none."""
+    if task.replay is None or episode.qpos.shape[1] == 0:
+        return None
+    model = task.replay(episode)
+    data = mujoco.MjData(model)
+    positions = np.empty((len(episode), model.nbody, 3))
+    rotations = np.empty((len(episode), model.nbody, 9))
+    for step, qpos in enumerate(episode.qpos):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        positions[step], rotations[step] = data.xpos, data.xmat
+    return Replay(model, positions, rotations.reshape(*rotations.shape[:2], 3, 3))
