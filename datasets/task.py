@@ -6,10 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from beliefscope.datasets.errors import one_of
 from beliefscope.datasets.episode import Episode
 
 Unit = Literal["m", "rad"]
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -18,6 +22,22 @@ class Component:
 
     name: str
     unit: Unit
+
+
+@dataclass(frozen=True)
+class Ghost:
+    """The object at given states, as a box to draw: true or estimated.
+
+    Attributes:
+        position: (..., 3) m, world: the box's centre. wxyz: (..., 4) its orientation.
+        size: (3,) m, along its own axes.
+        anchor: (..., 3) m, world: the point whose x and y are the map components (the hinge), where it is best seen.
+    """
+
+    position: Array
+    wxyz: Array
+    size: tuple[float, float, float]
+    anchor: Array
 
 
 @dataclass(frozen=True)
@@ -34,6 +54,9 @@ class Task:
         map_components: the two components that span the likelihood map (x to the right, y up).
         map_half_width: half the side of the map, m.
         replay: builds the ``mujoco.MjModel`` of an episode, whose ``qpos`` it replays; None where there is no replay.
+        ghost: states (..., n) -> ``Ghost``, to draw true and estimated objects; None where there is nothing to draw.
+        simulate: (seed, index, steps) -> the episode with that index of the collection with that seed; None where a task
+            cannot be simulated.
     """
 
     name: str
@@ -45,6 +68,8 @@ class Task:
     map_components: tuple[str, str]
     map_half_width: float
     replay: Callable[[Episode], Any] | None = None
+    ghost: Callable[[ArrayLike], Ghost] | None = None
+    simulate: Callable[[int, int, int], Episode] | None = None
 
     def index(self, component: str) -> int:
         """Position of a component in the state vector. Raises BadInput for an unknown name."""

@@ -1,0 +1,16 @@
+"""Every task there is. A new task is one file and one line here."""
+
+from __future__ import annotations
+
+from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.errors import one_of
+from beliefscope.datasets.task import Task
+
+TASKS: dict[str, Task] = {task.name: task for task in (DOOR,)}
+
+
+def find_task(name: str) -> Task:
+    """The task of that name. Raises BadInput for an unknown one."""
+    if name not in TASKS:
+        raise one_of("task", name, TASKS)
+    return TASKS[name]
