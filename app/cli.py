@@ -1,0 +1,80 @@
+"""The ``beliefscope`` command.
+
+Ends with 0, 1 (failed) or 2 (bad input), the last two with one line on standard error. What a command needs is imported
+when it runs, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from beliefscope import __version__
+from beliefscope.app import console
+from beliefscope.app.commands.collect import collect
+from beliefscope.app.commands.evaluate import evaluate
+from beliefscope.app.commands.record import record
+from beliefscope.app.commands.serve import serve
+from beliefscope.app.commands.trace import trace
+from beliefscope.app.commands.train import train
+from beliefscope.datasets.errors import BadInput
+
+COMMANDS = (serve, collect, train, evaluate, trace, record)
+
+cli = typer.Typer(
+    name="beliefscope",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for command in COMMANDS:
+    cli.command()(command)
+
+
+def main() -> None:
+    """Runs the command that ``sys.argv`` names and ends the process."""
+    debug = "--debug" in sys.argv[1:]
+    try:
+        code = cli(standalone_mode=False)
+    except typer.TyperException as error:
+        asked = getattr(getattr(error, "ctx", None), "command_path", cli.info.name)
+        console.fail(f"{error.format_message().rstrip('.')}. See: {asked} --help", error.exit_code)
+    except (typer.Abort, KeyboardInterrupt):
+        console.fail("interrupted", 130)
+    except Exception as error:
+        if debug:
+            raise
+        if isinstance(error, BadInput):
+            console.fail(str(error), 2)
+        console.fail(f"{type(error).__name__}: {error} (beliefscope --debug ... shows where)", 1)
+    raise SystemExit(code)
+
+
+@cli.callback(invoke_without_command=True)
+def beliefscope(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an error comes from.")] = False,
+) -> None:
+    """Look inside multimodal differentiable filters: beliefs, fusion weights and likelihood maps.
+
+    \b
+    Start here:
+      beliefscope serve          the page, with the filters and episodes that ship
+
+    \b
+    From a simulator to a recording:
+      beliefscope collect door --episodes 60 --steps 800 -o door.h5
+      beliefscope train door --filter crossmodal-pf --data door.h5 -o mine.safetensors
+      beliefscope evaluate door --filter mine.safetensors --data door.h5
+      beliefscope record door --filter mine.safetensors --data door.h5 -o run.rrd
+
+    Each command explains itself with --help. Exit codes: 0 done, 1 failed, 2 bad input.
+    """
+    if version:
+        print(f"beliefscope {__version__}")
+    elif context.invoked_subcommand is None:
+        print(context.get_help())

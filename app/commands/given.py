@@ -1,0 +1,115 @@
+"""What the commands are given: the options they share, and the things that names and paths stand for."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from beliefscope.app import console
+from beliefscope.datasets.errors import BadInput
+
+if TYPE_CHECKING:
+    from beliefscope.datasets.store import Dataset
+    from beliefscope.datasets.task import Task
+    from beliefscope.filters.checkpoint import Checkpoint
+    from beliefscope.inspect.trace import Trace
+
+TaskName = Annotated[str, typer.Argument(metavar="TASK", help="Name of the task: door.")]
+FilterName = Annotated[
+    str,
+    typer.Option(
+        "--filter",
+        metavar="NAME|CHECKPOINT",
+        help="A filter that ships trained (crossmodal-ekf, crossmodal-pf), or the path of a .safetensors file.",
+    ),
+]
+DataPath = Annotated[
+    Path | None,
+    typer.Option("--data", metavar="FILE.h5", help="Episodes to use. Without it: the sample set that ships."),
+]
+EpisodeIndex = Annotated[
+    int | None,
+    typer.Option("--episode", metavar="I", help="Index in the data set. Without it: the first that is kept for tests."),
+]
+Particles = Annotated[int, typer.Option("--particles", min=1, metavar="M", help="Of a particle filter.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, metavar="S", help="All randomness comes from it.")]
+Json = Annotated[
+    str | None,
+    typer.Option("--json", metavar="-", help="Print one JSON document to standard output instead of text."),
+]
+
+
+def check(output: Path | None, json: str | None) -> None:
+    """Raises BadInput for what would otherwise only fail once the work is done."""
+    if json not in (None, "-"):
+        raise BadInput(f"--json {json!r}: the document goes to standard output, which is written --json -")
+    if output is None:
+        return
+    if output.is_dir():
+        raise BadInput(f"output {str(output)!r} is a folder; give the name of a file in it")
+    if not output.parent.is_dir():
+        raise BadInput(f"folder {str(output.parent)!r} does not exist, so {output.name!r} cannot be written in it")
+    if not os.access(output.parent, os.W_OK):
+        raise BadInput(f"folder {str(output.parent)!r} may not be written to")
+
+
+def dataset(task: Task, path: Path | None) -> Dataset:
+    """The file's episodes, or the sample set's. Raises BadInput when they are of another task."""
+    from beliefscope.datasets.store import open_dataset, sample_path
+
+    data = open_dataset(sample_path(task.name) if path is None else path)
+    if data.task.name != task.name:
+        data.close()
+        raise BadInput(f"{str(path)!r} holds episodes of task {data.task.name!r}, not of {task.name!r}")
+    return data
+
+
+def checkpoint(task: str, name_or_path: str) -> Checkpoint:
+    """A path ends in .safetensors or holds a separator; anything else names a checkpoint that ships."""
+    from beliefscope.datasets.catalog import find_task
+    from beliefscope.filters.checkpoint import load_checkpoint, shipped
+
+    known = find_task(task)
+    is_path = name_or_path.endswith(".safetensors") or os.sep in name_or_path
+    loaded = load_checkpoint(Path(name_or_path) if is_path else shipped(known.name, name_or_path))
+    if loaded.task.name != known.name:
+        raise BadInput(f"filter {name_or_path!r} is for task {loaded.task.name!r}, not for {known.name!r}")
+    return loaded
+
+
+def traced(checkpoint: Checkpoint, data: Path | None, index: int | None, particles: int, seed: int) -> Trace:
+    """The trace of one episode, with a bar. An index of None is the first test episode."""
+    from beliefscope.inspect.trace import trace
+
+    with dataset(checkpoint.task, data) as episodes, console.progress("Filtering") as advance:
+        if index is None:
+            index = next((s.index for s in episodes.summaries if s.split == "test"), 0)
+        return trace(checkpoint, episodes[index], index, seed=seed, particles=particles, progress=advance)
+
+
+def described(trace: Trace, path: Path) -> dict[str, Any]:
+    """The JSON document of a file that was made from a trace."""
+    return {
+        "task": trace.episode.task,
+        "filter": trace.filter,
+        "episode": trace.episode_index,
+        "steps": len(trace),
+        "seed": trace.seed,
+        "checkpoint_hash": trace.checkpoint_hash,
+        "data_hash": trace.data_hash,
+        "path": str(path),
+        "bytes": path.stat().st_size,
+    }
+
+
+def title(trace: Trace, path: Path) -> str:
+    """The same in one line of text."""
+    what = f"{trace.filter} over {len(trace)} steps of {trace.episode.task} episode {trace.episode_index}"
+    return f"{size(path)}: {what}"
+
+
+def size(path: Path) -> str:
+    return f"{path} ({path.stat().st_size / 1e6:.1f} MB)"

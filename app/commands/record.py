@@ -1,0 +1,58 @@
+"""``beliefscope record``"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from beliefscope.app import console
+from beliefscope.app.commands.given import (
+    DataPath,
+    EpisodeIndex,
+    FilterName,
+    Json,
+    Particles,
+    Seed,
+    TaskName,
+    check,
+    checkpoint,
+    described,
+    title,
+    traced,
+)
+
+
+def record(
+    task: TaskName,
+    filter_: FilterName,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN.rrd", help="Where to write the recording.")],
+    data: DataPath = None,
+    episode: EpisodeIndex = None,
+    maps: Annotated[
+        int, typer.Option("--maps", min=0, metavar="STRIDE", help="Likelihood maps of each STRIDE-th step; 0: none.")
+    ] = 10,
+    particles: Particles = 300,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Write one episode as a Rerun recording.
+
+    Pictures, particles or ellipses, estimates beside the truth, fusion weights, contact, errors and likelihood
+    maps, with their layout. Open it with: rerun run.rrd.
+
+    \b
+    Example:
+      beliefscope record door --filter crossmodal-ekf --episode 9 --maps 5 -o run.rrd
+    """
+    from beliefscope.inspect.likelihood import MapEngine
+    from beliefscope.recordings.write import write_recording
+
+    check(output, json)
+    loaded = checkpoint(task, filter_)
+    made = traced(loaded, data, episode, particles, seed)
+    layers = MapEngine(loaded, made).maps(range(0, len(made), maps)) if maps else None
+    with console.progress("Recording") as advance:
+        write_recording(made, output, maps=layers, progress=advance)
+    console.result(described(made, output) | {"maps": maps}, title(made, output), json)

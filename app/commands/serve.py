@@ -1,0 +1,49 @@
+"""``beliefscope serve``"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from beliefscope.app.commands.given import Seed
+from beliefscope.datasets.errors import BadInput
+
+
+def serve(
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes any free one.")] = 8000,
+    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
+    workspace: Annotated[
+        Path, typer.Option("--workspace", metavar="DIR", help="Folder for recordings and traces; made if missing.")
+    ] = Path("workspace"),
+    open_page: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = False,
+    seed: Seed = 0,
+) -> None:
+    """Serve the page: replay, maps and weights.
+
+    Shows the filters and the episodes that ship. Prints the page's address on one line once it listens; Ctrl-C
+    ends it. For the page of another machine, leave the host as it is and forward the port:
+    ssh -L 8000:127.0.0.1:8000 MACHINE.
+
+    \b
+    Examples:
+      beliefscope serve --open
+      beliefscope serve --port 0 --workspace ~/beliefscope
+    """
+    from beliefscope.app.library import Settings
+    from beliefscope.app.server import serve as serve_until_signal
+
+    if workspace.exists() and not workspace.is_dir():
+        raise BadInput(f"workspace {str(workspace)!r} is a file, not a folder")
+    if not workspace.absolute().parent.is_dir():
+        raise BadInput(f"folder {str(workspace.parent)!r} does not exist, so {workspace.name!r} cannot be made in it")
+
+    def listening(url: str) -> None:
+        print(f"Beliefscope listens on {url}", flush=True)
+        if open_page:
+            import webbrowser
+
+            webbrowser.open(url)
+
+    serve_until_signal(Settings(workspace=workspace, seed=seed), host=host, port=port, listening=listening)

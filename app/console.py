@@ -1,0 +1,51 @@
+"""What the command line says: results to standard output, everything else to standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+
+def fail(message: str, code: int) -> NoReturn:
+    """Ends the process with one line on standard error."""
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    raise SystemExit(code)
+
+
+def result(document: Mapping[str, Any], text: str, destination: str | None) -> None:
+    """A command's result: as text, or as one JSON document where ``destination`` is ``-``; to standard output."""
+    print(text if destination is None else json.dumps(document, indent=2))
+
+
+def table(rows: Mapping[str, str]) -> str:
+    """Two columns, the second aligned to the right."""
+    left, right = max(map(len, rows)), max(map(len, rows.values()))
+    return "\n".join(f"{name:<{left}}  {value:>{right}}" for name, value in rows.items())
+
+
+@contextmanager
+def progress(label: str) -> Iterator[Callable[[float], None]]:
+    """One bar on standard error, moved by what is yielded: called with the share done, 0..1."""
+    with bars() as move:
+        yield lambda share: move(label, share, "")
+
+
+@contextmanager
+def bars() -> Iterator[Callable[[str, float, str], None]]:
+    """Bars on standard error, each there from its first move on; yields (label, share done, note) -> None."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    known: dict[str, TaskID] = {}
+    with Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True)) as view:
+
+        def move(label: str, share: float, note: str) -> None:
+            if label not in known:
+                known[label] = view.add_task(label, total=1.0, note=note)
+            view.update(known[label], completed=share, note=note)
+
+        yield move
