@@ -1,0 +1,269 @@
+"""A stretch of a trace as Rerun columns: what the eye is shown, drawn from the trace's numbers (``schema.SCHEMA``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.schema import colour
+
+Array = NDArray[Any]
+Columns = Iterable[tuple[str, Any]]
+"""Pairs of an entity path and its columns, one row a step."""
+
+SHOWN_UNIT = {"m": "cm", "rad": "deg"}
+SHOWN_SCALE = {"m": 100.0, "rad": 180.0 / np.pi}
+CONTACT_NAMES = ("free", "contact")
+SIGMAS = 2.0
+COLOUR_OF_ROBOT = "#B0B0B0"
+MODALITY = "estimate and weight of this modality alone"
+MEANINGS = {
+    "truth": "what the filter should find",
+    "fused": "the filter's estimate from all modalities",
+    "contact": "the robot touches the object",
+}
+
+
+def sources(trace: Trace) -> tuple[str, ...]:
+    """Whose estimates there are: ``fused``, then each modality's."""
+    return ("fused", *trace.modalities)
+
+
+def angles(task: Task) -> tuple[Component, ...]:
+    """The components that are angles."""
+    return tuple(component for component in task.components if component.unit == "rad")
+
+
+def plane_height(trace: Trace, task: Task) -> float:
+    """World height (m) of the plane on which the belief is drawn: of the object's anchor, else of the end effector."""
+    if task.ghost is not None:
+        return float(task.ghost(trace.episode.states[0]).anchor[2])
+    effector = trace.episode.observations.get("effector_position")
+    return 0.0 if effector is None else float(effector[0, 2])
+
+
+def columns(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
+    """Every drawn path of a stretch of steps, except the maps' and the contact's changes."""
+    yield from _world(trace, task, steps)
+    yield from _states(trace, task, steps)
+    yield from _errors(trace, task, steps)
+    for name in ("weights", "acting"):
+        values = getattr(trace, name)
+        if values is not None:
+            for k, modality in enumerate(trace.modalities):
+                yield f"{name}/{modality}", series(values[steps, k])
+    if trace.log_weights is not None:
+        weights = np.exp(trace.log_weights[steps].astype(np.float64))
+        size = weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)
+        yield "diagnostics/effective_sample_size", series(size)
+
+
+def series(values: Array) -> Any:
+    """Columns of (T,) or (T, S) numbers, S series in one entity. float32 survives as float64, so nothing is lost."""
+    rows = values.reshape(len(values), -1).astype(np.float64)
+    return rr.Scalars.columns(scalars=rows.ravel()).partition([rows.shape[1]] * len(rows))
+
+
+def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
+    """What does not change: names, colours and widths of every series and marker."""
+    yield "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
+    yield "world/plane", rr.Transform3D(translation=[0.0, 0.0, plane_height(trace, task)])
+    yield "world/effector", _marker(COLOUR_OF_ROBOT, 3.0)
+    yield "world/plane/truth", _marker(colour("truth", trace.modalities), 7.0)
+    if task.ghost is not None:
+        half = np.array([task.ghost(trace.episode.states[0]).size]) / 2.0
+        for name in ("truth", "fused"):
+            yield f"world/object/{name}", _box(_hex(name, trace), half, filled=name == "truth")
+    yield (
+        "contact",
+        rr.StateConfiguration(
+            values=CONTACT_NAMES,
+            labels=CONTACT_NAMES,
+            colors=np.array([rgba("#808080", 0.15), rgba(_hex("contact", trace))], np.uint32),
+        ),
+    )
+    for source in sources(trace):
+        hue, width = _hex(source, trace), 2.5 if source == "fused" else 1.2
+        yield f"world/plane/{source}/mean", _marker(hue, 6.0 if source == "fused" else 4.5)
+        yield (
+            f"world/plane/{source}/ellipse",
+            rr.Ellipsoids3D.from_fields(
+                colors=rgba(hue), line_radii=rr.Radius.ui_points(width), fill_mode="MajorWireframe"
+            ),
+        )
+        yield f"errors/position/{source}", _line(hue, width, f"{source} (cm)")
+        for component in angles(task):
+            yield f"errors/{component.name}/{source}", _line(hue, width, f"{source} (deg)")
+        for component in task.components:
+            yield f"states/{component.name}/{source}", _line(hue, width, source)
+    for component in task.components:
+        truth = _line(_hex("truth", trace), 2.0, "truth")
+        yield f"states/{component.name}/truth", truth
+        band = ["fused - 2 sigma", "fused + 2 sigma"]
+        yield f"states/{component.name}/two_sigma", _line(_hex("fused", trace), 1.0, *band, opacity=0.5)
+    for name in ("weights", "acting"):
+        values = getattr(trace, name)
+        if values is None:
+            continue
+        for modality in trace.modalities:
+            names = [modality]
+            if values.shape[2] > 1:
+                names = [f"{modality}, {component.name}" for component in task.components]
+            yield f"{name}/{modality}", _line(_hex(modality, trace), 2.0, *names)
+    if trace.log_weights is not None:
+        yield "diagnostics/effective_sample_size", _line(_hex("fused", trace), 1.5, "effective particles")
+
+
+def contact_changes(trace: Trace) -> tuple[NDArray[np.int64], Any]:
+    """The steps at which the contact begins or ends, step 0 first, and its columns there."""
+    contact = trace.episode.contact
+    steps = np.flatnonzero(np.concatenate([[True], contact[1:] != contact[:-1]]))
+    return steps, rr.StateChange.columns(state=[CONTACT_NAMES[int(contact[step])] for step in steps])
+
+
+def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
+    plane = list(task.map_indices)
+    truth = trace.episode.states[steps][:, plane]
+    yield "world/plane/truth", rr.Points3D.columns(positions=_lift(truth))
+    effector = trace.episode.observations.get("effector_position")
+    if effector is not None:
+        yield "world/effector", rr.Points3D.columns(positions=effector[steps])
+    for source, mean, covariance in _estimates(trace, steps):
+        centre, spread = mean[:, plane], covariance[:, plane][:, :, plane]
+        yield f"world/plane/{source}/mean", rr.Points3D.columns(positions=_lift(centre))
+        axes, turn = _ellipses(spread)
+        yield (
+            f"world/plane/{source}/ellipse",
+            rr.Ellipsoids3D.columns(centers=_lift(centre), half_sizes=_lift(axes), quaternions=turn),
+        )
+    if task.ghost is not None:
+        for name, states in (("truth", trace.episode.states), ("fused", trace.estimate_mean)):
+            ghost = task.ghost(states[steps])
+            wxyz = ghost.wxyz
+            yield (
+                f"world/object/{name}",
+                rr.Boxes3D.columns(centers=ghost.position, quaternions=np.roll(wxyz, -1, axis=-1)),
+            )
+    if trace.particles is not None and trace.log_weights is not None:
+        points = _lift(trace.particles[steps][:, :, plane])
+        rows, count = points.shape[:2]
+        shades = _shades(trace.log_weights[steps], _hex("fused", trace))
+        both = rr.Points3D.columns(positions=points.reshape(-1, 3), colors=shades.ravel())
+        yield "world/plane/particles", both.partition([count] * rows)
+
+
+def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
+    for i, component in enumerate(task.components):
+        scale = SHOWN_SCALE[component.unit]
+        yield f"states/{component.name}/truth", series(trace.episode.states[steps, i] * scale)
+        for source, mean, covariance in _estimates(trace, steps):
+            yield f"states/{component.name}/{source}", series(mean[:, i] * scale)
+            if source == "fused":
+                sigma = SIGMAS * np.sqrt(covariance[:, i, i])
+                band = np.stack([mean[:, i] - sigma, mean[:, i] + sigma], axis=1)
+                yield f"states/{component.name}/two_sigma", series(band * scale)
+
+
+def _errors(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
+    plane = list(task.map_indices)
+    for source, mean, _ in _estimates(trace, steps):
+        error = mean - trace.episode.states[steps]
+        distance = np.linalg.norm(error[:, plane], axis=1)
+        yield f"errors/position/{source}", series(distance * SHOWN_SCALE["m"])
+        for component in angles(task):
+            turn = error[:, task.index(component.name)]
+            shortest = np.abs(np.arctan2(np.sin(turn), np.cos(turn)))
+            yield f"errors/{component.name}/{source}", series(shortest * SHOWN_SCALE["rad"])
+
+
+def _estimates(trace: Trace, steps: slice) -> Iterator[tuple[str, Array, Array]]:
+    """(source, mean (T, n), covariance (T, n, n)) of the fused estimate and of each modality's."""
+    yield "fused", trace.estimate_mean[steps], trace.estimate_covariance[steps]
+    for k, modality in enumerate(trace.modalities):
+        yield modality, trace.modality_mean[steps, k], trace.modality_covariance[steps, k]
+
+
+def _ellipses(covariance: Array) -> tuple[Array, Array]:
+    """Half axes (T, 2) at ``SIGMAS`` standard deviations and turns (T, 4, xyzw) of covariances (T, 2, 2)."""
+    values, vectors = np.linalg.eigh(covariance.astype(np.float64))
+    # Rounding may leave a flat covariance with an eigenvalue just below zero.
+    axes = SIGMAS * np.sqrt(np.maximum(values, 0.0))
+    half = 0.5 * np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
+    zero = np.zeros_like(half)
+    return axes, np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
+
+
+def _lift(points: Array) -> Array:
+    """(..., 2) points of the plane as (..., 3)."""
+    return np.concatenate([points, np.zeros_like(points[..., :1])], axis=-1).astype(np.float32)
+
+
+def _shades(log_weights: Array, hue: str) -> NDArray[np.uint32]:
+    """(T, M) RGBA from gray (no weight) to the hue (the step's greatest weight)."""
+    share = np.sqrt(np.exp(log_weights - log_weights.max(axis=1, keepdims=True)))[..., None]
+    gray, full = np.full(3, 150.0), np.array([int(hue[i : i + 2], 16) for i in (1, 3, 5)], float)
+    red, green, blue = np.moveaxis(np.rint(gray + share * (full - gray)).astype(np.uint32), -1, 0)
+    return red << 24 | green << 16 | blue << 8 | np.uint32(255)
+
+
+def _hex(source: str, trace: Trace) -> str:
+    return colour(source, trace.modalities)
+
+
+def rgba(hue: str, opacity: float = 1.0) -> int:
+    """``#RRGGBB`` as Rerun's 0xRRGGBBAA."""
+    return int(hue[1:], 16) << 8 | round(255 * opacity)
+
+
+def _line(hue: str, width: float, *names: str, opacity: float = 1.0) -> rr.SeriesLines:
+    count = len(names)
+    colours = np.full(count, rgba(hue, opacity), np.uint32)
+    return rr.SeriesLines(colors=colours, widths=[width] * count, names=list(names))
+
+
+def _box(hue: str, half_sizes: Array, filled: bool) -> rr.Boxes3D:
+    return rr.Boxes3D.from_fields(
+        half_sizes=half_sizes,
+        colors=rgba(hue),
+        radii=rr.Radius.ui_points(1.5),
+        fill_mode="TransparentFillMajorWireframe" if filled else "MajorWireframe",
+    )
+
+
+def _marker(hue: str, points: float) -> rr.Points3D:
+    return rr.Points3D.from_fields(colors=rgba(hue), radii=rr.Radius.ui_points(points))
+
+
+def about(trace: Trace, task: Task) -> rr.TextDocument:
+    """What is shown, in words: a recording is read by people who have nothing else at hand."""
+    filter_kind = "particle filter" if trace.kind == "pf" else "bank of extended Kalman filters"
+    components = ", ".join(component.name for component in task.components)
+    names = ("truth", "fused", *trace.modalities, "contact")
+    legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
+    text = f"""# {task.name}, episode {trace.episode_index}, {trace.filter}
+
+A {filter_kind} estimates {components} from {" and ".join(trace.modalities)}: {len(trace)} steps of
+{trace.episode.dt:g} s. It starts at the true state and weighs its modalities anew at every step.
+
+| name | colour | what it is |
+| --- | --- | --- |
+{legend}
+
+* **Scene**: the object where it is and where the filter takes it to be. Contours are 2 sigma in
+  {task.map_components[0]} and {task.map_components[1]}. Brighter particles weigh more. Gray: the end
+  effector and where it came from.
+* **Likelihood maps**: bright where a modality finds the position likely, each against its own brightest cell; around
+  the truth, {200 * task.map_half_width:g} cm a side, {task.map_components[0]} to the right.
+* **Plots**: centimetres and degrees. Thin lines beside the fused estimate are 2 sigma away from it.
+
+checkpoint `{trace.checkpoint_hash}`
+data `{trace.data_hash}`
+seed {trace.seed}
+"""
+    return rr.TextDocument(text, media_type="text/markdown")

@@ -1,0 +1,73 @@
+"""Likelihood maps as Rerun columns: pictures of their own, and the fused one where it belongs in the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from beliefscope.datasets.task import Task
+from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.drawing import rgba, series, sources
+from beliefscope.recordings.schema import colour
+
+Array = NDArray[Any]
+
+
+def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
+    """What all maps of a recording have in common: size, colour table, markers."""
+    side = len(first.offsets_x)
+    depth = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8")
+    for layer in first.layers:
+        yield (
+            f"maps/{layer}",
+            rr.DepthImage.from_fields(format=depth, colormap="Inferno", depth_range=[0.0, 255.0]),
+        )
+        yield f"maps/{layer}/truth", _marker_2d(colour("truth", trace.modalities))
+        yield f"maps/{layer}/estimate", _marker_2d(colour(layer, trace.modalities))
+    cell = float(first.offsets_x[1] - first.offsets_x[0])
+    gray = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8", color_model="L")
+    yield (
+        "world/plane/map",
+        rr.GridMap.from_fields(format=gray, cell_size=cell, opacity=0.7, colormap="Inferno"),
+    )
+
+
+def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
+    """A block of maps of one size, rows turned so that y grows upwards as on a chart."""
+    x, y = task.map_indices
+    steps = [m.step for m in maps]
+    pixels = np.stack([m.normalised()[:, ::-1] for m in maps])
+    peaks = np.stack([m.log_likelihood.max(axis=(1, 2)) for m in maps])
+    means = np.concatenate([trace.estimate_mean[steps, None], trace.modality_mean[steps]], axis=1)[..., [x, y]]
+    for index, layer in enumerate(maps[0].layers):
+        yield f"maps/{layer}", rr.DepthImage.columns(buffer=list(pixels[:, index].reshape(len(maps), -1)))
+        yield f"maps/{layer}/log_peak", series(peaks[:, index])
+        mean = means[:, sources(trace).index(layer)]
+        yield f"maps/{layer}/estimate", rr.Points2D.columns(positions=_cells(maps, mean))
+        truth = trace.episode.states[steps][:, [x, y]]
+        yield f"maps/{layer}/truth", rr.Points2D.columns(positions=_cells(maps, truth))
+    fused = pixels[:, maps[0].layers.index("fused")].reshape(len(maps), -1)
+    first = maps[0]
+    half_cell = (first.offsets_x[1] - first.offsets_x[0]) / 2.0
+    below = -0.002  # or the map and the contours drawn on it would flicker through each other
+    corner = np.array([[m.centre[0] + m.offsets_x[0], m.centre[1] + m.offsets_y[0], below] for m in maps])
+    corner[:, :2] -= half_cell
+    yield "world/plane/map", rr.GridMap.columns(data=list(fused), translation=corner)
+
+
+def _cells(maps: Sequence[LikelihoodMap], points: Array) -> Array:
+    """World points (B, 2) as picture coordinates of their maps: cells from the upper left corner."""
+    origin = np.array([[m.offsets_x[0], m.offsets_y[0]] for m in maps]) + np.array([m.centre for m in maps])
+    spacing = np.array([[m.offsets_x[1] - m.offsets_x[0], m.offsets_y[1] - m.offsets_y[0]] for m in maps])
+    cells = (points - origin) / spacing + 0.5
+    cells[:, 1] = len(maps[0].offsets_y) - cells[:, 1]
+    return cells.astype(np.float32)
+
+
+def _marker_2d(hue: str) -> rr.Points2D:
+    return rr.Points2D.from_fields(colors=rgba(hue), radii=rr.Radius.ui_points(4.0))

@@ -1,0 +1,134 @@
+"""``.rrd`` -> trace, with Rerun's own reader."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections import defaultdict
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, HEADER, PROPERTIES, STEP, TRACE_COMPONENT
+
+VALUES = (TRACE_COMPONENT, "Image:buffer", "Scalars:scalars")
+STORED = ["/trace/**", "/observations/**", f"/{HEADER}"]
+
+
+def read_recording(path: str | Path) -> Trace:
+    """The trace that a recording was written from: equal numbers, in their own types.
+
+    Raises:
+        BadInput: no such file, not a recording of this project, of a newer format version, or cut off.
+    """
+    path = Path(path)
+    header, rows = _load(path)
+    steps = int(header["steps"])
+    arrays = {
+        name: _assemble(path, name, rows[name], steps, entry) for name, entry in json.loads(header["shapes"]).items()
+    }
+    made = json.loads(header["episode"])
+    observations = {
+        name.removeprefix("observations/"): array for name, array in arrays.items() if name.startswith("observations/")
+    }
+    fields_of = {name.removeprefix("trace/"): a for name, a in arrays.items() if name.startswith("trace/")}
+    of_episode = {field.name for field in fields(Episode)} & fields_of.keys()
+    episode = Episode(
+        task=header["task"],
+        observations=observations,
+        dt=float(header["dt"]),
+        seed=made["seed"],
+        split=made["split"],
+        provenance=made["provenance"],
+        **{name: fields_of[name] for name in of_episode},
+    )
+    return Trace(
+        episode=episode,
+        modalities=tuple(json.loads(header["modalities"])),
+        kind=header["kind"],
+        filter=header["filter"],
+        checkpoint_hash=header["checkpoint_hash"],
+        data_hash=header["data_hash"],
+        episode_index=int(header["episode_index"]),
+        seed=int(header["seed"]),
+        settings=json.loads(header["settings"]),
+        **{name: fields_of[name] for name in fields_of.keys() - of_episode},
+    )
+
+
+Rows = dict[str, list[tuple[NDArray[np.int64] | None, NDArray[Any]]]]
+"""Stored path -> its chunks: steps (R,), None where static, and values, flattened."""
+
+
+def _load(path: Path) -> tuple[dict[str, Any], Rows]:
+    """The header and the stored rows of a file."""
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; a recording (.rrd) is wanted.")
+    header: dict[str, Any] = {}
+    rows: Rows = defaultdict(list)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a file that was cut off is reported below, in one line
+            reader = RrdReader(path)
+            stores = [store for store in reader.recordings() if store.application_id == APPLICATION]
+            if stores:
+                for chunk in reader.stream(store=stores[0]).filter(content=STORED):
+                    batch = chunk.to_record_batch()
+                    if chunk.entity_path == f"/{HEADER}":
+                        header |= _properties(batch)
+                    else:
+                        rows[chunk.entity_path.removeprefix("/")] += _values(batch)
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0].split(f"{path}: ")[-1]
+        raise BadInput(f"{path}: not a whole Rerun recording ({reason}).") from None
+    version = header.get("format_version")
+    if version is None:
+        raise BadInput(f"{path}: a Rerun recording, but not one that {APPLICATION} wrote.")
+    if version != FORMAT_VERSION:
+        raise BadInput(f"{path}: recording format {version}; this version reads format {FORMAT_VERSION}.")
+    if missing := PROPERTIES.keys() - header.keys():
+        raise BadInput(f"{path}: the recording lacks the properties {', '.join(sorted(missing))}.")
+    return header, rows
+
+
+def _properties(batch: pa.RecordBatch) -> dict[str, Any]:
+    return {name: batch.column(name)[0].as_py()[0] for name in batch.schema.names if name in PROPERTIES}
+
+
+def _values(batch: pa.RecordBatch) -> list[tuple[NDArray[np.int64] | None, NDArray[Any]]]:
+    """The batch's stored values, if it has any (an entity's looks come in batches of their own)."""
+    names = batch.schema.names
+    steps = batch.column(STEP).to_numpy() if STEP in names else None
+    chunks = []
+    for name in VALUES:
+        if name in names:
+            values = batch.column(name)
+            while pa.types.is_list(values.type):
+                values = values.flatten()
+            chunks.append((steps, values.to_numpy(zero_copy_only=False)))
+    return chunks
+
+
+def _assemble(
+    path: Path, name: str, rows: list[tuple[NDArray[np.int64] | None, NDArray[Any]]], steps: int, entry: list[Any]
+) -> NDArray[Any]:
+    """One stored array, its rows in the order of their steps. ``entry`` is its line in the property ``shapes``."""
+    shape, dtype = tuple(entry[0]), np.dtype(entry[1])
+    if 0 in shape:
+        return np.zeros((steps, *shape), dtype)
+    indices = [index for index, _ in rows if index is not None]
+    if rows and not indices:
+        return rows[0][1].reshape(shape).astype(dtype, copy=False)
+    order = np.concatenate([np.zeros(0, np.int64), *indices])
+    if not np.array_equal(np.sort(order), np.arange(steps)):
+        raise BadInput(f"{path}: {name} holds {len(order)} of {steps} steps; the recording was cut off.")
+    values = np.concatenate([value for _, value in rows]).reshape(steps, *shape)
+    return values[np.argsort(order)].astype(dtype, copy=False)

@@ -1,0 +1,145 @@
+"""What is in a recording: its entities, its properties, its colours. ``docs/recordings.md`` is tested against this.
+
+Paths under ``trace/`` and ``observations/`` hold the trace's own numbers (SI units, stored types) and are what an
+import reads. All other paths are drawn from them, for the eye: the page's units (cm, degrees), colours, markers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+APPLICATION = "beliefscope"
+FORMAT_VERSION = 1
+"""Raised when a path changes its meaning or goes. A new path or property alone does not raise it."""
+
+HEADER = "__properties/beliefscope"
+"""Where Rerun keeps the recording property ``beliefscope``."""
+
+STEP, TIME = "step", "time"
+"""The two timelines: the trace's index t, and t * dt as a duration."""
+
+COLOURS: dict[str, str] = {
+    "truth": "#009E73",
+    "image": "#56B4E9",
+    "haptics": "#E69F00",
+    "fused": "#D55E00",
+    "contact": "#CC79A7",
+}
+"""Okabe and Ito's colours, which people with any colour vision tell apart. One meaning each, all over the product."""
+
+SPARE_COLOURS: tuple[str, ...] = ("#0072B2", "#F0E442", "#999999")
+"""For modalities that ``COLOURS`` does not name, in the order of the trace's modalities."""
+
+Needs = Literal["always", "weights", "acting", "ekf", "pf", "maps", "replay", "ghost"]
+
+
+@dataclass(frozen=True)
+class Entity:
+    """One row of the schema.
+
+    Attributes:
+        path: with ``{component}`` of the state, ``{modality}``, ``{source}`` (``fused`` or a modality), ``{key}`` of an
+            observation, ``{layer}`` of a likelihood map.
+        archetype: Rerun's, or ``Trace`` for numbers that no view of Rerun's draws.
+        shape: of one step; T steps, K modalities, n components, M particles, c controls, S cells a side of a map,
+            W weights a modality.
+        unit: of the numbers as stored.
+        needs: what the trace must have for the path to be there.
+        meaning: one line for the documentation.
+    """
+
+    path: str
+    archetype: str
+    shape: str
+    unit: str
+    needs: Needs
+    meaning: str
+
+    @property
+    def static(self) -> bool:
+        """Whether it is one value for the whole recording."""
+        return self.shape.endswith("static")
+
+
+TRACE_COMPONENT = "Trace:values"
+"""Component of the archetype ``Trace``: one row a step, the array flattened in C order, in its own type."""
+
+SCHEMA: tuple[Entity, ...] = (
+    # The numbers: read back exactly.
+    Entity("trace/states", "Trace", "(n,)", "m, rad", "always", "true state"),
+    Entity("trace/controls", "Trace", "(c,)", "task's", "always", "control that led to this step"),
+    Entity("trace/contact", "Trace", "()", "bool", "always", "whether the robot truly touched the object"),
+    Entity("trace/qpos", "Trace", "(nq,)", "m, rad", "replay", "joint positions for the replay"),
+    Entity("trace/estimate_mean", "Trace", "(n,)", "m, rad", "always", "fused posterior mean"),
+    Entity("trace/estimate_covariance", "Trace", "(n, n)", "m, rad", "always", "fused posterior covariance"),
+    Entity("trace/modality_mean", "Trace", "(K, n)", "m, rad", "always", "each modality's own mean"),
+    Entity("trace/modality_covariance", "Trace", "(K, n, n)", "m, rad", "always", "each modality's own covariance"),
+    Entity("trace/start_mean", "Trace", "(n,), static", "m, rad", "always", "mean before step 0"),
+    Entity("trace/start_covariance", "Trace", "(n, n), static", "m, rad", "always", "covariance before step 0"),
+    Entity("trace/weights", "Trace", "(K, W)", "1", "weights", "fusion weights beta as the network gave them"),
+    Entity("trace/acting", "Trace", "(K, W)", "1", "acting", "share of each modality as it acted"),
+    Entity("trace/predicted_mean", "Trace", "(K, n)", "m, rad", "ekf", "mean before the observation"),
+    Entity("trace/predicted_covariance", "Trace", "(K, n, n)", "m, rad", "ekf", "covariance before the observation"),
+    Entity("trace/observation_mean", "Trace", "(K, n)", "m, rad", "ekf", "virtual sensors' z"),
+    Entity("trace/observation_covariance", "Trace", "(K, n, n)", "m, rad", "ekf", "virtual sensors' R"),
+    Entity("trace/particles", "Trace", "(M, n)", "m, rad", "pf", "predicted particles"),
+    Entity("trace/prior_log_weights", "Trace", "(M,)", "log", "pf", "normalised weights before the observation"),
+    Entity("trace/log_weights", "Trace", "(M,)", "log", "pf", "normalised weights after it, before resampling"),
+    Entity("trace/log_likelihood", "Trace", "(K, M)", "log", "pf", "of each particle, not normalised"),
+    Entity("trace/ancestors", "Trace", "(M,)", "index", "pf", "particle each resampled one came from"),
+    Entity("observations/{key}", "Image or Scalars", "task's", "task's", "always", "what the filter saw"),
+    # The world: metres, z up; the plane carries the belief over the task's two map components.
+    Entity("world", "ViewCoordinates", "static", "m", "always", "right-handed, z up"),
+    Entity("world/effector", "Points3D", "(3,)", "m", "always", "end effector"),
+    Entity("world/plane", "Transform3D", "static", "m", "always", "height at which the belief is drawn"),
+    Entity("world/plane/truth", "Points3D", "(1, 3)", "m", "always", "true position"),
+    Entity("world/plane/{source}/mean", "Points3D", "(1, 3)", "m", "always", "estimated position"),
+    Entity("world/plane/{source}/ellipse", "Ellipsoids3D", "(1, 3)", "m", "always", "2 sigma contour and its axes"),
+    Entity("world/object/{state}", "Boxes3D", "(1, 3)", "m", "ghost", "the object at the state `truth` or `fused`"),
+    Entity("world/plane/particles", "Points3D", "(M, 3)", "m", "pf", "coloured by posterior weight"),
+    Entity("world/plane/map", "GridMap", "(S, S)", "u8", "maps", "fused map, laid where it belongs"),
+    # The plots: degrees and centimetres.
+    Entity("states/{component}/truth", "Scalars", "()", "cm or deg", "always", "true value"),
+    Entity("states/{component}/{source}", "Scalars", "()", "cm or deg", "always", "estimated value"),
+    Entity("states/{component}/two_sigma", "Scalars", "(2,)", "cm or deg", "always", "fused mean - and + 2 sigma"),
+    Entity("errors/position/{source}", "Scalars", "()", "cm", "always", "distance from the true position"),
+    Entity("errors/{angle}/{source}", "Scalars", "()", "deg", "always", "absolute error of each angle"),
+    Entity("weights/{modality}", "Scalars", "(W,)", "1", "weights", "beta, one series a column"),
+    Entity("acting/{modality}", "Scalars", "(W,)", "1", "acting", "acting share, one series a column"),
+    Entity("contact", "StateChange", "()", "text", "always", "`contact` or `free`, where it changes"),
+    Entity("diagnostics/effective_sample_size", "Scalars", "()", "particles", "pf", "1 / sum of squared weights"),
+    # The maps: at the steps they were made for.
+    Entity("maps/{layer}", "DepthImage", "(S, S)", "u8", "maps", "255 x likelihood / its maximum; top row: largest y"),
+    Entity("maps/{layer}/log_peak", "Scalars", "()", "log", "maps", "log-likelihood of the maximum"),
+    Entity("maps/{layer}/truth", "Points2D", "(1, 2)", "cells", "maps", "true position on the map"),
+    Entity("maps/{layer}/estimate", "Points2D", "(1, 2)", "cells", "maps", "this layer's estimate on the map"),
+    Entity("about", "TextDocument", "static", "text", "always", "what is shown, in words"),
+)
+
+PROPERTIES: dict[str, str] = {
+    "format_version": "version of this schema",
+    "versions": "JSON: versions of beliefscope, rerun-sdk and numpy that wrote the file",
+    "task": "name of the task",
+    "filter": "name of the filter",
+    "kind": "`ekf` or `pf`",
+    "modalities": "JSON list: the K modalities in order",
+    "episode_index": "index in its data set",
+    "steps": "T, rows of every path under `trace/` and `observations/` that is not static",
+    "dt": "seconds a step",
+    "seed": "seed of the filter's randomness",
+    "checkpoint_hash": "SHA-256 of the checkpoint's file",
+    "data_hash": "SHA-256 of the episode",
+    "settings": "JSON: the filter's settings",
+    "episode": "JSON: the episode's seed, split and provenance",
+    "shapes": "JSON: stored path -> shape and type of one step",
+}
+"""Properties of the recording (``property:beliefscope:...`` in Rerun's own queries)."""
+
+
+def colour(source: str, modalities: tuple[str, ...]) -> str:
+    """``#RRGGBB`` of ``truth``, ``fused``, ``contact`` or a modality."""
+    if source in COLOURS:
+        return COLOURS[source]
+    unnamed = [modality for modality in modalities if modality not in COLOURS]
+    return SPARE_COLOURS[unnamed.index(source) % len(SPARE_COLOURS)]

@@ -1,0 +1,215 @@
+"""Trace -> ``.rrd``. The file is complete or not there: it is written under another name and then renamed."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.any_batch_value import AnyBatchValue
+
+import beliefscope
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
+from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.trace import Trace
+from beliefscope.recordings import drawing
+from beliefscope.recordings.blueprint import blueprint
+from beliefscope.recordings.maps import map_columns, map_style
+from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, SCHEMA, STEP, TIME, TRACE_COMPONENT
+
+STEPS_PER_CHUNK = 100
+MAPS_PER_CHUNK = 16
+
+
+def write_recording(
+    trace: Trace,
+    path: str | Path,
+    maps: Iterable[LikelihoodMap] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
+    """Write a recording that Rerun's own viewer opens with its layout, and ``read_recording`` reads back.
+
+    Args:
+        trace: of a task in ``TASKS``.
+        path: of the ``.rrd`` file. A file that is there is replaced once the new one is complete.
+        maps: likelihood maps of steps of this trace, all of one size, each step at most once; they are taken block by
+            block, so they may be made while being written. Kept as 8-bit shares of their layer's maximum: the error
+            is at most 1/510 of it.
+        progress: called with the share that is done, 0 to 1.
+
+    Returns:
+        The path.
+
+    Raises:
+        BadInput: the folder does not exist or cannot be written; maps of different sizes or unknown steps.
+    """
+    rr.set_strict_mode(True)  # or Rerun turns its errors into warnings and leaves gaps
+    task = find_task(trace.episode.task)
+    report = progress or (lambda share: None)
+    blocks = _blocks(maps or (), MAPS_PER_CHUNK)
+    first = next(blocks, [])
+    layers = first[0].layers if first else ()
+    with _complete_or_absent(Path(path)) as unfinished:
+        stream = rr.RecordingStream(APPLICATION)
+        stream.save(unfinished, default_blueprint=blueprint(trace, task, layers))
+        _send_header(stream, trace)
+        _send_static(stream, trace, task)
+        stream.flush()  # so that even a file cut off later says what it is
+        for start in range(0, len(trace), STEPS_PER_CHUNK):
+            steps = slice(start, min(start + STEPS_PER_CHUNK, len(trace)))
+            _send_steps(stream, trace, task, steps)
+            report(0.5 * steps.stop / len(trace))
+        if first:
+            for entity, what in map_style(first[0], trace):
+                stream.log(entity, what, static=True)
+        while first:
+            _send_maps(stream, first, trace, task, layers)
+            report(0.5 + 0.5 * (first[-1].step + 1) / len(trace))
+            first = next(blocks, [])
+        stream.flush()
+        stream.disconnect()
+    report(1.0)
+    return Path(path)
+
+
+def stored_arrays(trace: Trace) -> Iterator[tuple[str, bool, NDArray[Any]]]:
+    """(path, whether static, array) of every path under ``trace/`` that this trace has something for."""
+    of_episode = {field.name for field in fields(Episode)}
+    for entity in SCHEMA:
+        if entity.archetype == "Trace":
+            name = entity.path.removeprefix("trace/")
+            array = getattr(trace.episode if name in of_episode else trace, name)
+            if array is not None and (array.size or not len(trace)):
+                yield entity.path, entity.static, array
+
+
+def is_picture(array: NDArray[Any]) -> bool:
+    """Whether an observation (T, ...) is stored as pictures; all others are stored as scalars."""
+    return array.ndim == 3 and array.dtype == np.uint8
+
+
+def _send_header(stream: rr.RecordingStream, trace: Trace) -> None:
+    episode = trace.episode
+    arrays = {path: (array if static else array[:1], static) for path, static, array in stored_arrays(trace)}
+    shapes = {p: [list(a.shape if static else a.shape[1:]), a.dtype.str] for p, (a, static) in arrays.items()}
+    shapes |= {
+        f"observations/{key}": [list(array.shape[1:]), array.dtype.str] for key, array in episode.observations.items()
+    }
+    shapes.setdefault("trace/qpos", [list(episode.qpos.shape[1:]), episode.qpos.dtype.str])
+    versions = {name: importlib.metadata.version(name) for name in ("rerun-sdk", "numpy")}
+    text = json.dumps
+    stream.send_property(
+        "beliefscope",
+        rr.AnyValues(
+            format_version=FORMAT_VERSION,
+            versions=text({"beliefscope": beliefscope.__version__} | versions),
+            task=episode.task,
+            filter=trace.filter,
+            kind=trace.kind,
+            modalities=text(trace.modalities),
+            episode_index=trace.episode_index,
+            steps=len(trace),
+            dt=float(episode.dt),
+            seed=trace.seed,
+            checkpoint_hash=trace.checkpoint_hash,
+            data_hash=trace.data_hash,
+            settings=text(dict(trace.settings)),
+            episode=text({"seed": episode.seed, "split": episode.split, "provenance": dict(episode.provenance)}),
+            shapes=text(shapes),
+        ),
+    )
+    stream.send_recording_name(f"{episode.task} {trace.episode_index}, {trace.filter}")
+
+
+def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task) -> None:
+    for path, static, array in stored_arrays(trace):
+        if static:
+            stream.log(path, [_values(array)], static=True)
+    for key, array in trace.episode.observations.items():
+        if is_picture(array):
+            height, width = array.shape[1:]
+            gray = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8")
+            stream.log(f"observations/{key}", rr.Image.from_fields(format=gray), static=True)
+    for path, what in drawing.style(trace, task):
+        stream.log(path, what, static=True)
+    stream.log("about", drawing.about(trace, task), static=True)
+    steps, states = drawing.contact_changes(trace)
+    stream.send_columns("contact", _times(steps, trace), states)
+
+
+def _send_steps(stream: rr.RecordingStream, trace: Trace, task: Task, steps: slice) -> None:
+    times = _times(np.arange(steps.start, steps.stop), trace)
+    for path, static, array in stored_arrays(trace):
+        if not static:
+            rows = array[steps]
+            column = rr.ComponentColumn(TRACE_COMPONENT, _batch(rows), lengths=[rows[0].size] * len(rows))
+            stream.send_columns(path, times, [column])
+    for key, array in trace.episode.observations.items():
+        rows = array[steps]
+        columns = (
+            rr.Image.columns(buffer=list(rows.reshape(len(rows), -1))) if is_picture(array) else drawing.series(rows)
+        )
+        stream.send_columns(f"observations/{key}", times, columns)
+    for path, columns in drawing.columns(trace, task, steps):
+        stream.send_columns(path, times, columns)
+
+
+def _send_maps(
+    stream: rr.RecordingStream, maps: list[LikelihoodMap], trace: Trace, task: Task, layers: tuple[str, ...]
+) -> None:
+    for one in maps:
+        if not 0 <= one.step < len(trace):
+            raise BadInput(f"map of step {one.step}: the trace has steps 0 to {len(trace) - 1}.")
+        if one.layers != layers or one.log_likelihood.shape != maps[0].log_likelihood.shape:
+            raise BadInput(f"map of step {one.step}: all maps of a recording have one size and one set of layers.")
+    times = _times(np.array([one.step for one in maps]), trace)
+    for path, columns in map_columns(maps, trace, task):
+        stream.send_columns(path, times, columns)
+
+
+def _times(steps: NDArray[np.int64], trace: Trace) -> list[rr.TimeColumn]:
+    nanoseconds = np.rint(steps * (trace.episode.dt * 1e9)).astype("timedelta64[ns]")
+    return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
+
+
+def _batch(array: NDArray[Any]) -> AnyBatchValue:
+    return AnyBatchValue(TRACE_COMPONENT, pa.array(array.ravel()))
+
+
+def _values(array: NDArray[Any]) -> Any:
+    return rr.DescribedComponentBatch(_batch(array), rr.ComponentDescriptor(TRACE_COMPONENT))
+
+
+def _blocks(maps: Iterable[LikelihoodMap], size: int) -> Iterator[list[LikelihoodMap]]:
+    rest = iter(maps)
+    while block := list(islice(rest, size)):
+        yield block
+
+
+@contextmanager
+def _complete_or_absent(path: Path) -> Iterator[Path]:
+    """A name in the same folder to write under; renamed to ``path`` at the end, removed if anything goes wrong."""
+    if not path.parent.is_dir():
+        raise BadInput(f"cannot write {path}: the folder {path.parent} does not exist.")
+    unfinished = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise BadInput(f"cannot write {path}: {error.strerror or error}.") from None
+    finally:
+        unfinished.unlink(missing_ok=True)

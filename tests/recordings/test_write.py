@@ -1,0 +1,212 @@
+"""Recordings: nothing is lost on the way, every path is as documented, and a file is whole or not there."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.read import read_recording
+from beliefscope.recordings.schema import HEADER, PROPERTIES, SCHEMA, STEP, TIME, Entity
+from beliefscope.recordings.write import write_recording
+
+MapMaker = Callable[..., LikelihoodMap]
+
+
+def assert_same(one: Trace, other: Trace) -> None:
+    for field in fields(Trace):
+        left, right = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(left, np.ndarray):
+            assert left.dtype == right.dtype, field.name
+            np.testing.assert_array_equal(left, right, field.name)
+        elif field.name != "episode":
+            assert left == right, field.name
+    assert one.episode.digest() == other.episode.digest()
+    assert one.episode.provenance == other.episode.provenance
+
+
+def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
+    """The paths that one row of the schema stands for in this trace's recording."""
+    task = find_task(trace.episode.task)
+    there = {
+        "always": True,
+        "weights": trace.weights is not None,
+        "acting": trace.acting is not None,
+        "ekf": trace.kind == "ekf",
+        "pf": trace.kind == "pf",
+        "maps": maps,
+        "replay": trace.episode.qpos.size > 0,
+        "ghost": task.ghost is not None,
+    }
+    if not there[entity.needs]:
+        return set()
+    values = {
+        "{component}": [c.name for c in task.components],
+        "{angle}": [c.name for c in task.components if c.unit == "rad"],
+        "{modality}": list(trace.modalities),
+        "{source}": ["fused", *trace.modalities],
+        "{state}": ["truth", "fused"],
+        "{layer}": [*trace.modalities, "fused"],
+        "{key}": list(trace.episode.observations),
+    }
+    paths = {entity.path}
+    for name, choices in values.items():
+        paths = {path.replace(name, choice) for path in paths for choice in choices}
+    return paths
+
+
+def written(path: Path) -> Iterator[tuple[str, list[str]]]:
+    for chunk in RrdReader(path).stream():
+        yield chunk.entity_path.removeprefix("/"), chunk.to_record_batch().schema.names
+
+
+def test_round_trip_is_exact(trace: Trace, tmp_path: Path) -> None:
+    write_recording(trace, tmp_path / "run.rrd")
+    assert_same(trace, read_recording(tmp_path / "run.rrd"))
+
+
+def test_round_trip_over_several_chunks_and_of_odd_numbers(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
+    trace = new_trace("pf", steps=213, particles=7)
+    assert trace.log_likelihood is not None
+    trace.log_likelihood[5, 0, :3] = np.nan, -np.inf, np.float32(1e-45)
+    write_recording(trace, tmp_path / "run.rrd")
+    assert_same(trace, read_recording(tmp_path / "run.rrd"))
+
+
+def test_a_trace_without_weights_or_replay(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
+    trace = new_trace("ekf")
+    trace = replace(
+        trace, weights=None, acting=None, episode=replace(trace.episode, qpos=np.zeros((len(trace), 0), np.float32))
+    )
+    write_recording(trace, tmp_path / "run.rrd")
+    again = read_recording(tmp_path / "run.rrd")
+    assert_same(trace, again)
+    assert again.weights is None
+
+
+@pytest.mark.parametrize("with_maps", [False, True])
+def test_paths_are_those_of_the_schema(trace: Trace, new_map: MapMaker, tmp_path: Path, with_maps: bool) -> None:
+    maps = [new_map(trace, step) for step in (0, 20)] if with_maps else None
+    write_recording(trace, tmp_path / "run.rrd", maps)
+    found: dict[str, set[str]] = {}
+    for path, columns in written(tmp_path / "run.rrd"):
+        found.setdefault(path, set()).update(columns)
+    assert set(PROPERTIES) <= found[HEADER]
+    for entity in SCHEMA:
+        for path in expected_paths(trace, entity, with_maps):
+            archetypes = {column.split(":")[0] for column in found.get(path, set())}
+            assert archetypes & set(entity.archetype.split(" or ")), (path, archetypes)
+            assert entity.static or {STEP, TIME} <= found[path], path
+    known = {path for entity in SCHEMA for path in expected_paths(trace, entity, with_maps)}
+    assert {path for path in found if not path.startswith("__properties")} == known
+
+
+def test_time_is_the_step_times_dt(trace: Trace, tmp_path: Path) -> None:
+    write_recording(trace, tmp_path / "run.rrd")
+    for chunk in RrdReader(tmp_path / "run.rrd").stream().filter(content="/trace/states"):
+        batch = chunk.to_record_batch()
+        seconds = batch.column(TIME).to_numpy().astype(np.int64) / 1e9
+        np.testing.assert_allclose(seconds, batch.column(STEP).to_numpy() * trace.episode.dt, atol=1e-9)
+
+
+def test_maps_are_stored_as_stated(new_trace: Callable[..., Trace], new_map: MapMaker, tmp_path: Path) -> None:
+    trace = new_trace("pf")
+    one = new_map(trace, 12, size=41)
+    write_recording(trace, tmp_path / "run.rrd", iter([one]))
+    values = {}
+    for chunk in RrdReader(tmp_path / "run.rrd").stream().filter(content="/maps/haptics/**"):
+        batch = chunk.to_record_batch()
+        for name in ("DepthImage:buffer", "Scalars:scalars"):
+            if name in batch.schema.names:
+                assert batch.column(STEP).to_pylist() == [12]
+                values[name] = batch.column(name)
+    shares = values["DepthImage:buffer"].flatten().flatten().to_numpy().reshape(41, 41)[::-1] / 255.0
+    log_peak = values["Scalars:scalars"].flatten().to_numpy()[0]
+    likelihood = np.exp(one.log_likelihood[1].astype(float))
+    assert np.abs(shares * np.exp(log_peak) - likelihood).max() <= likelihood.max() / 510 * 1.0001
+
+
+def test_the_viewer_finds_a_layout(trace: Trace, tmp_path: Path) -> None:
+    write_recording(trace, tmp_path / "run.rrd")
+    assert len(RrdReader(tmp_path / "run.rrd").blueprints()) == 1
+
+
+def test_reruns_own_check_passes(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+    path = write_recording(trace, tmp_path / "run.rrd", [new_map(trace, 3)])
+    rerun = shutil.which("rerun", path=os.path.dirname(sys.executable)) or shutil.which("rerun")
+    if rerun is None:
+        pytest.skip("the rerun command is not installed")
+    home = {"HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)}
+    done = subprocess.run([rerun, "rrd", "verify", path], capture_output=True, text=True, env=os.environ | home)
+    assert done.returncode == 0, done.stderr
+
+
+def test_progress_goes_from_nothing_to_all(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+    shares: list[float] = []
+    write_recording(trace, tmp_path / "run.rrd", (new_map(trace, s) for s in range(0, 40, 2)), shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+    path = write_recording(trace, tmp_path / "run.rrd")
+    before = path.read_bytes()
+
+    def failing() -> Iterator[LikelihoodMap]:
+        yield from (new_map(trace, step) for step in range(20))
+        assert path.read_bytes() == before
+        raise RuntimeError("the maps' maker fails")
+
+    with pytest.raises(RuntimeError, match="maker fails"):
+        write_recording(trace, path, failing())
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+KILLED = """
+import os, signal, sys
+sys.path.insert(0, {folder!r})
+from conftest import make_map, make_trace
+from beliefscope.recordings.write import write_recording
+trace = make_trace("pf")
+def maps():
+    yield from (make_map(trace, step) for step in range(20))
+    os.kill(os.getpid(), signal.SIGKILL)
+write_recording(trace, {path!r}, maps())
+"""
+
+
+def test_a_killed_writer_leaves_no_file_of_that_name(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    script = KILLED.format(folder=str(Path(__file__).parent), path=str(path))
+    assert subprocess.run([sys.executable, "-c", script]).returncode == -9
+    assert not path.exists()
+    assert all(left.name.startswith(".run.rrd.") for left in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("where", ["nowhere/run.rrd", "folder"])
+def test_a_place_that_cannot_be_written(trace: Trace, tmp_path: Path, where: str) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(BadInput, match="cannot write"):
+        write_recording(trace, tmp_path / where)
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_maps_that_do_not_fit(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="one size"):
+        write_recording(trace, tmp_path / "run.rrd", [new_map(trace, 0), new_map(trace, 1, size=21)])
+    with pytest.raises(BadInput, match="map of step 40: the trace has steps 0 to 39"):
+        write_recording(trace, tmp_path / "run.rrd", [replace(new_map(trace, 0), step=40)])
+    assert not list(tmp_path.iterdir())
