@@ -38,9 +38,9 @@ def main() -> None:
     """Runs the command that ``sys.argv`` names and ends the process."""
     debug = "--debug" in sys.argv[1:]
     try:
-        code = cli(standalone_mode=False)
+        code = cli(prog_name="beliefscope", standalone_mode=False)
     except typer.TyperException as error:
-        asked = getattr(getattr(error, "ctx", None), "command_path", cli.info.name)
+        asked = getattr(getattr(error, "ctx", None), "command_path", "beliefscope")
         console.fail(f"{error.format_message().rstrip('.')}. See: {asked} --help", error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
         console.fail("interrupted", 130)

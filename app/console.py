@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,8 +17,19 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def result(document: Mapping[str, Any], text: str, destination: str | None) -> None:
-    """A command's result: as text, or as one JSON document where ``destination`` is ``-``; to standard output."""
-    print(text if destination is None else json.dumps(document, indent=2))
+    """A command's result: as text, or as one JSON document where ``destination`` is ``-``; to standard output.
+
+    JSON knows no infinity and no NaN: a number that is not finite is null.
+    """
+    print(text if destination is None else json.dumps(_finite(document), indent=2, allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def table(rows: Mapping[str, str]) -> str:
@@ -40,12 +52,18 @@ def bars() -> Iterator[Callable[[str, float, str], None]]:
     from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    view = Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
     known: dict[str, TaskID] = {}
-    with Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True)) as view:
 
-        def move(label: str, share: float, note: str) -> None:
-            if label not in known:
-                known[label] = view.add_task(label, total=1.0, note=note)
-            view.update(known[label], completed=share, note=note)
+    def move(label: str, share: float, note: str) -> None:
+        if label not in known:
+            known[label] = view.add_task(label, total=1.0, note=note)
+            view.start()
+        view.update(known[label], completed=share, note=note)
 
+    try:
         yield move
+    finally:
+        # A view that was never started would still end with an empty line.
+        if known:
+            view.stop()

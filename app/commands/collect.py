@@ -8,16 +8,18 @@ from typing import Annotated
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import Json, Seed, TaskName, check, size
+from beliefscope.app.commands.given import Json, Seed, TaskName, check, size, whole
 
 
 def collect(
     task: TaskName,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, metavar="N", help="How many to simulate.")],
+    episodes: Annotated[int, typer.Option("--episodes", parser=whole(1), metavar="N", help="How many to simulate.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.h5", help="Where to write them.")],
-    steps: Annotated[int, typer.Option("--steps", min=2, metavar="T", help="Length of each, 0.1 s a step.")] = 200,
+    steps: Annotated[
+        int, typer.Option("--steps", parser=whole(2), metavar="T", help="Length of each, 0.1 s a step.")
+    ] = 200,
     workers: Annotated[
-        int | None, typer.Option("--workers", min=1, metavar="W", help="Processes. Without it: one a core.")
+        int | None, typer.Option("--workers", parser=whole(1), metavar="W", help="Processes. Without it: one a core.")
     ] = None,
     seed: Seed = 0,
     json: Json = None,

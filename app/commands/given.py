@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,23 @@ if TYPE_CHECKING:
     from beliefscope.datasets.task import Task
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.inspect.trace import Trace
+
+
+def whole(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Parser of an option's whole number. Unlike typer's own, it names the value that does not fit."""
+    valid = f"of at least {least}" if most is None else f"from {least} to {most}"
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least or (most is not None and value > most):
+            raise typer.BadParameter(f"{text!r} is not a whole number {valid}")
+        return value
+
+    return parse
+
 
 TaskName = Annotated[str, typer.Argument(metavar="TASK", help="Name of the task: door.")]
 FilterName = Annotated[
@@ -32,10 +50,15 @@ DataPath = Annotated[
 ]
 EpisodeIndex = Annotated[
     int | None,
-    typer.Option("--episode", metavar="I", help="Index in the data set. Without it: the first that is kept for tests."),
+    typer.Option(
+        "--episode",
+        parser=whole(0),
+        metavar="I",
+        help="Index in the data set. Without it: the first that is kept for tests.",
+    ),
 ]
-Particles = Annotated[int, typer.Option("--particles", min=1, metavar="M", help="Of a particle filter.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, metavar="S", help="All randomness comes from it.")]
+Particles = Annotated[int, typer.Option("--particles", parser=whole(1), metavar="M", help="Of a particle filter.")]
+Seed = Annotated[int, typer.Option("--seed", parser=whole(0), metavar="S", help="All randomness comes from it.")]
 Json = Annotated[
     str | None,
     typer.Option("--json", metavar="-", help="Print one JSON document to standard output instead of text."),

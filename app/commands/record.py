@@ -21,6 +21,7 @@ from beliefscope.app.commands.given import (
     described,
     title,
     traced,
+    whole,
 )
 
 
@@ -31,7 +32,10 @@ def record(
     data: DataPath = None,
     episode: EpisodeIndex = None,
     maps: Annotated[
-        int, typer.Option("--maps", min=0, metavar="STRIDE", help="Likelihood maps of each STRIDE-th step; 0: none.")
+        int,
+        typer.Option(
+            "--maps", parser=whole(0), metavar="STRIDE", help="Likelihood maps of each STRIDE-th step; 0: none."
+        ),
     ] = 10,
     particles: Particles = 300,
     seed: Seed = 0,

@@ -7,12 +7,14 @@ from typing import Annotated
 
 import typer
 
-from beliefscope.app.commands.given import Seed
+from beliefscope.app.commands.given import Seed, whole
 from beliefscope.datasets.errors import BadInput
 
 
 def serve(
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes any free one.")] = 8000,
+    port: Annotated[
+        int, typer.Option("--port", parser=whole(0, 65535), metavar="N", help="0 takes any free one.")
+    ] = 8000,
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     workspace: Annotated[
         Path, typer.Option("--workspace", metavar="DIR", help="Folder for recordings and traces; made if missing.")
@@ -40,7 +42,7 @@ def serve(
         raise BadInput(f"folder {str(workspace.parent)!r} does not exist, so {workspace.name!r} cannot be made in it")
 
     def listening(url: str) -> None:
-        print(f"Beliefscope listens on {url}", flush=True)
+        print(f"Beliefscope is at {url} (Ctrl-C ends it)", flush=True)
         if open_page:
             import webbrowser
 

@@ -1,0 +1,298 @@
+"""The command line as its users meet it: help that is true, one line for what is wrong, files that are whole."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import typer.main
+from safetensors.torch import save_file
+
+from beliefscope.app.cli import COMMANDS, cli, main
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.catalog import architecture, build
+from beliefscope.filters.checkpoint import save_checkpoint
+from beliefscope.inspect.trace import load_trace
+
+ROOT = Path(__file__).resolve().parents[1]
+GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
+NAMES = [command.__name__ for command in COMMANDS]
+OPTIONS = {
+    "serve": "--port --host --workspace --open --no-open --seed",
+    "collect": "--episodes --steps --seed --workers -o --json",
+    "train": "--filter --data --preset --seed -o --json",
+    "evaluate": "--filter --data --recipe --particles --seed --json",
+    "trace": "--filter --data --episode --seed -o --json",
+    "record": "--filter --data --episode --maps --seed -o --json",
+}
+"""What scripts outside the project may rely on."""
+
+Run = Callable[[str], tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a command line in this process: (exit code, standard output, standard error)."""
+
+    def run(line: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["beliefscope", *shlex.split(line)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main()
+        code = end.value.code or 0
+        assert isinstance(code, int)
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with files that can be used and files that cannot."""
+    monkeypatch.chdir(tmp_path)
+    sample = sample_path("door").read_bytes()
+    Path("cut.h5").write_bytes(sample[: len(sample) // 2])
+    Path("foreign.h5").write_text("no HDF5 at all\n")
+    with h5py.File("other.h5", "w") as file:
+        file["numbers"] = np.arange(3)
+    Path("shape.h5").write_bytes(sample)
+    with h5py.File("shape.h5", "r+") as file:
+        for group in file.values():
+            states = group["states"][()]
+            del group["states"]
+            group["states"] = states[:, :2]
+    untrained = build(architecture("door", "crossmodal-ekf"))
+    save_checkpoint(untrained, "crossmodal-ekf", {}, Path("ekf.safetensors"))
+    Path("cut.safetensors").write_bytes(Path("ekf.safetensors").read_bytes()[:-1000])
+    Path("foreign.safetensors").write_bytes(b"\x80\x04" + bytes(100))
+    save_file({"weight": torch.zeros(2)}, "other.safetensors")
+    Path("notes.txt").write_text("{not json")
+    Path("taken").mkdir()
+    return tmp_path
+
+
+def examples() -> list[str]:
+    """Every command line shown in the help and in the documentation."""
+    text = "\n".join([main_help(), *(command.__doc__ or "" for command in COMMANDS)])
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        if page.is_file():
+            text += "\n" + "\n".join(re.findall(r"```(?:sh|bash)?\n(.*?)```", page.read_text(), re.DOTALL))
+    return list(dict.fromkeys(re.findall(r"^ *(beliefscope (?:-|[a-z]+).*?)(?:   .*| +#.*)?$", text, re.MULTILINE)))
+
+
+def main_help() -> str:
+    return cli.registered_callback.callback.__doc__ or ""  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_names_every_promised_option_and_shows_an_example(run: Run, name: str) -> None:
+    code, out, err = run(f"{name} --help")
+    assert (code, err) == (0, "")
+    missing = [option for option in OPTIONS[name].split() if not re.search(rf"(?<![\w-]){option}\b", out)]
+    assert not missing
+    assert f"beliefscope {name} " in out.split("Example", 1)[1]
+
+
+def test_help_lists_the_commands(run: Run) -> None:
+    assert run("") == run("--help") == run("-h")
+    code, out, _ = run("")
+    assert code == 0
+    assert [line.split()[0] for line in out.split("Commands:\n")[1].splitlines()] == NAMES == list(OPTIONS)
+    assert "...\n" not in out.split("Commands:")[1], "a command's first sentence is too long for the list"
+
+
+@pytest.mark.parametrize("line", examples())
+def test_examples_are_accepted(line: str) -> None:
+    name, *arguments = shlex.split(line)[1:]
+    if name.startswith("-"):
+        return
+    command = typer.main.get_command(cli).commands[name]  # type: ignore[attr-defined]
+    command.make_context(name, arguments)
+
+
+def test_version(run: Run) -> None:
+    assert re.fullmatch(r"beliefscope \d+\.\d+\.\d+\S*\n", run("--version")[1])
+
+
+def test_help_imports_nothing_heavy() -> None:
+    heavy = {"torch", "mujoco", "h5py", "rerun", "fastapi", "uvicorn", "viser", "mjviser", "numpy", "rich"}
+    code = f"import sys, beliefscope.app.cli; print(*sorted(set(sys.modules) & {heavy}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.split() == []
+
+
+EKF = "door --filter ekf.safetensors"
+BAD = [
+    "nosuch",
+    "evaluate",
+    "evaluate dor --filter crossmodal-pf",
+    "evaluate door --filter crosmodal-pf",
+    "evaluate door --filter missing.safetensors",
+    "evaluate door --filter ./missing",
+    "evaluate door --filter foreign.safetensors",
+    "evaluate door --filter other.safetensors",
+    "evaluate door --filter cut.safetensors",
+    "evaluate door --filter shape.h5",
+    f"evaluate {EKF} --data missing.h5",
+    f"evaluate {EKF} --data taken",
+    f"evaluate {EKF} --data foreign.h5",
+    f"evaluate {EKF} --data other.h5",
+    f"evaluate {EKF} --data cut.h5",
+    f"evaluate {EKF} --data shape.h5",
+    f"evaluate {EKF} --data ekf.safetensors",
+    f"evaluate {EKF} --particles 0",
+    f"evaluate {EKF} --seed -1",
+    f"evaluate {EKF} --json out.json",
+    f"evaluate {EKF} --recipe notes.txt",
+    f"evaluate {EKF} --recipe missing.json",
+    f"evaluate {EKF} --recipe {{no}}",
+    f"""evaluate {EKF} --recipe '{{"noise": 1}}'""",
+    f"""evaluate {EKF} --recipe '{{"blackout": "much"}}'""",
+    f"""evaluate {EKF} --recipe '{{"blackout": 1.5}}'""",
+    f"""evaluate {EKF} --recipe '{{"only": "touch"}}'""",
+    "collect dor --episodes 1 -o new.h5",
+    "collect door --episodes 0 -o new.h5",
+    "collect door --episodes 1 --steps 1 -o new.h5",
+    "collect door --episodes 1 -o missing/new.h5",
+    "collect door --episodes 1 -o taken",
+    "collect door --episodes many -o new.h5",
+    "train door --filter crosmodal-pf -o new.safetensors",
+    "train door --filter crossmodal-pf --preset fast -o new.safetensors",
+    "train door --filter crossmodal-pf --data cut.h5 -o new.safetensors",
+    "train door --filter crossmodal-pf -o missing/new.safetensors",
+    "train door --filter crossmodal-pf",
+    f"trace {EKF} --episode 100000 -o new.trace",
+    f"trace {EKF} --episode -1 -o new.trace",
+    f"trace {EKF} -o missing/new.trace",
+    f"record {EKF} --maps -1 -o new.rrd",
+    f"record {EKF} --data cut.h5 -o new.rrd",
+    f"record {EKF} -o taken",
+    "serve --port 70000",
+    "serve --workspace notes.txt",
+    "serve --workspace missing/deep",
+]
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_bad_input_is_one_line_and_code_2(run: Run, folder: Path, line: str) -> None:
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    code, out, err = run(line)
+    assert (code, out) == (2, "")
+    assert re.fullmatch(r"error: .+\n", err)
+    after = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    assert after == before, "something half-written stays"
+    assert err.strip() == golden().get(line, err.strip())
+
+
+def golden() -> dict[str, str]:
+    """Command line -> error, of those whose text no library has a share in."""
+    found = re.findall(r"^\$ beliefscope (.*)\n(error: .*)$", GOLDEN.read_text(), re.MULTILINE)
+    return dict(found)
+
+
+def test_golden_errors_are_all_tested() -> None:
+    assert golden()
+    assert not golden().keys() - set(BAD)
+
+
+def test_busy_port(run: Run, folder: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        code, out, err = run(f"serve --port {port}")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert f"port {port}" in err
+    assert "--port" in err
+    assert not (folder / "workspace").exists()
+
+
+def test_other_failures_are_code_1_and_explain_themselves_on_demand(
+    run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("the network is full of eels")
+
+    monkeypatch.setattr("beliefscope.filters.evaluate.evaluate", broken)
+    code, out, err = run(f"evaluate {EKF}")
+    assert (code, out) == (1, "")
+    assert err.splitlines()[-1].startswith("error: RuntimeError: the network is full of eels")
+    assert "Traceback" not in err
+    monkeypatch.setattr(sys, "argv", ["beliefscope", "--debug", "evaluate", *EKF.split()])
+    with pytest.raises(RuntimeError, match="eels"):
+        main()
+
+
+def test_collect_to_recording(run: Run, folder: Path) -> None:
+    """The whole line: what one command writes, the next one reads, and the JSON agrees with the files."""
+    code, out, _ = run("collect door --episodes 2 --steps 12 --seed 3 --workers 1 -o few.h5 --json -")
+    collected = json.loads(out)
+    assert code == 0
+    with open_dataset(folder / "few.h5") as data:
+        assert collected["data_hash"] == data.hash
+        assert (collected["episodes"], [len(episode) for episode in data]) == (2, [12, 12])
+        digest = data[1].digest()
+
+    code, out, err = run("evaluate door --filter ekf.safetensors --data few.h5 --json -")
+    evaluated = json.loads(out)
+    assert code == 0
+    assert "Evaluating" in err
+    assert evaluated["data_hash"] == collected["data_hash"]
+    assert set(evaluated["rmse"]) == {"hinge_x_cm", "hinge_y_cm", "angle_deg", "position_cm"}
+    assert {"task", "filter", "checkpoint_hash", "episodes", "recipe", "nll", "nees", "coverage95"} <= set(evaluated)
+
+    code, out, _ = run(f"trace {EKF} --data few.h5 --episode 1 -o one.trace --json -")
+    assert code == 0
+    traced = load_trace(folder / "one.trace")
+    assert json.loads(out)["data_hash"] == traced.data_hash == digest
+    assert json.loads(out)["checkpoint_hash"] == traced.checkpoint_hash == evaluated["checkpoint_hash"]
+
+    code, out, _ = run(f"record {EKF} --data few.h5 --episode 1 --maps 6 -o one.rrd")
+    assert code == 0
+    assert out.startswith("one.rrd (")
+    assert len(out.splitlines()) == 1
+    assert (folder / "one.rrd").stat().st_size > 10_000
+
+
+def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> None:
+    run("collect door --episodes 10 --steps 40 --workers 2 -o ten.h5")
+    line = "train door --filter crossmodal-pf --data ten.h5 --preset smoke -o pf.safetensors --json -"
+    code, out, err = run(line)
+    trained = json.loads(out)
+    assert code == 0
+    assert "dynamics" in err
+    assert trained["record"]["command"].startswith("beliefscope train door --filter crossmodal-pf --data ten.h5")
+    code, out, _ = run("evaluate door --filter pf.safetensors --data ten.h5 --particles 50 --json -")
+    assert code == 0
+    assert json.loads(out)["checkpoint_hash"] == trained["checkpoint_hash"]
+    assert json.loads(out)["episodes"] == 1
+
+
+def test_serve_prints_its_address_and_ends_on_interrupt(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "beliefscope", "serve", "--port", "0", "--workspace", str(tmp_path / "w")]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        line = server.stdout.readline()
+        address = re.search(r"http://127\.0\.0\.1:\d+", line)
+        assert address, line
+        with urllib.request.urlopen(f"{address.group()}/healthz", timeout=30) as answer:
+            assert json.load(answer)["status"] == "ok"
+        server.send_signal(signal.SIGINT)
+        assert server.wait(30) == 0
+    finally:
+        server.kill()
+        server.communicate()
