@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.robot import ARM_JOINTS
+from beliefscope.datasets.robot import ARM_JOINTS, FINGERS, GRIPPER_OPEN
 
 Vector = NDArray[np.float64]
 
@@ -91,6 +91,11 @@ class HandController:
             step += 0.05 * null @ (POSTURE - data.qpos[:n])
             data.qpos[:n] = np.clip(data.qpos[:n] + step, self._limits[:, 0], self._limits[:, 1])
         return error
+
+    def set_fingers(self, opening: float, squeeze: bool) -> None:
+        """Open each finger by ``opening`` m, then hold it there or, to ``squeeze``, close with the full force."""
+        self._data.qpos[[self._model.joint(name).qposadr[0] for name in FINGERS]] = opening
+        self._data.ctrl[self._model.actuator("gripper").id] = -GRIPPER_OPEN if squeeze else opening
 
     def command(self, target: Vector, yaw: float) -> Vector:
         """Aim at ``target`` (3,) m, cut to the allowed lead; returns the set point in force."""

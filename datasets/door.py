@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from beliefscope.datasets.camera import Camera
 from beliefscope.datasets.control import Impedance, add_controller
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.robot import ROBOT_BIT, WORLD_BIT, add_panda, new_spec
+from beliefscope.datasets.robot import ROBOT_BIT, STIFF, WORLD_BIT, add_panda, new_spec
 from beliefscope.datasets.task import Component, Ghost, Task
 
+DT = 0.1  # s, of a step
 HINGE_CENTRE = (0.81, -0.28)
 HINGE_HALF_RANGE = 0.098  # uniform, so that the standard deviation is 5.7 cm
 PANEL_SIZE = (0.04, 0.5, 0.86)  # thickness, width, height
@@ -122,7 +123,7 @@ def _add_door(spec: mujoco.MjSpec, physics: DoorPhysics) -> None:
         springref=SPRING_REST,
         armature=0.02,
     )
-    touch = {"contype": WORLD_BIT, "conaffinity": ROBOT_BIT, "condim": 4}
+    touch = {"contype": WORLD_BIT, "conaffinity": ROBOT_BIT, "condim": 4, **STIFF}
     thickness, width, height = PANEL_SIZE
     door.add_geom(
         name="panel",
@@ -173,7 +174,7 @@ DOOR = Task(
     observations={"image": (32, 32), "effector_position": (3,), "force": (3,), "torque": (3,), "contact": (1,)},
     modalities={"image": ("image",), "haptics": ("effector_position", "force", "torque", "contact")},
     control_size=7,
-    dt=0.1,
+    dt=DT,
     map_components=("hinge_x", "hinge_y"),
     map_half_width=0.135,
     replay=_replay,

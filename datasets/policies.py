@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from beliefscope.datasets.door import HINGE_CENTRE, MAX_ANGLE, DoorPhysics
+from beliefscope.datasets.door import DT, HINGE_CENTRE, MAX_ANGLE, DoorPhysics
 
 Vector = NDArray[np.float64]
 
@@ -22,28 +22,50 @@ YAW_SHARE = 0.45  # of the door's angle that the hand turns along with it
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where to send the hand (m, world), how fast the set point goes (m/s), and steps to wait there."""
+    """Where to send the hand (m, world), how fast the set point goes (m/s), and how many steps it waits there."""
 
     position: Vector
     speed: float
     wait: int
 
+    def steps(self, start: Vector) -> int:
+        """Steps until the next waypoint: the way at this speed, at most 4 s of it, and the wait.
+
+        Time, not arrival, ends a waypoint: against a door at its stop the hand would never arrive.
+        """
+        way = float(np.linalg.norm(self.position - start))
+        return 1 + min(40, int(way / (DT * self.speed))) + self.wait
+
+    def approach(self, point: Vector, duration: float) -> Vector:
+        """(3,) m: ``point`` moved towards the waypoint for ``duration`` s."""
+        way = self.position - point
+        return point + way * min(1.0, self.speed * duration / max(float(np.linalg.norm(way)), 1e-9))
+
 
 class Policy(Protocol):
-    """``start_angle`` rad, ``start`` (3,) m, ``fingers`` m of opening each, then a waypoint whenever one is reached."""
+    """Where a trajectory starts, and a waypoint whenever one is over.
+
+    Attributes:
+        start_angle: of the door, rad.
+        fingers: m of opening of each finger at the start. squeeze: whether they then close with their full force.
+    """
 
     start_angle: float
     fingers: float
+    squeeze: bool
 
-    def start(self) -> Vector: ...
+    def start(self) -> Vector:
+        """(3,) m, world: where the hand starts."""
 
-    def next(self, angle: float, position: Vector) -> Waypoint: ...
+    def next(self, angle: float) -> Waypoint:
+        """The next waypoint, for a door now at ``angle`` rad."""
 
 
 class Pull:
     """Holds the bar and moves along its arc to random angles, off the arc by a few centimetres."""
 
-    fingers = 0.0
+    fingers = 0.016
+    squeeze = True
 
     def __init__(self, door: DoorPhysics, rng: Generator) -> None:
         self._door, self._rng = door, rng
@@ -52,21 +74,26 @@ class Pull:
         self._goal = self.start_angle
 
     def start(self) -> Vector:
-        return self._door.bar_point(self.start_angle, self.radius)
+        return self._on_bar(self.start_angle)
 
-    def next(self, angle: float, position: Vector) -> Waypoint:
+    def next(self, angle: float) -> Waypoint:
         rng = self._rng
         if abs(self._goal - angle) < 0.12 or rng.random() < 0.15:
             self._goal = float(rng.uniform(-0.1, MAX_ANGLE + 0.05))
         angle_next = angle + float(np.clip(self._goal - angle, -0.35, 0.35))
         noise = rng.normal(0.0, (0.03, 0.03, 0.03))
-        return Waypoint(self._door.bar_point(angle_next, self.radius) + noise, _speed(rng), _wait(rng))
+        return Waypoint(self._on_bar(angle_next) + noise, _speed(rng), _wait(rng))
+
+    def _on_bar(self, angle: float) -> Vector:
+        """The bar lies this deep between the fingers, clear of their tips."""
+        return self._door.bar_point(angle, self.radius) + 0.006 * _inward(angle)
 
 
 class Push:
     """Pushes the bar with closed fingertips, draws back to some place, and comes again. A spring opens the door."""
 
     fingers = 0.0
+    squeeze = False
 
     def __init__(self, door: DoorPhysics, rng: Generator) -> None:
         self._door, self._rng = door, rng
@@ -77,13 +104,13 @@ class Push:
     def start(self) -> Vector:
         return self._retreat(self.start_angle)
 
-    def next(self, angle: float, position: Vector) -> Waypoint:
+    def next(self, angle: float) -> Waypoint:
         rng = self._rng
         if not self._queue:
             self._queue = ["touch", *["push"] * int(rng.integers(1, 3)), *["retreat"] * int(rng.integers(2, 5))]
         move = self._queue.pop(0)
         if move == "retreat":
-            return Waypoint(self._retreat(angle), max(0.12, _speed(rng)), _wait(rng))
+            return Waypoint(self._retreat(angle), max(0.12, _speed(rng)), 2 * _wait(rng))
         if move == "touch":
             self._radius = float(rng.uniform(0.23, 0.43))
             target = self._door.bar_point(angle, self._radius) - 0.03 * _inward(angle)
@@ -92,7 +119,7 @@ class Push:
         slip = rng.normal(0.0, 0.02, 3) * (1, 1, 0.5)
         depth = float(rng.uniform(0.02, 0.16))
         target = self._door.bar_point(angle, self._radius) + depth * _inward(angle) + slip
-        return Waypoint(target, _speed(rng), _wait(rng))
+        return Waypoint(target, max(0.05, _speed(rng)), _wait(rng) // 2)
 
     def _retreat(self, angle: float) -> Vector:
         """A place before an average door at this angle, but never through this door."""

@@ -10,9 +10,13 @@ import mujoco
 import numpy as np
 
 ARM_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
+FINGERS = ("finger_left", "finger_right")
 GRIPPER_OPEN = 0.04  # m, travel of each finger
-GRIP_FORCE = 140.0  # N on each finger: squeezes with 70, but its spindle drive cannot be driven back
+GRIP_FORCE = 70.0  # N on each finger
 GRIP_OFFSET = 0.1034  # m, from the hand's frame to the point between the fingertips
+
+# The fingers are light: with the usual softness a firm grip would sink centimetres into what it holds.
+STIFF = {"solref": (0.008, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 
 # Bits of contype/conaffinity: the robot touches its surroundings but not itself.
 ROBOT_BIT, WORLD_BIT = 1, 2
@@ -89,6 +93,7 @@ def new_spec() -> mujoco.MjSpec:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
+    spec.option.noslip_iterations = 3  # or a held bar creeps out of the fingers
     return spec
 
 
@@ -144,14 +149,14 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
     )
     hand.explicitinertial, hand.mass, hand.ipos = True, 0.73, (-0.01, 0, 0.03)
     hand.inertia = (0.001, 0.0025, 0.0017)
-    touch = {"contype": ROBOT_BIT, "conaffinity": WORLD_BIT, "mass": 0, "condim": 4}
+    touch = {"contype": ROBOT_BIT, "conaffinity": WORLD_BIT, "mass": 0, "condim": 4, **STIFF}
     box, sphere = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
     hand.add_geom(
         type=box, pos=(0, 0, 0.033), size=(0.031, 0.1, 0.033), rgba=_WHITE, friction=(0.3, 5e-3, 1e-4), **touch
     )
     hand.add_site(name="wrist")
     hand.add_site(name="grip", pos=(0, 0, GRIP_OFFSET))
-    for side, name in ((1, "finger_left"), (-1, "finger_right")):
+    for side, name in zip((1, -1), FINGERS, strict=True):
         finger = hand.add_body(name=name, pos=(0, 0, 0.0584), gravcomp=1)
         finger.explicitinertial, finger.mass, finger.ipos = True, 0.05, (0, side * 0.01, 0.025)
         finger.inertia = (1.2e-5, 1.2e-5, 3e-6)
@@ -167,8 +172,8 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
         finger.add_geom(type=box, pos=(0, side * 0.014, 0.015), size=(0.009, 0.009, 0.015), rgba=_DARK, **touch)
         finger.add_geom(
             type=box,
-            pos=(0, side * 0.006, 0.042),
-            size=(0.011, 0.006, 0.012),
+            pos=(0, side * 0.006, 0.041),
+            size=(0.011, 0.006, 0.017),
             rgba=_PAD,
             friction=(1.5, 0.02, 1e-4),
             **touch,
@@ -176,7 +181,7 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
         # A rounded tip: pushing with a box's corner makes the contact jump.
         finger.add_geom(
             type=sphere,
-            pos=(0, side * 0.006, 0.049),
+            pos=(0, side * 0.011, 0.05),
             size=(0.011, 0, 0),
             rgba=_PAD,
             friction=(0.6, 5e-3, 1e-4),
@@ -189,6 +194,7 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
         name1="finger_right",
         name2="finger_left",
         data=[0.0, 1.0] + [0.0] * 10,
+        solref=(0.008, 1.0),
     )
     gripper = spec.add_actuator(name="gripper", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="finger_left")
     gripper.set_to_position(kp=4000)

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beliefscope.datasets.errors import one_of
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import one_of
 
 Unit = Literal["m", "rad"]
 Array = NDArray[np.float64]

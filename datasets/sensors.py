@@ -1,0 +1,40 @@
+"""What the robot feels: force and torque at the wrist, and touch."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+class HandSensors:
+    """Reads the sensors ``force``, ``torque`` (site ``wrist``) and ``contact`` of a model."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._data = data
+        self._gravity = np.array(model.opt.gravity)
+        self._hand, self._wrist = model.body("hand").id, model.site("wrist").id
+        self._tool_mass = float(model.body_subtreemass[self._hand])
+        starts = {name: int(model.sensor(name).adr[0]) for name in ("force", "torque", "contact")}
+        self._force, self._torque = (slice(starts[name], starts[name] + 3) for name in ("force", "torque"))
+        self._contact = starts["contact"]
+
+    def wrench(self) -> Vector:
+        """(6,) N and N m, world axes, about the wrist: what the surroundings do to the hand.
+
+        The raw sensor gives what link 7 does to the hand. That includes carrying the hand's weight, which it reads
+        even while the weight is compensated; the surroundings' part is the opposite of the rest.
+        """
+        data = self._data
+        axes = data.site_xmat[self._wrist].reshape(3, 3)
+        weight = self._tool_mass * self._gravity
+        lever = data.subtree_com[self._hand] - data.site_xpos[self._wrist]
+        force = -(axes @ data.sensordata[self._force] + weight)
+        torque = -(axes @ data.sensordata[self._torque] + np.cross(lever, weight))
+        return np.concatenate([force, torque])
+
+    def touching(self) -> bool:
+        """Whether the hand, its fingers included, touches the door."""
+        return bool(self._data.sensordata[self._contact] > 0)
