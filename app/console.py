@@ -16,6 +16,11 @@ def fail(message: str, code: int) -> NoReturn:
     raise SystemExit(code)
 
 
+def say(line: str) -> None:
+    """One line beside the result, on standard error."""
+    print(line, file=sys.stderr)
+
+
 def result(document: Mapping[str, Any], text: str, destination: str | None) -> None:
     """A command's result: as text, or as one JSON document where ``destination`` is ``-``; to standard output.
 

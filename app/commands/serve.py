@@ -7,8 +7,11 @@ from typing import Annotated
 
 import typer
 
+from beliefscope.app import console
 from beliefscope.app.commands.given import Seed, whole
 from beliefscope.datasets.errors import BadInput
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 def serve(
@@ -41,6 +44,9 @@ def serve(
     if not workspace.absolute().parent.is_dir():
         raise BadInput(f"folder {str(workspace.parent)!r} does not exist, so {workspace.name!r} cannot be made in it")
 
+    if host not in LOOPBACK:
+        console.say(f"warning: whoever can reach {host} can use this page; it has no password")
+
     def listening(url: str) -> None:
         print(f"Beliefscope is at {url} (Ctrl-C ends it)", flush=True)
         if open_page:
@@ -48,4 +54,5 @@ def serve(
 
             webbrowser.open(url)
 
-    serve_until_signal(Settings(workspace=workspace, seed=seed), host=host, port=port, listening=listening)
+    settings = Settings(workspace=workspace, hosts=(host,), seed=seed)
+    serve_until_signal(settings, host=host, port=port, listening=listening)
