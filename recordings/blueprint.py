@@ -12,6 +12,8 @@ from beliefscope.recordings.drawing import SHOWN_SCALE, SHOWN_UNIT, SIGMAS, angl
 from beliefscope.recordings.schema import STEP
 
 TRAIL_STEPS = 100
+VIEWING_DISTANCE = 1.0
+"""m from the scene's middle: an arm's reach is in view."""
 LINKED = rrb.TimeAxis(link="LinkToGlobal")
 
 
@@ -27,7 +29,7 @@ def blueprint(trace: Trace, task: Task, layers: tuple[str, ...] = ()) -> rrb.Blu
     story = _story(trace, task)
     return rrb.Blueprint(
         rrb.Horizontal(scene, story, column_shares=[1, 1]),
-        rrb.TimePanel(state="collapsed", timeline=STEP),
+        rrb.TimePanel(state="collapsed", timeline=STEP, play_state="paused"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         auto_layout=False,
@@ -37,9 +39,13 @@ def blueprint(trace: Trace, task: Task, layers: tuple[str, ...] = ()) -> rrb.Blu
 
 def _scene(trace: Trace, task: Task) -> rrb.Container:
     x, y = task.map_indices
-    middle = np.array([*trace.episode.states[:, [x, y]].mean(axis=0), plane_height(trace, task)])
-    distance = 5.0 * task.map_half_width
-    eye = middle + distance * np.array([-0.55, -0.35, 0.75])
+    height = plane_height(trace, task)
+    middle = np.array([*trace.episode.states[:, [x, y]].mean(axis=0), height])
+    effector = trace.episode.observations.get("effector_position")
+    if effector is not None:
+        middle = 0.5 * (middle + effector.mean(axis=0))
+    # From behind the robot and above, so that the map's axes run as on paper: x away, y to the left.
+    eye = middle + VIEWING_DISTANCE * np.array([-0.62, -0.12, 0.78])
     trail = rr.VisibleTimeRange(
         STEP,
         start=rrb.TimeRangeBoundary.cursor_relative(seq=-TRAIL_STEPS),
@@ -50,6 +56,8 @@ def _scene(trace: Trace, task: Task) -> rrb.Container:
         origin="world",
         name=name,
         eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=[0, 0, 1], kind="Orbital"),
+        # Dark whatever the viewer's theme, so that a map's empty cells look empty.
+        background=rrb.Background(kind="SolidColor", color=[16, 17, 24]),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.05, plane=rr.components.Plane3D.XY),
         overrides={"world/effector": rrb.VisibleTimeRanges(trail)},
     )
@@ -105,5 +113,5 @@ def _plot(origin: str, name: str, limits: tuple[float, float] | None = None, leg
         name=name,
         axis_x=LINKED,
         axis_y=axis,
-        plot_legend=rrb.PlotLegend(corner="RightTop", visible=legend),
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
     )

@@ -83,9 +83,7 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     yield (
         "contact",
         rr.StateConfiguration(
-            values=CONTACT_NAMES,
-            labels=CONTACT_NAMES,
-            colors=np.array([rgba("#808080", 0.15), rgba(_hex("contact", trace))], np.uint32),
+            values=CONTACT_NAMES, colors=np.full(2, rgba(_hex("contact", trace)), np.uint32), visible=[False, True]
         ),
     )
     for source in sources(trace):
@@ -115,7 +113,9 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
             names = [modality]
             if values.shape[2] > 1:
                 names = [f"{modality}, {component.name}" for component in task.components]
-            yield f"{name}/{modality}", _line(_hex(modality, trace), 2.0, *names)
+            # One hue a modality: its components tell apart by their strength.
+            opacity = np.linspace(1.0, 0.35, len(names))
+            yield f"{name}/{modality}", _line(_hex(modality, trace), 2.0, *names, opacity=opacity)
     if trace.log_weights is not None:
         yield "diagnostics/effective_sample_size", _line(_hex("fused", trace), 1.5, "effective particles")
 
@@ -221,9 +221,9 @@ def rgba(hue: str, opacity: float = 1.0) -> int:
     return int(hue[1:], 16) << 8 | round(255 * opacity)
 
 
-def _line(hue: str, width: float, *names: str, opacity: float = 1.0) -> rr.SeriesLines:
+def _line(hue: str, width: float, *names: str, opacity: Array | float = 1.0) -> rr.SeriesLines:
     count = len(names)
-    colours = np.full(count, rgba(hue, opacity), np.uint32)
+    colours = np.array([rgba(hue, one) for one in np.broadcast_to(opacity, count)], np.uint32)
     return rr.SeriesLines(colors=colours, widths=[width] * count, names=list(names))
 
 

@@ -33,7 +33,7 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
     gray = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8", color_model="L")
     yield (
         "world/plane/map",
-        rr.GridMap.from_fields(format=gray, cell_size=cell, opacity=0.7, colormap="Inferno"),
+        rr.GridMap.from_fields(format=gray, cell_size=cell, opacity=0.8, colormap="Inferno"),
     )
 
 
@@ -70,4 +70,4 @@ def _cells(maps: Sequence[LikelihoodMap], points: Array) -> Array:
 
 
 def _marker_2d(hue: str) -> rr.Points2D:
-    return rr.Points2D.from_fields(colors=rgba(hue), radii=rr.Radius.ui_points(4.0))
+    return rr.Points2D.from_fields(colors=rgba(hue), radii=rr.Radius.ui_points(3.0))

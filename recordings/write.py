@@ -18,6 +18,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.any_batch_value import AnyBatchValue
+from rerun.chunk import RrdReader
 
 import beliefscope
 from beliefscope.datasets.catalog import find_task
@@ -80,8 +81,7 @@ def write_recording(
             _send_maps(stream, first, trace, task, layers)
             report(0.5 + 0.5 * (first[-1].step + 1) / len(trace))
             first = next(blocks, [])
-        stream.flush()
-        stream.disconnect()
+        _finish(stream, unfinished)
     report(1.0)
     return Path(path)
 
@@ -198,6 +198,16 @@ def _blocks(maps: Iterable[LikelihoodMap], size: int) -> Iterator[list[Likelihoo
     rest = iter(maps)
     while block := list(islice(rest, size)):
         yield block
+
+
+def _finish(stream: rr.RecordingStream, path: Path) -> None:
+    """Writes what is still queued, then asks the file for its footer: Rerun only logs that a disk was full."""
+    try:
+        stream.flush()
+        stream.disconnect()
+        RrdReader(path).store()
+    except (RuntimeError, ValueError):
+        raise OSError("the file could not be written to its end; is the disk full?") from None
 
 
 @contextmanager

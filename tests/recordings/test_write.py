@@ -210,3 +210,31 @@ def test_maps_that_do_not_fit(trace: Trace, new_map: MapMaker, tmp_path: Path) -
     with pytest.raises(BadInput, match="map of step 40: the trace has steps 0 to 39"):
         write_recording(trace, tmp_path / "run.rrd", [replace(new_map(trace, 0), step=40)])
     assert not list(tmp_path.iterdir())
+
+
+FULL = """
+import resource, sys
+sys.path.insert(0, {folder!r})
+from conftest import make_trace
+from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.write import write_recording
+trace = make_trace("pf", steps=300)
+for limit in {limits}:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    try:
+        write_recording(trace, {path!r})
+        sys.exit("written")
+    except BadInput as error:
+        assert "is the disk full?" in str(error), error
+"""
+
+
+def test_a_full_disk_is_noticed(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    size = write_recording(new_trace("pf", steps=300), path).stat().st_size
+    path.unlink()
+    limits = [int(share * size) for share in (0.3, 0.999)]
+    script = FULL.format(folder=str(Path(__file__).parent), path=str(path), limits=limits)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert not list(tmp_path.iterdir())
