@@ -1,0 +1,72 @@
+/** What the page asks of its server over HTTP (docs/api.md). */
+
+import { Trace } from './trace.js';
+
+/**
+ * @typedef {{name: string, unit: 'm' | 'rad'}} Component
+ * @typedef {{index: number, steps: number, policy: string, split: string, seed: number, contact_fraction: number}} Summary
+ * @typedef {object} Task
+ * @property {string} name @property {Component[]} components @property {string[]} modalities @property {number} dt s
+ * @property {{x: string, y: string, half_width: number}} map
+ * @property {{name: string, kind: string, checkpoint_hash: string}[]} filters @property {Summary[]} episodes
+ * @typedef {{version: string, tasks: Task[], problems?: string[]}} Catalog
+ * @typedef {{name: string, url: string, bytes: number, seconds: number}} Recording
+ */
+
+const AGAIN = 150; // ms until a trace that is being computed is asked for again
+const RECORDED_MAPS = 40; // sets of maps that a recording holds: a few seconds to compute
+
+/** An answer that says what is wrong, in a line that a person can read. */
+export class ServerError extends Error {}
+
+/** @param {string} url @param {RequestInit} [options] @returns {Promise<Response>} Raises ServerError. */
+async function ask(url, options) {
+  let response;
+  try {
+    response = await fetch(url, options);
+  } catch (error) {
+    if (error.name === 'AbortError') throw error;
+    throw new ServerError('The server does not answer. Is `beliefscope serve` still running?');
+  }
+  if (response.ok) return response;
+  const body = await response.json().catch(() => ({}));
+  throw new ServerError(body.error ?? `The server answered ${response.status} ${response.statusText}.`);
+}
+
+const post = (url, body) =>
+  ask(url, { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify(body) });
+
+/** @returns {Promise<Catalog>} */
+export const catalog = async () => (await ask('/api/catalog')).json();
+
+/** @param {boolean} dark @returns {Promise<{view: string, scene: string, socket: string}>} */
+export const openView = async (dark) => (await post('/api/views', { dark })).json();
+
+/**
+ * A trace with all its numbers and pictures; the server computes it first if need be.
+ * @param {Task} task @param {string} filter @param {number} episode
+ * @param {(share: number) => void} progress @param {AbortSignal} signal
+ * @returns {Promise<Trace>}
+ */
+export async function loadTrace(task, filter, episode, progress, signal) {
+  const url = `/api/trace/${encodeURIComponent(task.name)}/${encodeURIComponent(filter)}/${episode}`;
+  let response = await ask(url, { signal });
+  while (response.status === 202) {
+    progress((await response.json()).progress);
+    await new Promise((resolve) => setTimeout(resolve, AGAIN));
+    response = await ask(url, { signal });
+  }
+  const header = await response.json();
+  const hasPictures = task.modalities.includes('image');
+  const [columns, pictures] = await Promise.all([
+    ask(`${url}/columns`, { signal }).then((r) => r.arrayBuffer()),
+    hasPictures ? ask(`${url}/images`, { signal }).then((r) => r.arrayBuffer()) : null,
+  ]);
+  return new Trace(task, filter, episode, header, columns, pictures);
+}
+
+/** Writes a recording of a trace, with maps at even steps. @param {Trace} trace @returns {Promise<Recording>} */
+export async function record(trace) {
+  const maps = Math.ceil(trace.steps / RECORDED_MAPS);
+  return (await post('/api/recordings', { task: trace.task.name, filter: trace.filter, episode: trace.episode, maps })).json();
+}

@@ -1,0 +1,28 @@
+/** The picture as the filter sees it at a step: 32 x 32 gray, enlarged; a black-out is named. */
+
+export class Camera {
+  #figure;
+  #pen;
+  #trace = null;
+
+  /** @param {HTMLElement} figure */
+  constructor(figure) {
+    this.#figure = figure;
+    this.#pen = figure.querySelector('canvas').getContext('2d');
+  }
+
+  /** @param {import('./trace.js').Trace} trace */
+  show(trace) {
+    this.#trace = trace;
+    this.#figure.hidden = !trace.pictures;
+  }
+
+  move(step) {
+    const picture = this.#trace?.picture(step);
+    if (!picture) return;
+    const image = new ImageData(32, 32);
+    new Uint32Array(image.data.buffer).set(Uint32Array.from(picture, (gray) => 0xff000000 | (gray * 0x010101)));
+    this.#pen.putImageData(image, 0, 0);
+    this.#figure.querySelector('.black-out').hidden = !this.#trace.black[step];
+  }
+}

@@ -1,0 +1,127 @@
+/** One track of the time line: a uPlot chart without cursor, legend or axis of its own, with shaded stretches. */
+
+import { colour, line, translucent } from './palette.js';
+
+/**
+ * @typedef {object} Series
+ * @property {string} name truth, fused, a modality @property {number} index of the modality @property {ArrayLike<number>} values
+ * @property {ArrayLike<number>} [sigma] draws a band of two of them on either side
+ * @typedef {object} Track
+ * @property {string} title @property {string} unit @property {Series[]} series
+ * @property {[number, number]} [limits] of the y axis; fitted to what is in view otherwise
+ * @property {boolean} [fromZero]
+ * @property {number} [digits] of the values in the legend
+ * @typedef {{contact: [number, number][], black: [number, number][]}} Shading stretches of steps
+ */
+
+/** px beside and below a track's plot. */
+export const GUTTER = { left: 46, right: 12, axis: 33 };
+const FONT = '10px system-ui, sans-serif';
+
+/**
+ * @param {HTMLElement} parent @param {Track} track @param {Shading} shading
+ * @param {{width: number, height: number, window: () => [number, number], steps: number, withAxis: boolean, stepName: string}} frame
+ * @returns {uPlot}
+ */
+export function chart(parent, track, shading, frame) {
+  const ink = { stroke: colour('muted'), grid: { stroke: colour('grid'), width: 1 }, ticks: { stroke: colour('grid'), size: 4, width: 1 }, font: FONT };
+  const steps = Float64Array.from({ length: frame.steps }, (_, t) => t);
+  const data = [steps];
+  const series = [{}];
+  const bands = [];
+  for (const { name, index, values, sigma } of track.series) {
+    if (!sigma) continue;
+    const edge = { points: { show: false }, width: 0, stroke: 'transparent' };
+    data.push(values.map((v, t) => v + 2 * sigma[t]), values.map((v, t) => v - 2 * sigma[t]));
+    series.push({ ...edge }, { ...edge });
+    bands.push({ series: [data.length - 2, data.length - 1], fill: translucent(line(name, index).stroke, name === 'fused' ? 0.2 : 0.08) });
+  }
+  for (const { name, index, values } of track.series) {
+    data.push(values);
+    series.push({ ...line(name, index), points: { show: false } });
+  }
+  return new uPlot(
+    {
+      width: frame.width,
+      height: frame.height,
+      padding: [4, GUTTER.right, frame.withAxis ? 0 : 4, 0],
+      cursor: { show: false },
+      legend: { show: false },
+      select: { show: false },
+      scales: {
+        x: { time: false, range: () => frame.window() },
+        y: { range: () => track.limits ?? fitted(track, frame.window()) },
+      },
+      axes: [
+        stepAxis(ink, frame),
+        { ...ink, size: GUTTER.left, gap: 3, space: 20 },
+      ],
+      series,
+      bands,
+      hooks: { drawClear: [(plot) => shade(plot, shading)] },
+    },
+    data,
+    parent,
+  );
+}
+
+/** Only the lowest track names the steps; the others have the same grid. (uPlot draws no axis after one not shown.) */
+function stepAxis(ink, { withAxis, stepName }) {
+  const axis = { ...ink, gap: 2, space: 60, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] };
+  if (!withAxis) return { ...axis, size: 0, ticks: { show: false }, values: (_, splits) => splits.map(() => '') };
+  return { ...axis, size: GUTTER.axis - 14, label: stepName, labelSize: 14, labelGap: 0, labelFont: FONT };
+}
+
+/** Fits what matters: the truth and the fused belief wholly, a modality that runs away only as far as most of it. */
+function fitted(track, [from, to]) {
+  let [low, high] = [Infinity, -Infinity];
+  const take = (value) => {
+    if (!Number.isFinite(value)) return;
+    low = Math.min(low, value);
+    high = Math.max(high, value);
+  };
+  const [first, last] = [Math.max(0, Math.floor(from)), Math.ceil(to)];
+  for (const { name, values, sigma } of track.series) {
+    const part = Array.from(values.slice(first, last + 1));
+    if (name === 'truth' || name === 'fused') {
+      part.forEach((v, t) => (sigma ? [v - 2 * sigma[first + t], v + 2 * sigma[first + t]] : [v]).forEach(take));
+    } else {
+      part.sort((a, b) => a - b);
+      take(part[Math.floor(0.02 * (part.length - 1))]);
+      take(part[Math.ceil(0.98 * (part.length - 1))]);
+    }
+  }
+  if (track.fromZero) low = 0;
+  if (!(high > low)) [low, high] = Number.isFinite(low) ? [low - 1, low + 1] : [0, 1];
+  const margin = 0.06 * (high - low);
+  return [track.fromZero ? 0 : low - margin, high + margin];
+}
+
+/** Contact behind everything, as the paper draws it; black pictures hatched along the top edge. */
+function shade(plot, { contact, black }) {
+  const { ctx, bbox } = plot;
+  const across = ([first, last]) => {
+    const left = Math.max(bbox.left, plot.valToPos(first - 0.5, 'x', true));
+    return [left, Math.min(bbox.left + bbox.width, plot.valToPos(last + 0.5, 'x', true)) - left];
+  };
+  ctx.save();
+  ctx.fillStyle = colour('contact-band');
+  for (const [left, width] of contact.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, width, bbox.height);
+  ctx.fillStyle = hatch(ctx);
+  for (const [left, width] of black.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, Math.max(width, 1), bbox.height);
+  ctx.restore();
+}
+
+function hatch(ctx) {
+  const tile = new OffscreenCanvas(8, 8);
+  const pen = tile.getContext('2d');
+  pen.strokeStyle = colour('black-band');
+  pen.lineWidth = 1.5;
+  pen.beginPath();
+  for (const shift of [-8, 0, 8]) {
+    pen.moveTo(shift, 8);
+    pen.lineTo(shift + 8, 0);
+  }
+  pen.stroke();
+  return ctx.createPattern(tile, 'repeat');
+}

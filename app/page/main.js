@@ -1,0 +1,257 @@
+/** Puts the page together: one state, one trace, and the panels that follow them. */
+
+import * as api from './api.js';
+import { Camera } from './camera.js';
+import { Clock } from './clock.js';
+import { Heatmaps, paintColourBar } from './heatmap.js';
+import { keys } from './keys.js';
+import { Numbers } from './numbers.js';
+import { Theme, swatch } from './palette.js';
+import { Messages, say } from './panel.js';
+import { choice, pickers } from './pickers.js';
+import { reading } from './reading.js';
+import { saving } from './recordings.js';
+import { Rerun } from './rerun.js';
+import { Slice } from './slice.js';
+import { ViewSocket } from './socket.js';
+import { Store, resolve } from './state.js';
+import { TimeLine } from './timeline.js';
+import { fixed, spoken } from './units.js';
+import { Scene, tabs } from './views.js';
+
+const $ = (selector) => document.querySelector(selector);
+const KEPT = 1000; // latencies
+const bodies = ['#heatmaps', '#moment .body', '#timeline .body'].map($);
+const messages = new Messages($('#messages'));
+const stats = { scrub: [], scene: [], maps: null, drawn: null };
+
+bodies.forEach((body) => say(body, 'loading', 'Loading …'));
+paintColourBar($('.colourbar canvas'));
+start().catch((error) => {
+  const line = error instanceof api.ServerError ? error.message : `The page failed: ${error.message}`;
+  if (!(error instanceof api.ServerError)) console.error(error);
+  bodies.forEach((body) => say(body, 'error', line));
+  messages.say('start', line);
+});
+
+async function start() {
+  const catalog = await api.catalog();
+  messages.say('catalog', catalog.problems?.join(' '));
+  if (!catalog.tasks.some((t) => t.filters.length && t.episodes.length)) {
+    throw new api.ServerError('There is nothing to show: no task has both episodes and a trained filter.');
+  }
+  const { state, problems } = resolve(location.search, catalog);
+  messages.say('link', problems.join(' '));
+  new Page(catalog, new Store(state));
+}
+
+/** Everything on the page, and what makes it move. */
+class Page {
+  #catalog;
+  #store;
+  #trace = null;
+  #loading = new AbortController();
+
+  constructor(catalog, store) {
+    [this.#catalog, this.#store] = [catalog, store];
+    pickers(catalog, store);
+    this.theme = new Theme((dark) => this.#recolour(dark));
+    this.clock = new Clock(store);
+    this.timeline = new TimeLine($('#timeline .body'), store);
+    this.heatmaps = new Heatmaps($('#heatmaps'));
+    this.camera = new Camera($('#camera'));
+    this.numbers = new Numbers($('#numbers'));
+    this.slice = new Slice($('#slice-label'), $('#slice-true'), store);
+    this.scene = new Scene($('#scene'));
+    this.rerun = new Rerun($('#rerun'), (step) => store.set({ step, playing: false }, { origin: 'rerun' }));
+    this.showTab = tabs(store);
+    this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
+    this.save = saving($('#save'), $('#saved'), () => this.rerun.recording(this.#trace), () => store.set({ tab: 'rerun' }));
+    store.listen((state, changed) => this.#follow(state, changed));
+    this.#takeKeys();
+    this.#takeButtons();
+    this.#showTab(store.state.tab);
+    this.#load();
+    window.beliefscope = { state: () => ({ ...store.state }), stats, rerun: { getState: () => this.rerun.getState() } };
+  }
+
+  /** The view's socket tells. */
+  #handlers() {
+    return {
+      view: ({ scene }) => this.scene.open(scene),
+      maps: (maps, inputTime) => {
+        if (!this.#trace) return;
+        this.heatmaps.draw(maps, this.#trace);
+        say($('#heatmaps'), 'ready');
+        stats.maps = { serial: maps.serial, step: maps.step, size: maps.size };
+        if (inputTime !== null) keep(stats.scrub, performance.now() - inputTime);
+      },
+      drawn: (step, { inputTime }) => {
+        this.scene.drawn();
+        stats.drawn = { step };
+        if (inputTime) keep(stats.scene, performance.now() - inputTime);
+      },
+      moved: (step) => this.#store.set({ step: this.#within(step), playing: false }, { origin: 'scene' }),
+      error: (line) => messages.say('cursor', line),
+      connection: (problem) => messages.say('connection', problem),
+    };
+  }
+
+  /** The state has changed: whatever depends on it is drawn in this frame. */
+  #follow(state, changed) {
+    const any = (...names) => names.some((name) => changed.has(name));
+    if (any('task', 'filter', 'episode')) this.#load();
+    if (any('tab')) this.#showTab(state.tab);
+    if (any('playing')) this.#showPlaying(state.playing);
+    if (!this.#trace) return;
+    if (any('component', 'weights', 'track')) this.#choose();
+    if (any('step', 'angle')) this.#move();
+  }
+
+  /** Loads the trace that the state names and shows it in every panel. */
+  async #load() {
+    const { task: name, filter, episode } = this.#store.state;
+    this.#loading.abort();
+    const loading = (this.#loading = new AbortController());
+    this.#trace = null;
+    this.clock.show(null);
+    const wait = (share) => bodies.forEach((body) => say(body, 'loading', 'Running the filter over the episode …', share));
+    const patience = setTimeout(() => bodies.forEach((body) => say(body, 'loading', 'Loading …')), 150);
+    const progress = (share) => (clearTimeout(patience), wait(share));
+    try {
+      const task = this.#catalog.tasks.find((t) => t.name === name);
+      const trace = await api.loadTrace(task, filter, episode, progress, loading.signal);
+      clearTimeout(patience);
+      this.#show(trace);
+    } catch (error) {
+      clearTimeout(patience);
+      if (error.name === 'AbortError') return;
+      if (!(error instanceof api.ServerError)) console.error(error);
+      bodies.forEach((body) => say(body, 'error', error.message));
+    }
+  }
+
+  #show(trace) {
+    this.#trace = trace;
+    const { step } = this.#store.state;
+    if (step >= trace.steps) {
+      messages.say('link', `Step ${step} does not exist: this episode has steps 0 to ${trace.steps - 1}.`);
+      this.#store.set({ step: trace.steps - 1 });
+    }
+    bodies.slice(1).forEach((body) => say(body, 'ready'));
+    for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun]) panel.show(trace);
+    $('#maps-what').textContent = spoken(trace.task.map.x).replace(/ x$/, '') || 'position';
+    $('#black-key').hidden = !trace.black.some(Boolean);
+    $('#worst').disabled = false;
+    $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s, i) => [swatch(s, i - 1), ` ${s}  `]));
+    this.#choose();
+    this.#move();
+  }
+
+  /** Another component, kind of weights or lowest chart. */
+  #choose() {
+    const [trace, { state }] = [this.#trace, this.#store];
+    const set = (key) => (value) => this.#store.set({ [key]: value });
+    choice($('#components'), trace.components.map((c) => [c.name, spoken(c.name)]), state.component, set('component'));
+    choice($('#weights'), trace.has('weights') ? [['raw', 'β raw'], ['acting', 'as it acted']] : [], state.weights, set('weights'));
+    choice($('#track'), trace.particles ? [['error', 'error'], ['particles', 'particles']] : [], state.track, set('track'));
+    this.timeline.redraw();
+    this.numbers.show(trace, state.component);
+    this.numbers.move(state.step);
+    this.#read(state);
+  }
+
+  #move() {
+    const [trace, { state, origin, inputTime }] = [this.#trace, this.#store];
+    const { task, filter, episode, step, angle } = state;
+    for (const panel of [this.timeline, this.camera, this.numbers, this.slice]) panel.move(step);
+    this.rerun.move(step, origin === 'rerun');
+    this.socket.move({ task, filter, episode, step, angle }, inputTime);
+    this.#read(state);
+    const [count, time] = $('#readout').children;
+    count.textContent = `${step} / ${trace.steps - 1}`;
+    time.textContent = `${fixed(step * trace.dt)} s`;
+  }
+
+  #read({ step, component }) {
+    const { tone, text } = reading(this.#trace, step, this.#trace.components.findIndex((c) => c.name === component));
+    const line = $('#reading');
+    line.dataset.tone = tone;
+    line.textContent = line.title = text;
+  }
+
+  #within(step) {
+    return Math.min(Math.max(step, 0), (this.#trace?.steps ?? 1) - 1);
+  }
+
+  #step(by, inputTime) {
+    this.#store.set({ step: this.#within(this.#store.state.step + by), playing: false }, { inputTime });
+  }
+
+  #showTab(tab) {
+    this.showTab(tab);
+    this.rerun.open = tab === 'rerun';
+    if (this.#trace) this.rerun.move(this.#store.state.step, false);
+  }
+
+  #showPlaying(playing) {
+    document.body.classList.toggle('playing', playing);
+    $('#play').setAttribute('aria-label', playing ? 'Pause' : 'Play');
+  }
+
+  #recolour(dark) {
+    this.socket.theme(dark);
+    this.timeline.redraw();
+    this.heatmaps.redraw();
+  }
+
+  #goWorst() {
+    if (this.#trace) this.#store.set({ step: this.timeline.worst(), playing: false }, { inputTime: performance.now() });
+  }
+
+  #nextComponent() {
+    const names = this.#trace?.components.map((c) => c.name) ?? [];
+    const place = names.indexOf(this.#store.state.component);
+    if (names.length) this.#store.set({ component: names[(place + 1) % names.length] });
+  }
+
+  #takeKeys() {
+    const by = (steps) => (event) => this.#step(event.shiftKey ? 10 * steps : steps, event.timeStamp);
+    keys({
+      ' ': () => this.clock.toggle(),
+      ArrowLeft: by(-1),
+      ArrowRight: by(1),
+      Home: (event) => this.#step(-Infinity, event.timeStamp),
+      End: (event) => this.#step(Infinity, event.timeStamp),
+      '[': () => this.clock.changeSpeed(-1),
+      ']': () => this.clock.changeSpeed(1),
+      1: () => this.#store.set({ tab: 'scene' }),
+      2: () => this.#store.set({ tab: 'rerun' }),
+      c: () => this.#nextComponent(),
+      e: () => this.#goWorst(),
+      s: () => this.save(),
+      d: () => this.theme.toggle(),
+      '?': () => $('#keys').showModal(),
+    });
+  }
+
+  #takeButtons() {
+    const press = (selector, action) => $(selector).addEventListener('click', action);
+    press('#play', () => this.clock.toggle());
+    press('#back', (event) => this.#step(-1, event.timeStamp));
+    press('#forward', (event) => this.#step(1, event.timeStamp));
+    press('#dark', () => this.theme.toggle());
+    press('#help', () => $('#keys').showModal());
+    press('#whole', () => this.timeline.whole());
+    press('#worst', () => this.#goWorst());
+    for (const selector of ['#heatmaps', '#camera']) {
+      const turn = (event) => (event.preventDefault(), this.#step(Math.sign(event.deltaY || event.deltaX), event.timeStamp));
+      $(selector).addEventListener('wheel', turn, { passive: false });
+    }
+  }
+}
+
+function keep(list, value) {
+  list.push(value);
+  if (list.length > KEPT) list.shift();
+}

@@ -1,0 +1,92 @@
+/** Colours, dashes and the colour table of the maps. The colours themselves are in page.css, for light and dark. */
+
+/** Viridis at 16 even places, from 0 to 1. */
+const VIRIDIS = [
+  0x440154, 0x481a6c, 0x472f7d, 0x414487, 0x39568c, 0x31688e, 0x2a788e, 0x23888e,
+  0x1f988b, 0x22a884, 0x35b779, 0x54c568, 0x7ad151, 0xa5db36, 0xd2e21b, 0xfde725,
+];
+
+/** One meaning has one colour and one dash everywhere, so that lines differ without colour too. */
+const DASHES = { truth: [], fused: [], image: [7, 3], haptics: [2, 2.5] };
+const WIDTHS = { truth: 1.25, fused: 2.25 };
+const SPARE_DASHES = [[9, 3, 2, 3], [4, 2], [1, 3]];
+
+/** @returns {Uint32Array} 256 colours as the bytes R, G, B, A in memory: what ImageData holds. */
+function colourTable() {
+  const bytes = new Uint8ClampedArray(256 * 4);
+  for (let i = 0; i < 256; i++) {
+    const place = (i / 255) * (VIRIDIS.length - 1);
+    const low = Math.min(Math.floor(place), VIRIDIS.length - 2);
+    for (let channel = 0; channel < 3; channel++) {
+      const shift = 16 - 8 * channel;
+      const [a, b] = [(VIRIDIS[low] >> shift) & 255, (VIRIDIS[low + 1] >> shift) & 255];
+      bytes[4 * i + channel] = a + (b - a) * (place - low);
+    }
+    bytes[4 * i + 3] = 255;
+  }
+  return new Uint32Array(bytes.buffer);
+}
+
+export const COLOUR_TABLE = colourTable();
+
+/** @param {string} name of a colour in page.css. @returns {string} as it is now, light or dark. */
+export function colour(name) {
+  const style = getComputedStyle(document.documentElement);
+  return style.getPropertyValue(`--${name}`) || style.getPropertyValue('--other');
+}
+
+/** @param {string} colour `rgb(...)` as the browser gives it. @param {number} alpha 0..1. */
+export function translucent(colour, alpha) {
+  return `color-mix(in srgb, ${colour} ${100 * alpha}%, transparent)`;
+}
+
+/**
+ * @param {string} name truth, fused or a modality. @param {number} index of the modality, for names not known here.
+ * @returns {{stroke: string, dash: number[], width: number}} how its line is drawn.
+ */
+export function line(name, index = 0) {
+  const dash = DASHES[name] ?? SPARE_DASHES[index % SPARE_DASHES.length];
+  return { stroke: colour(name), dash, width: WIDTHS[name] ?? 1.5 };
+}
+
+/** A short piece of the line, for legends. @returns {SVGElement} */
+export function swatch(name, index = 0) {
+  const { dash, width } = line(name, index);
+  const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');
+  svg.setAttribute('class', 'swatch');
+  svg.setAttribute('viewBox', '0 0 20 8');
+  svg.setAttribute('aria-hidden', 'true');
+  const path = document.createElementNS(svg.namespaceURI, 'path');
+  path.setAttribute('d', 'M0 4h20');
+  path.setAttribute('stroke-dasharray', dash.join(' '));
+  path.setAttribute('stroke-width', String(width));
+  path.style.stroke = `var(--${name}, var(--other))`;
+  svg.append(path);
+  return svg;
+}
+
+/** Light or dark: the system's, until somebody chooses. */
+export class Theme {
+  #media = matchMedia('(prefers-color-scheme: dark)');
+  #changed;
+
+  /** @param {(dark: boolean) => void} changed */
+  constructor(changed) {
+    this.#changed = changed;
+    const kept = localStorage.getItem('beliefscope.theme');
+    if (kept === 'light' || kept === 'dark') document.documentElement.dataset.theme = kept;
+    this.#media.addEventListener('change', () => changed(this.dark));
+  }
+
+  get dark() {
+    const chosen = document.documentElement.dataset.theme;
+    return chosen ? chosen === 'dark' : this.#media.matches;
+  }
+
+  toggle() {
+    const theme = this.dark ? 'light' : 'dark';
+    document.documentElement.dataset.theme = theme;
+    localStorage.setItem('beliefscope.theme', theme);
+    this.#changed(this.dark);
+  }
+}

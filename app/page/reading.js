@@ -1,0 +1,45 @@
+/** One line that says what the numbers of a step amount to: is the belief off, does it know, and whom does it follow? */
+
+import { fixed, percent, spoken } from './units.js';
+
+const NEAR = 1; // cm: two errors closer than this are called alike
+const SURE = 2; // standard deviations within which an error is what the filter expects
+const LEADS = 0.6; // share from which one modality is said to lead
+const FEW = 0.05; // of the particles
+
+/**
+ * @param {import('./trace.js').Trace} trace @param {number} step @param {number} component whose shares count
+ * @returns {{tone: 'good' | 'warn' | 'bad', text: string}}
+ */
+export function reading(trace, step, component) {
+  const error = trace.error('fused', 'position')[step];
+  const [sigmas, worst] = trace.surprise(step);
+  const said = [];
+  const sure = sigmas <= SURE;
+  const far = sigmas > 2 * SURE;
+  const verdict = sure ? 'within what it expects' : far ? 'overconfident' : 'more than it expects';
+  said.push(`Fused belief is ${fixed(error, 1)} cm off; worst in ${spoken(worst)}, ${fixed(sigmas, 1)}σ: ${verdict}.`);
+
+  const [best, leader] = [closest(trace, step), leading(trace, step, component)];
+  if (leader && best && leader.name !== best.name && best.error + NEAR < error) {
+    said.push(`It follows ${leader.name} (${percent(leader.share)}), though ${best.name} alone is ${fixed(best.error, 1)} cm off.`);
+  } else if (leader && leader.share >= LEADS) {
+    said.push(`It follows ${leader.name} (${percent(leader.share)}).`);
+  }
+  if (trace.black[step]) said.push('The picture is black.');
+  if (!trace.contact[step] && leader?.name === 'haptics' && leader.share >= LEADS) said.push('There is no contact to feel.');
+  const particles = trace.particles?.[step];
+  const count = trace.header.settings?.particles;
+  if (particles && count && particles < FEW * count) said.push(`${fixed(particles, 0)} of ${count} particles carry the weight.`);
+  return { tone: sure ? 'good' : far ? 'bad' : 'warn', text: said.join(' ') };
+}
+
+function closest(trace, step) {
+  const each = trace.modalities.map((name) => ({ name, error: trace.error(name, 'position')[step] }));
+  return each.sort((a, b) => a.error - b.error)[0];
+}
+
+function leading(trace, step, component) {
+  const each = trace.modalities.map((name) => ({ name, share: trace.weight('acting', name, component)?.[step] }));
+  return each.filter((m) => m.share !== undefined).sort((a, b) => b.share - a.share)[0];
+}

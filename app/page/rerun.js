@@ -1,0 +1,130 @@
+/** Rerun's viewer in the page, loaded when its tab is first opened; its time and the page's step follow each other. */
+
+import { record } from './api.js';
+import { say } from './panel.js';
+
+const ECHO = 400; // ms in which a time that we set ourselves is told back to us
+
+export class Rerun {
+  #host;
+  #moved;
+  #viewer = null;
+  #starting = null;
+  #recordings = new Map(); // trace's key -> promise of its recording
+  #shown = null; // the trace whose recording is open
+  #trace = null;
+  #step = 0;
+  #pending = null;
+  #busy = false;
+  #echoes = new Map(); // step that we set -> when
+  #open = false;
+
+  /** @param {HTMLElement} host @param {(step: number) => void} moved called when the time was moved in the viewer. */
+  constructor(host, moved) {
+    [this.#host, this.#moved] = [host, moved];
+  }
+
+  /** @param {import('./trace.js').Trace} trace */
+  show(trace) {
+    this.#trace = trace;
+    if (this.#open) this.#load();
+  }
+
+  /** The tab is in front, or no longer. */
+  set open(open) {
+    this.#open = open;
+    if (open && this.#trace) this.#load();
+  }
+
+  /** @param {number} step @param {boolean} fromRerun whether it was moved in the viewer itself. */
+  move(step, fromRerun) {
+    this.#step = step;
+    if (!fromRerun) this.#seek(step);
+  }
+
+  /** The recording of a trace: written once, however often it is asked for. @param {import('./trace.js').Trace} trace */
+  recording(trace) {
+    const key = `${trace.header.checkpoint_hash} ${trace.header.data_hash} ${trace.header.seed}`;
+    if (!this.#recordings.has(key)) {
+      const made = record(trace);
+      this.#recordings.set(key, made);
+      made.catch(() => this.#recordings.delete(key));
+    }
+    return this.#recordings.get(key);
+  }
+
+  /** What the viewer shows: for tests. */
+  async getState() {
+    return this.#viewer ? this.#viewer.get_state() : null;
+  }
+
+  async #load() {
+    const trace = this.#trace;
+    if (this.#shown === trace) {
+      this.#seek(this.#step);
+      return;
+    }
+    this.#shown = trace;
+    try {
+      say(this.#host, 'loading', 'Writing the recording …');
+      const [recording] = await Promise.all([this.recording(trace), this.#start()]);
+      if (this.#shown !== trace) return;
+      say(this.#host, 'loading', 'Opening the recording …');
+      const before = (await this.#viewer.get_state()).recordings ?? [];
+      await this.#viewer.open(new URL(recording.url, location.href).href);
+      await Promise.all(before.map((r) => this.#viewer.close(r.store_id).catch(() => null)));
+      say(this.#host, 'ready');
+      this.#seek(this.#step);
+    } catch (error) {
+      this.#shown = null;
+      say(this.#host, 'error', `Rerun cannot show this: ${error.message ?? error}`);
+    }
+  }
+
+  #start() {
+    this.#starting ??= (async () => {
+      const { WebViewer } = await import('/vendor/rerun/viewer.js');
+      const viewer = new WebViewer();
+      viewer.on('time_update', (event) => this.#heard(event.time));
+      const place = document.createElement('div');
+      place.className = 'viewer';
+      this.#host.append(place);
+      await viewer.start(null, place, {
+        width: '100%',
+        height: '100%',
+        hide_welcome_screen: true,
+        check_for_updates_on_startup: false,
+        theme: 'system',
+      });
+      this.#viewer = viewer;
+    })();
+    this.#starting.catch(() => (this.#starting = null));
+    return this.#starting;
+  }
+
+  /** Moves the viewer's time, one request at a time: the newest wins. */
+  async #seek(step) {
+    this.#pending = step;
+    if (this.#busy || !this.#viewer || !this.#open || this.#host.dataset.state !== 'ready') return;
+    this.#busy = true;
+    while (this.#pending !== null) {
+      const next = this.#pending;
+      this.#pending = null;
+      this.#echoes.set(next, performance.now());
+      try {
+        await this.#viewer.set_time({ timeline: 'step', sequence: next, play_state: 'paused' });
+      } catch (error) {
+        console.warn('Rerun did not take the time:', error);
+      }
+    }
+    this.#busy = false;
+  }
+
+  #heard(time) {
+    const step = Math.round(time);
+    const now = performance.now();
+    for (const [sent, when] of this.#echoes) if (now - when > ECHO) this.#echoes.delete(sent);
+    if (this.#busy || this.#echoes.has(step) || step === this.#step || !this.#open) return;
+    if (step >= 0 && step < this.#trace.steps) this.#moved(step);
+  }
+}

@@ -1,0 +1,158 @@
+/** The view's socket: sends the cursor, receives maps (docs/api.md). Never more than one cursor in flight. */
+
+import { openView } from './api.js';
+
+/**
+ * @typedef {{task: string, filter: string, episode: number, step: number, angle: number | null, size: number}} Cursor
+ * @typedef {object} Maps
+ * @property {number} serial @property {number} step @property {number} size cells a side @property {number | null} angle
+ * @property {string[]} layers @property {number} half_width m @property {number[]} centre m @property {number[]} truth
+ * @property {number[]} estimate @property {number[]} log_max @property {number[][]} peak m, offsets
+ * @property {number[] | null} effector m @property {Uint8Array[]} values by layer; row 0 is the smallest y offset
+ * @typedef {object} Handlers
+ * @property {(view: {view: string, scene: string}) => void} view a new view has been opened
+ * @property {(maps: Maps, inputTime: number | null) => void} maps @property {(step: number, cause: object) => void} drawn
+ * @property {(step: number) => void} moved in the 3D scene
+ * @property {(line: string) => void} error @property {(problem: string | null) => void} connection
+ */
+
+const COARSE = 41;
+const FINE = 135;
+const REST = 120; // ms without a move after which the fine maps are asked for
+const PATIENCE = 10_000; // ms until an answer is taken for lost
+const RETRY = { first: 500, most: 8000 }; // ms
+const decoder = new TextDecoder();
+
+export class ViewSocket {
+  #handlers;
+  #dark;
+  #view = null;
+  #socket = null;
+  #serial = 0;
+  #wanted = null;
+  #inFlight = null;
+  #sent = new Map();
+  #last = null;
+  #rest = 0;
+  #lost = 0;
+  #pause = RETRY.first;
+
+  /** @param {Handlers} handlers @param {() => boolean} dark */
+  constructor(handlers, dark) {
+    [this.#handlers, this.#dark] = [handlers, dark];
+    this.#connect();
+  }
+
+  /** The cursor has moved: coarse maps now, fine ones when it rests. @param {Cursor} cursor without its size. */
+  move(cursor, inputTime = null) {
+    this.#last = cursor;
+    this.#want({ ...cursor, size: COARSE }, inputTime);
+    clearTimeout(this.#rest);
+    this.#rest = setTimeout(() => this.#want({ ...cursor, size: FINE }, null), REST);
+  }
+
+  /** The page's colours have changed. */
+  theme(dark) {
+    this.#send({ type: 'theme', dark });
+  }
+
+  #want(cursor, inputTime) {
+    // A coarse cursor that was overtaken by its own fine one must not lose when its input came.
+    const before = this.#wanted;
+    this.#wanted = { cursor, inputTime: inputTime ?? (before?.cursor.step === cursor.step ? before.inputTime : null) };
+    this.#pump();
+  }
+
+  #pump() {
+    if (this.#inFlight !== null || !this.#wanted || this.#socket?.readyState !== WebSocket.OPEN) return;
+    const { cursor, inputTime } = this.#wanted;
+    this.#wanted = null;
+    this.#inFlight = ++this.#serial;
+    this.#sent.set(this.#serial, { ...cursor, inputTime });
+    this.#send({ type: 'cursor', serial: this.#serial, ...cursor });
+    this.#lost = setTimeout(() => this.#answered(this.#inFlight), PATIENCE);
+  }
+
+  #answered(serial) {
+    if (serial !== this.#inFlight) return;
+    clearTimeout(this.#lost);
+    this.#inFlight = null;
+    this.#pump();
+  }
+
+  #send(message) {
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(message));
+  }
+
+  async #connect() {
+    try {
+      if (!this.#view) {
+        this.#view = await openView(this.#dark());
+        this.#handlers.view(this.#view);
+      }
+    } catch (error) {
+      this.#retry(error.message);
+      return;
+    }
+    const url = new URL(this.#view.socket, location.href);
+    url.protocol = url.protocol.replace('http', 'ws');
+    const socket = new WebSocket(url);
+    socket.binaryType = 'arraybuffer';
+    let opened = false;
+    socket.onopen = () => {
+      opened = true;
+      this.#pause = RETRY.first;
+      this.#handlers.connection(null);
+      if (this.#last) this.move(this.#last);
+    };
+    socket.onmessage = (event) => this.#heard(event.data);
+    socket.onclose = () => {
+      if (this.#socket !== socket) return;
+      // A view whose socket does not even open has gone with its server.
+      if (!opened) this.#view = null;
+      clearTimeout(this.#lost);
+      this.#inFlight = null;
+      this.#sent.clear();
+      this.#retry('The server has gone.');
+    };
+    this.#socket = socket;
+  }
+
+  #retry(problem) {
+    const seconds = this.#pause / 1000;
+    this.#handlers.connection(`${problem} Trying again every ${seconds < 1 ? 'moment' : `${Math.round(seconds)} s`} …`);
+    setTimeout(() => this.#connect(), this.#pause);
+    this.#pause = Math.min(2 * this.#pause, RETRY.most);
+  }
+
+  #heard(data) {
+    if (data instanceof ArrayBuffer) {
+      const maps = readMaps(data);
+      const sent = this.#sent.get(maps.serial);
+      this.#handlers.maps(maps, sent?.inputTime ?? null);
+      this.#answered(maps.serial);
+      return;
+    }
+    const message = JSON.parse(data);
+    if (message.type === 'cursor') this.#handlers.moved(message.step);
+    if (message.type === 'drawn') {
+      this.#handlers.drawn(message.step, this.#sent.get(message.serial) ?? {});
+      for (const serial of this.#sent.keys()) if (serial <= message.serial) this.#sent.delete(serial);
+    }
+    if (message.type === 'error') {
+      this.#handlers.error(message.error);
+      this.#sent.delete(message.serial);
+      this.#answered(message.serial);
+    }
+  }
+}
+
+/** @param {ArrayBuffer} buffer @returns {Maps} */
+function readMaps(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(decoder.decode(new Uint8Array(buffer, 4, length)));
+  const start = 4 + Math.ceil(length / 4) * 4;
+  const cells = header.size ** 2;
+  header.values = header.layers.map((_, layer) => new Uint8Array(buffer, start + layer * cells, cells));
+  return header;
+}

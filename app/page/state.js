@@ -1,0 +1,113 @@
+/** The one state of the page, and its address: a pasted link opens the same moment. */
+
+import { spoken } from './units.js';
+
+/**
+ * @typedef {object} State
+ * @property {string} task @property {string} filter @property {number} episode index in the data set
+ * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
+ * @property {'scene' | 'rerun'} tab
+ * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
+ * @property {'error' | 'particles'} track the lowest chart
+ * @property {boolean} playing @property {number} speed
+ */
+
+export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
+const CHOICES = { tab: ['scene', 'rerun'], weights: ['raw', 'acting'], track: ['error', 'particles'] };
+const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
+
+/** Holds the state; tells listeners once a frame what has changed. */
+export class Store {
+  /** @type {State} */
+  state;
+  /** Who moved the step last: `page`, `scene`, `rerun`, `clock`. */
+  origin = 'page';
+  /** When the input came that moved the step last, ms; null where nobody's hand did. */
+  inputTime = null;
+  #listeners = [];
+  #changed = new Set();
+  #frame = 0;
+  #addressTimer = 0;
+
+  /** @param {State} state */
+  constructor(state) {
+    this.state = state;
+  }
+
+  /** @param {(state: State, changed: Set<string>) => void} listener called in a frame after one or more changes. */
+  listen(listener) {
+    this.#listeners.push(listener);
+  }
+
+  /** @param {Partial<State>} patch @param {{origin?: string, inputTime?: number | null}} [cause] */
+  set(patch, { origin = 'page', inputTime = null } = {}) {
+    for (const [key, value] of Object.entries(patch)) {
+      if (this.state[key] === value) continue;
+      this.state[key] = value;
+      this.#changed.add(key);
+      if (key === 'step') [this.origin, this.inputTime] = [origin, inputTime];
+    }
+    if (this.#changed.size && !this.#frame) this.#frame = requestAnimationFrame(() => this.flush());
+  }
+
+  /** Tells the listeners now. */
+  flush() {
+    cancelAnimationFrame(this.#frame);
+    this.#frame = 0;
+    if (!this.#changed.size) return;
+    const changed = this.#changed;
+    this.#changed = new Set();
+    for (const listener of this.#listeners) listener(this.state, changed);
+    clearTimeout(this.#addressTimer);
+    this.#addressTimer = setTimeout(() => history.replaceState(null, '', address(this.state)), ADDRESS_PAUSE);
+  }
+}
+
+/** @param {State} state @returns {string} what follows the `?` says all of it that a link should keep. */
+export function address(state) {
+  const { task, filter, episode, step, angle, tab, component, weights, track } = state;
+  const kept = { task, filter, episode, step, component, weights, track, tab };
+  if (angle !== null) kept.angle = Number(angle.toFixed(4));
+  return `?${new URLSearchParams(kept)}`;
+}
+
+/**
+ * The state that an address asks for, as far as the catalog has it.
+ * @param {string} search @param {import('./api.js').Catalog} catalog with at least one task, filter and episode.
+ * @returns {{state: State, problems: string[]}} a line for each part that was not to be had.
+ */
+export function resolve(search, catalog) {
+  const asked = new URLSearchParams(search);
+  const problems = [];
+  const pick = (key, names, fallback, kind = key) => {
+    const name = asked.get(key);
+    if (name === null || names.includes(name)) return name ?? fallback;
+    problems.push(`The link asks for ${kind} “${name}”, which does not exist. Available: ${names.join(', ')}.`);
+    return fallback;
+  };
+  const shown = catalog.tasks.filter((t) => t.filters.length && t.episodes.length);
+  const task = shown.find((t) => t.name === pick('task', shown.map((s) => s.name), shown[0].name));
+  const names = task.filters.map((f) => f.name);
+  const firstUnseen = task.episodes.find((e) => e.split === 'test') ?? task.episodes[0];
+  const state = {
+    task: task.name,
+    filter: pick('filter', names, names.includes('crossmodal-pf') ? 'crossmodal-pf' : names[0]),
+    episode: number(asked, 'episode', firstUnseen.index, task.episodes.map((e) => e.index), problems),
+    step: number(asked, 'step', 0, null, problems),
+    angle: asked.has('angle') && Number.isFinite(Number(asked.get('angle'))) ? Number(asked.get('angle')) : null,
+    component: pick('component', task.components.map((c) => c.name), task.map.x),
+    playing: false,
+    speed: 1,
+  };
+  for (const [key, values] of Object.entries(CHOICES)) state[key] = pick(key, values, values[0], spoken(key));
+  return { state, problems };
+}
+
+function number(asked, key, fallback, allowed, problems) {
+  if (!asked.has(key)) return fallback;
+  const value = Number(asked.get(key));
+  if (Number.isInteger(value) && value >= 0 && (allowed === null || allowed.includes(value))) return value;
+  const range = allowed ? ` Available: ${Math.min(...allowed)} to ${Math.max(...allowed)}.` : ' It is an integer from 0.';
+  problems.push(`The link asks for ${key} “${asked.get(key)}”, which does not exist.${range}`);
+  return fallback;
+}

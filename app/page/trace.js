@@ -1,0 +1,160 @@
+/** A trace's numbers as the page shows them: columns over time, in cm and degrees. */
+
+import { SHOWN, wrapped } from './units.js';
+
+const FUSED = 'fused';
+
+export class Trace {
+  #columns = new Map();
+  #cache = new Map();
+
+  /**
+   * @param {import('./api.js').Task} task @param {string} filter @param {number} episode
+   * @param {object} header as the server sent it @param {ArrayBuffer} buffer its columns, end to end
+   * @param {ArrayBuffer | null} pictures T x 32 x 32 bytes
+   */
+  constructor(task, filter, episode, header, buffer, pictures) {
+    [this.task, this.filter, this.episode, this.header] = [task, filter, episode, header];
+    this.steps = header.steps;
+    this.dt = header.dt;
+    this.components = header.components;
+    this.modalities = header.modalities;
+    /** Whose estimates there are: each modality alone, and all of them. */
+    this.sources = [...header.modalities, FUSED];
+    this.pictures = pictures && new Uint8Array(pictures);
+    for (const { name, shape, offset } of header.columns) {
+      const size = shape.reduce((a, b) => a * b, 1);
+      this.#columns.set(name, { data: new Float32Array(buffer, offset, size), shape });
+    }
+    const index = (name) => this.components.findIndex((c) => c.name === name);
+    /** Positions in the state of the two components that span the maps. */
+    this.position = [index(task.map.x), index(task.map.y)];
+    this.angles = this.components.map((c, i) => (c.unit === 'rad' ? i : -1)).filter((i) => i >= 0);
+    this.contact = this.#slice('contact') ?? new Float32Array(this.steps);
+    this.black = this.#blackPictures();
+  }
+
+  has(column) {
+    return this.#columns.has(column);
+  }
+
+  /** The number of weights a modality has: one, or one for each component. */
+  get weightWidth() {
+    return this.#columns.get('weights')?.shape[2] ?? 0;
+  }
+
+  /** The state component's unit as shown, and what m or rad must be multiplied by. */
+  shown(component) {
+    return SHOWN[this.components[component].unit];
+  }
+
+  /** (T,) */
+  truth(component) {
+    return this.#scaled('truth', component, component);
+  }
+
+  /** (T,) What a source believes. @param {string} source a modality or `fused`. */
+  mean(source, component) {
+    return this.#of('mean', source, component);
+  }
+
+  /** (T,) Its standard deviation. */
+  sigma(source, component) {
+    return this.#of('sigma', source, component);
+  }
+
+  /** (T,) or undefined: beta as the network gave it (`raw`), or the share that acted (`acting`). */
+  weight(kind, modality, component) {
+    const name = kind === 'raw' ? 'weights' : 'acting';
+    const k = this.modalities.indexOf(modality);
+    if (!this.has(name) || k < 0) return undefined;
+    const { shape } = this.#columns.get(name);
+    return this.#slice(name, k, shape[2] > 1 ? component : 0);
+  }
+
+  /** (T,) or undefined: number of particles that still carry weight. */
+  get particles() {
+    return this.#slice('effective_sample_size');
+  }
+
+  /** (T,) Distance of a source's position to the true one, cm; of an angle, degrees. @param {number | 'position'} what */
+  error(source, what) {
+    return this.#cached(`error ${source} ${what}`, () => {
+      if (what !== 'position') return difference(this.mean(source, what), this.truth(what), this.shown(what).unit).map(Math.abs);
+      const [x, y] = this.position.map((i) => difference(this.mean(source, i), this.truth(i), 'cm'));
+      return x.map((dx, t) => Math.hypot(dx, y[t]));
+    });
+  }
+
+  /** (T,) Radius that a source claims for its position: the root of the summed variances, cm. */
+  radius(source) {
+    return this.#cached(`radius ${source}`, () => {
+      const [x, y] = this.position.map((i) => this.sigma(source, i));
+      return x.map((sx, t) => Math.hypot(sx, y[t]));
+    });
+  }
+
+  /** The fused belief's largest error of any component at a step, in its own standard deviations, and whose it is. */
+  surprise(step) {
+    const each = this.components.map(({ name }, i) => {
+      const off = this.mean(FUSED, i)[step] - this.truth(i)[step];
+      const error = this.shown(i).unit === '°' ? wrapped(off) : off;
+      return [Math.abs(error) / this.sigma(FUSED, i)[step], name];
+    });
+    return each.sort((a, b) => b[0] - a[0])[0];
+  }
+
+  /** The 32 x 32 picture of a step, or null. */
+  picture(step) {
+    return this.pictures && this.pictures.subarray(step * 1024, (step + 1) * 1024);
+  }
+
+  #of(kind, source, component) {
+    const k = this.modalities.indexOf(source);
+    return k < 0 ? this.#scaled(`estimate_${kind}`, component, component) : this.#scaled(`modality_${kind}`, component, k, component);
+  }
+
+  #scaled(name, component, ...index) {
+    const { scale } = this.shown(component);
+    return this.#cached(`${name} ${index}`, () => this.#slice(name, ...index).map((v) => v * scale));
+  }
+
+  /** (T,) of a column: one place of its other axes. */
+  #slice(name, ...index) {
+    const column = this.#columns.get(name);
+    if (!column) return undefined;
+    return this.#cached(`slice ${name} ${index}`, () => {
+      const [steps, ...rest] = column.shape;
+      const stride = rest.reduce((a, b) => a * b, 1);
+      const start = index.reduce((sum, i, axis) => sum * rest[axis] + i, 0);
+      return Float32Array.from({ length: steps }, (_, t) => column.data[t * stride + start]);
+    });
+  }
+
+  #cached(key, compute) {
+    if (!this.#cache.has(key)) this.#cache.set(key, compute());
+    return this.#cache.get(key);
+  }
+
+  #blackPictures() {
+    const black = new Uint8Array(this.steps);
+    if (this.pictures) for (let t = 0; t < this.steps; t++) black[t] = Number(this.picture(t).every((v) => v === 0));
+    return black;
+  }
+}
+
+function difference(a, b, unit) {
+  return a.map((value, t) => (unit === '°' ? wrapped(value - b[t]) : value - b[t]));
+}
+
+/** First and last step of each stretch where `flags` is true. @returns {[number, number][]} */
+export function stretches(flags) {
+  const found = [];
+  for (let t = 0; t < flags.length; t++) {
+    if (!flags[t]) continue;
+    const start = t;
+    while (t + 1 < flags.length && flags[t + 1]) t++;
+    found.push([start, t]);
+  }
+  return found;
+}

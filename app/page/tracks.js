@@ -1,0 +1,62 @@
+/** Which charts the time line has for a trace and a state. */
+
+import { spoken } from './units.js';
+
+/**
+ * @param {import('./trace.js').Trace} trace @param {import('./state.js').State} state
+ * @returns {import('./chart.js').Track[]}
+ */
+export function tracks(trace, state) {
+  const component = trace.components.findIndex((c) => c.name === state.component);
+  return [weights(trace, state.weights, component), estimates(trace, component), lowest(trace, state.track, component)].filter(Boolean);
+}
+
+function weights(trace, kind, component) {
+  const series = trace.modalities
+    .map((name, index) => ({ name, index, values: trace.weight(kind, name, component) }))
+    .filter((s) => s.values);
+  if (!series.length) return null;
+  const what = trace.weightWidth > 1 ? ` for ${spoken(trace.components[component].name)}` : '';
+  const title = kind === 'raw' ? `Fusion weight β${what}` : `Acting share${what}`;
+  const most = Math.max(1, ...series.map((s) => s.values.reduce((a, b) => Math.max(a, b), 0)));
+  return { title, unit: '', series, limits: [-0.04 * most, 1.06 * most], digits: 2 };
+}
+
+function estimates(trace, component) {
+  const { name } = trace.components[component];
+  const { unit } = trace.shown(component);
+  const sources = trace.sources.map((source, index) => ({
+    name: source,
+    index,
+    values: trace.mean(source, component),
+    sigma: trace.sigma(source, component),
+  }));
+  const truth = { name: 'truth', index: 0, values: trace.truth(component) };
+  return { title: capital(spoken(name)), unit, series: [truth, ...sources], digits: 1 };
+}
+
+function lowest(trace, kind, component) {
+  if (kind === 'particles' && trace.particles) {
+    const most = trace.header.settings?.particles ?? trace.particles.reduce((a, b) => Math.max(a, b), 0);
+    const series = [{ name: 'fused', index: 0, values: trace.particles }];
+    return { title: 'Particles', unit: `of ${most}`, series, limits: [0, 1.04 * most], digits: 0 };
+  }
+  const angle = trace.angles.includes(component);
+  const what = angle ? component : 'position';
+  const series = trace.sources.map((name, index) => ({ name, index, values: trace.error(name, what) }));
+  return {
+    title: angle ? `${capital(spoken(trace.components[component].name))} error` : 'Position error',
+    unit: angle ? '°' : 'cm',
+    series,
+    fromZero: true,
+    digits: 1,
+  };
+}
+
+/** (T,) The error that the lowest chart is about. */
+export function shownError(trace, state) {
+  const component = trace.components.findIndex((c) => c.name === state.component);
+  return trace.error('fused', trace.angles.includes(component) ? component : 'position');
+}
+
+const capital = (text) => text[0].toUpperCase() + text.slice(1);

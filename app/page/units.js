@@ -1,0 +1,25 @@
+/** From the wire's m and rad to the page's cm and degrees. */
+
+export const SHOWN = { m: { unit: 'cm', scale: 100 }, rad: { unit: '°', scale: 180 / Math.PI } };
+
+/** @param {string} name as in the state: hinge_x. */
+export const spoken = (name) => name.replaceAll('_', ' ');
+
+/** A number with a true minus sign and a fixed number of digits; a dash where there is none. */
+export function fixed(value, digits = 1) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return '–';
+  const text = value.toFixed(digits);
+  return /^-[0.]*$/.test(text) ? text.slice(1) : text.replace('-', '−');
+}
+
+/** As `fixed`, with the sign always written. */
+export const signed = (value, digits = 1) => (value > 0 && Number(value.toFixed(digits)) > 0 ? '+' : '') + fixed(value, digits);
+
+export const percent = (share) => (Number.isFinite(share) ? `${Math.round(100 * share)} %` : '–');
+
+/** The difference of two angles in degrees, in -180..180. */
+export const wrapped = (degrees) => degrees - 360 * Math.round(degrees / 360);
+
+export function bytes(count) {
+  return count < 1e6 ? `${Math.round(count / 1e3)} kB` : `${(count / 1e6).toFixed(1)} MB`;
+}

@@ -1,0 +1,55 @@
+/** The left of the page: tabs for the 3D scene and for Rerun's viewer. */
+
+import { say } from './panel.js';
+
+const TABS = ['scene', 'rerun'];
+
+/** The scene's frame: another page of the server's, which follows the cursor by itself. */
+export class Scene {
+  #host;
+  #frame = document.createElement('iframe');
+
+  /** @param {HTMLElement} host */
+  constructor(host) {
+    this.#host = host;
+    this.#frame.title = '3D scene: robot, door, true and estimated hinge';
+    say(host, 'loading', 'Starting the 3D scene …');
+  }
+
+  /** @param {string} url of a new view's scene. */
+  open(url) {
+    say(this.#host, 'loading', 'Starting the 3D scene …');
+    this.#frame.src = url;
+    if (!this.#frame.isConnected) this.#host.append(this.#frame);
+  }
+
+  /** The server has drawn a cursor. */
+  drawn() {
+    if (this.#host.dataset.state !== 'ready') say(this.#host, 'ready');
+  }
+}
+
+/**
+ * @param {import('./state.js').Store} store
+ * @returns {(tab: string) => void} shows a tab
+ */
+export function tabs(store) {
+  const buttons = TABS.map((name) => document.querySelector(`#tab-${name}`));
+  buttons.forEach((button, i) => {
+    button.addEventListener('click', () => store.set({ tab: TABS[i] }));
+    button.addEventListener('keydown', (event) => {
+      if (event.key !== 'ArrowLeft' && event.key !== 'ArrowRight') return;
+      event.stopPropagation();
+      const other = TABS[(i + 1) % TABS.length];
+      store.set({ tab: other });
+      buttons[(i + 1) % TABS.length].focus();
+    });
+  });
+  return (shown) => {
+    TABS.forEach((name, i) => {
+      buttons[i].setAttribute('aria-selected', String(name === shown));
+      buttons[i].tabIndex = name === shown ? 0 : -1;
+      document.querySelector(`#${name}`).hidden = name !== shown;
+    });
+  };
+}
