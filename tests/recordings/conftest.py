@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,18 @@ def make_map(trace: Trace, step: int, size: int = 41) -> LikelihoodMap:
     return LikelihoodMap(step, float(truth[2]), (*trace.modalities, "fused"), axis, axis, truth[:2], layers)
 
 
+def _assert_same(one: Trace, other: Trace) -> None:
+    for field in fields(Trace):
+        left, right = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(left, np.ndarray):
+            assert left.dtype == right.dtype, field.name
+            np.testing.assert_array_equal(left, right, field.name)
+        elif field.name != "episode":
+            assert left == right, field.name
+    assert one.episode.digest() == other.episode.digest()
+    assert one.episode.provenance == other.episode.provenance
+
+
 @pytest.fixture(params=["ekf", "pf"])
 def trace(request: pytest.FixtureRequest) -> Trace:
     return make_trace(request.param)
@@ -133,3 +146,8 @@ def new_trace() -> Callable[..., Trace]:
 @pytest.fixture
 def new_map() -> Callable[..., LikelihoodMap]:
     return make_map
+
+
+@pytest.fixture
+def assert_same() -> Callable[[Trace, Trace], None]:
+    return _assert_same
