@@ -5,18 +5,21 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
+import signal
+import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+import mujoco
+
+import beliefscope
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, write_dataset
 
 Progress = Callable[[int, int], None]
-
-MOST_WORKERS = 64
 
 
 def collect(
@@ -31,48 +34,46 @@ def collect(
     """Simulate ``episodes`` trajectories of ``steps`` steps into the HDF5 file ``path``.
 
     Episode i depends on the seed and on i alone, so that the data are the same for any number of workers. Finished
-    episodes are kept in the folder ``<path>.partial`` until all are there; run again after a kill, only the missing ones
-    are simulated. The file itself appears whole, or not at all.
+    episodes are kept in the folder ``<path>.partial`` until all are there: run again after a kill, only the missing
+    ones are simulated. The file itself appears whole, or not at all.
 
     Args:
-        task: name in ``TASKS``. seed: not negative. workers: processes; None is one a core.
+        task: name in ``TASKS``.
+        seed: not negative.
+        workers: processes; None is one a core.
         progress: called with (episodes done, episodes in all), at once and after each.
 
     Raises:
-        BadInput: for an unknown task, a count below one, or a place that cannot be written.
+        BadInput: for an unknown task, a count that is too small, or a place that cannot be written.
     """
     chosen, path = find_task(task), Path(path)
     if chosen.simulate is None:
         raise BadInput(f"Task {task!r} cannot be simulated: its data are recorded ones.")
-    for name, value, least in (
-        ("episodes", episodes, 1),
-        ("steps", steps, 2),
-        ("seed", seed, 0),
-        ("workers", workers, 1),
-    ):
-        if value is not None and value < least:
-            raise BadInput(f"{name} is {value}, expected at least {least}.")
+    for name, value, least in (("episodes", episodes, 1), ("steps", steps, 2), ("seed", seed, 0)):
+        _require(name, value, least)
+    _require("workers", 1 if workers is None else workers, 1)
     parts = _Parts(path, task, steps, seed)
     missing = [i for i in range(episodes) if not parts.holds(i)]
     done = episodes - len(missing)
-    if progress:
-        progress(done, episodes)
-    if missing:
-        count = min(workers or os.cpu_count() or 1, len(missing), MOST_WORKERS)
-        for _ in _simulated(parts, missing, count):
-            done += 1
-            if progress:
-                progress(done, episodes)
-    write_dataset(path, chosen, (parts.read(i) for i in range(episodes)))
-    parts.discard()
+    report = progress or (lambda done, count: None)
+    report(done, episodes)
+    for _ in _simulated(parts, missing, workers or os.cpu_count() or 1):
+        done += 1
+        report(done, episodes)
+    parts.join(episodes)
+
+
+def _require(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise BadInput(f"{name} is {value}, expected at least {least}.")
 
 
 class _Parts:
-    """The folder of finished episodes, one file each, bound to the task, steps and seed that made them."""
+    """The folder of finished episodes: a file each, named after all that it depends on."""
 
     def __init__(self, path: Path, task: str, steps: int, seed: int) -> None:
         self.task, self.steps, self.seed = task, steps, seed
-        self._folder = path.with_name(path.name + ".partial")
+        self._whole, self._folder = path, path.with_name(path.name + ".partial")
         if path.is_dir():
             raise BadInput(f"{path} is a folder, expected the name of a file to write.")
         try:
@@ -80,48 +81,67 @@ class _Parts:
         except FileNotFoundError:
             raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.") from None
         except OSError as error:
-            raise BadInput(f"Cannot write to {path.parent}: {error.strerror}.") from None
-
-    def _path(self, index: int) -> Path:
-        return self._folder / f"{self.task}-{self.seed}-{self.steps}-{index:05d}.h5"
+            raise BadInput(f"Cannot write {path}: {error.strerror}.") from None
 
     def holds(self, index: int) -> bool:
-        if not self._path(index).exists():
+        """Whether this episode is there and undamaged."""
+        if not self._part(index).exists():
             return False
         try:
-            self.read(index)
+            self._read(index)
         except BadInput:
             return False
         return True
 
-    def read(self, index: int) -> Episode:
-        with open_dataset(self._path(index)) as part:
-            return part[0]
-
     def make(self, index: int) -> None:
+        """Simulate this episode."""
         task = find_task(self.task)
         assert task.simulate is not None
-        write_dataset(self._path(index), task, [task.simulate(self.seed, index, self.steps)])
+        write_dataset(self._part(index), task, [task.simulate(self.seed, index, self.steps)])
 
-    def discard(self) -> None:
+    def join(self, episodes: int) -> None:
+        """Make the one file of them, in the folder so that a kill leaves nothing beside it, and drop the folder."""
+        joined = self._folder / "all.h5"
+        write_dataset(joined, find_task(self.task), (self._read(i) for i in range(episodes)))
+        os.replace(joined, self._whole)
         shutil.rmtree(self._folder)
+
+    def _part(self, index: int) -> Path:
+        made_by = f"{beliefscope.__version__}-mujoco{mujoco.__version__}"
+        return self._folder / f"{self.task}-seed{self.seed}-steps{self.steps}-{index}-{made_by}.h5"
+
+    def _read(self, index: int) -> Episode:
+        with open_dataset(self._part(index)) as part:
+            return part[0]
 
 
 def _simulated(parts: _Parts, indices: list[int], workers: int) -> Iterator[None]:
-    """Make the missing parts, yielding after each. Spawned, not forked: threads of the caller would not survive a fork."""
-    if workers == 1:
+    """Make the missing parts, yielding after each."""
+    if min(workers, len(indices)) <= 1:
         for index in indices:
             parts.make(index)
             yield
         return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        pending = {pool.submit(parts.make, index) for index in indices}
+    # Spawned, not forked: whoever calls may have threads, and locks held by them would stay locked in a fork.
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(indices)), spawn, _live_with_parent) as pool:
         try:
-            while pending:
-                finished, pending = wait(pending, return_when=FIRST_EXCEPTION, timeout=0.1)
-                for future in finished:
-                    future.result()
-                    yield
+            for future in as_completed([pool.submit(parts.make, index) for index in indices]):
+                future.result()
+                yield
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _live_with_parent() -> None:
+    """In a worker: leave Ctrl-C to the parent, and end with it, be it killed, instead of waiting for work forever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from beliefscope.datasets.camera import Camera
 from beliefscope.datasets.control import Impedance, add_controller
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.robot import ROBOT_BIT, STIFF, WORLD_BIT, add_panda, new_spec
 from beliefscope.datasets.task import Component, Ghost, Task
 
@@ -35,7 +36,11 @@ IMPEDANCE = Impedance((1600, 1600, 1200))
 
 @dataclass(frozen=True)
 class DoorPhysics:
-    """What differs between doors: the hinge (2,) m, the height of the handle's bar (m), and an opening spring (N m/rad)."""
+    """What differs between doors.
+
+    Attributes:
+        hinge: (2,) m, world. bar_height: of the handle's bar, m. spring: opens the door, N m/rad; 0 is none.
+    """
 
     hinge: tuple[float, float]
     bar_height: float
@@ -158,11 +163,18 @@ def _add_door(spec: mujoco.MjSpec, physics: DoorPhysics) -> None:
 
 
 def _replay(episode: Episode) -> mujoco.MjModel:
-    hinge_x, hinge_y = episode.provenance["hinge"]
-    return door_model(DoorPhysics((hinge_x, hinge_y), episode.provenance["bar_height"]))
+    try:
+        x, y = (float(value) for value in episode.provenance["hinge"])
+        height = float(episode.provenance["bar_height"])
+    except (KeyError, TypeError, ValueError):
+        raise BadInput(
+            "The episode's provenance does not describe its door: expected 'hinge': [x, y] and 'bar_height', in m."
+        ) from None
+    return door_model(DoorPhysics((x, y), height))
 
 
 def _simulate(seed: int, index: int, steps: int) -> Episode:
+    # Imported here because the simulation needs this module's door.
     from beliefscope.datasets.simulate import simulate_door
 
     return simulate_door(seed, index, steps)

@@ -70,7 +70,7 @@ class Pull:
     def __init__(self, door: DoorPhysics, rng: Generator) -> None:
         self._door, self._rng = door, rng
         self.start_angle = float(rng.uniform(0.0, 1.3))
-        self.radius = float(rng.uniform(0.25, 0.42))
+        self._radius = float(rng.uniform(0.25, 0.42))
         self._goal = self.start_angle
 
     def start(self) -> Vector:
@@ -81,12 +81,12 @@ class Pull:
         if abs(self._goal - angle) < 0.12 or rng.random() < 0.15:
             self._goal = float(rng.uniform(-0.1, MAX_ANGLE + 0.05))
         angle_next = angle + float(np.clip(self._goal - angle, -0.35, 0.35))
-        noise = rng.normal(0.0, (0.03, 0.03, 0.03))
+        noise = rng.normal(0.0, 0.03, 3)
         return Waypoint(self._on_bar(angle_next) + noise, _speed(rng), _wait(rng))
 
     def _on_bar(self, angle: float) -> Vector:
-        """The bar lies this deep between the fingers, clear of their tips."""
-        return self._door.bar_point(angle, self.radius) + 0.006 * _inward(angle)
+        """(3,) m: where the hand holds the bar, which then lies clear of the tips of its fingers."""
+        return self._door.bar_point(angle, self._radius) + 0.006 * _inward(angle)
 
 
 class Push:
@@ -99,6 +99,7 @@ class Push:
         self._door, self._rng = door, rng
         self._average = DoorPhysics(HINGE_CENTRE, door.bar_height)
         self.start_angle = float(rng.uniform(0.15, 1.45))
+        self._radius = 0.0
         self._queue: list[str] = []
 
     def start(self) -> Vector:
@@ -122,7 +123,7 @@ class Push:
         return Waypoint(target, max(0.05, _speed(rng)), _wait(rng) // 2)
 
     def _retreat(self, angle: float) -> Vector:
-        """A place before an average door at this angle, but never through this door."""
+        """(3,) m: a place before the average door at this angle, and before this door too."""
         rng = self._rng
         inward = _inward(angle)
         along = np.array([-inward[1], inward[0], 0.0])
@@ -139,8 +140,10 @@ def _inward(angle: float) -> Vector:
 
 
 def _speed(rng: Generator) -> float:
+    """3 to 25 cm/s, log-uniform."""
     return float(0.03 * np.exp(rng.uniform(0.0, np.log(25 / 3))))
 
 
 def _wait(rng: Generator) -> int:
+    """0 to 5 steps."""
     return int(rng.integers(0, 6))

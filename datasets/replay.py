@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 
 Array = NDArray[np.float64]
@@ -30,10 +31,18 @@ class Replay:
 
 
 def replay(task: Task, episode: Episode) -> Replay | None:
-    """The whole replay of an episode (some 10 ms for 800 steps), or None where the task or the episode has none."""
+    """The whole replay of an episode (some 10 ms for 800 steps), or None where the task or the episode has none.
+
+    Raises BadInput where the joint positions are not those of the task's model.
+    """
     if task.replay is None or episode.qpos.shape[1] == 0:
         return None
     model = task.replay(episode)
+    if episode.qpos.shape[1] != model.nq:
+        raise BadInput(
+            f"The episode's 'qpos' has {episode.qpos.shape[1]} joint positions a step; the model of task {task.name!r} "
+            f"has {model.nq}."
+        )
     data = mujoco.MjData(model)
     positions = np.empty((len(episode), model.nbody, 3))
     rotations = np.empty((len(episode), model.nbody, 9))

@@ -92,7 +92,7 @@ def quantise(values: NDArray[np.float64], bits: int) -> FloatArray:
 
 
 def hand_controls(position: FloatArray, touch: FloatArray) -> FloatArray:
-    """(T, 7): previous hand position (T, 3), its change, touch (T, 1). Before step 0 the hand is where step 0 finds it."""
+    """(T, 7): previous hand position (T, 3), its change, touch (T, 1); the position before step 0 is that of step 0."""
     previous = np.concatenate([position[:1], position[:-1]])
     return np.concatenate([previous, position - previous, touch], axis=1)
 

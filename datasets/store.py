@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -24,6 +25,10 @@ FORMAT = "beliefscope-episodes"
 VERSION = 1
 SPLITS = ("train", "val", "test")
 
+T = TypeVar("T")
+
+# What h5py raises on meeting a damaged file.
+_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 _SAMPLES = Path(__file__).parent / "samples"
 
 
@@ -57,7 +62,7 @@ def open_dataset(path: str | Path) -> Dataset:
 class Dataset:
     """A file of episodes of one task: ``len``, ``[i]``, iteration; a context manager.
 
-    Opening reads only attributes; ``[i]`` reads and checks one episode.
+    Opening reads only attributes; ``[i]`` reads one episode and checks it.
 
     Attributes:
         path: of the file. task: what it holds.
@@ -73,12 +78,12 @@ class Dataset:
             self._groups = self._find_groups()
             self.summaries = tuple(self._summary(i) for i in range(len(self._groups)))
             digests = [self._attribute(group, "digest", str) for group in self._groups]
-        except OSError as error:
-            self.close()
-            raise BadInput(f"{path} is damaged: {_reason(error)}. Collect or copy it again.") from None
-        except BaseException:
+        except BadInput:
             self.close()
             raise
+        except _DAMAGE as error:
+            self.close()
+            raise _damaged(path, error) from None
         self.hash = hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -88,34 +93,19 @@ class Dataset:
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, index: int) -> Episode:
-        """Read one episode. Raises BadInput where a key is missing, of a wrong shape, not finite, or damaged."""
+        """Read one episode.
+
+        Raises BadInput where there is none of that index, where an array is missing, of another shape or type than the
+        task's, or not finite, and where the whole does not match its digest.
+        """
         if not 0 <= index < len(self):
             raise BadInput(f"Episode {index} is not in {self.path}, which has episodes 0 to {len(self) - 1}.")
-        group, summary, task = self._groups[index], self.summaries[index], self.task
-        states = self._array(group, "states", (summary.steps, len(task.components)))
-        observations = {
-            key: self._array(
-                group, f"observations/{key}", (summary.steps, *shape), np.uint8 if len(shape) == 2 else np.float32
-            )
-            for key, shape in task.observations.items()
-        }
-        episode = Episode(
-            task=task.name,
-            states=states,
-            controls=self._array(group, "controls", (summary.steps, task.control_size)),
-            observations=observations,
-            contact=self._array(group, "contact", (summary.steps,), np.uint8).astype(bool),
-            qpos=self._array(group, "qpos", (summary.steps, None)),
-            dt=float(self._attribute(group, "dt", float)),
-            seed=summary.seed,
-            split=summary.split,
-            provenance=self._provenance(group),
-        )
-        if episode.digest() != self._attribute(group, "digest", str):
-            raise BadInput(
-                f"{self.path}: {group.name[1:]} does not match its digest: it was changed or damaged. Collect or copy it again."
-            )
-        return episode
+        try:
+            return self._read(index)
+        except BadInput:
+            raise
+        except _DAMAGE as error:
+            raise _damaged(self.path, error) from None
 
     def close(self) -> None:
         """Close the file. Episodes already read stay valid."""
@@ -130,10 +120,11 @@ class Dataset:
         self.close()
 
     def _read_task(self) -> Task:
-        if self._file.attrs.get("format") != FORMAT:
+        found = self._file.attrs.get("format")
+        if found != FORMAT:
             raise BadInput(
-                f"{self.path} is an HDF5 file, but not a set of episodes: its attribute 'format' is "
-                f"{self._file.attrs.get('format')!r}, expected {FORMAT!r}."
+                f"{self.path} is an HDF5 file, but not a set of episodes: its attribute 'format' is {found!r}, "
+                f"expected {FORMAT!r}."
             )
         version = self._file.attrs.get("version")
         if version != VERSION:
@@ -147,93 +138,121 @@ class Dataset:
         count = sum(1 for name in self._file if name.startswith("trajectory"))
         if not count:
             raise BadInput(f"{self.path} holds no trajectory; expected groups 'trajectory0', 'trajectory1', ...")
-        missing = [f"trajectory{i}" for i in range(count) if f"trajectory{i}" not in self._file]
-        if missing:
-            raise BadInput(f"{self.path} has {count} trajectories, but {missing[0]!r} is missing.")
-        return [self._file[f"trajectory{i}"] for i in range(count)]
+        groups = [self._file.get(f"trajectory{i}") for i in range(count)]
+        for i, group in enumerate(groups):
+            if not isinstance(group, h5py.Group):
+                raise BadInput(f"{self.path} has {count} trajectories, but no group 'trajectory{i}'.")
+        return groups
 
     def _summary(self, index: int) -> EpisodeSummary:
         group = self._groups[index]
+        states = self._stored(group, "states")
+        if not states.shape or states.shape[0] < 1:
+            raise BadInput(f"{self._place(group, 'states')} has shape {states.shape}, expected at least one step.")
         split = self._attribute(group, "split", str)
         if split not in SPLITS:
-            raise BadInput(f"{self.path}: {group.name[1:]} is of split {split!r}. Available: {', '.join(SPLITS)}.")
-        if "states" not in group:
-            raise self._missing(group, "states", group)
+            raise BadInput(f"{self._place(group, 'split')} is {split!r}. Available: {', '.join(SPLITS)}.")
         return EpisodeSummary(
             index=index,
-            steps=len(group["states"]),
+            steps=int(states.shape[0]),
             policy=str(self._provenance(group).get("policy", "")),
             split=split,
-            seed=int(self._attribute(group, "seed", int)),
-            contact_fraction=float(self._attribute(group, "contact_fraction", float)),
+            seed=self._attribute(group, "seed", int),
+            contact_fraction=self._attribute(group, "contact_fraction", float),
         )
 
+    def _read(self, index: int) -> Episode:
+        group, summary, task = self._groups[index], self.summaries[index], self.task
+        steps = summary.steps
+        dt = self._attribute(group, "dt", float)
+        if not math.isclose(dt, task.dt):
+            raise BadInput(f"{self._place(group, 'dt')} is {dt} s; task {task.name!r} has steps of {task.dt} s.")
+        episode = Episode(
+            task=task.name,
+            states=self._array(group, "states", (steps, len(task.components))),
+            controls=self._array(group, "controls", (steps, task.control_size)),
+            observations={
+                key: self._array(
+                    group, f"observations/{key}", (steps, *shape), np.uint8 if len(shape) == 2 else np.float32
+                )
+                for key, shape in task.observations.items()
+            },
+            contact=self._array(group, "contact", (steps,), np.uint8).astype(bool),
+            qpos=self._array(group, "qpos", (steps, None)),
+            dt=dt,
+            seed=summary.seed,
+            split=summary.split,
+            provenance=self._provenance(group),
+        )
+        if episode.digest() != self._attribute(group, "digest", str):
+            raise BadInput(f"{self.path}: the arrays of {group.name[1:]} do not match its digest: they were changed.")
+        return episode
+
     def _provenance(self, group: h5py.Group) -> dict[str, Any]:
-        text = self._attribute(group, "provenance", str)
         try:
-            value = json.loads(text)
+            value = json.loads(self._attribute(group, "provenance", str))
         except json.JSONDecodeError:
             value = None
         if not isinstance(value, dict):
-            raise BadInput(f"{self.path}: attribute 'provenance' of {group.name[1:]} is not a JSON object.")
+            raise BadInput(f"{self._place(group, 'provenance')} is not a JSON object.")
         return value
 
-    def _attribute(self, group: h5py.Group, key: str, kind: type) -> Any:
+    def _attribute(self, group: h5py.Group, key: str, kind: Callable[[Any], T]) -> T:
         if key not in group.attrs:
             raise BadInput(
                 f"{self.path}: {group.name[1:]} has no attribute {key!r}. It has: {', '.join(group.attrs) or 'none'}."
             )
+        value = group.attrs[key]
         try:
-            return kind(group.attrs[key])
+            return kind(value)
         except (TypeError, ValueError):
-            raise BadInput(
-                f"{self.path}: attribute {key!r} of {group.name[1:]} is {group.attrs[key]!r}, expected {kind.__name__}."
-            ) from None
+            name = getattr(kind, "__name__", "another type")
+            raise BadInput(f"{self._place(group, key)} is {value!r}, expected {name}.") from None
 
-    def _missing(self, group: h5py.Group, key: str, where: h5py.Group) -> BadInput:
-        return BadInput(f"{self.path}: {group.name[1:]} has no {key!r}. It has: {', '.join(where) or 'nothing'}.")
+    def _stored(self, group: h5py.Group, key: str) -> h5py.Dataset:
+        stored = group.get(key)
+        if not isinstance(stored, h5py.Dataset):
+            raise BadInput(f"{self.path}: {group.name[1:]} has no {key!r}. It has: {', '.join(group) or 'nothing'}.")
+        return stored
 
     def _array(
         self, group: h5py.Group, key: str, shape: tuple[int | None, ...], kind: type = np.float32
     ) -> NDArray[Any]:
-        place = f"{self.path}: {key!r} of {group.name[1:]}"
-        if not isinstance(group.get(key), h5py.Dataset):
-            raise self._missing(group, key, group)
-        try:
-            array = group[key][()]
-        except OSError as error:
-            raise BadInput(f"{place} cannot be read: {_reason(error)}. Collect or copy the file again.") from None
-        fits = len(array.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+        array, place = self._stored(group, key)[()], self._place(group, key)
+        fits = np.ndim(array) == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         if not fits:
-            expected = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
-            raise BadInput(f"{place} has shape {array.shape}, expected {expected}.")
+            expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+            raise BadInput(f"{place} has shape {np.shape(array)}, expected {expected}.")
         if array.dtype != kind:
             raise BadInput(f"{place} is {array.dtype}, expected {np.dtype(kind)}.")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
+        if not np.isfinite(array).all():
             step = int(np.argwhere(~np.isfinite(array))[0][0])
-            raise BadInput(f"{place} holds {array[step]} at step {step}, expected finite numbers.")
+            raise BadInput(f"{place} is {array[step]} at step {step}, expected finite numbers.")
         return np.asarray(array)
+
+    def _place(self, group: h5py.Group, key: str) -> str:
+        return f"{self.path}: {key!r} of {group.name[1:]}"
 
 
 def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> None:
-    """Write episodes to a new file, replacing what is there only once all is written.
+    """Write episodes to a new file; what was there is replaced only when all is written.
 
-    The same episodes give the same bytes. Raises BadInput where the folder does not exist or cannot be written.
+    The same episodes give the same bytes. Raises BadInput where the file cannot be written.
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.")
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
+        with h5py.File(unfinished, "w", libver=("v110", "v110")) as file:
             file.attrs["format"], file.attrs["version"], file.attrs["task"] = FORMAT, VERSION, task.name
             for index, episode in enumerate(episodes):
                 _write_episode(file.create_group(f"trajectory{index}"), episode)
-        os.replace(partial, path)
-    except PermissionError:
-        raise BadInput(f"No permission to write {path}.") from None
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise BadInput(f"Cannot write {path}: {_reason(error)}.") from None
     finally:
-        partial.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
 
 
 def _write_episode(group: h5py.Group, episode: Episode) -> None:
@@ -247,15 +266,13 @@ def _write_episode(group: h5py.Group, episode: Episode) -> None:
     arrays["contact"] = episode.contact.astype(np.uint8)
     arrays |= {f"observations/{key}": value for key, value in episode.observations.items()}
     for key, array in arrays.items():
-        _write_array(group, key, np.ascontiguousarray(array))
-
-
-def _write_array(group: h5py.Group, key: str, array: NDArray[Any]) -> None:
-    """One HDF5 element a step: the shuffle filter then lays each pixel's or component's bytes out over time."""
-    kind = np.dtype((array.dtype, array.shape[1:])) if array.ndim > 1 and array.size else array.dtype
-    group.create_dataset(
-        key, (len(array),), kind, chunks=(len(array),), compression="gzip", compression_opts=9, shuffle=True
-    )[...] = array
+        # One HDF5 element a step: the shuffle filter then lays the bytes of each pixel or component out over time,
+        # which takes a fifth off the pictures.
+        element = np.dtype((array.dtype, array.shape[1:])) if array.ndim > 1 and array.size else array.dtype
+        stored = group.create_dataset(
+            key, (len(array),), element, chunks=(len(array),), compression="gzip", compression_opts=9, shuffle=True
+        )
+        stored[...] = array
 
 
 def _open(path: Path) -> h5py.File:
@@ -267,11 +284,16 @@ def _open(path: Path) -> h5py.File:
         return h5py.File(path, "r")
     except PermissionError:
         raise BadInput(f"No permission to read {path}.") from None
-    except OSError as error:
+    except _DAMAGE as error:
         if not h5py.is_hdf5(path):
             raise BadInput(f"{path} is not an HDF5 file.") from None
-        raise BadInput(f"{path} is damaged or cut short: {_reason(error)}. Collect or copy it again.") from None
+        raise _damaged(path, error) from None
 
 
-def _reason(error: OSError) -> str:
-    return str(error).splitlines()[0].rstrip(".")
+def _damaged(path: Path, error: Exception) -> BadInput:
+    return BadInput(f"{path} is damaged or cut short: {_reason(error)}. Collect or copy it again.")
+
+
+def _reason(error: Exception) -> str:
+    """HDF5's own words, in one line."""
+    return (getattr(error, "strerror", None) or " ".join(str(error).split())).strip(" '\".")

@@ -55,8 +55,8 @@ class Task:
         map_half_width: half the side of the map, m.
         replay: builds the ``mujoco.MjModel`` of an episode, whose ``qpos`` it replays; None where there is no replay.
         ghost: states (..., n) -> ``Ghost``, to draw true and estimated objects; None where there is nothing to draw.
-        simulate: (seed, index, steps) -> the episode with that index of the collection with that seed; None where a task
-            cannot be simulated.
+        simulate: (seed, index, steps) -> that episode of the collection with that seed; None where the task cannot be
+            simulated.
     """
 
     name: str
