@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -58,28 +59,36 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     return run
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory, with files that can be used and files that cannot."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with files that can be used and files that cannot."""
+    place = tmp_path_factory.mktemp("files")
     sample = sample_path("door").read_bytes()
-    Path("cut.h5").write_bytes(sample[: len(sample) // 2])
-    Path("foreign.h5").write_text("no HDF5 at all\n")
-    with h5py.File("other.h5", "w") as file:
+    (place / "cut.h5").write_bytes(sample[: len(sample) // 2])
+    (place / "foreign.h5").write_text("no HDF5 at all\n")
+    with h5py.File(place / "other.h5", "w") as file:
         file["numbers"] = np.arange(3)
-    Path("shape.h5").write_bytes(sample)
-    with h5py.File("shape.h5", "r+") as file:
-        for group in file.values():
-            states = group["states"][()]
-            del group["states"]
-            group["states"] = states[:, :2]
+    (place / "shape.h5").write_bytes(sample)
+    with h5py.File(place / "shape.h5", "r+") as file:
+        group = file["trajectory9"]
+        states = group["states"][()]
+        del group["states"]
+        group["states"] = states[:, :2]
     untrained = build(architecture("door", "crossmodal-ekf"))
-    save_checkpoint(untrained, "crossmodal-ekf", {}, Path("ekf.safetensors"))
-    Path("cut.safetensors").write_bytes(Path("ekf.safetensors").read_bytes()[:-1000])
-    Path("foreign.safetensors").write_bytes(b"\x80\x04" + bytes(100))
-    save_file({"weight": torch.zeros(2)}, "other.safetensors")
-    Path("notes.txt").write_text("{not json")
-    Path("taken").mkdir()
+    save_checkpoint(untrained, "crossmodal-ekf", {}, place / "ekf.safetensors")
+    (place / "cut.safetensors").write_bytes((place / "ekf.safetensors").read_bytes()[:-1000])
+    (place / "foreign.safetensors").write_bytes(b"\x80\x04" + bytes(100))
+    save_file({"weight": torch.zeros(2)}, place / "other.safetensors")
+    (place / "notes.txt").write_text("{not json")
+    (place / "taken").mkdir()
+    return place
+
+
+@pytest.fixture
+def folder(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory: a copy of ``files``."""
+    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
@@ -268,7 +277,7 @@ def test_collect_to_recording(run: Run, folder: Path) -> None:
 
 
 def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> None:
-    run("collect door --episodes 10 --steps 40 --workers 2 -o ten.h5")
+    run("collect door --episodes 10 --steps 20 --workers 1 -o ten.h5")
     line = "train door --filter crossmodal-pf --data ten.h5 --preset smoke -o pf.safetensors --json -"
     code, out, err = run(line)
     trained = json.loads(out)
