@@ -77,14 +77,14 @@ class Dataset:
             self.task = self._read_task()
             self._groups = self._find_groups()
             self.summaries = tuple(self._summary(i) for i in range(len(self._groups)))
-            digests = [self._attribute(group, "digest", str) for group in self._groups]
+            digests = "\n".join(self._attribute(group, "digest", str) for group in self._groups)
+            self.hash = hashlib.sha256(digests.encode()).hexdigest()
         except BadInput:
             self.close()
             raise
         except _DAMAGE as error:
             self.close()
             raise _damaged(path, error) from None
-        self.hash = hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
     def __len__(self) -> int:
         return len(self._groups)

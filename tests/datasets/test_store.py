@@ -1,0 +1,270 @@
+"""Episodes survive the file; files that are not ours, or no longer whole, are told apart and named."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
+
+STEPS = 7
+
+
+def made_up(seed: int = 0, split: str = "train") -> Episode:
+    rng = np.random.default_rng(seed)
+
+    def floats(*shape: int) -> np.ndarray:
+        return rng.normal(size=(STEPS, *shape)).astype(np.float32)
+
+    contact = rng.random(STEPS) < 0.5
+    return Episode(
+        task="door",
+        states=floats(3),
+        controls=floats(7),
+        observations={
+            "image": rng.integers(0, 256, (STEPS, 32, 32), np.uint8),
+            "effector_position": floats(3),
+            "force": floats(3),
+            "torque": floats(3),
+            "contact": contact[:, None].astype(np.float32),
+        },
+        contact=contact,
+        qpos=floats(10),
+        dt=0.1,
+        seed=seed,
+        split=split,
+        provenance={"policy": "pull", "hinge": [0.8, -0.3], "note": "é"},
+    )
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "set.h5"
+    write_dataset(path, DOOR, [made_up(0), made_up(1, "val")])
+    return path
+
+
+def test_round_trip_is_exact(path: Path) -> None:
+    with open_dataset(path) as data:
+        assert len(data) == 2
+        assert data.task is DOOR
+        for i, split in enumerate(("train", "val")):
+            original, read = made_up(i, split), data[i]
+            assert read.digest() == original.digest()
+            assert read.provenance == original.provenance
+            np.testing.assert_array_equal(read.observations["image"], original.observations["image"])
+            assert read.contact.dtype == bool
+        summary = data.summaries[1]
+    assert (summary.index, summary.steps, summary.policy, summary.split, summary.seed) == (1, STEPS, "pull", "val", 1)
+    assert summary.contact_fraction == pytest.approx(made_up(1).contact.mean())
+
+
+def test_same_episodes_same_bytes_and_same_hash(path: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.h5"
+    write_dataset(again, DOOR, [made_up(0), made_up(1, "val")])
+    assert again.read_bytes() == path.read_bytes()
+    with open_dataset(again) as a, open_dataset(path) as b:
+        assert a.hash == b.hash
+    write_dataset(again, DOOR, [made_up(0), made_up(2, "val")])
+    with open_dataset(again) as a, open_dataset(path) as b:
+        assert a.hash != b.hash
+
+
+def test_any_hdf5_reader_sees_plain_arrays(path: Path) -> None:
+    with h5py.File(path) as file:
+        image = file["trajectory0/observations/image"][()]
+        assert image.shape == (STEPS, 32, 32)
+        assert file["trajectory0"].attrs["split"] == "train"
+
+
+def test_a_writer_that_fails_leaves_what_was_there(path: Path) -> None:
+    before = path.read_bytes()
+
+    def failing() -> Iterator[Episode]:
+        yield made_up(5)
+        raise RuntimeError("the simulator fell over")
+
+    with pytest.raises(RuntimeError, match="fell over"):
+        write_dataset(path, DOOR, failing())
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_write_needs_its_folder(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"Folder .*missing does not exist: cannot write a\.h5 there"):
+        write_dataset(tmp_path / "missing" / "a.h5", DOOR, [made_up()])
+
+
+def refuse(path: Path, message: str) -> None:
+    with pytest.raises(BadInput, match=message) as error, open_dataset(path) as data:
+        list(data)
+    assert "\n" not in str(error.value)
+    assert path.name in str(error.value)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    refuse(tmp_path / "no.h5", "does not exist")
+
+
+def test_folder(tmp_path: Path) -> None:
+    refuse(tmp_path, "is not a file")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_forbidden_file(path: Path) -> None:
+    path.chmod(0)
+    refuse(path, "No permission")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x89HDF\r\n\x1a", bytes(5000)])
+def test_not_hdf5(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.h5"
+    path.write_bytes(content)
+    refuse(path, "is not an HDF5 file")
+
+
+@pytest.mark.parametrize("share", [0.01, 0.2, 0.5, 0.9, 0.999])
+def test_cut_short(path: Path, share: float) -> None:
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    refuse(path, "damaged or cut short|is not an HDF5 file")
+
+
+def test_any_flipped_byte_is_noticed_or_harmless(path: Path) -> None:
+    """Whatever a damaged byte does, it never gives wrong numbers, nor anything but BadInput."""
+    whole = path.read_bytes()
+    good = [made_up(0).digest(), made_up(1, "val").digest()]
+    rng = np.random.default_rng(0)
+    noticed = 0
+    for at in rng.integers(0, len(whole), 100):
+        damaged = bytearray(whole)
+        damaged[at] ^= 0xFF
+        path.write_bytes(damaged)
+        try:
+            with open_dataset(path) as data:
+                assert [e.digest() for e in data] == good
+        except BadInput:
+            noticed += 1
+    assert noticed > 50
+
+
+Edit = Callable[[h5py.File], None]
+
+
+def without(name: str) -> Edit:
+    return lambda file: file.__delitem__(name)
+
+
+def replaced(name: str, array: np.ndarray) -> Edit:
+    def edit(file: h5py.File) -> None:
+        del file[name]
+        file[name] = array
+
+    return edit
+
+
+def attribute(name: str, key: str, value: object) -> Edit:
+    return lambda file: file[name].attrs.__setitem__(key, value)
+
+
+def no_attribute(name: str, key: str) -> Edit:
+    return lambda file: file[name].attrs.__delitem__(key)
+
+
+def changed_pixel(file: h5py.File) -> None:
+    image = file["trajectory1/observations/image"][()]
+    image[3, 4, 5] += 1
+    file["trajectory1/observations/image"][...] = image
+
+
+def with_nan(shape: tuple[int, ...]) -> np.ndarray:
+    array = np.zeros(shape, np.float32)
+    array[3] = np.nan
+    return array
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (no_attribute("/", "format"), r"not a set of episodes: its attribute 'format' is None, expected 'beliefscope-"),
+        (attribute("/", "format", 3), "not a set of episodes"),
+        (attribute("/", "version", 9), "version 9 of the layout; this release reads version 1"),
+        (attribute("/", "task", "drawer"), r"of task 'drawer'\. Available: door"),
+        (lambda f: [f.__delitem__(k) for k in list(f)], "holds no trajectory"),
+        (without("trajectory0"), r"has 1 trajectories, but no group 'trajectory0'"),
+        (replaced("trajectory1", np.zeros(3)), "no group 'trajectory1'"),
+        (without("trajectory1/states"), r"trajectory1 has no 'states'\. It has: contact, controls"),
+        (without("trajectory1/observations/force"), "trajectory1 has no 'observations/force'"),
+        (without("trajectory1/observations"), "trajectory1 has no 'observations/image'"),
+        (no_attribute("trajectory0", "digest"), "trajectory0 has no attribute 'digest'"),
+        (no_attribute("trajectory0", "split"), "trajectory0 has no attribute 'split'"),
+        (attribute("trajectory0", "split", "exam"), r"'split' of trajectory0 is 'exam'\. Available: train, val, test"),
+        (attribute("trajectory0", "seed", "x"), "'seed' of trajectory0 is 'x', expected int"),
+        (attribute("trajectory0", "dt", 0.05), r"'dt' of trajectory0 is 0\.05 s; task 'door' has steps of 0\.1 s"),
+        (attribute("trajectory0", "provenance", "{"), "'provenance' of trajectory0 is not a JSON object"),
+        (attribute("trajectory0", "provenance", "[]"), "'provenance' of trajectory0 is not a JSON object"),
+        (replaced("trajectory0/states", np.zeros((0, 3), np.float32)), "expected at least one step"),
+        (replaced("trajectory0/states", np.float32(1)), "expected at least one step"),
+        (
+            replaced("trajectory0/states", np.zeros((STEPS, 4), np.float32)),
+            rf"'states' of trajectory0 has shape \({STEPS}, 4\), expected \({STEPS}, 3\)",
+        ),
+        (
+            replaced("trajectory0/observations/image", np.zeros((STEPS, 64, 64), np.uint8)),
+            rf"'observations/image' of trajectory0 has shape \({STEPS}, 64, 64\), expected \({STEPS}, 32, 32\)",
+        ),
+        (
+            replaced("trajectory0/observations/force", np.zeros((STEPS - 1, 3), np.float32)),
+            rf"'observations/force' of trajectory0 has shape \({STEPS - 1}, 3\)",
+        ),
+        (replaced("trajectory0/qpos", np.zeros(STEPS, np.float32)), rf"'qpos' .* expected \({STEPS}, any\)"),
+        (
+            replaced("trajectory0/controls", np.zeros((STEPS, 7))),
+            "'controls' of trajectory0 is float64, expected float32",
+        ),
+        (
+            replaced("trajectory0/observations/torque", with_nan((STEPS, 3))),
+            r"'observations/torque' of trajectory0 is \[nan nan nan\] at step 3, expected finite numbers",
+        ),
+        (changed_pixel, "the arrays of trajectory1 do not match its digest"),
+        (attribute("trajectory1", "split", "test"), "the arrays of trajectory1 do not match its digest"),
+    ],
+)
+def test_what_is_wrong_is_named(path: Path, edit: Edit, message: str) -> None:
+    with h5py.File(path, "r+") as file:
+        edit(file)
+    refuse(path, message)
+
+
+def test_a_foreign_file_is_told_what_it_lacks(tmp_path: Path) -> None:
+    path = tmp_path / "theirs.h5"
+    with h5py.File(path, "w") as file:
+        file["trajectory0/object-state"] = np.zeros((5, 5), np.float32)
+    refuse(path, "is an HDF5 file, but not a set of episodes")
+
+
+@pytest.mark.parametrize("index", [-1, 2])
+def test_no_such_episode(path: Path, index: int) -> None:
+    with open_dataset(path) as data, pytest.raises(BadInput, match=f"Episode {index} is not in .* 0 to 1"):
+        data[index]
+
+
+def test_no_such_task() -> None:
+    with pytest.raises(BadInput, match=r"task 'drawer' does not exist\. Available: door"):
+        sample_path("drawer")
+
+
+def test_closed_after_use(path: Path) -> None:
+    with open_dataset(path) as data:
+        episode = data[0]
+    assert len(episode) == STEPS
+    with h5py.File(path, "r+"):
+        pass  # would be refused while it is still open for reading

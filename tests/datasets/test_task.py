@@ -1,0 +1,25 @@
+"""The tasks themselves."""
+
+from __future__ import annotations
+
+import pytest
+
+from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.errors import BadInput
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))
+def test_a_task_is_of_one_piece(task) -> None:  # type: ignore[no-untyped-def]
+    keys = [key for keys in task.modalities.values() for key in keys]
+    assert sorted(keys) == sorted(task.observations), "every observation belongs to one modality"
+    x, y = task.map_indices
+    assert x != y
+    assert {task.components[i].unit for i in (x, y)} == {"m"}
+    assert find_task(task.name) is task
+
+
+def test_unknown_names_are_answered_with_the_known() -> None:
+    with pytest.raises(BadInput, match=r"task 'dor' does not exist\. Available: door"):
+        find_task("dor")
+    with pytest.raises(BadInput, match=r"component of task 'door' 'hinge_z' .*Available: hinge_x, hinge_y, angle"):
+        find_task("door").index("hinge_z")
