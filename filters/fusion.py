@@ -46,7 +46,7 @@ def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule =
 
 
 def mixture(log_likelihood: Tensor, log_weights: Tensor | None) -> Tensor:
-    """``log sum_k b_k p_k``: log-likelihoods (..., K, M) and log beta (..., K, 1) to (..., M); eq. 14, 15 of the paper."""
+    """``log sum_k b_k p_k`` (eq. 14, 15): log-likelihoods (..., K, M) and log beta (..., K, 1) to (..., M)."""
     if log_weights is None:
         return torch.logsumexp(log_likelihood, dim=-2)
     return torch.logsumexp(log_likelihood + log_weights, dim=-2)

@@ -78,7 +78,7 @@ class ResidualConvolution(nn.Module):
 class ImageEncoder(nn.Module):
     """Pictures (B, H, W), standardised, to features (B, units); the convolutions' output is flattened.
 
-    The first layer has stride 2: a fifth of the time of full resolution at like accuracy (docs/filters.md).
+    The first layer has stride 2: a fifth of the time of full resolution at like accuracy (see docs/filters.md).
     """
 
     def __init__(self, shape: tuple[int, int], units: int, stride: int = 2) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from beliefscope.filters.catalog import build
 from beliefscope.filters.ekf import ExtendedKalmanFilter, VirtualSensor
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Architecture, Filter
-from beliefscope.filters.pf import MeasurementModel, ParticleFilter
+from beliefscope.filters.pf import MeasurementModel
 from beliefscope.filters.rollout import START_VARIANCE, rollout, start_at_truth
 
 Report = Callable[[str, int, int, float], None]
@@ -44,7 +44,8 @@ class Plan:
     """
 
     dynamics: int = 100
-    measurement: int = 400
+    measurement: int = 300
+    likelihood: int = 1500
     alone: int = 60
     weights: int = 60
     together: tuple[int, ...] = (80, 80, 120)
@@ -58,8 +59,16 @@ class Plan:
 
 PLANS = {
     "cpu": Plan(),
-    "full": Plan(dynamics=2000, measurement=8000, alone=1500, weights=1500, together=(1500, 1500, 4000), batch=64),
-    "smoke": Plan(dynamics=2, measurement=2, alone=1, weights=1, together=(1,), lengths=(4,), batch=4),
+    "full": Plan(
+        dynamics=2000,
+        measurement=8000,
+        likelihood=20_000,
+        alone=1500,
+        weights=1500,
+        together=(1500, 1500, 4000),
+        batch=64,
+    ),
+    "smoke": Plan(dynamics=2, measurement=2, likelihood=2, alone=1, weights=1, together=(1,), lengths=(4,), batch=4),
 }
 
 
@@ -82,7 +91,7 @@ def train(
     report: Report | None = None,
     device: str | None = None,
 ) -> Trained:
-    """Trains a filter on the ``train`` episodes, keeps what is best on ``val``, and measures on ``test``.
+    """Trains a filter on the ``train`` episodes and measures it on ``test`` ones (``val`` where there are none).
 
     CUDA is used where there is one. The same seed on the same machine gives the same weights.
 
@@ -97,7 +106,7 @@ def train(
     filter_ = build(architecture, seed).to(device)
     steps = Steps.of(filter_.task, by_split["train"], device)
     filter_.statistics.fit(steps)
-    trainer = Trainer(filter_, steps, by_split["val"], plan, torch.Generator().manual_seed(seed), report)
+    trainer = Trainer(filter_, steps, plan, torch.Generator().manual_seed(seed), report)
     trainer.run()
     filter_.eval().requires_grad_(False)
     seconds = time.monotonic() - began
@@ -140,14 +149,12 @@ class Trainer:
         self,
         filter_: Filter,
         steps: Steps,
-        validation: Sequence[Episode],
         plan: Plan,
         generator: torch.Generator,
         report: Report | None,
     ) -> None:
         self.filter = filter_
         self.steps = steps
-        self.validation = validation
         self.plan = plan
         self.generator = generator
         self.report = report
@@ -163,9 +170,9 @@ class Trainer:
         if crossmodal:
             everything_else = [p for n, p in self.filter.named_parameters() if not n.startswith("weight_model.")]
             for k, name in enumerate(self.filter.names):
-                self.end_to_end(f"{name} alone", everything_else, self.plan.alone, self.plan.lengths[0], only=k)
+                self.end_to_end(f"{name} alone", everything_else, self.plan.alone, self.plan.lengths[-1], only=k)
             weights = self.filter.get_submodule("weight_model").parameters()
-            self.end_to_end("weights", list(weights), self.plan.weights, self.plan.lengths[0])
+            self.end_to_end("weights", list(weights), self.plan.weights, self.plan.lengths[-1])
         parameters = list(self.filter.parameters())
         for length, count in zip(self.plan.lengths, self.plan.together, strict=True):
             self.end_to_end(f"together, {length} steps", parameters, count, length)
@@ -202,45 +209,77 @@ class Trainer:
             )
 
     def pretrain_measurement(self, name: str) -> None:
-        """EKF: squared error of the virtual sensor's state. PF: see ``likelihood_target``."""
-        filter_ = self.filter
+        """Regression of the state: by the virtual sensor, or by a linear readout of a likelihood's encoders.
+
+        The readout is thrown away. Encoders learn far faster from the state itself than from likelihoods, whose
+        remaining layers then learn on stored features (``pretrain_likelihood``).
+        """
+        filter_, module = self.filter, self.measurement_module(name)
+        if isinstance(module, VirtualSensor):
+            sensor = module
+            parameters = list(sensor.parameters())
+
+            def regress(observations: Mapping[str, Tensor]) -> Tensor:
+                return sensor(observations)[0]
+        else:
+            encoders = module.encoders
+            readout = nn.Linear(encoders.size, filter_.n)
+            nn.init.normal_(readout.weight, std=encoders.size**-0.5, generator=self.generator)
+            nn.init.zeros_(readout.bias)
+            readout.to(self.device)
+            parameters = [*encoders.parameters(), *readout.parameters()]
+
+            def regress(observations: Mapping[str, Tensor]) -> Tensor:
+                return readout(encoders(observations))
 
         def loss() -> Tensor:
-            batch = self.sample(1, 4 * self.plan.batch)
-            observations = filter_.observations(batch)
+            batch = self.steps.sample(4 * self.plan.batch, 1, self.generator)
             truth = filter_.statistics.standardise("state", batch.states)
-            # A black picture says nothing: no target fits it. The noise that says so is learned end to end.
-            seen = torch.ones_like(truth[..., 0])
-            for modality in name.split("+"):
-                if batch.observations[modality].dtype == torch.uint8:
-                    seen = seen * batch.observations[modality].flatten(2).any(-1)
-            if isinstance(filter_, ExtendedKalmanFilter):
-                sensor = filter_.virtual_sensors[name]
-                assert isinstance(sensor, VirtualSensor)
-                z, _ = sensor(observations)
-                return ((z - truth).square().mean(-1) * seen).mean()
-            assert isinstance(filter_, ParticleFilter)
-            states, target = self.likelihood_target(truth)
-            model = filter_.measurement_model(name)
-            part = model.observation_part(observations).unsqueeze(2)
-            value = model.log_likelihood(part, model.state_part(states))
-            return (nn.functional.smooth_l1_loss(value, target, reduction="none").mean(-1) * seen).mean()
+            return (regress(filter_.observations(batch)) - truth).square().mean()
 
-        module = self.measurement_module(name)
-        self.optimise(f"{name} model", list(module.parameters()), self.plan.measurement, self.plan.rate, loss)
+        self.optimise(f"{name} model", parameters, self.plan.measurement, self.plan.rate, loss)
+        if isinstance(module, MeasurementModel):
+            self.pretrain_likelihood(name, module)
+
+    def pretrain_likelihood(self, name: str, model: MeasurementModel) -> None:
+        """Regression of the Gaussian log density around the truth, on features of all pictures stored once."""
+        bright, dark = self.features(model, 0.0), self.features(model, 1.0)
+        truth = self.filter.statistics.standardise("state", self.steps.states)
+        parameters = [p for n, p in model.named_parameters() if not n.startswith("encoders.")]
+
+        def loss() -> Tensor:
+            index = torch.randint(len(truth), (8 * self.plan.batch,), generator=self.generator).to(self.device)
+            is_dark = torch.rand(len(index), 1, generator=self.generator).to(self.device) < sum(BLACKOUTS) / len(
+                BLACKOUTS
+            )
+            features = torch.where(is_dark, dark[index], bright[index])
+            states, target = self.likelihood_target(truth[index])
+            part = model.join_observation(features).unsqueeze(1)
+            return nn.functional.smooth_l1_loss(model.log_likelihood(part, model.state_part(states)), target)
+
+        self.optimise(f"{name} likelihood", parameters, self.plan.likelihood, 2 * self.plan.rate, loss)
+
+    @torch.no_grad()
+    def features(self, model: MeasurementModel, blackout: float) -> Tensor:
+        """(S, d) encoded observations of all training steps."""
+        parts = []
+        for starts in torch.arange(len(self.steps.states), device=self.device).split(1024):
+            batch = black_out(self.steps.windows(starts, 1), torch.tensor(blackout), self.generator)
+            parts.append(model.encoders(self.filter.observations(batch))[0])
+        return torch.cat(parts)
 
     def likelihood_target(self, truth: Tensor) -> tuple[Tensor, Tensor]:
-        """States (T, N, 20, n) around the truth (T, N, n) and their Gaussian log density with covariance 0.1 I.
+        """States (B, 20, n) around the truth (B, n) and their Gaussian log density with covariance 0.1 I.
 
         Half of the states come from that Gaussian, as in the paper's training; half from a unit one, so that the
-        likelihood is also right far from the truth, where maps show it. The constant is left out; values end at -20.
+        likelihood is also right far from the truth, where maps show it. The constant is left out; values end at -10.
         """
         scale = torch.ones(20, 1, device=truth.device)
         scale[:10] = START_VARIANCE**0.5
-        unit = torch.randn((*truth.shape[:2], 20, truth.shape[-1]), generator=self.noise, device=truth.device)
+        unit = torch.randn((len(truth), 20, truth.shape[-1]), generator=self.noise, device=truth.device)
         offset = unit * scale
         target = -0.5 * offset.square().sum(-1) / START_VARIANCE
-        return truth.unsqueeze(2) + offset, target.clamp_min(-20.0)
+        return truth.unsqueeze(1) + offset, target.clamp_min(-10.0)
 
     def measurement_module(self, name: str) -> VirtualSensor | MeasurementModel:
         bank = "virtual_sensors" if isinstance(self.filter, ExtendedKalmanFilter) else "measurement_models"
@@ -259,11 +298,17 @@ class Trainer:
             if only is not None:
                 evidence = evidence.only(only)
             start = self.perturbed(start_at_truth(self.filter, batch))
-            estimate = rollout(self.filter, evidence, start, self.noise, self.plan.particles).estimate
+            run = rollout(self.filter, evidence, start, self.noise, self.plan.particles, keep=True)
             truth = self.filter.statistics.standardise("state", batch.states)
-            error = estimate.mean - truth
-            squared = error.square().sum(-1).mean()
-            return squared + self.plan.likelihood_weight * negative_log_likelihood(error, estimate.covariance)
+            error = run.estimate.mean - truth
+            likelihood = negative_log_likelihood(error, run.estimate.covariance)
+            # Unimodal EKFs that beta ignores would otherwise never learn how wrong they are.
+            banks = [step.modality for step in run.steps if step.modality is not None]
+            if banks:
+                means = torch.stack([bank.mean for bank in banks])
+                covariances = torch.stack([bank.covariance for bank in banks])
+                likelihood = likelihood + negative_log_likelihood(means - truth.unsqueeze(2), covariances)
+            return error.square().sum(-1).mean() + self.plan.likelihood_weight * likelihood
 
         self.optimise(stage, parameters, count, self.plan.fine_rate, loss)
 

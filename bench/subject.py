@@ -1,0 +1,50 @@
+"""What is timed: the shipped filters on one simulated door episode of 800 steps."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import cache
+from statistics import median
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.episode import Episode
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.inspect.trace import Trace, trace
+
+STEPS = 800
+NAMES = ("crossmodal-ekf", "crossmodal-pf")
+
+Row = tuple[str, str, str]
+"""What, its figure, its bar."""
+
+
+@cache
+def episode() -> Episode:
+    """The episode of seed 1, index 1: a push, which makes and breaks contact."""
+    simulate = find_task("door").simulate
+    assert simulate is not None
+    return simulate(1, 1, STEPS)
+
+
+@cache
+def checkpoint(name: str) -> Checkpoint:
+    return load_checkpoint(shipped("door", name))
+
+
+@cache
+def traced(name: str) -> Trace:
+    return trace(checkpoint(name), episode())
+
+
+def seconds(function: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    function()
+    return time.perf_counter() - began
+
+
+def in_turn(first: Callable[[], object], second: Callable[[], object], turns: int) -> tuple[float, float, float]:
+    """Median seconds of both, run in turn after one warm-up each, and the median of second / first pair by pair."""
+    first(), second()
+    pairs = [(seconds(first), seconds(second)) for _ in range(turns)]
+    return median(a for a, _ in pairs), median(b for _, b in pairs), median(b / a for a, b in pairs)

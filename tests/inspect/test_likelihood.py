@@ -1,0 +1,124 @@
+"""Likelihood maps against the naive way, cell by cell, and their geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.batch import Steps
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.pf import ParticleFilter
+from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
+from beliefscope.inspect.trace import trace
+
+
+def engine(name: str) -> MapEngine:
+    with open_dataset(sample_path("door")) as dataset:
+        episode = dataset[next(s.index for s in dataset.summaries if s.split == "test")]
+    checkpoint = load_checkpoint(shipped("door", name))
+    return MapEngine(checkpoint, trace(checkpoint, episode, particles=50))
+
+
+@pytest.fixture(scope="module")
+def pf() -> MapEngine:
+    return engine("crossmodal-pf")
+
+
+@pytest.fixture(scope="module")
+def ekf() -> MapEngine:
+    return engine("crossmodal-ekf")
+
+
+def states_of(map_: LikelihoodMap) -> np.ndarray:
+    """(S, S, 3) world states of the cells, from the map's own axes."""
+    x, y = np.meshgrid(map_.centre[0] + map_.offsets_x, map_.centre[1] + map_.offsets_y)
+    return np.stack([x, y, np.full_like(x, map_.angle)], axis=-1)
+
+
+@torch.no_grad()
+def test_particle_filter_maps_equal_the_naive_way(pf: MapEngine) -> None:
+    """Whole networks on whole inputs, one observation repeated for every cell."""
+    step, size = 40, 21
+    map_ = pf.map(step, size=size)
+    filter_ = pf.checkpoint.filter
+    assert isinstance(filter_, ParticleFilter)
+    batch = Steps.of(filter_.task, [pf.trace.episode]).episode(0)
+    observed = {
+        m: v[step : step + 1].expand(1, size * size, *v.shape[2:]) for m, v in filter_.observations(batch).items()
+    }
+    cells = torch.from_numpy(states_of(map_).reshape(1, -1, 3).astype(np.float32))
+    standard = filter_.statistics.standardise("state", cells)
+    each = []
+    for name in filter_.names:
+        model = filter_.measurement_model(name)
+        hidden = model.join_observation(model.encoders(observed)) + model.join_state(model.state_encoder(standard))
+        each.append(model.head(hidden).reshape(size, size).numpy())
+    # Float32 through some ten layers: values of order 10 agree to about 1e-5; the grid itself is rounded to 1e-7 m.
+    np.testing.assert_allclose(map_.log_likelihood[0], each[0], atol=2e-4)
+    np.testing.assert_allclose(map_.log_likelihood[1], each[1], atol=2e-4)
+    weights = pf.trace.weights
+    assert weights is not None
+    fused = np.log(weights[step, 0] * np.exp(each[0]) + weights[step, 1] * np.exp(each[1]))
+    np.testing.assert_allclose(map_.log_likelihood[2], fused, atol=2e-4)
+
+
+def test_ekf_maps_are_its_gaussians(ekf: MapEngine) -> None:
+    scipy_stats = pytest.importorskip("scipy.stats", reason="the independent density needs scipy")
+    map_ = ekf.map(50, angle=0.5, size=31)
+    cells = states_of(map_)
+    trace_ = ekf.trace
+    means = [*trace_.modality_mean[50], trace_.estimate_mean[50]]
+    covariances = [*trace_.modality_covariance[50], trace_.estimate_covariance[50]]
+    for layer, mean, covariance in zip(map_.log_likelihood, means, covariances, strict=True):
+        expected = scipy_stats.multivariate_normal(mean, covariance.astype(np.float64)).logpdf(cells)
+        np.testing.assert_allclose(layer, expected, rtol=1e-4, atol=1e-3)
+
+
+def test_axes_are_cell_centres_around_the_truth(pf: MapEngine) -> None:
+    map_ = pf.map(3)
+    assert map_.layers == ("image", "haptics", "fused")
+    assert map_.log_likelihood.shape == (3, 135, 135)
+    np.testing.assert_allclose(np.diff(map_.offsets_x), 0.002, atol=1e-7)
+    assert map_.offsets_x[0] == pytest.approx(-0.134)
+    assert map_.offsets_y[67] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_array_equal(map_.centre, pf.trace.episode.states[3, :2])
+    assert map_.angle == pf.trace.episode.states[3, 2]
+
+
+def test_another_angle_is_another_slice(pf: MapEngine) -> None:
+    same = pf.map(60, angle=float(pf.trace.episode.states[60, 2]), size=41)
+    other = pf.map(60, angle=float(pf.trace.episode.states[60, 2]) + 0.5, size=41)
+    np.testing.assert_array_equal(same.log_likelihood, pf.map(60, size=41).log_likelihood)
+    assert np.abs(other.log_likelihood - same.log_likelihood).max() > 0.1
+
+
+def test_normalised_peaks_at_255_where_peaks_says(pf: MapEngine) -> None:
+    map_ = pf.map(60, size=41)
+    shown = map_.normalised()
+    assert shown.dtype == np.uint8
+    for layer, (x, y) in zip(shown, map_.peaks(), strict=True):
+        iy, ix = np.unravel_index(layer.argmax(), layer.shape)
+        assert layer.max() == 255
+        assert (map_.offsets_x[ix], map_.offsets_y[iy]) == (x, y)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"step": -1}, "step -1 is not in this episode"),
+        ({"step": 10**6}, "it has steps 0 to"),
+        ({"step": 0, "size": 1}, "2 to 1024 cells along a side, not 1"),
+        ({"step": 0, "angle": float("nan")}, "finite number of rad, not nan"),
+    ],
+)
+def test_bad_input(pf: MapEngine, arguments: dict, message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        pf.map(**arguments)
+
+
+def test_a_trace_of_another_checkpoint_is_refused(pf: MapEngine, ekf: MapEngine) -> None:
+    with pytest.raises(BadInput, match="made by checkpoint"):
+        MapEngine(pf.checkpoint, ekf.trace)

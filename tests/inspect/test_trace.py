@@ -1,0 +1,117 @@
+"""Traces of the shipped filters on the sample set: nothing changed by looking, nothing lost on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.batch import Steps
+from beliefscope.filters.catalog import FILTERS
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.evaluate import run
+from beliefscope.inspect.trace import ARRAYS, Trace, load_trace, save_trace, trace
+
+
+@pytest.fixture(scope="module")
+def episode() -> Episode:
+    with open_dataset(sample_path("door")) as dataset:
+        index = next(s.index for s in dataset.summaries if s.split == "test")
+        return dataset[index]
+
+
+@pytest.fixture(scope="module", params=FILTERS)
+def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
+    return load_checkpoint(shipped("door", request.param))
+
+
+@pytest.fixture(scope="module")
+def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
+    return trace(checkpoint, episode, seed=7, particles=100)
+
+
+def test_tracing_changes_no_bit_of_the_estimates(checkpoint: Checkpoint, episode: Episode, traced: Trace) -> None:
+    filter_ = checkpoint.filter
+    batch = Steps.of(filter_.task, [episode]).episode(0)
+    error, covariance = run(filter_, batch, blackout=0.0, only=None, particles=100, seed=7)
+    si = torch.from_numpy(traced.estimate_mean)
+    assert torch.equal(si - batch.states[:, 0], error[:, 0])
+    assert torch.equal(torch.from_numpy(traced.estimate_covariance), covariance[:, 0])
+
+
+def test_saved_and_loaded_without_loss(traced: Trace, tmp_path: Path) -> None:
+    path = tmp_path / "run.trace"
+    save_trace(traced, path)
+    again = load_trace(path)
+    for name in ARRAYS:
+        before, after = getattr(traced, name), getattr(again, name)
+        assert (before is None) == (after is None), name
+        if before is not None:
+            assert before.dtype == after.dtype
+            np.testing.assert_array_equal(before, after, err_msg=name)
+    assert again.episode.digest() == traced.episode.digest() == traced.data_hash
+    for name in ("modalities", "kind", "filter", "checkpoint_hash", "episode_index", "seed", "settings"):
+        assert getattr(again, name) == getattr(traced, name), name
+
+
+def test_shares_sum_to_one_and_covariances_are_definite(traced: Trace) -> None:
+    assert traced.weights is not None
+    assert traced.acting is not None
+    np.testing.assert_allclose(traced.weights.sum(1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(traced.acting.sum(1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(traced.estimate_covariance, traced.estimate_covariance.swapaxes(1, 2), atol=1e-12)
+    # Scaled to unit diagonal, so that m and rad compare; a particle set may hold a flat direction, to rounding.
+    scale = np.sqrt(np.diagonal(traced.estimate_covariance, axis1=1, axis2=2)) + 1e-9
+    correlation = traced.estimate_covariance / scale[:, :, None] / scale[:, None]
+    assert np.linalg.eigvalsh(correlation).min() > -1e-5
+
+
+def test_particle_weights_explain_the_estimate_and_the_ancestors(traced: Trace) -> None:
+    if traced.kind != "pf":
+        pytest.skip("an EKF has no particles")
+    assert traced.particles is not None
+    assert traced.log_weights is not None
+    assert traced.ancestors is not None
+    weights = np.exp(traced.log_weights.astype(np.float64))
+    np.testing.assert_allclose(weights.sum(1), 1.0, atol=1e-5)
+    mean = np.einsum("tm,tmn->tn", weights, traced.particles)
+    np.testing.assert_allclose(mean, traced.estimate_mean, atol=1e-5)
+    # Captured before resampling: weights differ. Systematic resampling keeps counts within one of the share.
+    assert (weights.std(1) > 1e-6).mean() > 0.9
+    counts = np.stack([np.bincount(row, minlength=100) for row in traced.ancestors])
+    assert np.abs(counts - 100 * weights).max() < 1.001
+
+
+def test_blackout_is_kept_as_the_filter_saw_it(checkpoint: Checkpoint, episode: Episode) -> None:
+    dark = trace(checkpoint, episode, particles=20, blackout=1.0)
+    assert not dark.episode.observations["image"].any()
+    assert episode.observations["image"].any()
+    assert dark.data_hash == episode.digest()
+
+
+def test_a_running_filter_needs_sense(checkpoint: Checkpoint, episode: Episode) -> None:
+    with pytest.raises(BadInput, match="particles must be at least 1, not 0"):
+        trace(checkpoint, episode, particles=0)
+    with pytest.raises(BadInput, match=r"blackout must be a chance between 0 and 1, not 1\.5"):
+        trace(checkpoint, episode, blackout=1.5)
+
+
+def test_bad_trace_files(traced: Trace, tmp_path: Path) -> None:
+    whole = tmp_path / "whole.trace"
+    save_trace(traced, whole)
+    with pytest.raises(BadInput, match="does not exist"):
+        load_trace(tmp_path / "none.trace")
+    cut = tmp_path / "cut.trace"
+    cut.write_bytes(whole.read_bytes()[:-1000])
+    with pytest.raises(BadInput, match="not a readable trace"):
+        load_trace(cut)
+    with pytest.raises(BadInput, match="not a trace of Beliefscope"):
+        load_trace(shipped("door", "crossmodal-pf"))
+    with pytest.raises(BadInput, match=r"folder .* does not exist"):
+        save_trace(traced, tmp_path / "no" / "folder.trace")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.trace", "whole.trace"]
