@@ -5,22 +5,27 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.drawing import SHOWN_SCALE, SHOWN_UNIT, SIGMAS, angles, plane_height
 from beliefscope.recordings.schema import STEP
 
 TRAIL_STEPS = 100
-VIEWING_DISTANCE = 1.0
+VIEWING_DISTANCE = 1.2
 """m from the scene's middle: an arm's reach is in view."""
+# Dark whatever the viewer's theme, so that a map's empty cells look empty.
+BACKGROUND = rrb.Background(kind="SolidColor", color=[16, 17, 24])
 LINKED = rrb.TimeAxis(link="LinkToGlobal")
 
 
-def blueprint(trace: Trace, task: Task, layers: tuple[str, ...] = ()) -> rrb.Blueprint:
-    """The layout for a trace whose recording has maps of these layers (none: the maps' views are left out)."""
+def blueprint(trace: Trace, task: Task, first: LikelihoodMap | None = None) -> rrb.Blueprint:
+    """The layout for a trace. ``first`` is the first of its maps; where there is none, they have no views."""
     sensed = [_picture(key) for key, shape in task.observations.items() if len(shape) == 2]
-    sensed += [_map(layer) for layer in layers]
+    if first is not None:
+        sensed += [_map(layer, len(first.offsets_x)) for layer in first.layers]
     scene = rrb.Vertical(
         _scene(trace, task),
         rrb.Horizontal(*sensed) if sensed else rrb.TextDocumentView(origin="about"),
@@ -38,38 +43,48 @@ def blueprint(trace: Trace, task: Task, layers: tuple[str, ...] = ()) -> rrb.Blu
 
 
 def _scene(trace: Trace, task: Task) -> rrb.Container:
+    """The whole scene from behind the robot, and the belief from straight above, as the maps show it."""
     x, y = task.map_indices
-    height = plane_height(trace, task)
-    middle = np.array([*trace.episode.states[:, [x, y]].mean(axis=0), height])
+    anchor = np.array([*trace.episode.states[:, [x, y]].mean(axis=0), plane_height(trace, task)])
     effector = trace.episode.observations.get("effector_position")
-    if effector is not None:
-        middle = 0.5 * (middle + effector.mean(axis=0))
-    # From behind the robot and above, so that the map's axes run as on paper: x away, y to the left.
-    eye = middle + VIEWING_DISTANCE * np.array([-0.62, -0.12, 0.78])
+    middle = anchor if effector is None else 0.5 * (anchor + effector.mean(axis=0))
     trail = rr.VisibleTimeRange(
         STEP,
         start=rrb.TimeRangeBoundary.cursor_relative(seq=-TRAIL_STEPS),
         end=rrb.TimeRangeBoundary.cursor_relative(seq=0),
     )
-    name = f"{task.map_components[0]}, {task.map_components[1]}: truth, belief, end effector"
-    world = rrb.Spatial3DView(
+    scene = rrb.Spatial3DView(
         origin="world",
-        name=name,
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=[0, 0, 1], kind="Orbital"),
-        # Dark whatever the viewer's theme, so that a map's empty cells look empty.
-        background=rrb.Background(kind="SolidColor", color=[16, 17, 24]),
-        line_grid=rrb.LineGrid3D(visible=True, spacing=0.05, plane=rr.components.Plane3D.XY),
+        name="Scene",
+        eye_controls=_eye(middle, middle + VIEWING_DISTANCE * np.array([-0.62, -0.12, 0.78]), (0, 0, 1)),
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=True, spacing=0.1, plane=rr.components.Plane3D.XY),
         overrides={"world/effector": rrb.VisibleTimeRanges(trail)},
     )
-    return rrb.Tabs(world, rrb.TextDocumentView(origin="about", name="About"), active_tab=0)
+    above = rrb.Spatial3DView(
+        origin="world",
+        contents="world/plane/**",
+        name=f"Belief: {task.map_components[0]}, {task.map_components[1]}",
+        eye_controls=_eye(anchor, anchor + np.array([0.0, 0.0, 3.4 * task.map_half_width]), (0, 1, 0)),
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+    about = rrb.TextDocumentView(origin="about", name="About")
+    return rrb.Horizontal(rrb.Tabs(scene, about, active_tab=0), above, column_shares=[5, 4])
+
+
+def _eye(target: NDArray[np.float64], position: NDArray[np.float64], up: tuple[int, int, int]) -> rrb.EyeControls3D:
+    return rrb.EyeControls3D(position=position, look_target=target, eye_up=up, kind="Orbital")
 
 
 def _picture(key: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=f"observations/{key}", name="Camera")
 
 
-def _map(layer: str) -> rrb.Spatial2DView:
-    return rrb.Spatial2DView(origin=f"maps/{layer}", name=layer)
+def _map(layer: str, side: int) -> rrb.Spatial2DView:
+    # Without bounds the view would shrink the map to make room for an estimate that lies outside it.
+    bounds = rrb.VisualBounds2D(x_range=[0, side], y_range=[0, side])
+    return rrb.Spatial2DView(origin=f"maps/{layer}", name=layer, visual_bounds=bounds)
 
 
 def _story(trace: Trace, task: Task) -> rrb.Container:

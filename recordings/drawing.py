@@ -75,7 +75,7 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     yield "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
     yield "world/plane", rr.Transform3D(translation=[0.0, 0.0, plane_height(trace, task)])
     yield "world/effector", _marker(COLOUR_OF_ROBOT, 3.0)
-    yield "world/plane/truth", _marker(colour("truth", trace.modalities), 7.0)
+    yield "world/plane/truth", _marker(_hex("truth", trace), 4.0)
     if task.ghost is not None:
         half = np.array([task.ghost(trace.episode.states[0]).size]) / 2.0
         for name in ("truth", "fused"):
@@ -88,7 +88,7 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     )
     for source in sources(trace):
         hue, width = _hex(source, trace), 2.5 if source == "fused" else 1.2
-        yield f"world/plane/{source}/mean", _marker(hue, 6.0 if source == "fused" else 4.5)
+        yield f"world/plane/{source}/mean", _marker(hue, 3.5 if source == "fused" else 2.5)
         yield (
             f"world/plane/{source}/ellipse",
             rr.Ellipsoids3D.from_fields(
@@ -259,7 +259,8 @@ A {filter_kind} estimates {components} from {" and ".join(trace.modalities)}: {l
   {task.map_components[0]} and {task.map_components[1]}. Brighter particles weigh more. Gray: the end
   effector and where it came from.
 * **Likelihood maps**: bright where a modality finds the position likely, each against its own brightest cell; around
-  the truth, {200 * task.map_half_width:g} cm a side, {task.map_components[0]} to the right.
+  the truth, {200 * task.map_half_width:g} cm a side, {task.map_components[0]} to the right. Squares
+  frame the truth (large) and the estimate (small).
 * **Plots**: centimetres and degrees. Thin lines beside the fused estimate are 2 sigma away from it.
 
 checkpoint `{trace.checkpoint_hash}`

@@ -27,8 +27,8 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
             f"maps/{layer}",
             rr.DepthImage.from_fields(format=depth, colormap="Inferno", depth_range=[0.0, 255.0]),
         )
-        yield f"maps/{layer}/truth", _marker_2d(colour("truth", trace.modalities))
-        yield f"maps/{layer}/estimate", _marker_2d(colour(layer, trace.modalities))
+        yield f"maps/{layer}/truth", _frame(colour("truth", trace.modalities), side / 18)
+        yield f"maps/{layer}/estimate", _frame(colour(layer, trace.modalities), side / 30)
     cell = float(first.offsets_x[1] - first.offsets_x[0])
     gray = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8", color_model="L")
     yield (
@@ -48,9 +48,9 @@ def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iter
         yield f"maps/{layer}", rr.DepthImage.columns(buffer=list(pixels[:, index].reshape(len(maps), -1)))
         yield f"maps/{layer}/log_peak", series(peaks[:, index])
         mean = means[:, sources(trace).index(layer)]
-        yield f"maps/{layer}/estimate", rr.Points2D.columns(positions=_cells(maps, mean))
+        yield f"maps/{layer}/estimate", rr.Boxes2D.columns(centers=_cells(maps, mean))
         truth = trace.episode.states[steps][:, [x, y]]
-        yield f"maps/{layer}/truth", rr.Points2D.columns(positions=_cells(maps, truth))
+        yield f"maps/{layer}/truth", rr.Boxes2D.columns(centers=_cells(maps, truth))
     fused = pixels[:, maps[0].layers.index("fused")].reshape(len(maps), -1)
     first = maps[0]
     half_cell = (first.offsets_x[1] - first.offsets_x[0]) / 2.0
@@ -69,5 +69,6 @@ def _cells(maps: Sequence[LikelihoodMap], points: Array) -> Array:
     return cells.astype(np.float32)
 
 
-def _marker_2d(hue: str) -> rr.Points2D:
-    return rr.Points2D.from_fields(colors=rgba(hue), radii=rr.Radius.ui_points(3.0))
+def _frame(hue: str, half: float) -> rr.Boxes2D:
+    """A hollow square about a position: a dot would hide the peak of a sharp map."""
+    return rr.Boxes2D.from_fields(half_sizes=[[half, half]], colors=rgba(hue), radii=rr.Radius.ui_points(1.0))

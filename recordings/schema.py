@@ -112,8 +112,8 @@ SCHEMA: tuple[Entity, ...] = (
     # The maps: at the steps they were made for.
     Entity("maps/{layer}", "DepthImage", "(S, S)", "u8", "maps", "255 x likelihood / its maximum; top row: largest y"),
     Entity("maps/{layer}/log_peak", "Scalars", "()", "log", "maps", "log-likelihood of the maximum"),
-    Entity("maps/{layer}/truth", "Points2D", "(1, 2)", "cells", "maps", "true position on the map"),
-    Entity("maps/{layer}/estimate", "Points2D", "(1, 2)", "cells", "maps", "this layer's estimate on the map"),
+    Entity("maps/{layer}/truth", "Boxes2D", "(1, 2)", "cells", "maps", "true position on the map"),
+    Entity("maps/{layer}/estimate", "Boxes2D", "(1, 2)", "cells", "maps", "this layer's estimate on the map"),
     Entity("about", "TextDocument", "static", "text", "always", "what is shown, in words"),
 )
 

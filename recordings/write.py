@@ -66,7 +66,7 @@ def write_recording(
     layers = first[0].layers if first else ()
     with _complete_or_absent(Path(path)) as unfinished:
         stream = rr.RecordingStream(APPLICATION)
-        stream.save(unfinished, default_blueprint=blueprint(trace, task, layers))
+        stream.save(unfinished, default_blueprint=blueprint(trace, task, first[0] if first else None))
         _send_header(stream, trace)
         _send_static(stream, trace, task)
         stream.flush()  # so that even a file cut off later says what it is
