@@ -22,7 +22,7 @@ SHOWN_SCALE = {"m": 100.0, "rad": 180.0 / np.pi}
 CONTACT_NAMES = ("free", "contact")
 SIGMAS = 2.0
 COLOUR_OF_ROBOT = "#B0B0B0"
-MODALITY = "estimate and weight of this modality alone"
+MODALITY = "this modality alone, its weight"
 MEANINGS = {
     "truth": "what the filter should find",
     "fused": "the filter's estimate from all modalities",
@@ -263,8 +263,8 @@ A {filter_kind} estimates {components} from {" and ".join(trace.modalities)}: {l
   frame the truth (large) and the estimate (small).
 * **Plots**: centimetres and degrees. Thin lines beside the fused estimate are 2 sigma away from it.
 
-checkpoint `{trace.checkpoint_hash}`
-data `{trace.data_hash}`
-seed {trace.seed}
+* checkpoint `{trace.checkpoint_hash}`
+* data `{trace.data_hash}`
+* seed {trace.seed}
 """
     return rr.TextDocument(text, media_type="text/markdown")
