@@ -44,9 +44,10 @@ _LIMITS = (
 _EFFORT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # N m
 
 # mass (kg), centre of mass (m), inertia about it (xx, yy, zz, xy, xz, yz; kg m^2), in the link's frame:
-# Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot", RA-L 2019, as Franka publishes them.
+# Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot", RA-L 2019. Link 1 turns about the vertical: how
+# high its centre lies cannot be identified, and does not matter.
 _INERTIAS = (
-    (4.970684, (3.875e-3, 2.081e-3, -4.762e-2), (0.70337, 0.70661, 9.117e-3, -1.39e-4, 6.772e-3, 1.9169e-2)),
+    (4.970684, (3.875e-3, 2.081e-3, -1.75e-1), (0.70337, 0.70661, 9.117e-3, -1.39e-4, 6.772e-3, 1.9169e-2)),
     (0.646926, (-3.141e-3, -2.872e-2, 3.495e-3), (7.962e-3, 2.811e-2, 2.5995e-2, -3.925e-3, 1.0254e-2, 7.04e-4)),
     (
         3.228604,

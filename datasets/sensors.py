@@ -14,9 +14,8 @@ class HandSensors:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._data = data
-        self._gravity = np.array(model.opt.gravity)
         self._hand, self._wrist = model.body("hand").id, model.site("wrist").id
-        self._tool_mass = float(model.body_subtreemass[self._hand])
+        self._weight = float(model.body_subtreemass[self._hand]) * np.array(model.opt.gravity)
         starts = {name: int(model.sensor(name).adr[0]) for name in ("force", "torque", "contact")}
         self._force, self._torque = (slice(starts[name], starts[name] + 3) for name in ("force", "torque"))
         self._contact = starts["contact"]
@@ -29,11 +28,12 @@ class HandSensors:
         """
         data = self._data
         axes = data.site_xmat[self._wrist].reshape(3, 3)
-        weight = self._tool_mass * self._gravity
         lever = data.subtree_com[self._hand] - data.site_xpos[self._wrist]
-        force = -(axes @ data.sensordata[self._force] + weight)
-        torque = -(axes @ data.sensordata[self._torque] + np.cross(lever, weight))
-        return np.concatenate([force, torque])
+        tilt = np.empty(3)
+        mujoco.mju_cross(tilt, lever, self._weight)
+        force = axes @ data.sensordata[self._force] + self._weight
+        torque = axes @ data.sensordata[self._torque] + tilt
+        return -np.concatenate([force, torque])
 
     def touching(self) -> bool:
         """Whether the hand, its fingers included, touches the door."""
