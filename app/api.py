@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
-import json
 import re
 import threading
 import time
@@ -24,7 +22,6 @@ from beliefscope.app.session import Views
 from beliefscope.app.vendor import cached_file
 from beliefscope.app.wire import header
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.write import write_recording
 
 RECORDING = re.compile(r"(?P<task>.+)-(?P<filter>.+)-episode(?P<episode>\d+)-[0-9a-f]{8}")
@@ -116,8 +113,8 @@ def routes(library: Library, views: Views) -> APIRouter:
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
     @router.post("/api/views", status_code=201)
-    async def open_view(wanted: Annotated[ViewRequest, Body()] = ViewRequest()) -> dict[str, str]:
-        name = (await views.open(wanted.dark)).name
+    async def open_view(wanted: Annotated[ViewRequest | None, Body()] = None) -> dict[str, str]:
+        name = (await views.open(wanted is not None and wanted.dark)).name
         return {"view": name, "scene": f"/scene/{name}/", "socket": f"/api/views/{name}"}
 
     @router.websocket("/api/views/{name}")
@@ -172,5 +169,6 @@ def _listed(path: Path) -> dict[str, Any]:
 
 
 async def _no_view(websocket: WebSocket, name: str) -> None:
-    body = json.dumps({"error": f"View {name!r} is not open."}).encode()
-    await websocket.send_denial_response(Response(body, 404, media_type="application/json"))
+    # A browser shows its page neither status nor body of a refused handshake, but the code of a close.
+    await websocket.accept()
+    await websocket.close(4004, f"View {name!r} is not open.")

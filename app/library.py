@@ -98,7 +98,7 @@ class Traced:
 
 
 class Library:
-    """Everything a server can show. Its methods may be called from any thread and block: keep them off the event loop."""
+    """Everything a server can show. Methods may be called from any thread; they block, so not from the event loop."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings

@@ -108,7 +108,7 @@ class EmbeddedViser:
             self._put(connection, None)
             await asyncio.wait({handling}, timeout=2.0)
             self._connections.discard(connection)
-            with contextlib.suppress(RuntimeError):
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await websocket.close()
 
     async def _handle(self, connection: _Connection) -> None:

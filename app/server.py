@@ -8,7 +8,7 @@ import logging
 import signal
 import socket
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
 import uvicorn
@@ -83,6 +83,7 @@ def serve(
     with _bound(host, port) as listener:
         shown = f"[{host}]" if ":" in host else host
         url = f"http://{shown}:{listener.getsockname()[1]}/"
+        logging.getLogger("uvicorn.error").addFilter(_no_false_alarm)
         config = uvicorn.Config(
             create_app(settings),
             log_level="warning",
@@ -171,7 +172,7 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 @contextlib.contextmanager
-def _signals_end_in_peace() -> AsyncIterator[None]:
+def _signals_end_in_peace() -> Iterator[None]:
     """uvicorn raises the signal that stopped it once more when it is done; a stop that was asked for is no error."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -182,6 +183,11 @@ def _signals_end_in_peace() -> AsyncIterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _no_false_alarm(record: logging.LogRecord) -> bool:
+    """uvicorn calls a WebSocket that was refused with an answer one that was not answered."""
+    return record.getMessage() != "ASGI callable returned without completing handshake."
 
 
 def _print_url(url: str) -> None:

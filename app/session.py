@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import secrets
@@ -106,13 +107,13 @@ class View:
             raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(trace) - 1}.")
         maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)
         await websocket.send_bytes(maps_message(wanted.serial, trace, maps))
-        await asyncio.to_thread(self.scene.show, traced, wanted.step, maps)
+        await asyncio.to_thread(self.scene.show, traced, wanted.step)
         await websocket.send_json({"type": "drawn", "serial": wanted.serial, "step": wanted.step})
 
     async def _ready_before_newer(self, traced: Traced) -> bool:
         """Wait for the trace, but no longer than until a newer cursor comes. Raises what computing it raised."""
-        ready = asyncio.wrap_future(traced.done)
-        newer = asyncio.ensure_future(self._arrived.wait())
+        ready: asyncio.Future[Any] = asyncio.wrap_future(traced.done)
+        newer: asyncio.Future[Any] = asyncio.ensure_future(self._arrived.wait())
         try:
             await asyncio.wait({ready, newer}, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -133,7 +134,8 @@ class Views:
     """The open views, a bounded number of them.
 
     Args:
-        limit: most views at a time: each is a thread and some MB. patience: s a view outlives its page, to allow a reload.
+        limit: most views at a time: each is a thread and some MB.
+        patience: s that a view outlives its page, to allow for a lost connection.
     """
 
     def __init__(self, library: Library, limit: int = 16, patience: float = 30.0) -> None:
@@ -180,10 +182,8 @@ class Views:
 
 async def _quietly(sending: Any) -> None:
     """Await something sent to a socket that may have gone."""
-    try:
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         await sending
-    except (WebSocketDisconnect, RuntimeError):
-        pass
 
 
 async def _tell_error(websocket: WebSocket, serial: Any, error: str) -> None:
