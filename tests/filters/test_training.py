@@ -12,7 +12,8 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import FILTERS, architecture, build
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
-from beliefscope.filters.train import PLANS, Trainer, train
+from beliefscope.filters.train import PLANS, train
+from beliefscope.filters.trainer import Trainer
 
 SMOKE = PLANS["smoke"]
 
