@@ -3,7 +3,7 @@
 import { record } from './api.js';
 import { say } from './panel.js';
 
-const ECHO = 400; // ms in which a time that we set ourselves is told back to us
+const ECHO_FRAMES = 4; // that the viewer may take to tell back a time that we set
 
 export class Rerun {
   #host;
@@ -16,7 +16,7 @@ export class Rerun {
   #step = 0;
   #pending = null;
   #busy = false;
-  #echoes = new Map(); // step that we set -> when
+  #echo = null; // the step that we set last, until the viewer has told it back
   #open = false;
 
   /** @param {HTMLElement} host @param {(step: number) => void} moved called when the time was moved in the viewer. */
@@ -83,6 +83,8 @@ export class Rerun {
 
   #start() {
     this.#starting ??= (async () => {
+      // Its log of every shader it compiles is tens of thousands of lines and takes seconds.
+      console.debug = () => {};
       const { WebViewer } = await import('/vendor/rerun/viewer.js');
       const viewer = new WebViewer();
       viewer.on('time_update', (event) => this.#heard(event.time));
@@ -97,6 +99,7 @@ export class Rerun {
         theme: 'system',
       });
       this.#viewer = viewer;
+      document.activeElement?.blur(); // it takes the keys as it starts; they are the page's until somebody clicks in it
     })();
     this.#starting.catch(() => (this.#starting = null));
     return this.#starting;
@@ -108,23 +111,29 @@ export class Rerun {
     if (this.#busy || !this.#viewer || !this.#open || this.#host.dataset.state !== 'ready') return;
     this.#busy = true;
     while (this.#pending !== null) {
-      const next = this.#pending;
-      this.#pending = null;
-      this.#echoes.set(next, performance.now());
+      const started = performance.now();
+      [this.#echo, this.#pending] = [this.#pending, null];
       try {
-        await this.#viewer.set_time({ timeline: 'step', sequence: next, play_state: 'paused' });
+        await this.#viewer.set_time({ timeline: 'step', sequence: this.#echo, play_state: 'paused' });
+        // It tells nothing back if it was there already. Its frames are ours: how long they take does not matter.
+        for (let i = 0; i < ECHO_FRAMES && this.#echo !== null && this.#pending === null; i++) await frame();
       } catch (error) {
         console.warn('Rerun did not take the time:', error);
       }
+      this.#echo = null;
+      // It draws in our thread: as long as it took, the rest of the page has its turn.
+      await new Promise((resolve) => setTimeout(resolve, performance.now() - started));
     }
     this.#busy = false;
   }
 
   #heard(time) {
     const step = Math.round(time);
-    const now = performance.now();
-    for (const [sent, when] of this.#echoes) if (now - when > ECHO) this.#echoes.delete(sent);
-    if (this.#busy || this.#echoes.has(step) || step === this.#step || !this.#open) return;
+    const ours = this.#echo !== null || this.#pending !== null; // on its way: whatever comes is older
+    if (step === this.#echo) this.#echo = null;
+    if (ours || !this.#open || this.#host.dataset.state !== 'ready' || step === this.#step) return;
     if (step >= 0 && step < this.#trace.steps) this.#moved(step);
   }
 }
+
+const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));

@@ -1,6 +1,6 @@
 /** The angle at which the maps are cut: the true one, until somebody takes hold of the slider. */
 
-import { fixed, spoken, wrapped } from './units.js';
+import { fixed, signed, spoken, wrapped } from './units.js';
 
 const REACH = 60; // degrees to either side of the episode's true angles
 
@@ -50,8 +50,8 @@ export class Slice {
     if (document.activeElement !== this.#input || angle === null) this.#input.value = String(shown);
     const { unit } = this.#trace.shown(this.#angle);
     const off = wrapped(shown - truth);
-    this.#label.querySelector('output').textContent = `${fixed(shown, 1)}${unit}`;
-    this.#label.title = angle === null ? 'Cut at the true value' : `${fixed(off, 1)}${unit} from the true value`;
+    this.#label.querySelector('output').textContent = angle === null ? `${fixed(shown)}${unit} true` : `${fixed(shown)}${unit}`;
+    this.#label.title = angle === null ? 'The maps are cut at the true value' : `${signed(off)}${unit} from the true value`;
     this.#button.disabled = angle === null;
   }
 }

@@ -147,7 +147,6 @@ export class TimeLine {
     element.addEventListener('pointerdown', (event) => {
       if (!this.#trace || event.button !== 0) return;
       element.setPointerCapture(event.pointerId);
-      element.focus({ preventScroll: true });
       scrub(event);
     });
     element.addEventListener('pointermove', (event) => {
@@ -181,6 +180,7 @@ export class TimeLine {
     this.#pointer.hidden = this.#hover === null;
     if (this.#hover !== null) {
       place(this.#pointer, this.#x(this.#hover));
+      this.#pointer.classList.toggle('leftward', this.#x(this.#hover) > this.#host.clientWidth - 90);
       this.#pointer.firstChild.textContent = `${this.#hover} · ${fixed(this.#hover * this.#trace.dt)} s`;
     }
     this.#host.classList.toggle('hovering', this.#hover !== null);

@@ -16,8 +16,8 @@ function weights(trace, kind, component) {
     .map((name, index) => ({ name, index, values: trace.weight(kind, name, component) }))
     .filter((s) => s.values);
   if (!series.length) return null;
-  const what = trace.weightWidth > 1 ? ` for ${spoken(trace.components[component].name)}` : '';
-  const title = kind === 'raw' ? `Fusion weight β${what}` : `Acting share${what}`;
+  const what = trace.weightWidth > 1 ? `, ${spoken(trace.components[component].name)}` : '';
+  const title = kind === 'raw' ? `Weight β${what}` : `Acting share${what}`;
   const most = Math.max(1, ...series.map((s) => s.values.reduce((a, b) => Math.max(a, b), 0)));
   return { title, unit: '', series, limits: [-0.04 * most, 1.06 * most], digits: 2 };
 }
