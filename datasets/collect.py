@@ -7,8 +7,9 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from pathlib import Path
 
 import mujoco
@@ -57,9 +58,11 @@ def collect(
     done = episodes - len(missing)
     report = progress or (lambda done, count: None)
     report(done, episodes)
-    for _ in _simulated(parts, missing, workers or os.cpu_count() or 1):
-        done += 1
-        report(done, episodes)
+    # Closed at once when stopped: else the workers would finish everything before the process can end.
+    with closing(_simulated(parts, missing, workers or os.cpu_count() or 1)) as simulated:
+        for _ in simulated:
+            done += 1
+            report(done, episodes)
     parts.join(episodes)
 
 
@@ -115,7 +118,7 @@ class _Parts:
             return part[0]
 
 
-def _simulated(parts: _Parts, indices: list[int], workers: int) -> Iterator[None]:
+def _simulated(parts: _Parts, indices: list[int], workers: int) -> Generator[None, None, None]:
     """Make the missing parts, yielding after each."""
     if min(workers, len(indices)) <= 1:
         for index in indices:
@@ -124,14 +127,13 @@ def _simulated(parts: _Parts, indices: list[int], workers: int) -> Iterator[None
         return
     # Spawned, not forked: whoever calls may have threads, and locks held by them would stay locked in a fork.
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(indices)), spawn, _live_with_parent) as pool:
-        try:
-            for future in as_completed([pool.submit(parts.make, index) for index in indices]):
-                future.result()
-                yield
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    pool = ProcessPoolExecutor(min(workers, len(indices)), spawn, _live_with_parent)
+    try:
+        for future in as_completed([pool.submit(parts.make, index) for index in indices]):
+            future.result()
+            yield
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _live_with_parent() -> None:

@@ -118,6 +118,7 @@ def _run(door: DoorPhysics, policy: Policy, steps: int) -> _Log:
 
     data.qpos[hinge] = policy.start_angle
     yaw = YAW_SHARE * policy.start_angle
+    # One push in eighty would start out of reach. It then starts as near as the arm gets, and goes on from there.
     controller.place(policy.start(), yaw)
     controller.set_fingers(policy.fingers, policy.squeeze)
     mujoco.mj_forward(model, data)

@@ -103,6 +103,12 @@ def test_kill_9_loses_no_finished_episode_and_leaves_no_worker(tmp_path: Path) -
     assert sha(path) == sha(tmp_path / "afresh.h5")
 
 
+def test_stopping_does_not_wait_for_all_the_rest(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        collect("door", 200, 10, 0, 2, tmp_path / "a.h5", stop_at(2))
+    assert len(list((tmp_path / "a.h5.partial").iterdir())) < 40
+
+
 def test_a_damaged_part_is_made_again(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     with pytest.raises(KeyboardInterrupt):
