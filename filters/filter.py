@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import torch
-from beliefscope.datasets.catalog import find_task
 from torch import Tensor, nn
 
+from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Statistics
