@@ -28,7 +28,7 @@ BELIEF_ABOVE = 0.10  # m from the anchor to the plane on which particles and con
 FORCE_SCALE = 0.004  # m an N
 FORCE_LENGTH = 0.30  # m, the longest arrow
 PALE = 130.0  # gray of a particle without weight
-EYE = np.array([-0.35, -1.75, 1.25])  # m from what the camera looks at
+EYE = np.array([-0.30, -1.45, 1.45])  # m from what the camera looks at
 UP = np.array([0.0, 0.0, 1.0])
 
 MUJOCO_PLANE = 0  # mjtGeom.mjGEOM_PLANE
@@ -202,8 +202,8 @@ class Drawing:
         """Where robot, object and belief are seen. A browser that has moved its camera keeps it."""
         at = self._anchors[:, 0].mean(axis=0)
         camera = self._server.initial_camera
-        camera.look_at = at * [0.6, 0.3, 0.6]
-        camera.position = at * [0.6, 0.3, 0.6] + EYE
+        camera.look_at = at * [0.6, 0.3, 0.65]
+        camera.position = at * [0.6, 0.3, 0.65] + EYE
         camera.fov = np.deg2rad(45.0)
 
 

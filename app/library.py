@@ -25,6 +25,7 @@ from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 
 TRACES_IN_MEMORY = 8
+DEFAULT_FILTER = "crossmodal-pf"
 FINE = max(MAP_SIZES)
 
 
@@ -133,6 +134,7 @@ class Library:
         """The filter of that name. Raises BadInput for an unknown name or an unreadable file."""
         with self._lock:
             if (task, name) not in self._checkpoints:
+                find_task(task)
                 given = self.settings.checkpoints
                 if name not in given and name not in FILTERS:
                     raise one_of("filter", name, [*given, *(f for f in FILTERS if f not in given)])
@@ -163,10 +165,18 @@ class Library:
         return {"tasks": tasks, "problems": problems}
 
     def default(self) -> Selection:
-        """What a page shows first: Crossmodal Fusion PF on the first episode that was kept for tests."""
-        task = next(iter(TASKS))
-        episodes = self.dataset(task).summaries
-        return Selection(task, "crossmodal-pf", next((e.index for e in episodes if e.split == "test"), 0))
+        """What a page shows first: the first task, the crossmodal PF if there is one, the first episode for tests.
+
+        Raises BadInput where there is no filter to show.
+        """
+        catalog = self.catalog()
+        for task in catalog["tasks"]:
+            names = [f["name"] for f in task["filters"]]
+            if names:
+                name = DEFAULT_FILTER if DEFAULT_FILTER in names else names[0]
+                tested = (e["index"] for e in task["episodes"] if e["split"] == "test")
+                return Selection(task["name"], name, next(tested, 0))
+        raise BadInput("; ".join(catalog["problems"]) or "no trained filter is there to show; train one first.")
 
     def traced(self, selection: Selection) -> Traced:
         """The selection's trace, whose computing begins now if it has not yet. Raises BadInput for unknown names."""

@@ -95,7 +95,11 @@ class EmbeddedViser:
         return f"viser-v{viser.__version__}"
 
     async def connect(self, websocket: WebSocket) -> None:
-        """Serve one browser until it, or ``close``, ends the connection."""
+        """Serve one browser until it, or ``close``, ends the connection. Another version's client is turned away."""
+        if self.subprotocol not in websocket.scope["subprotocols"]:
+            await websocket.accept()
+            await websocket.close(1002, f"This scene speaks {self.subprotocol}.")
+            return
         await websocket.accept(subprotocol=self.subprotocol)
         connection = _Connection(websocket, self.subprotocol, asyncio.get_running_loop())
         self._connections.add(connection)

@@ -12,6 +12,7 @@ from beliefscope.app.drawing import Drawing
 from beliefscope.app.library import Traced
 from beliefscope.app.proxy import EmbeddedViser
 
+PANEL_WIDTH = 180  # pixels
 USER_HOLDS = 0.5  # s after the step was moved in the scene in which an echo does not move the slider under the hand
 
 
@@ -29,6 +30,7 @@ class Scene:
         self._moved = moved
         self._lock = threading.Lock()
         self._drawing: Drawing | None = None
+        self._closed = False
         self._key = ""
         self._slider: GuiSliderHandle[int] | None = None
         self._user_moved = -USER_HOLDS
@@ -44,6 +46,8 @@ class Scene:
     def show(self, traced: Traced, step: int) -> None:
         """Draw a step of a trace and send it to the browser."""
         with self._lock:
+            if self._closed:
+                return
             if self._key != traced.key:
                 self._build(traced)
             assert self._drawing is not None
@@ -54,7 +58,9 @@ class Scene:
             self._server.flush()
 
     def close(self) -> None:
-        """End the scene's connections and threads."""
+        """End the scene's connections and threads; ``show`` does nothing from now on."""
+        with self._lock:
+            self._closed = True
         self.viser.close()
 
     def _build(self, traced: Traced) -> None:
@@ -65,6 +71,7 @@ class Scene:
             self._drawing = Drawing(server, traced)
             self._slider = server.gui.add_slider("step", 0, max(1, len(traced.trace) - 1), 1, 0)
             self._slider.on_update(self._on_slider)
+            server.gui.main_panel.set_width(PANEL_WIDTH)
             server.gui.main_panel.minimize()
         self._key = traced.key
 

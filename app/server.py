@@ -9,6 +9,7 @@ import signal
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import CancelledError
 from pathlib import Path
 
 import uvicorn
@@ -23,6 +24,7 @@ from beliefscope.app.library import Library, Settings
 from beliefscope.app.security import Guard
 from beliefscope.app.session import Views
 from beliefscope.app.vendor import UPLOT_FILES, RerunViewer, cached_file, installed
+from beliefscope.app.wire import MAP_SIZES
 from beliefscope.datasets.errors import BadInput
 
 __all__ = ["Settings", "create_app", "serve"]
@@ -53,6 +55,7 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
         await asyncio.to_thread(library.close)
 
     app = FastAPI(title="Beliefscope", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.library, app.state.views = library, views
     app.include_router(routes(library, views))
     _add_files(app, rerun)
     app.add_middleware(Guard, hosts=settings.hosts)
@@ -133,12 +136,12 @@ def _add_files(app: FastAPI, rerun: RerunViewer) -> None:
 
 
 def _warm(library: Library, rerun: RerunViewer) -> None:
-    """Have ready what the first page asks for. What goes wrong here is told to the page that asks for it."""
-    try:
-        library.traced(library.default()).trace  # noqa: B018 - waits
-        rerun.prepare()
-    except Exception as error:
-        log.warning("Could not prepare the first page: %s", error)
+    """Have ready what the first page asks for, maps before Rerun. What fails is told to the page that asks for it."""
+    for prepare in (lambda: library.traced(library.default()).map(0, None, MAP_SIZES[0]), rerun.prepare):
+        try:
+            prepare()
+        except (Exception, CancelledError) as error:
+            log.warning("Not prepared in advance: %s", error)
 
 
 def _say(status: int | None) -> Callable[[Request, Exception], JSONResponse]:

@@ -107,6 +107,8 @@ class View:
             raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(trace) - 1}.")
         maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)
         await websocket.send_bytes(maps_message(wanted.serial, trace, maps))
+        if not wanted.scene:
+            return
         await asyncio.to_thread(self.scene.show, traced, wanted.step)
         await websocket.send_json({"type": "drawn", "serial": wanted.serial, "step": wanted.step})
 

@@ -20,7 +20,10 @@ SENSORS = ("effector_position", "force")
 
 @dataclass(frozen=True)
 class Cursor:
-    """The page's whole selection, as one message of it says. Serial: the page's own count of its cursors."""
+    """The page's whole selection, as one message of it says.
+
+    Serial: the page's own count of its cursors. Scene: whether the 3D scene follows, or only the maps.
+    """
 
     serial: int
     task: str
@@ -29,6 +32,7 @@ class Cursor:
     step: int
     angle: float | None
     size: int
+    scene: bool = True
 
 
 def cursor(message: dict[str, Any]) -> Cursor:
@@ -45,7 +49,10 @@ def cursor(message: dict[str, Any]) -> Cursor:
     size = message.get("size", MAP_SIZES[0])
     if size not in MAP_SIZES:
         raise BadInput(f"cursor's 'size' is {' or '.join(map(str, MAP_SIZES))}; got {size!r}.")
-    return Cursor(task=message["task"], filter=message["filter"], angle=angle, size=size, **integers)
+    scene = message.get("scene", True)
+    if not isinstance(scene, bool):
+        raise BadInput(f"cursor's 'scene' is true or false; got {scene!r}.")
+    return Cursor(task=message["task"], filter=message["filter"], angle=angle, size=size, scene=scene, **integers)
 
 
 def _integer(message: dict[str, Any], key: str) -> int:

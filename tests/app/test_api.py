@@ -1,0 +1,201 @@
+"""The page's interface over HTTP, as docs/api.md promises it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from beliefscope import __version__
+from beliefscope.app.server import Settings
+from beliefscope.inspect.trace import load_trace
+from beliefscope.recordings.read import read_recording
+
+OpenClient = Callable[..., TestClient]
+
+
+def columns(client: TestClient, url: str) -> dict[str, np.ndarray[Any, Any]]:
+    described = client.get(url).json()["columns"]
+    buffer = client.get(f"{url}/columns").content
+    return {
+        c["name"]: np.frombuffer(buffer, "<f4", count=int(np.prod(c["shape"])), offset=c["offset"]).reshape(c["shape"])
+        for c in described
+    }
+
+
+def test_the_catalog_says_what_there_is(client: TestClient, steps: int) -> None:
+    catalog = client.get("/api/catalog").json()
+    assert catalog["version"] == __version__
+    assert catalog["problems"] == []
+    (door,) = catalog["tasks"]
+    assert [c["name"] for c in door["components"]] == ["hinge_x", "hinge_y", "angle"]
+    assert door["map"] == {"x": "hinge_x", "y": "hinge_y", "half_width": 0.135}
+    assert [(f["name"], f["kind"]) for f in door["filters"]] == [("crossmodal-ekf", "ekf"), ("crossmodal-pf", "pf")]
+    assert door["filters"][0]["metrics"] == {"position_cm": 1.5}
+    assert [(e["index"], e["steps"], e["split"]) for e in door["episodes"]] == [(0, steps, "train"), (1, steps, "test")]
+
+
+def test_a_trace_comes_as_its_own_numbers(client: TestClient, traced: str, settings: Settings, steps: int) -> None:
+    header = client.get(traced).json()
+    (file,) = (settings.workspace / "traces").iterdir()
+    trace = load_trace(file)
+    assert header["steps"] == len(trace) == steps
+    assert header["checkpoint_hash"] == trace.checkpoint_hash
+    assert header["modalities"] == ["image", "haptics"]
+    got = columns(client, traced)
+    np.testing.assert_array_equal(got["truth"], trace.episode.states)
+    np.testing.assert_array_equal(got["estimate_mean"], trace.estimate_mean)
+    np.testing.assert_array_equal(got["acting"], trace.acting)
+    np.testing.assert_array_equal(got["contact"], trace.episode.contact)
+    np.testing.assert_array_equal(got["force"], trace.episode.observations["force"])
+    np.testing.assert_allclose(got["estimate_sigma"][:, 0] ** 2, trace.estimate_covariance[:, 0, 0], rtol=1e-5)
+    assert trace.log_weights is not None
+    np.testing.assert_allclose(
+        got["effective_sample_size"], 1.0 / np.square(np.exp(trace.log_weights)).sum(axis=1), rtol=1e-4
+    )
+    pictures = np.frombuffer(client.get(f"{traced}/images").content, np.uint8).reshape(steps, 32, 32)
+    np.testing.assert_array_equal(pictures, trace.episode.observations["image"])
+
+
+def test_a_filter_without_particles_has_no_sample_size(client: TestClient) -> None:
+    url = "/api/trace/door/crossmodal-ekf/0"
+    while client.get(url).status_code == 202:
+        pass
+    assert "effective_sample_size" not in columns(client, url)
+
+
+def test_a_trace_outlives_the_server(
+    client: TestClient, traced: str, settings: Settings, open_client: OpenClient
+) -> None:
+    (file,) = (settings.workspace / "traces").iterdir()
+    written = file.stat().st_mtime_ns
+    with open_client(settings) as again:
+        while again.get(traced).status_code == 202:
+            pass
+        assert columns(again, traced).keys() == columns(client, traced).keys()
+    assert file.stat().st_mtime_ns == written
+
+
+def test_a_damaged_trace_file_is_computed_again(traced: str, settings: Settings, open_client: OpenClient) -> None:
+    (file,) = (settings.workspace / "traces").iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with open_client(settings) as again:
+        while (answer := again.get(traced)).status_code == 202:
+            pass
+        assert answer.status_code == 200
+    assert len(file.read_bytes()) == len(whole)
+
+
+@pytest.mark.parametrize("part", ["", "/columns", "/images"])
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("nothing/crossmodal-pf/0", "task 'nothing' does not exist. Available: door"),
+        ("door/crosmodal-pf/0", "filter 'crosmodal-pf' does not exist. Available: crossmodal-ekf, crossmodal-pf"),
+        ("door/crossmodal-pf/2", "episode 2 does not exist. Available: 0 to 1."),
+        ("door/crossmodal-pf/-1", "episode -1 does not exist."),
+    ],
+)
+def test_unknown_names_get_one_readable_line(client: TestClient, path: str, part: str, said: str) -> None:
+    answer = client.get(f"/api/trace/{path}{part}")
+    assert answer.status_code == 400
+    assert said in answer.json()["error"]
+    assert "\n" not in answer.json()["error"]
+
+
+@pytest.mark.parametrize(
+    "path", ["/nowhere", "/scene/none/", "/static/none.js", "/vendor/uplot/none.js", "/api/recordings/x.rrd"]
+)
+def test_what_is_not_there_is_said_in_json(client: TestClient, path: str) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 404
+    assert answer.json()["error"]
+
+
+def test_a_trace_is_fetched_once(client: TestClient, traced: str) -> None:
+    first = client.get(f"{traced}/columns")
+    again = client.get(f"{traced}/columns", headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str, settings: Settings) -> None:
+    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "maps": 20}
+    answer = client.post("/api/recordings", json=wanted)
+    assert answer.status_code == 201, answer.text
+    made = answer.json()
+    assert made["name"].startswith("door-crossmodal-pf-episode1-")
+    (listed,) = client.get("/api/recordings").json()
+    assert (listed["name"], listed["bytes"]) == (made["name"], made["bytes"])
+    assert (listed["task"], listed["filter"], listed["episode"]) == ("door", "crossmodal-pf", 1)
+    content = client.get(made["url"]).content
+    assert content == (settings.workspace / "recordings" / made["name"]).read_bytes()
+    part = client.get(made["url"], headers={"Range": "bytes=4-11"})
+    assert (part.status_code, part.content) == (206, content[4:12])
+    np.testing.assert_array_equal(
+        read_recording(settings.workspace / "recordings" / made["name"]).estimate_mean,
+        columns(client, traced)["estimate_mean"],
+    )
+
+
+@pytest.mark.parametrize(
+    "name", ["../traces/x", "..%2ftraces%2fx", "..%5cx", "%2fetc%2fpasswd", ".hidden", "door-crossmodal-pf-episode1-zz"]
+)
+def test_a_recordings_name_leads_nowhere_else(client: TestClient, settings: Settings, name: str) -> None:
+    (settings.workspace / "traces").mkdir(parents=True)
+    (settings.workspace / "traces" / "x.rrd").write_bytes(b"secret")
+    answer = client.get(f"/api/recordings/{name}.rrd")
+    assert answer.status_code == 404
+    assert b"secret" not in answer.content
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "said"),
+    [
+        (b"not json", 422, "JSON"),
+        (b"{}", 422, "Field required"),
+        (b'{"task": "door", "filter": "crossmodal-pf", "episode": "1"}', 422, "body.episode"),
+        (b'{"task": "door", "filter": "crossmodal-pf", "episode": 1, "maps": -1}', 422, "body.maps"),
+        (b'{"task": "door", "filter": "none", "episode": 1}', 400, "filter 'none' does not exist"),
+    ],
+)
+def test_a_bad_request_for_a_recording_writes_nothing(
+    client: TestClient, settings: Settings, body: bytes, status: int, said: str
+) -> None:
+    answer = client.post("/api/recordings", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == status
+    assert said in answer.json()["error"]
+    assert not (settings.workspace / "recordings").exists()
+
+
+@pytest.mark.parametrize("broken", ["data", "checkpoint"])
+def test_a_corrupt_file_is_told_and_the_server_goes_on(
+    settings: Settings, tmp_path: Path, open_client: OpenClient, broken: str
+) -> None:
+    bad = tmp_path / "bad"
+    bad.write_bytes(b"not what it should be")
+    if broken == "data":
+        settings = replace(settings, data={"door": bad})
+    else:
+        settings = replace(settings, checkpoints={**settings.checkpoints, "crossmodal-pf": bad})
+    with open_client(settings, warm=True) as client:
+        (problem,) = client.get("/api/catalog").json()["problems"]
+        assert str(bad) in problem
+        answer = client.get("/api/trace/door/crossmodal-pf/0")
+        assert answer.status_code == 400
+        assert str(bad) in answer.json()["error"]
+        assert client.get("/healthz").status_code == 200
+
+
+def test_the_first_trace_is_ready_before_it_is_asked_for(settings: Settings, open_client: OpenClient) -> None:
+    with open_client(settings, warm=True):
+        deadline = time.monotonic() + 30.0
+        while not list((settings.workspace / "traces").glob("door-crossmodal-pf-episode1-*.trace")):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)

@@ -1,0 +1,164 @@
+"""viser behind our port: its sockets come through ours, it opens none, and nothing of it stays."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.request import Request, urlopen
+
+import pytest
+import viser
+import websockets.asyncio.server
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin, Subprotocol
+
+from beliefscope.app.proxy import EmbeddedViser
+from beliefscope.app.server import Settings
+from beliefscope.app.session import Views
+
+PROTOCOL = f"viser-v{viser.__version__}"
+
+
+def listening() -> set[str]:
+    """Addresses on which this process listens."""
+    folder = Path("/proc/self")
+    if not (folder / "net/tcp").exists():
+        pytest.skip("needs /proc to see which ports are open")
+    ours = set()
+    for descriptor in (folder / "fd").iterdir():
+        with contextlib.suppress(OSError):
+            ours.add(str(descriptor.readlink()))
+    found = set()
+    for table in ("net/tcp", "net/tcp6"):
+        if (folder / table).exists():
+            rows = [line.split() for line in (folder / table).read_text().splitlines()[1:]]
+            found |= {row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in ours}
+    return found
+
+
+def open_view(address: str) -> dict[str, str]:
+    request = Request(f"http://{address}/api/views", method="POST", headers={"Origin": f"http://{address}"})
+    with urlopen(request) as answer:
+        view: dict[str, str] = json.load(answer)
+    return view
+
+
+@contextlib.contextmanager
+def joined(address: str, path: str, *protocols: str) -> Iterator[ClientConnection]:
+    with connect(
+        f"ws://{address}{path}",
+        origin=Origin(f"http://{address}"),
+        subprotocols=[Subprotocol(p) for p in protocols] or None,
+        max_size=None,
+        proxy=None,
+    ) as socket:
+        yield socket
+
+
+def received(socket: ClientConnection, enough: int) -> int:
+    """Bytes that came, at least ``enough``; fails after a while."""
+    count, deadline = 0, time.monotonic() + 20.0
+    while count < enough:
+        count += len(socket.recv(timeout=deadline - time.monotonic()))
+    return count
+
+
+def draw(socket: ClientConnection, step: int) -> None:
+    selection: dict[str, Any] = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "step": step}
+    socket.send(json.dumps({"type": "cursor", "serial": step, "angle": None, "size": 41, **selection}))
+    assert isinstance(socket.recv(timeout=30.0), bytes)
+    assert json.loads(socket.recv(timeout=30.0)) == {"type": "drawn", "serial": step, "step": step}
+
+
+def test_the_scene_comes_through_our_own_port(address: str) -> None:
+    before = listening()
+    view = open_view(address)
+    with urlopen(f"http://{address}{view['scene']}") as page:
+        assert b'<div id="root">' in page.read()
+    with (
+        joined(address, view["socket"]) as page_socket,
+        joined(address, view["scene"].rstrip("/"), PROTOCOL) as scene,
+    ):
+        assert scene.subprotocol == PROTOCOL
+        draw(page_socket, 3)
+        received(scene, 50_000)  # the robot's meshes
+        draw(page_socket, 4)
+        received(scene, 1)
+        assert listening() == before
+
+
+def test_another_version_of_the_client_is_turned_away(address: str) -> None:
+    path = open_view(address)["scene"].rstrip("/")
+    for protocols in ([], ["viser-v0.0.1"]):
+        with contextlib.suppress(Exception), joined(address, path, *protocols) as socket:
+            with pytest.raises(ConnectionClosed) as closed:
+                socket.recv(timeout=5.0)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1002
+
+
+def test_a_scene_leaves_no_thread_and_no_connection_behind(address: str) -> None:
+    threads = set(threading.enumerate())
+    embedded = EmbeddedViser()
+    embedded.server.gui.add_slider("a", 0, 1, 1, 0)
+    assert set(threading.enumerate()) - threads
+    embedded.close()
+    deadline = time.monotonic() + 5.0
+    while set(threading.enumerate()) - threads:
+        assert time.monotonic() < deadline, set(threading.enumerate()) - threads
+        time.sleep(0.01)
+
+
+def test_the_servers_own_views_end_with_it(address: str) -> None:
+    for _ in range(2):
+        view = open_view(address)
+        with joined(address, view["socket"]) as socket, joined(address, view["scene"].rstrip("/"), PROTOCOL) as scene:
+            draw(socket, 1)
+            received(scene, 1)
+    # The fixture ends the server and sees its thread go, connections of viser's included.
+
+
+def test_viser_must_be_as_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Other(viser.infra.WebsockServer):
+        __module__ = "somewhere.else"
+
+    monkeypatch.setattr(viser.infra, "WebsockServer", Other)
+    with pytest.raises(RuntimeError, match=r"written for viser 1\.1"):
+        EmbeddedViser()
+
+
+def test_only_viser_is_kept_from_listening() -> None:
+    before = websockets.asyncio.server.serve
+    EmbeddedViser().close()
+    assert websockets.asyncio.server.serve is before
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
+
+
+@pytest.mark.anyio
+async def test_views_are_bounded_and_the_idle_ones_go(settings: Settings) -> None:
+    from beliefscope.app.library import Library
+    from beliefscope.datasets.errors import BadInput
+
+    views = Views(Library(settings), limit=2)
+    first, second = await views.open(dark=False), await views.open(dark=True)
+    first.idle_since = None  # a page is there
+    third = await views.open(dark=False)
+    assert len(views) == 2
+    assert views[first.name] is first
+    with pytest.raises(KeyError):
+        views[second.name]
+    third.idle_since = None
+    with pytest.raises(BadInput, match="2 pages are open already"):
+        await views.open(dark=False)
+    await views.close()
+    assert len(views) == 0

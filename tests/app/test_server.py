@@ -1,0 +1,121 @@
+"""Files of the page and of others, and the server as a process: its port, its signals."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from urllib.request import urlopen
+
+import brotli
+import pytest
+from starlette.requests import Request
+from starlette.testclient import TestClient
+
+from beliefscope.app.server import Settings, serve
+from beliefscope.app.vendor import RerunViewer, installed, without_names
+from beliefscope.datasets.errors import BadInput
+
+# A module with a type section, a `name` section and another custom section.
+SECTIONS = {"type": b"\x01\x04\x01\x60\x00\x00", "name": b"\x00\x07\x04name\x01\x00", "other": b"\x00\x06\x05other"}
+PREAMBLE = b"\0asm\x01\0\0\0"
+
+
+def test_only_the_names_are_left_out() -> None:
+    module = PREAMBLE + SECTIONS["type"] + SECTIONS["name"] + SECTIONS["other"]
+    assert without_names(module) == PREAMBLE + SECTIONS["type"] + SECTIONS["other"]
+    assert without_names(without_names(module)) == without_names(module)
+    with pytest.raises(ValueError, match="Not a WebAssembly"):
+        without_names(b"MZ")
+
+
+def request(encodings: str, **headers: str) -> Request:
+    sent = {"accept-encoding": encodings} | headers
+    return Request({"type": "http", "headers": [(k.encode(), v.encode()) for k, v in sent.items()]})
+
+
+def test_reruns_viewer_is_compressed_for_who_can_read_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = RerunViewer(tmp_path)
+    module = PREAMBLE + SECTIONS["type"] + SECTIONS["name"]
+    monkeypatch.setattr(viewer, "_original", tmp_path / "original")
+    (tmp_path / "original").write_bytes(module)
+    assert "content-encoding" not in viewer.wasm(request("gzip, br")).headers
+    viewer.prepare()
+    answer = viewer.wasm(request("gzip, br;q=0.9"))
+    assert answer.headers["content-encoding"] == "br"
+    assert answer.media_type == "application/wasm"
+    assert answer.headers["vary"] == "accept-encoding"
+    (compressed,) = tmp_path.glob("*.br")
+    assert brotli.decompress(compressed.read_bytes()) == without_names(module)
+    assert "content-encoding" not in viewer.wasm(request("gzip")).headers
+    assert viewer.wasm(request("br", **{"if-none-match": answer.headers["etag"]})).status_code == 304
+
+
+def test_the_installed_viewer_is_what_we_take_it_for() -> None:
+    widget = (installed("rerun_notebook") / "static" / "widget.js").read_bytes()
+    assert b"var WebViewer = class" in widget
+    assert b"re_viewer_bg.wasm" in widget
+
+
+@pytest.mark.parametrize(
+    ("path", "kind", "content"),
+    [
+        ("/", "text/html", b"<html"),
+        ("/vendor/uplot/uPlot.iife.js", "text/javascript", b"uPlot"),
+        ("/vendor/uplot/uPlot.min.css", "text/css", b".uplot"),
+        ("/vendor/rerun/viewer.js", "text/javascript", b"export { WebViewer };"),
+    ],
+)
+def test_files_come_with_their_type_and_are_revalidated(
+    client: TestClient, path: str, kind: str, content: bytes
+) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith(kind)
+    assert answer.headers["cache-control"] == "no-cache"
+    assert content in answer.content
+    if "etag" in answer.headers:
+        assert client.get(path, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+
+
+@pytest.mark.parametrize("path", ["/static/../server.py", "/static/..%2fserver.py", "/vendor/uplot/..%2f__init__.py"])
+def test_files_beside_the_page_are_not_served(client: TestClient, path: str) -> None:
+    assert client.get(path).status_code == 404
+
+
+def test_a_busy_port_is_one_clear_line(settings: Settings) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(BadInput, match=f"Cannot listen on 127.0.0.1 port {port}: Address already in use"):
+            serve(settings, port=port)
+
+
+@pytest.mark.parametrize(("host", "port"), [("nowhere.invalid", 8000), ("127.0.0.1", 70000)])
+def test_an_impossible_address_is_one_clear_line(settings: Settings, host: str, port: int) -> None:
+    with pytest.raises(BadInput, match=f"Cannot listen on {host} port {port}: "):
+        serve(settings, host=host, port=port)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_server_in_peace(settings: Settings, number: signal.Signals) -> None:
+    code = (
+        "from pathlib import Path; from beliefscope.app.server import Settings, serve; "
+        f"data = {{'door': Path({str(settings.data['door'])!r})}}; "
+        f"serve(Settings(Path({str(settings.workspace)!r}), data=data), port=0)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        url = next(word for word in line.split() if word.startswith("http"))
+        with urlopen(f"{url}healthz") as answer:
+            assert answer.status == 200
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=20.0)
+        assert (process.returncode, "Traceback" in errors) == (0, False), errors
+    finally:
+        process.kill()
+        shutil.rmtree(settings.workspace, ignore_errors=True)

@@ -1,0 +1,162 @@
+"""The view's socket: maps for cursors, the newest wins, the scene answers back, and nothing said can break it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient, WebSocketTestSession
+from starlette.websockets import WebSocketDisconnect
+
+from beliefscope.app.library import Traced
+from beliefscope.app.server import Settings
+from beliefscope.filters.checkpoint import load_checkpoint
+from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.trace import load_trace
+
+
+def cursor(serial: int = 1, **changes: Any) -> dict[str, Any]:
+    whole = {"type": "cursor", "serial": serial, "task": "door", "filter": "crossmodal-pf", "episode": 1, "step": 7}
+    return whole | {"angle": None, "size": 41} | changes
+
+
+def maps(socket: WebSocketTestSession) -> tuple[dict[str, Any], np.ndarray[Any, Any]]:
+    data = socket.receive_bytes()
+    length = int.from_bytes(data[:4], "little")
+    header = json.loads(data[4 : 4 + length])
+    start = 4 + length + -length % 4
+    assert start % 4 == 0
+    shape = (len(header["layers"]), header["size"], header["size"])
+    return header, np.frombuffer(data, np.uint8, offset=start).reshape(shape)
+
+
+@pytest.fixture
+def socket(client: TestClient, traced: str) -> Any:
+    view = client.post("/api/views").json()
+    with client.websocket_connect(view["socket"]) as socket:
+        yield socket
+
+
+@pytest.mark.parametrize("size", [41, 135])
+def test_a_cursor_is_answered_with_maps_then_the_scene(
+    socket: WebSocketTestSession, settings: Settings, size: int
+) -> None:
+    socket.send_json(cursor(serial=3, size=size, angle=0.4))
+    header, layers = maps(socket)
+    assert socket.receive_json() == {"type": "drawn", "serial": 3, "step": 7}
+    trace = load_trace(next((settings.workspace / "traces").iterdir()))
+    expected = MapEngine(load_checkpoint(settings.checkpoints["crossmodal-pf"]), trace).map(7, angle=0.4, size=size)
+    np.testing.assert_array_equal(layers, expected.normalised())
+    assert header["layers"] == ["image", "haptics", "fused"]
+    assert (header["serial"], header["step"], header["size"], header["angle"]) == (3, 7, size, 0.4)
+    assert header["half_width"] == pytest.approx(0.135)
+    np.testing.assert_allclose(header["peak"], expected.peaks(), rtol=1e-6)
+    np.testing.assert_allclose(header["truth"], trace.episode.states[7], rtol=1e-6)
+    np.testing.assert_allclose(header["effector"], trace.episode.observations["effector_position"][7, :2], rtol=1e-6)
+
+
+def test_the_newest_cursor_wins(
+    socket: WebSocketTestSession, monkeypatch: pytest.MonkeyPatch, client: TestClient
+) -> None:
+    busy, go_on = threading.Event(), threading.Event()
+    real = Traced.map
+
+    def slow(self: Traced, step: int, angle: float | None, size: int) -> Any:
+        busy.set()
+        assert go_on.wait(10.0)
+        return real(self, step, angle, size)
+
+    monkeypatch.setattr(Traced, "map", slow)
+    socket.send_json(cursor(serial=1, step=1))
+    assert busy.wait(10.0)
+    for serial in range(2, 9):
+        socket.send_json(cursor(serial=serial, step=serial))
+    socket.send_text("understood in order, so by now all of the above are")
+    assert socket.receive_json()["type"] == "error"
+    go_on.set()
+    answered = []
+    for _ in range(2):
+        answered.append(maps(socket)[0]["serial"])
+        assert socket.receive_json()["type"] == "drawn"
+    assert answered == [1, 8]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("not json", "Not JSON"),
+        ("[1]", "JSON object"),
+        ("{}", "Message type None does not exist. Available: cursor, theme."),
+        (json.dumps(cursor(task="nothing")), "task 'nothing' does not exist"),
+        (json.dumps(cursor(filter="nothing")), "filter 'nothing' does not exist"),
+        (json.dumps(cursor(filter=3)), "cursor needs 'filter', a name; got 3."),
+        (json.dumps(cursor(episode=9)), "episode 9 does not exist"),
+        (json.dumps(cursor(step=40)), "step 40 does not exist. Available: 0 to 39."),
+        (json.dumps(cursor(step=-1)), "cursor needs 'step', an integer from 0; got -1."),
+        (json.dumps(cursor(step=1.5)), "cursor needs 'step', an integer from 0; got 1.5."),
+        (json.dumps(cursor(step=True)), "cursor needs 'step', an integer from 0; got True."),
+        (json.dumps(cursor(size=10**6)), "cursor's 'size' is 41 or 135; got 1000000."),
+        (json.dumps(cursor(angle="wide")), "cursor's 'angle' is a number of radians or null; got 'wide'."),
+        (json.dumps(cursor(angle=float("nan"))), "cursor's 'angle' is a number of radians or null; got nan."),
+    ],
+)
+def test_what_cannot_be_answered_is_said_and_the_socket_stays(
+    socket: WebSocketTestSession, text: str, said: str
+) -> None:
+    socket.send_text(text)
+    answer = socket.receive_json()
+    assert answer["type"] == "error"
+    assert said in answer["error"]
+    socket.send_json(cursor(serial=2))
+    assert maps(socket)[0]["serial"] == 2
+
+
+def test_a_failure_of_ours_is_said_too(socket: WebSocketTestSession, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as broken:
+        broken.setattr(Traced, "map", lambda *_: 1 / 0)
+        socket.send_json(cursor(serial=4))
+        answer = socket.receive_json()
+    assert answer == {"type": "error", "serial": 4, "error": "The server failed: division by zero"}
+    socket.send_json(cursor(serial=5))
+    assert maps(socket)[0]["serial"] == 5
+
+
+def test_the_scene_moves_the_cursor_without_an_echo(client: TestClient, traced: str) -> None:
+    views = client.app.state.views  # type: ignore[attr-defined]
+    view = client.post("/api/views", json={"dark": True}).json()
+    with client.websocket_connect(view["socket"]) as socket:
+        socket.send_json(cursor(step=7))
+        maps(socket)
+        assert socket.receive_json()["type"] == "drawn"
+        scene = views[view["view"]].scene
+        assert scene._slider.value == 7  # moved by us: nothing is told
+        scene._on_slider(SimpleNamespace(client_id=0, target=SimpleNamespace(value=12)))
+        assert socket.receive_json() == {"type": "cursor", "step": 12, "origin": "scene"}
+        scene._on_slider(SimpleNamespace(client_id=0, target=SimpleNamespace(value=13)))
+        assert socket.receive_json()["step"] == 13
+        # The page follows with a step that the hand has left already: the slider stays under the hand.
+        socket.send_json(cursor(serial=2, step=12))
+        maps(socket)
+        assert socket.receive_json()["type"] == "drawn"
+        assert scene._slider.value == 7
+
+
+def test_a_view_that_is_not_open_says_so(client: TestClient) -> None:
+    for path in ("/api/views/none", "/scene/none"):
+        with client.websocket_connect(path) as socket, pytest.raises(WebSocketDisconnect) as closed:
+            socket.receive_text()
+        assert closed.value.code == 4004
+
+
+def test_a_second_page_takes_a_view_over(client: TestClient, traced: str) -> None:
+    address = client.post("/api/views").json()["socket"]
+    with client.websocket_connect(address) as first, client.websocket_connect(address) as second:
+        with pytest.raises(WebSocketDisconnect) as closed:
+            first.receive_text()
+        assert closed.value.code == 4000
+        second.send_json(cursor())
+        assert maps(second)[0]["serial"] == 1
