@@ -20,6 +20,8 @@ const COARSE = 41;
 const FINE = 135;
 const REST = 120; // ms without a move after which the fine maps are asked for
 const PATIENCE = 10_000; // ms until an answer is taken for lost
+const SWIFT = 40; // ms: a longer frame is one in which the scene was drawn
+const CALM = 3; // swift frames one after another: it has been drawn
 const RETRY = { first: 500, most: 8000 }; // ms
 const decoder = new TextDecoder();
 
@@ -36,6 +38,7 @@ export class ViewSocket {
   #rest = 0;
   #lost = 0;
   #pause = RETRY.first;
+  #sceneDue = 0; // ms; before it a moving cursor is not drawn in the scene
 
   /** @param {Handlers} handlers @param {() => boolean} dark */
   constructor(handlers, dark) {
@@ -46,9 +49,9 @@ export class ViewSocket {
   /** The cursor has moved: coarse maps now, fine ones when it rests. @param {Cursor} cursor without its size. */
   move(cursor, inputTime = null) {
     this.#last = cursor;
-    this.#want({ ...cursor, size: COARSE }, inputTime);
+    this.#want({ ...cursor, size: COARSE, scene: performance.now() >= this.#sceneDue }, inputTime);
     clearTimeout(this.#rest);
-    this.#rest = setTimeout(() => this.#want({ ...cursor, size: FINE }, null), REST);
+    this.#rest = setTimeout(() => this.#want({ ...cursor, size: FINE, scene: true }, null), REST);
   }
 
   /** The page's colours have changed. */
@@ -78,6 +81,22 @@ export class ViewSocket {
     clearTimeout(this.#lost);
     this.#inFlight = null;
     this.#pump();
+  }
+
+  /**
+   * The scene is drawn in our thread, for long where there is no GPU: twice as long as it took, it gets no turn, so that
+   * a drag stays smooth. The fine cursor at the end always draws it.
+   */
+  #paceScene() {
+    const start = performance.now();
+    this.#sceneDue = Infinity;
+    const watch = (before, swift) =>
+      requestAnimationFrame((now) => {
+        const count = now - before < SWIFT ? swift + 1 : 0;
+        if (count < CALM) watch(now, count);
+        else this.#sceneDue = now + 2 * Math.max(0, now - start - CALM * SWIFT);
+      });
+    watch(start, 0);
   }
 
   #send(message) {
@@ -136,6 +155,7 @@ export class ViewSocket {
     const message = JSON.parse(data);
     if (message.type === 'cursor') this.#handlers.moved(message.step);
     if (message.type === 'drawn') {
+      this.#paceScene();
       this.#handlers.drawn(message.step, this.#sent.get(message.serial) ?? {});
       for (const serial of this.#sent.keys()) if (serial <= message.serial) this.#sent.delete(serial);
     }
