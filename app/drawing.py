@@ -23,16 +23,16 @@ RGB = tuple[int, int, int]
 
 SIGMAS = 2.0
 POLE_RADIUS = 0.005  # m
-POLE_STEP = 0.05  # m that one pole ends above the next, so that their labels do not meet
+POLE_STEP = 0.06  # m that one pole ends above the next, so that their labels do not meet
 BELIEF_ABOVE = 0.10  # m from the anchor to the plane on which particles and contours are drawn
 FORCE_SCALE = 0.004  # m an N
 FORCE_LENGTH = 0.30  # m, the longest arrow
 PALE = 130.0  # gray of a particle without weight
-EYE = np.array([-0.30, -1.45, 1.45])  # m from what the camera looks at
+EYE = np.array([-0.28, -1.32, 1.22])  # m from what the camera looks at
 UP = np.array([0.0, 0.0, 1.0])
 
 MUJOCO_PLANE = 0  # mjtGeom.mjGEOM_PLANE
-FLOOR_GRAY = (150, 150, 150)
+FLOOR_GRAY = (125, 125, 125)
 LINES = np.arange(-1.0, 1.01, 0.25)
 FLOOR = np.array(
     [[(-1.0, a, 0.0), (1.0, a, 0.0)] for a in LINES] + [[(a, -1.0, 0.0), (a, 1.0, 0.0)] for a in LINES], np.float32
@@ -105,7 +105,7 @@ class Drawing:
             f"/belief/{name}/pole", POLE_RADIUS, height, color=_rgb(name, trace), cast_shadow=False
         )
         label = scene.add_label(
-            f"/belief/{name}/label", name, font_screen_scale=0.75, anchor="bottom-center", depth_test=False
+            f"/belief/{name}/label", name, font_screen_scale=0.7, anchor="bottom-center", depth_test=False
         )
         return pole, label
 
@@ -202,8 +202,8 @@ class Drawing:
         """Where robot, object and belief are seen. A browser that has moved its camera keeps it."""
         at = self._anchors[:, 0].mean(axis=0)
         camera = self._server.initial_camera
-        camera.look_at = at * [0.6, 0.3, 0.65]
-        camera.position = at * [0.6, 0.3, 0.65] + EYE
+        camera.look_at = at * [0.62, 0.3, 0.68]
+        camera.position = at * [0.62, 0.3, 0.68] + EYE
         camera.fov = np.deg2rad(45.0)
 
 
