@@ -35,6 +35,7 @@ class Scene:
         self._slider: GuiSliderHandle[int] | None = None
         self._user_moved = -USER_HOLDS
         self.set_dark(dark)
+        self._fold_panel()
 
     def set_dark(self, dark: bool) -> None:
         """Follow the page's colours."""
@@ -71,9 +72,13 @@ class Scene:
             self._drawing = Drawing(server, traced)
             self._slider = server.gui.add_slider("step", 0, max(1, len(traced.trace) - 1), 1, 0)
             self._slider.on_update(self._on_slider)
-            server.gui.main_panel.set_width(PANEL_WIDTH)
-            server.gui.main_panel.minimize()
+            self._fold_panel()
         self._key = traced.key
+
+    def _fold_panel(self) -> None:
+        panel = self._server.gui.main_panel
+        panel.set_width(PANEL_WIDTH)
+        panel.minimize()
 
     def _on_slider(self, event: GuiEvent[GuiSliderHandle[int]]) -> None:
         # Without a client it was we who moved it, following the page: that must not go back there.
