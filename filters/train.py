@@ -26,8 +26,8 @@ class Plan:
 
     Attributes:
         dynamics: for each of the lengths 1, 4, 8, 16. measurement: for each virtual sensor, and for a likelihood's
-            picture encoders. likelihood: PF: for the layers after these; four times as many for a likelihood without
-            pictures, which trains as a whole. alone: for each modality through the filter. weights: weight model alone.
+            picture encoders. likelihood: PF: for the layers after these, and for a likelihood without pictures.
+            alone: for each modality through the filter. weights: weight model alone.
             together: for each of the lengths.
         batch: windows a step. lengths: of the subsequences of the last stage. particles: in training.
         rate, fine_rate: Adam's learning rate before and during end-to-end stages.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -94,7 +95,7 @@ class Trainer:
             )
 
     def pretrain_measurement(self, name: str) -> None:
-        """EKF: regression of the state by the virtual sensor. PF: regression of the likelihood.
+        """EKF: regression of the state by the virtual sensor. PF: of the likelihood, or by contrast without pictures.
 
         A likelihood's picture encoders first learn to tell the state through a linear readout, which is thrown away:
         that is far faster than from likelihoods, whose layers then learn on stored features.
@@ -110,9 +111,9 @@ class Trainer:
             readout.to(self.device)
             parameters = [*encoders.parameters(), *readout.parameters()]
             self.pretrain_regression(f"{name} model", parameters, lambda o: readout(encoders(o)))
-            self.pretrain_likelihood(name, module, self.plan.likelihood, stored=True)
+            self.pretrain_likelihood(name, module)
         else:
-            self.pretrain_likelihood(name, module, 4 * self.plan.likelihood, stored=False)
+            self.pretrain_contrast(name, module)
 
     def pretrain_regression(
         self, stage: str, parameters: Sequence[nn.Parameter], regress: Callable[[Mapping[str, Tensor]], Tensor]
@@ -126,25 +127,42 @@ class Trainer:
 
         self.optimise(stage, parameters, self.plan.measurement, self.plan.rate, loss)
 
-    def pretrain_likelihood(self, name: str, model: MeasurementModel, count: int, stored: bool) -> None:
-        """Regression of the Gaussian log density around the truth; ``stored``: the encoders stay as they are."""
-        if stored:
-            bright, dark = self.features(model, 0.0), self.features(model, 1.0)
+    def pretrain_likelihood(self, name: str, model: MeasurementModel) -> None:
+        """Regression of the Gaussian log density around the truth, on stored features: encoders stay as they are."""
+        bright, dark = self.features(model, 0.0), self.features(model, 1.0)
         truth = self.filter.statistics.standardise("state", self.steps.states)
-        parameters = [p for n, p in model.named_parameters() if not (stored and n.startswith("encoders."))]
+        parameters = [p for n, p in model.named_parameters() if not n.startswith("encoders.")]
 
         def loss() -> Tensor:
             index = torch.randint(len(truth), (8 * self.plan.batch,), generator=self.generator).to(self.device)
-            if stored:
-                chance = torch.rand(len(index), 1, generator=self.generator).to(self.device)
-                features = torch.where(chance < sum(BLACKOUTS) / len(BLACKOUTS), dark[index], bright[index])
-            else:
-                features = model.encoders(self.filter.observations(self.steps.windows(index, 1)))[0]
+            chance = torch.rand(len(index), 1, generator=self.generator).to(self.device)
+            features = torch.where(chance < sum(BLACKOUTS) / len(BLACKOUTS), dark[index], bright[index])
             states, target = self.likelihood_target(truth[index])
             part = model.join_observation(features).unsqueeze(1)
             return nn.functional.smooth_l1_loss(model.log_likelihood(part, model.state_part(states)), target)
 
-        self.optimise(f"{name} likelihood", parameters, count, 2 * self.plan.rate, loss)
+        self.optimise(f"{name} likelihood", parameters, self.plan.likelihood, 2 * self.plan.rate, loss)
+
+    def pretrain_contrast(self, name: str, model: MeasurementModel) -> None:
+        """Which of the batch's states belongs to an observation? The best answer is log p(z | x) / p(z) + c(z).
+
+        A regression of the expected log density, which serves pictures well, is no likelihood where an observation says
+        little: it bulges where the training states end. This is flat there. The second term pins c(z) at 0.
+        """
+        filter_ = self.filter
+
+        def loss() -> Tensor:
+            batch = self.steps.sample(4 * self.plan.batch, 1, self.generator)
+            states = filter_.statistics.standardise("state", batch.states)
+            part = model.observation_part(filter_.observations(batch))[0]
+            value = model.log_likelihood(part.unsqueeze(1), model.state_part(states))
+            evidence = torch.logsumexp(value, dim=1) - math.log(len(value))
+            return (evidence - value.diagonal()).mean() + 0.01 * evidence.square().mean()
+
+        # Few different states in many observations: without decay it learns the training trajectories by heart.
+        self.optimise(
+            f"{name} likelihood", list(model.parameters()), self.plan.likelihood, 2 * self.plan.rate, loss, decay=0.01
+        )
 
     @torch.no_grad()
     def features(self, model: MeasurementModel, blackout: float) -> Tensor:
@@ -211,13 +229,14 @@ class Trainer:
         count: int,
         rate: float,
         loss: Callable[[], Tensor],
+        decay: float = 0.0,
     ) -> None:
-        """``count`` steps of Adam on these parameters; all others stay as they are."""
+        """``count`` steps of Adam on these parameters, with weight decay; all others stay as they are."""
         chosen = list(parameters)
         self.filter.requires_grad_(False)
         for parameter in chosen:
             parameter.requires_grad_(True)
-        optimiser = torch.optim.Adam(chosen, lr=rate)
+        optimiser = torch.optim.AdamW(chosen, lr=rate, weight_decay=decay)
         schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.1, total_iters=max(count, 1))
         for done in range(count):
             optimiser.zero_grad(set_to_none=True)
