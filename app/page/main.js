@@ -135,7 +135,7 @@ class Page {
     this.#trace = trace;
     const { step } = this.#store.state;
     if (step >= trace.steps) {
-      messages.say('link', `Step ${step} does not exist: this episode has steps 0 to ${trace.steps - 1}.`);
+      messages.say('step', `Step ${step} does not exist: this episode has steps 0 to ${trace.steps - 1}.`);
       this.#store.set({ step: trace.steps - 1 });
     }
     bodies.slice(1).forEach((body) => say(body, 'ready'));

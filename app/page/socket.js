@@ -1,6 +1,7 @@
 /** The view's socket: sends the cursor, receives maps (docs/api.md). Never more than one cursor in flight. */
 
 import { openView } from './api.js';
+import { Pace } from './pace.js';
 
 /**
  * @typedef {{task: string, filter: string, episode: number, step: number, angle: number | null, size: number}} Cursor
@@ -20,8 +21,6 @@ const COARSE = 41;
 const FINE = 135;
 const REST = 120; // ms without a move after which the fine maps are asked for
 const PATIENCE = 10_000; // ms until an answer is taken for lost
-const SWIFT = 40; // ms: a longer frame is one in which the scene was drawn
-const CALM = 3; // swift frames one after another: it has been drawn
 const RETRY = { first: 500, most: 8000 }; // ms
 const decoder = new TextDecoder();
 
@@ -38,7 +37,7 @@ export class ViewSocket {
   #rest = 0;
   #lost = 0;
   #pause = RETRY.first;
-  #sceneDue = 0; // ms; before it a moving cursor is not drawn in the scene
+  #pace = new Pace();
 
   /** @param {Handlers} handlers @param {() => boolean} dark */
   constructor(handlers, dark) {
@@ -49,9 +48,14 @@ export class ViewSocket {
   /** The cursor has moved: coarse maps now, fine ones when it rests. @param {Cursor} cursor without its size. */
   move(cursor, inputTime = null) {
     this.#last = cursor;
-    this.#want({ ...cursor, size: COARSE, scene: performance.now() >= this.#sceneDue }, inputTime);
+    this.#want({ ...cursor, size: COARSE, scene: this.#pace.wait === 0 }, inputTime);
+    const rest = () => {
+      const wait = this.#pace.wait;
+      this.#want({ ...cursor, size: FINE, scene: wait === 0 }, null);
+      if (wait > 0) this.#rest = setTimeout(rest, wait);
+    };
     clearTimeout(this.#rest);
-    this.#rest = setTimeout(() => this.#want({ ...cursor, size: FINE, scene: true }, null), REST);
+    this.#rest = setTimeout(rest, REST);
   }
 
   /** The page's colours have changed. */
@@ -73,6 +77,7 @@ export class ViewSocket {
     this.#inFlight = ++this.#serial;
     this.#sent.set(this.#serial, { ...cursor, inputTime });
     this.#send({ type: 'cursor', serial: this.#serial, ...cursor });
+    if (cursor.scene) this.#pace.taken();
     this.#lost = setTimeout(() => this.#answered(this.#inFlight), PATIENCE);
   }
 
@@ -81,22 +86,6 @@ export class ViewSocket {
     clearTimeout(this.#lost);
     this.#inFlight = null;
     this.#pump();
-  }
-
-  /**
-   * The scene is drawn in our thread, for long where there is no GPU: twice as long as it took, it gets no turn, so that
-   * a drag stays smooth. The fine cursor at the end always draws it.
-   */
-  #paceScene() {
-    const start = performance.now();
-    this.#sceneDue = Infinity;
-    const watch = (before, swift) =>
-      requestAnimationFrame((now) => {
-        const count = now - before < SWIFT ? swift + 1 : 0;
-        if (count < CALM) watch(now, count);
-        else this.#sceneDue = now + 2 * Math.max(0, now - start - CALM * SWIFT);
-      });
-    watch(start, 0);
   }
 
   #send(message) {
@@ -155,7 +144,6 @@ export class ViewSocket {
     const message = JSON.parse(data);
     if (message.type === 'cursor') this.#handlers.moved(message.step);
     if (message.type === 'drawn') {
-      this.#paceScene();
       this.#handlers.drawn(message.step, this.#sent.get(message.serial) ?? {});
       for (const serial of this.#sent.keys()) if (serial <= message.serial) this.#sent.delete(serial);
     }

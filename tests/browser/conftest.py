@@ -1,0 +1,154 @@
+"""A running server and a page in Chromium, watched for errors, broken policies and requests to other hosts."""
+
+from __future__ import annotations
+
+import subprocess
+import sysconfig
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install -e '.[dev]'")
+
+SCREENSHOTS = Path(__file__).resolve().parents[2] / "out" / "screenshots"
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+PATIENCE = 60.0  # s: without a GPU the first picture of a 3D view takes long
+
+# viser's client starts a sorter for Gaussian splats, which we never show, by building a function from a string.
+# The policy refuses that, as it should.
+TOLERATED = "Evaluating a string as JavaScript violates"
+
+
+class Served:
+    """``beliefscope serve`` as a user starts it."""
+
+    def __init__(self, workspace: Path, port: int = 0) -> None:
+        command = Path(sysconfig.get_path("scripts")) / "beliefscope"
+        options = ["serve", "--port", str(port), "--no-open", "--workspace", str(workspace)]
+        self.process = subprocess.Popen([str(command), *options], stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        self.listening = time.monotonic()
+        found = [word for word in line.split() if word.startswith("http://")]
+        assert found, f"no address in {line!r}"
+        self.url = found[0]
+
+    def stop(self) -> None:
+        self.process.terminate()
+        try:
+            self.process.wait(10)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+@pytest.fixture(scope="session")
+def served(tmp_path_factory: pytest.TempPathFactory, chromium: str) -> Iterator[Served]:
+    server = Served(tmp_path_factory.mktemp("workspace"))
+    yield server
+    server.stop()
+
+
+@pytest.fixture(scope="session")
+def browser(chromium: str) -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+class Watched:
+    """A page, and everything about it that must not be."""
+
+    def __init__(self, page: Any, url: str) -> None:
+        self.page = page
+        self.url = url
+        self.wrong: list[str] = []
+        page.add_init_script(
+            "document.addEventListener('securitypolicyviolation', (event) => {"
+            "  if (event.blockedURI !== 'eval') console.error('policy', event.violatedDirective, event.blockedURI);"
+            "});"
+        )
+        page.on("console", lambda message: message.type == "error" and self.wrong.append(message.text))
+        page.on("pageerror", lambda error: TOLERATED in error.message or self.wrong.append(f"{error.stack or error}"))
+        page.on("request", lambda request: self._asked(request.url))
+
+    def _asked(self, url: str) -> None:
+        parts = urlsplit(url)
+        if parts.scheme not in ("data", "blob") and parts.netloc != urlsplit(self.url).netloc:
+            self.wrong.append(f"request to another host: {url}")
+
+    def open(self, link: str = "") -> Watched:
+        """Opens a link of the page's and waits for the fine maps."""
+        self.page.goto(self.url + link)
+        self.until("() => window.beliefscope?.stats.maps?.size === 135")
+        return self
+
+    def until(self, condition: str, patience: float = PATIENCE) -> None:
+        """Waits until a function in the page is true. Playwright's own wait evaluates a string, which is banned."""
+        end = time.monotonic() + patience
+        while not self.page.evaluate(condition):
+            assert time.monotonic() < end, f"not within {patience} s: {condition}; {self.page.evaluate(STATE)}"
+            time.sleep(0.05)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        return self.page.evaluate("() => window.beliefscope.state()")
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        return self.page.evaluate("() => window.beliefscope.stats")
+
+    def maps(self) -> list[str]:
+        """What each map shows."""
+        return self.page.evaluate("() => [...document.querySelectorAll('#heatmaps canvas')].map((c) => c.toDataURL())")
+
+    def settle(self, step: int) -> None:
+        """Waits until the step's fine maps are there and the scene has followed."""
+        self.until(
+            f"() => {{ const {{ maps, drawn }} = beliefscope.stats;"
+            f" return maps.step === {step} && maps.size === 135 && drawn?.step === {step}; }}"
+        )
+
+    def picture(self, name: str) -> None:
+        """Keeps a screenshot."""
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        self.page.screenshot(path=SCREENSHOTS / f"{name}.png", timeout=1000 * PATIENCE)
+
+
+STATE = (
+    "() => JSON.stringify([window.beliefscope?.state(), window.beliefscope?.stats,"
+    " [...document.querySelectorAll('.note, #messages')].map((n) => n.textContent)])"
+)
+OpenPage = Callable[..., Watched]
+
+
+@pytest.fixture
+def open_page(browser: Any, served: Served) -> Iterator[OpenPage]:
+    """Opens pages, and checks at the end that nothing went wrong on any of them."""
+    opened: list[Watched] = []
+
+    def open_(link: str = "", url: str = "", **options: Any) -> Watched:
+        options = {"viewport": {"width": 1024, "height": 768}, "color_scheme": "light"} | options
+        watched = Watched(browser.new_page(**options), url or served.url)
+        opened.append(watched)
+        return watched.open(link)
+
+    yield open_
+    wrong = [line for watched in opened for line in watched.wrong]
+    for watched in opened:
+        watched.page.close()
+    assert not wrong
