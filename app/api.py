@@ -35,6 +35,7 @@ class RecordingRequest(BaseModel):
     task: str
     filter: str
     episode: int
+    blackout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     maps: Annotated[int, Field(ge=0)] = 0
 
 
@@ -60,8 +61,8 @@ def routes(library: Library, views: Views) -> APIRouter:
         return {"version": __version__, **library.catalog()}
 
     @router.get("/api/trace/{task}/{filter}/{episode}")
-    def trace_header(task: str, filter: str, episode: int) -> Response:
-        traced = library.traced(Selection(task, filter, episode))
+    def trace_header(task: str, filter: str, episode: int, blackout: float = 0.0) -> Response:
+        traced = library.traced(Selection(task, filter, episode, blackout))
         try:
             trace = traced.done.result(timeout=PATIENCE)
         except NotYet:
@@ -70,13 +71,13 @@ def routes(library: Library, views: Views) -> APIRouter:
         return JSONResponse(header(trace, traced.columns[0], components) | {"filter": filter})
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
-    def trace_columns(task: str, filter: str, episode: int, request: Request) -> Response:
-        traced = library.traced(Selection(task, filter, episode))
+    def trace_columns(task: str, filter: str, episode: int, request: Request, blackout: float = 0.0) -> Response:
+        traced = library.traced(Selection(task, filter, episode, blackout))
         return _immutable(request, traced, "columns", lambda: traced.columns[1])
 
     @router.get("/api/trace/{task}/{filter}/{episode}/images")
-    def trace_images(task: str, filter: str, episode: int, request: Request) -> Response:
-        traced = library.traced(Selection(task, filter, episode))
+    def trace_images(task: str, filter: str, episode: int, request: Request, blackout: float = 0.0) -> Response:
+        traced = library.traced(Selection(task, filter, episode, blackout))
         if "image" not in traced.trace.episode.observations:
             raise HTTPException(404, f"Task {task!r} has no pictures.")
         return _immutable(request, traced, "images", traced.trace.episode.observations["image"].tobytes)
@@ -89,7 +90,7 @@ def routes(library: Library, views: Views) -> APIRouter:
     @router.post("/api/recordings", status_code=201)
     def record(wanted: RecordingRequest) -> dict[str, Any]:
         started = time.perf_counter()
-        traced = library.traced(Selection(wanted.task, wanted.filter, wanted.episode))
+        traced = library.traced(Selection(wanted.task, wanted.filter, wanted.episode, wanted.blackout))
         trace = traced.trace
         parts = hashlib.sha256(f"{traced.key} maps {wanted.maps}".encode()).hexdigest()[:8]
         path = recordings / f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}.rrd"

@@ -51,18 +51,19 @@ class Settings:
 
 @dataclass(frozen=True)
 class Selection:
-    """What is being looked at: the names of a task and a filter, and an episode's index."""
+    """What is being looked at: names of a task and a filter, an episode's index, the chance of a black picture."""
 
     task: str
     filter: str
     episode: int
+    blackout: float = 0.0
 
 
 class Traced:
     """A trace that is being computed, or is there; and what is derived from it.
 
     Attributes:
-        key: hash of everything the trace depends on: checkpoint, episode, seed, particles.
+        key: hash of everything the trace depends on: checkpoint, episode, seed, particles, blackout.
         done: the trace, or the error that computing it ended in. progress: 0..1.
     """
 
@@ -179,13 +180,21 @@ class Library:
         raise BadInput("; ".join(catalog["problems"]) or "no trained filter is there to show; train one first.")
 
     def traced(self, selection: Selection) -> Traced:
-        """The selection's trace, whose computing begins now if it has not yet. Raises BadInput for unknown names."""
+        """The selection's trace, computed from now on if it is not there. Raises BadInput for what does not exist."""
+        if not 0.0 <= selection.blackout <= 1.0:
+            raise BadInput(f"blackout is a chance between 0 and 1, not {selection.blackout}.")
         with self._lock:
             known = self._traced.get(self._keys.get(selection, ""))
             if known is None or (known.done.done() and known.done.exception() is not None):
                 checkpoint = self.checkpoint(selection.task, selection.filter)
                 episode = self.episode(selection.task, selection.episode)
-                parts = (checkpoint.hash, episode.digest(), self.settings.seed, self.settings.particles)
+                parts = (
+                    checkpoint.hash,
+                    episode.digest(),
+                    self.settings.seed,
+                    self.settings.particles,
+                    selection.blackout,
+                )
                 key = hashlib.sha256(repr(parts).encode()).hexdigest()
                 self._keys[selection] = key
                 known = self._traced[key] = Traced(key, checkpoint)
@@ -214,6 +223,7 @@ class Library:
                 episode_index=selection.episode,
                 seed=self.settings.seed,
                 particles=self.settings.particles,
+                blackout=selection.blackout,
                 progress=progress,
             )
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -99,7 +99,8 @@ class View:
                 await _tell_error(websocket, wanted.serial, f"The server failed: {error}")
 
     async def _answer_one(self, websocket: WebSocket, wanted: Cursor) -> None:
-        traced = await asyncio.to_thread(self._library.traced, Selection(wanted.task, wanted.filter, wanted.episode))
+        selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.blackout)
+        traced = await asyncio.to_thread(self._library.traced, selection)
         if not await self._ready_before_newer(traced):
             return
         trace = traced.trace

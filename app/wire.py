@@ -22,7 +22,8 @@ SENSORS = ("effector_position", "force")
 class Cursor:
     """The page's whole selection, as one message of it says.
 
-    Serial: the page's own count of its cursors. Scene: whether the 3D scene follows, or only the maps.
+    Serial: the page's own count of its cursors. Blackout: chance of a black picture. Scene: whether the 3D scene
+    follows, or only the maps.
     """
 
     serial: int
@@ -32,6 +33,7 @@ class Cursor:
     step: int
     angle: float | None
     size: int
+    blackout: float = 0.0
     scene: bool = True
 
 
@@ -42,17 +44,30 @@ def cursor(message: dict[str, Any]) -> Cursor:
         if not isinstance(message.get(key), str):
             raise BadInput(f"cursor needs {key!r}, a name; got {message.get(key)!r}.")
     angle = message.get("angle")
-    if angle is not None and (
-        isinstance(angle, bool) or not isinstance(angle, int | float) or not math.isfinite(angle)
-    ):
+    if angle is not None and not _is_number(angle):
         raise BadInput(f"cursor's 'angle' is a number of radians or null; got {angle!r}.")
+    blackout = message.get("blackout", 0.0)
+    if not _is_number(blackout):
+        raise BadInput(f"cursor's 'blackout' is a chance between 0 and 1; got {blackout!r}.")
     size = message.get("size", MAP_SIZES[0])
     if size not in MAP_SIZES:
         raise BadInput(f"cursor's 'size' is {' or '.join(map(str, MAP_SIZES))}; got {size!r}.")
     scene = message.get("scene", True)
     if not isinstance(scene, bool):
         raise BadInput(f"cursor's 'scene' is true or false; got {scene!r}.")
-    return Cursor(task=message["task"], filter=message["filter"], angle=angle, size=size, scene=scene, **integers)
+    return Cursor(
+        task=message["task"],
+        filter=message["filter"],
+        angle=angle,
+        size=size,
+        blackout=float(blackout),
+        scene=scene,
+        **integers,
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _integer(message: dict[str, Any], key: str) -> int:
