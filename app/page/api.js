@@ -44,23 +44,24 @@ export const openView = async (dark) => (await post('/api/views', { dark })).jso
 
 /**
  * A trace with all its numbers and pictures; the server computes it first if need be.
- * @param {Task} task @param {string} filter @param {number} episode
+ * @param {Task} task @param {string} filter @param {number} episode @param {string} blackout chance of a black picture
  * @param {(share: number) => void} progress @param {AbortSignal} signal
  * @returns {Promise<Trace>}
  */
-export async function loadTrace(task, filter, episode, progress, signal) {
+export async function loadTrace(task, filter, episode, blackout, progress, signal) {
   const url = `/api/trace/${encodeURIComponent(task.name)}/${encodeURIComponent(filter)}/${episode}`;
-  let response = await ask(url, { signal });
+  const query = `?blackout=${blackout}`;
+  let response = await ask(url + query, { signal });
   while (response.status === 202) {
     progress((await response.json()).progress);
     await new Promise((resolve) => setTimeout(resolve, AGAIN));
-    response = await ask(url, { signal });
+    response = await ask(url + query, { signal });
   }
   const header = await response.json();
   const hasPictures = task.modalities.includes('image');
   const [columns, pictures] = await Promise.all([
-    ask(`${url}/columns`, { signal }).then((r) => r.arrayBuffer()),
-    hasPictures ? ask(`${url}/images`, { signal }).then((r) => r.arrayBuffer()) : null,
+    ask(`${url}/columns${query}`, { signal }).then((r) => r.arrayBuffer()),
+    hasPictures ? ask(`${url}/images${query}`, { signal }).then((r) => r.arrayBuffer()) : null,
   ]);
   return new Trace(task, filter, episode, header, columns, pictures);
 }
@@ -68,5 +69,6 @@ export async function loadTrace(task, filter, episode, progress, signal) {
 /** Writes a recording of a trace, with maps at even steps. @param {Trace} trace @returns {Promise<Recording>} */
 export async function record(trace) {
   const maps = Math.ceil(trace.steps / RECORDED_MAPS);
-  return (await post('/api/recordings', { task: trace.task.name, filter: trace.filter, episode: trace.episode, maps })).json();
+  const { task, filter, episode, header } = trace;
+  return (await post('/api/recordings', { task: task.name, filter, episode, blackout: header.settings.blackout, maps })).json();
 }

@@ -1,14 +1,16 @@
 /** What is shown: task, filter, episode, speed; and the small choices above the time line. */
 
-import { SPEEDS } from './state.js';
+import { BLACKOUTS, SPEEDS } from './state.js';
 import { percent } from './units.js';
 
 /** @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store */
 export function pickers(catalog, store) {
-  const [task, filter, episode, speed] = ['task', 'filter', 'episode', 'speed'].map((id) => document.getElementById(id));
+  const ids = ['task', 'filter', 'episode', 'blackout', 'speed'];
+  const [task, filter, episode, blackout, speed] = ids.map((id) => document.getElementById(id));
   const shown = catalog.tasks.filter((t) => t.filters.length && t.episodes.length);
   const current = () => shown.find((t) => t.name === store.state.task);
   fill(task, shown.map((t) => [t.name, t.name]));
+  fill(blackout, BLACKOUTS.map((chance) => [chance, `${percent(Number(chance))} black`]));
   fill(speed, SPEEDS.map((s) => [s, `${s}×`]));
   const refill = () => {
     fill(filter, current().filters.map((f) => [f.name, f.name]));
@@ -20,10 +22,11 @@ export function pickers(catalog, store) {
   });
   filter.addEventListener('change', () => store.set({ filter: filter.value }));
   episode.addEventListener('change', () => store.set({ episode: Number(episode.value), step: 0, playing: false }));
+  blackout.addEventListener('change', () => store.set({ blackout: blackout.value }));
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
   const show = (state, changed = new Set(['task'])) => {
     if (changed.has('task')) refill();
-    [task.value, filter.value, episode.value, speed.value] = [state.task, state.filter, state.episode, state.speed];
+    for (const select of [task, filter, episode, blackout, speed]) select.value = state[select.id];
   };
   show(store.state);
   store.listen(show);
