@@ -5,6 +5,7 @@ import { fixed, signed } from './units.js';
 
 const MARGIN = { left: 34, bottom: 30, top: 1, right: 5, gap: 9 }; // px around a map's square
 const SMALLEST = Math.log(0.5 / 255); // below this a byte is 0
+const HALO = ['rgb(255 255 255 / 0.55)', 3.5];
 const FONT = '10px system-ui, sans-serif';
 
 export class Heatmaps {
@@ -147,21 +148,21 @@ export class Heatmaps {
       outlined([['rgb(255 255 255 / 0.75)', 1]], () => (pen.moveTo(tx, ty), pen.lineTo(...place(effector))));
       pen.setLineDash([]);
     }
-    const halo = ['rgb(0 0 0 / 0.65)', 4];
-    outlined([halo, ['#fff', 2]], () => {
-      pen.moveTo(tx - 6, ty);
-      pen.lineTo(tx + 6, ty);
-      pen.moveTo(tx, ty - 6);
-      pen.lineTo(tx, ty + 6);
+    // Open in the middle: a sharp peak is no larger than a mark.
+    outlined([['rgb(0 0 0 / 0.6)', 3.5], ['#fff', 1.5]], () => {
+      for (const [dx, dy] of [[1, 0], [0, 1], [-1, 0], [0, -1]]) {
+        pen.moveTo(tx + 4 * dx, ty + 4 * dy);
+        pen.lineTo(tx + 10 * dx, ty + 10 * dy);
+      }
     });
     if (this.#trace.modalities.includes(name)) {
       const [x, y] = place(positionOf(name));
-      outlined([['#fff', 4.5], [line(name).stroke, 2.5]], () => pen.arc(x, y, 5, 0, 2 * Math.PI));
+      outlined([HALO, [line(name).stroke, 2]], () => pen.arc(x, y, 5, 0, 2 * Math.PI));
     }
     const [x, y] = place(this.#trace.position.map((i) => estimate[i]));
-    outlined([['#fff', 4.5], [line('fused').stroke, 2.5]], () => {
-      pen.moveTo(x, y - 6);
-      for (const [dx, dy] of [[6, 0], [0, 6], [-6, 0], [0, -6]]) pen.lineTo(x + dx, y + dy);
+    outlined([HALO, [line('fused').stroke, 2]], () => {
+      pen.moveTo(x, y - 9);
+      for (const [dx, dy] of [[9, 0], [0, 9], [-9, 0]]) pen.lineTo(x + dx, y + dy);
       pen.closePath();
     });
     if (!this.#hover) return;

@@ -3,6 +3,7 @@
 import { record } from './api.js';
 import { say } from './panel.js';
 
+const SETTLING = 30; // frames at most until a recording that is being opened keeps our time
 const ECHO_FRAMES = 4; // that the viewer may take to tell back a time that we set
 
 export class Rerun {
@@ -44,7 +45,8 @@ export class Rerun {
 
   /** The recording of a trace: written once, however often it is asked for. @param {import('./trace.js').Trace} trace */
   recording(trace) {
-    const key = `${trace.header.checkpoint_hash} ${trace.header.data_hash} ${trace.header.seed}`;
+    const { checkpoint_hash, data_hash, seed, settings } = trace.header;
+    const key = [checkpoint_hash, data_hash, seed, settings.blackout].join(' ');
     if (!this.#recordings.has(key)) {
       const made = record(trace);
       this.#recordings.set(key, made);
@@ -73,11 +75,23 @@ export class Rerun {
       const before = (await this.#viewer.get_state()).recordings ?? [];
       await this.#viewer.open(new URL(recording.url, location.href).href);
       await Promise.all(before.map((r) => this.#viewer.close(r.store_id).catch(() => null)));
+      await this.#settle();
       say(this.#host, 'ready');
       this.#seek(this.#step);
     } catch (error) {
       this.#shown = null;
       say(this.#host, 'error', `Rerun cannot show this: ${error.message ?? error}`);
+    }
+  }
+
+  /** A recording that has just been opened sets its own time once more when its blueprint comes: insist on ours. */
+  async #settle() {
+    for (let tries = 0, kept = 0; tries < SETTLING && kept < 3; tries++) {
+      const { active_store_id: active, recordings } = await this.#viewer.get_state();
+      const now = recordings.find((r) => r.store_id === active)?.current_time;
+      kept = now?.timeline === 'step' && Number(now.time) === this.#step ? kept + 1 : 0;
+      const time = { timeline: 'step', sequence: this.#step, play_state: 'paused' };
+      if (!kept) await this.#viewer.set_time(time).catch(() => frame());
     }
   }
 

@@ -62,6 +62,20 @@ def served(tmp_path_factory: pytest.TempPathFactory, chromium: str) -> Iterator[
     server.stop()
 
 
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
+    """Starts servers of the test's own, on one workspace."""
+    started: list[Served] = []
+
+    def start(port: int = 0) -> Served:
+        started.append(Served(tmp_path / "workspace", port))
+        return started[-1]
+
+    yield start
+    for server in started:
+        server.stop()
+
+
 @pytest.fixture(scope="session")
 def browser(chromium: str) -> Iterator[Any]:
     with sync_api.sync_playwright() as playwright:
