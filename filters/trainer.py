@@ -203,16 +203,9 @@ class Trainer:
             if only is not None:
                 evidence = evidence.only(only)
             start = self.perturbed(start_at_truth(self.filter, batch))
-            run = rollout(self.filter, evidence, start, self.noise, self.plan.particles, keep=True)
-            truth = self.filter.statistics.standardise("state", batch.states)
-            error = run.estimate.mean - truth
-            likelihood = negative_log_likelihood(error, run.estimate.covariance)
-            # Unimodal EKFs that beta ignores would otherwise never learn how wrong they are.
-            banks = [step.modality for step in run.steps if step.modality is not None]
-            if banks:
-                means = torch.stack([bank.mean for bank in banks])
-                covariances = torch.stack([bank.covariance for bank in banks])
-                likelihood = likelihood + negative_log_likelihood(means - truth.unsqueeze(2), covariances)
+            estimate = rollout(self.filter, evidence, start, self.noise, self.plan.particles).estimate
+            error = estimate.mean - self.filter.statistics.standardise("state", batch.states)
+            likelihood = negative_log_likelihood(error, estimate.covariance)
             return error.square().sum(-1).mean() + self.plan.likelihood_weight * likelihood
 
         self.optimise(stage, parameters, count, self.plan.fine_rate, loss)
