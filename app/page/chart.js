@@ -16,6 +16,7 @@ import { colour, line, translucent } from './palette.js';
 
 /** px beside and below a track's plot. */
 export const GUTTER = { left: 46, right: 12, axis: 33 };
+const BLACK_STRIP = 8; // px
 const FONT = '10px system-ui, sans-serif';
 
 /**
@@ -108,7 +109,7 @@ function shade(plot, { contact, black }) {
   ctx.fillStyle = colour('contact-band');
   for (const [left, width] of contact.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, width, bbox.height);
   ctx.fillStyle = hatch(ctx);
-  for (const [left, width] of black.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, Math.max(width, 1), bbox.height);
+  for (const [left, width] of black.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, Math.max(width, 1), BLACK_STRIP * devicePixelRatio);
   ctx.restore();
 }
 

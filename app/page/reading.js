@@ -21,13 +21,13 @@ export function reading(trace, step, component) {
   said.push(`Fused belief is ${fixed(error, 1)} cm off; worst in ${spoken(worst)}, ${fixed(sigmas, 1)}σ: ${verdict}.`);
 
   const [best, leader] = [closest(trace, step), leading(trace, step, component)];
-  if (leader && best && leader.name !== best.name && best.error + NEAR < error) {
-    said.push(`It follows ${leader.name} (${percent(leader.share)}), though ${best.name} alone is ${fixed(best.error, 1)} cm off.`);
-  } else if (leader && leader.share >= LEADS) {
-    said.push(`It follows ${leader.name} (${percent(leader.share)}).`);
+  const blind = (leader?.name === 'image' && trace.black[step] && 'the picture is black') || (leader?.name === 'haptics' && !trace.contact[step] && 'there is no contact to feel');
+  const better = leader && best.name !== leader.name && best.error + NEAR < error && `${best.name} alone is ${fixed(best.error, 1)} cm off`;
+  const though = [blind, better].filter(Boolean).join(' and ');
+  if (leader && (leader.share >= LEADS || better)) {
+    said.push(`It follows ${leader.name} (${percent(leader.share)})${though && `, though ${though}`}.`);
   }
-  if (trace.black[step]) said.push('The picture is black.');
-  if (!trace.contact[step] && leader?.name === 'haptics' && leader.share >= LEADS) said.push('There is no contact to feel.');
+  if (trace.black[step] && leader?.name !== 'image') said.push('The picture is black.');
   const particles = trace.particles?.[step];
   const count = trace.header.settings?.particles;
   if (particles && count && particles < FEW * count) said.push(`${fixed(particles, 0)} of ${count} particles carry the weight.`);

@@ -134,6 +134,21 @@ def test_a_slice_at_another_angle_changes_the_maps(open_page: Any) -> None:
     page.until("() => beliefscope.state().angle === null")
 
 
+def test_black_pictures_are_named(open_page: Any) -> None:
+    page = open_page("?step=20")
+    assert not page.page.locator("#black-key").is_visible()
+    page.page.locator("#blackout").select_option("0.8")
+    page.until("() => !document.querySelector('#black-key').hidden")
+    for _ in range(30):
+        if page.page.locator(".black-out").is_visible():
+            break
+        page.page.keyboard.press("ArrowRight")
+        time.sleep(0.1)
+    assert page.page.locator(".black-out").is_visible()
+    page.settle(page.state["step"])
+    page.picture("black-out")
+
+
 def test_a_link_opens_the_same_moment(open_page: Any) -> None:
     first = open_page("?step=33&component=angle&weights=acting&angle=0.7")
     first.page.keyboard.press("ArrowRight")
