@@ -120,10 +120,15 @@ def modality_shape(task: Task, modality: str) -> tuple[int, ...]:
     return keys[0] if len(keys[0]) == 2 else (sum(shape[0] for shape in keys),)
 
 
+LARGEST_LOGIT = 3.0
+"""Bound of the weight model's logits: a weight that reached 0 or 1 would never learn again."""
+
+
 class WeightModel(nn.Module):
     """Crossmodal weights: every modality through an encoder of its own, joined, to log beta (T, N, K, W).
 
-    A softmax over K makes the weights positive and sum to one in each component.
+    A softmax over K makes the weights positive and sum to one in each component; bounded logits keep each between
+    0.0025 and 0.9975.
     """
 
     def __init__(self, task: Task, models: tuple[str, ...], width: int, units: int, image_stride: int) -> None:
@@ -138,4 +143,5 @@ class WeightModel(nn.Module):
 
     def forward(self, observations: Mapping[str, Tensor]) -> Tensor:
         logits = self.output(self.trunk(self.encoders(observations))).unflatten(-1, self.shape)
+        logits = LARGEST_LOGIT * torch.tanh(logits / LARGEST_LOGIT)
         return torch.log_softmax(logits, dim=-2)

@@ -30,7 +30,7 @@ class Plan:
             alone: for each modality through the filter. weights: weight model alone.
             together: for each of the lengths.
         batch: windows a step. lengths: of the subsequences of the last stage. particles: in training.
-        rate, fine_rate: Adam's learning rate before and during end-to-end stages.
+        rate, fine_rate: Adam's learning rate, the fine one where whole filters train end to end.
         likelihood_weight: of the negative log-likelihood beside the squared error of the mean, end to end: the squared
             error alone, as in the authors' code, leaves covariances without a meaning.
     """
@@ -39,8 +39,8 @@ class Plan:
     measurement: int = 300
     likelihood: int = 1500
     alone: int = 80
-    weights: int = 80
-    together: tuple[int, ...] = (100, 150, 400)
+    weights: int = 120
+    together: tuple[int, ...] = (80, 100, 300)
     lengths: tuple[int, ...] = (4, 8, 16)
     batch: int = 32
     particles: int = 30

@@ -58,7 +58,7 @@ class Trainer:
             for k, name in enumerate(self.filter.names):
                 self.end_to_end(f"{name} alone", everything_else, self.plan.alone, self.plan.lengths[-1], only=k)
             weights = self.filter.get_submodule("weight_model").parameters()
-            self.end_to_end("weights", list(weights), self.plan.weights, self.plan.lengths[-1])
+            self.end_to_end("weights", list(weights), self.plan.weights, self.plan.lengths[-1], rate=self.plan.rate)
         parameters = list(self.filter.parameters())
         for length, count in zip(self.plan.lengths, self.plan.together, strict=True):
             self.end_to_end(f"together, {length} steps", parameters, count, length)
@@ -193,7 +193,13 @@ class Trainer:
         return module
 
     def end_to_end(
-        self, stage: str, parameters: Sequence[nn.Parameter], count: int, length: int, only: int | None = None
+        self,
+        stage: str,
+        parameters: Sequence[nn.Parameter],
+        count: int,
+        length: int,
+        only: int | None = None,
+        rate: float | None = None,
     ) -> None:
         """Backpropagation through ``length`` steps of the filter."""
 
@@ -208,7 +214,7 @@ class Trainer:
             likelihood = negative_log_likelihood(error, estimate.covariance)
             return error.square().sum(-1).mean() + self.plan.likelihood_weight * likelihood
 
-        self.optimise(stage, parameters, count, self.plan.fine_rate, loss)
+        self.optimise(stage, parameters, count, rate or self.plan.fine_rate, loss)
 
     def perturbed(self, start: Gaussian) -> Gaussian:
         """A first belief whose mean is off by as much as its covariance says: the filter must learn to come back."""
