@@ -52,7 +52,7 @@ def measure() -> list[Row]:
         page = chromium.new_page(viewport={"width": 1440, "height": 900})
         launched = time.perf_counter()
         page.goto(url)
-        page.wait_for_function("window.beliefscope?.stats.maps", timeout=60_000)
+        page.wait_for_function("() => window.beliefscope?.stats.maps", timeout=60_000)
         usable = time.perf_counter()
         rows.append(("from listening to maps drawn, browser's start left out", f"{usable - launched:.2f} s", "<= 3 s"))
         rows.append(("of this machine's browser: its start", f"{launched - listening:.2f} s", ""))

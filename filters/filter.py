@@ -33,6 +33,8 @@ class Architecture:
         units: width of all fully connected layers. image_stride: of the first convolution.
         covariance: EKF: rule of the fused covariance. feedback: EKF: hand the fused belief back to every unimodal
             filter (the paper's text leaves them independent).
+        likelihoods: PF: ``normalised`` over the particles in each model before they are weighed, so that beta is the
+            share a model has in the particle weights; or ``raw``: what finds all states likely outweighs the rest.
     """
 
     task: str
@@ -43,6 +45,7 @@ class Architecture:
     image_stride: int = 2
     covariance: CovarianceRule = "paper"
     feedback: bool = False
+    likelihoods: Literal["normalised", "raw"] = "normalised"
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self) | {"models": list(self.models)}

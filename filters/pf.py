@@ -50,7 +50,10 @@ class MeasurementModel(nn.Module):
 
 
 class ParticleFilter(Filter):
-    """Sampling importance resampling with ``w_i = sum_k beta_k p_k(z | x_i)``; systematic resampling at every step."""
+    """Sampling importance resampling with ``w_i = sum_k beta_k p_k(z | x_i) / s_k``.
+
+    The scale s_k is each model's evidence, or 1 (``architecture.likelihoods``). Systematic resampling at every step.
+    """
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
@@ -83,6 +86,15 @@ class ParticleFilter(Filter):
         ]
         return torch.stack(values, dim=1)
 
+    def scale(self, log_weights: Tensor, log_likelihood: Tensor) -> Tensor:
+        """(N, K, 1) what is taken off each model's log-likelihoods (N, K, M) before they are fused.
+
+        Normalised: the evidence ``log sum_i w_i p_k(z | x_i)`` with the particles' prior log-weights (N, M). Raw: zero.
+        """
+        if self.architecture.likelihoods == "raw":
+            return torch.zeros_like(log_likelihood[..., :1])
+        return torch.logsumexp(log_weights.unsqueeze(1) + log_likelihood, dim=-1, keepdim=True)
+
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Particles:
         factor = torch.linalg.cholesky(belief.covariance)
         shape = (len(belief.mean), particles, self.n)
@@ -96,7 +108,8 @@ class ParticleFilter(Filter):
         unit = torch.randn(moved.shape, generator=generator, device=moved.device)
         predicted = Particles(moved + unit * self.dynamics.noise, belief.log_weights)
         log_likelihood = self.log_likelihood(evidence, predicted.states)
-        log_weights = predicted.log_weights + mixture(log_likelihood, evidence.log_weights)
+        weighed = log_likelihood - self.scale(predicted.log_weights, log_likelihood)
+        log_weights = predicted.log_weights + mixture(weighed, evidence.log_weights)
         posterior = Particles(predicted.states, torch.log_softmax(log_weights, dim=-1))
         ancestors = systematic(posterior.log_weights.detach(), generator)
         resampled = Particles(

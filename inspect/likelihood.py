@@ -33,7 +33,8 @@ LARGEST = 1024
 class LikelihoodMap:
     """One map per modality and one fused, over offsets from the true position.
 
-    PF: the measurement models' log-likelihood. EKF: log density of each unimodal posterior and of the fused one.
+    PF: the measurement models' log-likelihood, and their mixture as it is fused. EKF: log density of each unimodal
+    posterior and of the fused one.
 
     Attributes:
         step: of the trace. angle: value of the one component that is held fixed (rad), NaN where there is none.
@@ -151,8 +152,13 @@ class MapEngine:
         standard = filter_.statistics.standardise("state", states).unsqueeze(0)
         chunks = [filter_.log_likelihood(evidence, part) for part in standard.split(CELLS_AT_ONCE, dim=1)]
         each = torch.cat(chunks, dim=-1)[0]
+        trace = self.trace
+        assert trace.prior_log_weights is not None
+        assert trace.log_likelihood is not None
+        prior, of_particles = trace.prior_log_weights[step], trace.log_likelihood[step]
+        scale = filter_.scale(torch.from_numpy(prior)[None], torch.from_numpy(of_particles)[None])[0]
         log_weights = None if evidence.log_weights is None else evidence.log_weights[0]
-        return torch.cat([each, mixture(each, log_weights).unsqueeze(0)])
+        return torch.cat([each, mixture(each - scale, log_weights).unsqueeze(0)])
 
     def _gaussians(self, step: int, states: Tensor) -> Tensor:
         """(K + 1, S * S) log densities of each unimodal posterior and of the fused one."""

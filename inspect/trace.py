@@ -21,6 +21,7 @@ from beliefscope.filters.batch import Steps, black_out
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, moments
 from beliefscope.filters.checkpoint import Checkpoint, write_atomically
 from beliefscope.filters.filter import Filter
+from beliefscope.filters.pf import ParticleFilter
 from beliefscope.filters.rollout import rollout, start_at_truth
 
 Array = NDArray[np.float32]
@@ -45,7 +46,7 @@ class Trace:
         start_mean, start_covariance: (n,), (n, n) belief before the first step.
         weights: (T, K, W) beta as the network gave it; W is n (per component) or 1.
         acting: (T, K, W) share of each modality in the fused result as it acted; sums to one over K. EKF: beta over the
-            sum of betas; PF: prior weight x beta x likelihood of that modality over that of all, summed over particles.
+            sum of betas; PF: prior weight x beta x likelihood as fused, over that of all, summed over particles.
         predicted_mean, predicted_covariance: EKF: (T, K, n), (T, K, n, n): before the observation.
         observation_mean, observation_covariance: EKF: (T, K, n), (T, K, n, n): the virtual sensors' z and R.
         particles: PF: (T, M, n) predicted particles.
@@ -210,7 +211,9 @@ def _pf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> d
         "modality_mean": si.state_to_si(modality.mean),
         "modality_covariance": si.covariance_to_si(modality.covariance),
     }
-    evidence_of_each = torch.logsumexp(prior.unsqueeze(1) + log_likelihood, dim=-1, keepdim=True)
+    assert isinstance(filter_, ParticleFilter)
+    weighed = log_likelihood - filter_.scale(prior, log_likelihood)
+    evidence_of_each = torch.logsumexp(prior.unsqueeze(1) + weighed, dim=-1, keepdim=True)
     if evidence.log_weights is not None:
         evidence_of_each = evidence_of_each + evidence.log_weights[:, 0]
     arrays["acting"] = torch.softmax(evidence_of_each, dim=1)

@@ -61,7 +61,12 @@ def test_particle_filter_maps_equal_the_naive_way(pf: MapEngine) -> None:
     np.testing.assert_allclose(map_.log_likelihood[1], each[1], atol=2e-4)
     weights = pf.trace.weights
     assert weights is not None
-    fused = np.log(weights[step, 0] * np.exp(each[0]) + weights[step, 1] * np.exp(each[1]))
+    # Each likelihood is divided by its evidence: its mean over the particles, weighted as they were before this step.
+    assert pf.trace.prior_log_weights is not None
+    assert pf.trace.log_likelihood is not None
+    prior = np.exp(pf.trace.prior_log_weights[step])
+    evidence = [(prior * np.exp(values)).sum() for values in pf.trace.log_likelihood[step]]
+    fused = np.log(sum(weights[step, k] * np.exp(each[k]) / evidence[k] for k in range(2)))
     np.testing.assert_allclose(map_.log_likelihood[2], fused, atol=2e-4)
 
 

@@ -64,10 +64,11 @@ def test_shares_sum_to_one_and_covariances_are_definite(traced: Trace) -> None:
     assert traced.acting is not None
     np.testing.assert_allclose(traced.weights.sum(1), 1.0, atol=1e-6)
     np.testing.assert_allclose(traced.acting.sum(1), 1.0, atol=1e-6)
-    np.testing.assert_allclose(traced.estimate_covariance, traced.estimate_covariance.swapaxes(1, 2), atol=1e-12)
     # Scaled to unit diagonal, so that m and rad compare; a particle set may hold a flat direction, to rounding.
     scale = np.sqrt(np.diagonal(traced.estimate_covariance, axis1=1, axis2=2)) + 1e-9
     correlation = traced.estimate_covariance / scale[:, :, None] / scale[:, None]
+    # Float32: sums over particles are right to some 1e-7 of the variances.
+    np.testing.assert_allclose(correlation, correlation.swapaxes(1, 2), atol=1e-5)
     assert np.linalg.eigvalsh(correlation).min() > -1e-5
 
 
