@@ -47,12 +47,18 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         tidying = asyncio.create_task(views.tidy())
+        stopping = threading.Event()
+        warming = threading.Thread(target=_warm, args=(library, rerun, stopping), name="warming")
         if warm:
-            threading.Thread(target=_warm, args=(library, rerun), name="warming", daemon=True).start()
+            warming.start()
         yield
+        stopping.set()
         tidying.cancel()
         await views.close()
         await asyncio.to_thread(library.close)
+        # A thread that is inside C++ when Python ends takes the whole process down with an abort.
+        if warm:
+            await asyncio.to_thread(warming.join)
 
     app = FastAPI(title="Beliefscope", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     app.state.library, app.state.views = library, views
@@ -135,13 +141,18 @@ def _add_files(app: FastAPI, rerun: RerunViewer) -> None:
         return cached_file(request, uplot / name, media_type, {})
 
 
-def _warm(library: Library, rerun: RerunViewer) -> None:
+def _warm(library: Library, rerun: RerunViewer, stopping: threading.Event) -> None:
     """Have ready what the first page asks for, maps before Rerun. What fails is told to the page that asks for it."""
-    for prepare in (lambda: library.traced(library.default()).map(0, None, MAP_SIZES[0]), rerun.prepare):
+    for prepare in (
+        lambda: library.traced(library.default()).map(0, None, MAP_SIZES[0]),
+        lambda: rerun.prepare(stopping.is_set),
+    ):
         try:
-            prepare()
+            if not stopping.is_set():
+                prepare()
         except (Exception, CancelledError) as error:
-            log.warning("Not prepared in advance: %s", error)
+            if not stopping.is_set():
+                log.warning("Not prepared in advance: %s", error)
 
 
 def _say(status: int | None) -> Callable[[Request, Exception], JSONResponse]:

@@ -10,7 +10,7 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import brotli
@@ -22,6 +22,7 @@ from beliefscope.filters.checkpoint import write_atomically
 UPLOT_FILES = ("uPlot.iife.js", "uPlot.min.css")
 # widget.js is made for notebooks and keeps its viewer class to itself.
 EXPORT = b"\nexport { WebViewer };\n"
+COMPRESSED_AT_ONCE = 1 << 20  # bytes between two looks at whether the server is being stopped
 
 
 class RerunViewer:
@@ -45,11 +46,17 @@ class RerunViewer:
         """The viewer's module, which exports ``WebViewer`` and loads ``re_viewer_bg.wasm`` from beside itself."""
         return self._widget.read_bytes() + EXPORT
 
-    def prepare(self) -> None:
-        """Make the compressed file if it is missing: about 5 s of one core, once."""
+    def prepare(self, given_up: Callable[[], bool] = lambda: False) -> None:
+        """Make the compressed file if it is missing: about 5 s of one core, once. Ends early when ``given_up``."""
         plain = self._stripped()
-        if not self._compressed.exists():
-            write_atomically(self._compressed, brotli.compress(plain.read_bytes(), quality=5))
+        if self._compressed.exists():
+            return
+        compressor, data, parts = brotli.Compressor(quality=5), plain.read_bytes(), []
+        for start in range(0, len(data), COMPRESSED_AT_ONCE):
+            if given_up():
+                return
+            parts.append(compressor.process(data[start : start + COMPRESSED_AT_ONCE]))
+        write_atomically(self._compressed, b"".join([*parts, compressor.finish()]))
 
     def wasm(self, request: Request) -> Response:
         """The stripped module, compressed where the browser can and the file is ready. Blocks to strip it once."""
