@@ -56,7 +56,7 @@ def measure() -> list[Row]:
         usable = time.perf_counter()
         rows.append(("from listening to maps drawn, browser's start left out", f"{usable - launched:.2f} s", "<= 3 s"))
         rows.append(("of this machine's browser: its start", f"{launched - listening:.2f} s", ""))
-        page.wait_for_timeout(2000)
+        page.wait_for_timeout(10_000)  # until the server has prepared the Rerun viewer, once a workspace
         page.evaluate("window.beliefscope.stats.scrub.length = 0")
         for number in range(KEYS):
             page.keyboard.press("ArrowRight" if number // 40 % 2 == 0 else "ArrowLeft")

@@ -2,7 +2,8 @@
 
 const SLOW = 50; // ms; a longer frame is one in which something heavy was drawn
 const WATCHED = 1500; // ms after the last request during which frames are watched
-const SHARE = 3; // the scene waits so many times as long as it takes to draw
+/** The scene waits so many times as long as it takes to draw: a hand must not feel it, a replay may. */
+export const SHARE = { hand: 30, clock: 3 };
 const MOST = 600; // ms of drawing that are believed: the first picture takes longer than any after it
 
 export class Pace {
@@ -12,11 +13,11 @@ export class Pace {
   #until = 0;
   #watching = false;
 
-  /** ms until it is the scene's turn: none where it costs nothing. */
-  get wait() {
+  /** Whether it is the scene's turn: always where it costs nothing. @param {number} share one of SHARE */
+  mayDraw(share) {
     this.#until = performance.now() + WATCHED;
     if (!this.#watching) this.#watch();
-    return Math.max(0, this.#turn + SHARE * Math.min(MOST, Math.max(this.#cost, this.#before)) - performance.now());
+    return performance.now() >= this.#turn + share * Math.min(MOST, Math.max(this.#cost, this.#before));
   }
 
   /** The scene is being drawn. */

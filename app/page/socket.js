@@ -1,7 +1,7 @@
 /** The view's socket: sends the cursor, receives maps (docs/api.md). Never more than one cursor in flight. */
 
 import { openView } from './api.js';
-import { Pace } from './pace.js';
+import { Pace, SHARE } from './pace.js';
 
 /**
  * @typedef {{task: string, filter: string, episode: number, step: number, angle: number | null, size: number}} Cursor
@@ -45,17 +45,13 @@ export class ViewSocket {
     this.#connect();
   }
 
-  /** The cursor has moved: coarse maps now, fine ones when it rests. @param {Cursor} cursor without its size. */
+  /** The cursor has moved: coarse maps now; fine ones and the scene when it rests. @param {Cursor} cursor without its size. */
   move(cursor, inputTime = null) {
     this.#last = cursor;
-    this.#want({ ...cursor, size: COARSE, scene: this.#pace.wait === 0 }, inputTime);
-    const rest = () => {
-      const wait = this.#pace.wait;
-      this.#want({ ...cursor, size: FINE, scene: wait === 0 }, null);
-      if (wait > 0) this.#rest = setTimeout(rest, wait);
-    };
+    const scene = this.#pace.mayDraw(inputTime === null ? SHARE.clock : SHARE.hand);
+    this.#want({ ...cursor, size: COARSE, scene }, inputTime);
     clearTimeout(this.#rest);
-    this.#rest = setTimeout(rest, REST);
+    this.#rest = setTimeout(() => this.#want({ ...cursor, size: FINE, scene: true }, null), REST);
   }
 
   /** The page's colours have changed. */
