@@ -189,6 +189,7 @@ DOOR = Task(
     dt=DT,
     map_components=("hinge_x", "hinge_y"),
     map_half_width=0.135,
+    positions={"effector_position": (0, 1), "control": (0, 1)},
     replay=_replay,
     ghost=panel_ghost,
     simulate=_simulate,

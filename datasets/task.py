@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -53,6 +53,8 @@ class Task:
         dt: seconds a step.
         map_components: the two components that span the likelihood map (x to the right, y up).
         map_half_width: half the side of the map, m.
+        positions: observation key, or ``control`` -> the two channels that are x and y of a place in the frame of the
+            map components: shift these and the map components alike, and nothing else that is felt changes.
         replay: builds the ``mujoco.MjModel`` of an episode, whose ``qpos`` it replays; None where there is no replay.
         ghost: states (..., n) -> ``Ghost``, to draw true and estimated objects; None where there is nothing to draw.
         simulate: (seed, index, steps) -> that episode of the collection with that seed; None where the task cannot be
@@ -67,6 +69,7 @@ class Task:
     dt: float
     map_components: tuple[str, str]
     map_half_width: float
+    positions: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     replay: Callable[[Episode], Any] | None = None
     ghost: Callable[[ArrayLike], Ghost] | None = None
     simulate: Callable[[int, int, int], Episode] | None = None
