@@ -12,23 +12,44 @@ from beliefscope.datasets.robot import ARM_JOINTS, FINGERS, GRIPPER_OPEN
 
 Vector = NDArray[np.float64]
 
-# The reference frame of the impedance: the hand's axes (x, y, z) lie along the world's (-y, -z, x), so that it points
-# along +x and its fingers close vertically. Rotations are measured from it.
-_REFERENCE = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
-# Elbow to the side, hand pointing along +x at the height of the handle: the posture the null space returns to.
-POSTURE = np.array([-1.609, -0.615, 1.696, -1.627, 1.782, 3.228, 1.073])
+@dataclass(frozen=True)
+class Stance:
+    """How the hand is held.
+
+    Attributes:
+        axes: (3, 3) rows of the rotation from the hand's axes to the world's, from which its rotation is measured. The
+            hand points along its own z, its fingers close along its own y.
+        posture: (7,) rad: the joints that the null space returns to.
+    """
+
+    axes: tuple[tuple[float, float, float], ...]
+    posture: tuple[float, ...]
+
+
+# Elbow to the side, hand pointing along +x at the height of a handle: its fingers close vertically.
+FORWARD = Stance(((0, 0, 1), (-1, 0, 0), (0, -1, 0)), (-1.609, -0.615, 1.696, -1.627, 1.782, 3.228, 1.073))
+# Elbow up, hand pointing at the ground half a metre before the robot: its fingers close along y.
+DOWN = Stance(((1, 0, 0), (0, -1, 0), (0, 0, -1)), (0.0, 0.15, 0.0, -2.35, 0.0, 2.5, 0.785))
 
 
 @dataclass(frozen=True)
 class Impedance:
-    """Stiffness along world x, y, z (N/m) and about each axis (N m/rad), and how far the set point may lead (m)."""
+    """How the hand is held, how stiffly, and how far ahead it may be sent.
 
+    Attributes:
+        stance: what it is held like.
+        stiffness: along world x, y, z, N/m. rotational_stiffness: about each axis, N m/rad.
+        rotational_damping: N m s/rad. posture_stiffness: of each joint, N m/rad.
+        lead: how far the set point may lead the hand, m.
+    """
+
+    stance: Stance
     stiffness: tuple[float, float, float]
+    lead: float
     rotational_stiffness: float = 60.0
     rotational_damping: float = 6.0
     posture_stiffness: float = 6.0
-    lead: float = 0.05
 
 
 def add_controller(spec: mujoco.MjSpec, impedance: Impedance) -> None:
@@ -37,10 +58,10 @@ def add_controller(spec: mujoco.MjSpec, impedance: Impedance) -> None:
     The effective mass that a stiffness kp acts on is about 4 kg, hence the damping 1.8 sqrt(4 kp).
     """
     quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, _REFERENCE.ravel())
+    axes = np.array(impedance.stance.axes, float)
+    mujoco.mju_mat2Quat(quaternion, axes.ravel())
     spec.worldbody.add_site(name="reference", quat=quaternion, group=5)
-    kx, ky, kz = impedance.stiffness
-    gains = [(kp, 1.8 * np.sqrt(4 * kp)) for kp in (ky, kz, kx)]
+    gains = [(kp, 1.8 * np.sqrt(4 * kp)) for kp in np.abs(axes.T) @ impedance.stiffness]
     gains += [(impedance.rotational_stiffness, impedance.rotational_damping)] * 3
     for axis, (kp, kv) in enumerate(gains):
         actuator = spec.add_actuator(
@@ -61,6 +82,7 @@ class HandController:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, impedance: Impedance) -> None:
         self._model, self._data, self._lead = model, data, impedance.lead
+        self._axes, self._rest = np.array(impedance.stance.axes, float), np.array(impedance.stance.posture)
         self._grip = model.site("grip").id
         self._hand = [model.actuator(f"hand{axis}").id for axis in range(6)]
         self._posture = [model.actuator(f"posture_{joint}").id for joint in ARM_JOINTS]
@@ -74,12 +96,12 @@ class HandController:
     def place(self, position: Vector, yaw: float) -> float:
         """Put the hand at a pose by damped least squares from the rest posture; returns the error left, m + rad."""
         data, n = self._data, len(ARM_JOINTS)
-        data.qpos[:n] = POSTURE
+        data.qpos[:n] = self._rest
         error = np.inf
         for _ in range(200):
             mujoco.mj_kinematics(self._model, data)
             mujoco.mj_comPos(self._model, data)
-            turn = np.cross(data.site_xmat[self._grip].reshape(3, 3).T, (_rotation_z(yaw) @ _REFERENCE).T).sum(0) / 2
+            turn = np.cross(data.site_xmat[self._grip].reshape(3, 3).T, (_rotation_z(yaw) @ self._axes).T).sum(0) / 2
             twist = np.concatenate([position - self.position, turn])
             error = float(np.linalg.norm(twist[:3]) + np.linalg.norm(turn))
             if error < 1e-5:
@@ -88,7 +110,7 @@ class HandController:
             jacobian = self._jacobian()
             step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-4 * np.eye(6), twist)
             null = np.eye(n) - np.linalg.pinv(jacobian) @ jacobian
-            step += 0.05 * null @ (POSTURE - data.qpos[:n])
+            step += 0.05 * null @ (self._rest - data.qpos[:n])
             data.qpos[:n] = np.clip(data.qpos[:n] + step, self._limits[:, 0], self._limits[:, 1])
         return error
 
@@ -103,12 +125,12 @@ class HandController:
         offset = target - position
         length = float(np.linalg.norm(offset))
         set_point = position + offset * min(1.0, self._lead / max(length, 1e-9))
-        self._data.ctrl[self._hand] = [*(_REFERENCE.T @ set_point), 0.0, -yaw, 0.0]
+        self._data.ctrl[self._hand] = [*(self._axes.T @ set_point), *(yaw * self._axes[2])]
         # Without the projection the posture would pull at the hand with about 10 N.
         jacobian = self._jacobian()
         joints = np.array(self._data.qpos[: len(ARM_JOINTS)])
         null = np.eye(len(ARM_JOINTS)) - np.linalg.pinv(jacobian) @ jacobian
-        self._data.ctrl[self._posture] = joints + null @ (POSTURE - joints)
+        self._data.ctrl[self._posture] = joints + null @ (self._rest - joints)
         return set_point
 
     def _jacobian(self) -> Vector:

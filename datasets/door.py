@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beliefscope.datasets.camera import Camera
-from beliefscope.datasets.control import Impedance, add_controller
+from beliefscope.datasets.control import FORWARD, Impedance, add_controller
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.robot import ROBOT_BIT, STIFF, WORLD_BIT, add_panda, new_spec
+from beliefscope.datasets.sensors import add_touch
+from beliefscope.datasets.simulate import DT, POSITION_BITS, Scene, episode_rng, quantise, simulate
 from beliefscope.datasets.task import Component, Ghost, Task
 
-DT = 0.1  # s, of a step
 HINGE_CENTRE = (0.81, -0.28)
 HINGE_HALF_RANGE = 0.098  # uniform, so that the standard deviation is 5.7 cm
 PANEL_SIZE = (0.04, 0.5, 0.86)  # thickness, width, height
@@ -28,10 +29,11 @@ BAR_HEIGHTS = (0.55, 0.69)
 BAR_OFFSET = 0.085  # from the panel's middle towards the robot
 BAR_RADII = (0.20, 0.46)  # from the hinge, where the bar begins and ends
 MAX_ANGLE = 1.55
+SPRING = 1.6  # N m/rad, opens a pushed door for the next push
 SPRING_REST = 2.0  # rad; friction stops the door before it
 
 CAMERA = Camera((0.50, -0.08, 2.6), (0, 0, -1), (1, 0, 0), float(np.deg2rad(31)))
-IMPEDANCE = Impedance((1600, 1600, 1200))
+IMPEDANCE = Impedance(FORWARD, (1600, 1600, 1200), lead=0.05)
 
 
 @dataclass(frozen=True)
@@ -77,16 +79,7 @@ def door_model(physics: DoorPhysics) -> mujoco.MjModel:
     add_controller(spec, IMPEDANCE)
     _add_surroundings(spec, physics.hinge)
     _add_door(spec, physics)
-    touch = spec.add_sensor(
-        name="contact",
-        type=mujoco.mjtSensor.mjSENS_CONTACT,
-        objtype=mujoco.mjtObj.mjOBJ_XBODY,
-        objname="hand",
-        reftype=mujoco.mjtObj.mjOBJ_XBODY,
-        refname="door",
-    )
-    found, force = int(mujoco.mjtConDataField.mjCONDATA_FOUND), int(mujoco.mjtConDataField.mjCONDATA_FORCE)
-    touch.intprm = [1 << found | 1 << force, 3, 1]  # fields; reduce to the net force; one slot
+    add_touch(spec, "door")
     return spec.compile()
 
 
@@ -173,11 +166,31 @@ def _replay(episode: Episode) -> mujoco.MjModel:
     return door_model(DoorPhysics((x, y), height))
 
 
-def _simulate(seed: int, index: int, steps: int) -> Episode:
-    # Imported here because the simulation needs this module's door.
-    from beliefscope.datasets.simulate import simulate_door
+def policy_of(index: int) -> str:
+    """Alternates, and swaps every ten, so that every split holds both policies."""
+    return ("pull", "push")[(index + index // 10) % 2]
 
-    return simulate_door(seed, index, steps)
+
+def simulate_door(seed: int, index: int, steps: int) -> Episode:
+    """Trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s, the same on every call."""
+    # Imported here because the policies need this module's door.
+    from beliefscope.datasets.policies import Pull, Push
+
+    rng = episode_rng(seed, index)
+    hinge = quantise(HINGE_CENTRE + rng.uniform(-HINGE_HALF_RANGE, HINGE_HALF_RANGE, 2), POSITION_BITS)
+    name = policy_of(index)
+    spring = 0.0 if name == "pull" else SPRING
+    door = DoorPhysics((float(hinge[0]), float(hinge[1])), float(rng.uniform(*BAR_HEIGHTS)), spring)
+    return simulate(
+        "door",
+        Scene(door_model(door), IMPEDANCE, CAMERA),
+        {"pull": Pull, "push": Push}[name](door, rng),
+        lambda qpos: np.concatenate([np.broadcast_to(hinge, (steps, 2)), qpos[:, -1:]], axis=1),
+        seed,
+        index,
+        steps,
+        {"policy": name, "hinge": list(door.hinge), "bar_height": door.bar_height, "spring": door.spring},
+    )
 
 
 DOOR = Task(
@@ -192,5 +205,5 @@ DOOR = Task(
     positions={"effector_position": (0, 1), "control": (0, 1)},
     replay=_replay,
     ghost=panel_ghost,
-    simulate=_simulate,
+    simulate=simulate_door,
 )

@@ -9,6 +9,20 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 
+def add_touch(spec: mujoco.MjSpec, body: str) -> None:
+    """Add the sensor ``contact``, between the hand with its fingers and a body."""
+    touch = spec.add_sensor(
+        name="contact",
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname="hand",
+        reftype=mujoco.mjtObj.mjOBJ_XBODY,
+        refname=body,
+    )
+    found, force = int(mujoco.mjtConDataField.mjCONDATA_FOUND), int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+    touch.intprm = [1 << found | 1 << force, 3, 1]  # fields; reduce to the net force; one slot
+
+
 class HandSensors:
     """Reads the sensors ``force``, ``torque`` (site ``wrist``) and ``contact`` of a model."""
 
@@ -36,5 +50,5 @@ class HandSensors:
         return -np.concatenate([force, torque])
 
     def touching(self) -> bool:
-        """Whether the hand, its fingers included, touches the door."""
+        """Whether the hand, its fingers included, touches the object."""
         return bool(self._data.sensordata[self._contact] > 0)

@@ -1,56 +1,121 @@
-"""One simulated trajectory of the door task: the policy decides, the controller acts, the sensors and camera record."""
+"""The loop of every simulated trajectory: the policy decides, the controller acts, sensors and camera record."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 import beliefscope
-from beliefscope.datasets.camera import Picture, RayCaster
-from beliefscope.datasets.control import HandController
-from beliefscope.datasets.door import (
-    BAR_HEIGHTS,
-    CAMERA,
-    DT,
-    HINGE_CENTRE,
-    HINGE_HALF_RANGE,
-    IMPEDANCE,
-    DoorPhysics,
-    door_model,
-)
+from beliefscope.datasets.camera import Camera, Picture, RayCaster
+from beliefscope.datasets.control import HandController, Impedance
 from beliefscope.datasets.episode import Episode, FloatArray
-from beliefscope.datasets.policies import YAW_SHARE, Policy, Pull, Push, Waypoint
+from beliefscope.datasets.robot import ARM_JOINTS, FINGERS
 from beliefscope.datasets.sensors import HandSensors
 
 Vector = NDArray[np.float64]
 
-SPRING = 1.6  # N m/rad, opens the door for the next push
-SETTLING_STEPS = 5  # before the record begins, so that the grasp has closed
+DT = 0.1  # s, of a step
+SETTLING_STEPS = 5  # before the record begins, so that a grasp has closed
+TURN = 0.05  # rad that the hand turns in a step, at most
+ROBOT_JOINTS = len(ARM_JOINTS) + len(FINGERS)  # they come first in qpos; the object's follow
 
 # The sensors' resolution, in powers of two so that the values compress: 15 um, 1 mN, 61 uN m, 15 urad.
 POSITION_BITS, FORCE_BITS, TORQUE_BITS, ANGLE_BITS = 16, 10, 14, 16
 
 
-def simulate_door(seed: int, index: int, steps: int) -> Episode:
-    """Trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s, the same on every call."""
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-    hinge = quantise(HINGE_CENTRE + rng.uniform(-HINGE_HALF_RANGE, HINGE_HALF_RANGE, 2), POSITION_BITS)
-    name = policy_of(index)
-    spring = 0.0 if name == "pull" else SPRING
-    door = DoorPhysics((float(hinge[0]), float(hinge[1])), float(rng.uniform(*BAR_HEIGHTS)), spring)
-    policy: Policy = Pull(door, rng) if name == "pull" else Push(door, rng)
-    log = _run(door, policy, steps)
+@dataclass(frozen=True)
+class Waypoint:
+    """Where to send the hand (m, world), how fast the set point goes (m/s), and how many steps it waits there."""
 
+    position: Vector
+    speed: float
+    wait: int
+
+    def steps(self, start: Vector) -> int:
+        """Steps until the next waypoint: the way at this speed, at most 4 s of it, and the wait.
+
+        Time, not arrival, ends a waypoint: against a door at its stop the hand would never arrive.
+        """
+        way = float(np.linalg.norm(self.position - start))
+        return 1 + min(40, int(way / (DT * self.speed))) + self.wait
+
+    def approach(self, point: Vector, duration: float) -> Vector:
+        """(3,) m: ``point`` moved towards the waypoint for ``duration`` s."""
+        way = self.position - point
+        return point + way * min(1.0, self.speed * duration / max(float(np.linalg.norm(way)), 1e-9))
+
+
+class Policy(Protocol):
+    """Moves the hand. ``joints`` are the object's: what follows the robot's in qpos (rad, m, unit quaternions).
+
+    Attributes:
+        object_start: (j,) the object's joints at the start.
+        fingers: m of opening of each finger at the start. squeeze: whether they then close with their full force.
+    """
+
+    object_start: Vector
+    fingers: float
+    squeeze: bool
+
+    def start(self) -> Vector:
+        """(3,) m, world: where the hand starts."""
+
+    def next(self, joints: Vector) -> Waypoint:
+        """The next waypoint, whenever one is over."""
+
+    def yaw(self, joints: Vector) -> float:
+        """rad: how the hand should be turned about the vertical."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the loop is given of a task.
+
+    Attributes:
+        model: the robot and one object.
+        impedance: of the hand, as given to ``add_controller``. camera: what takes the pictures.
+    """
+
+    model: mujoco.MjModel
+    impedance: Impedance
+    camera: Camera
+
+
+def episode_rng(seed: int, index: int) -> Generator:
+    """All randomness of trajectory ``index`` of the collection with ``seed``."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+
+
+def simulate(
+    task: str,
+    scene: Scene,
+    policy: Policy,
+    states: Callable[[FloatArray], FloatArray],
+    seed: int,
+    index: int,
+    steps: int,
+    provenance: Mapping[str, Any],
+) -> Episode:
+    """Trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s.
+
+    Args:
+        states: (T, nq) recorded joint positions -> (T, n) true states.
+        provenance: what the replay needs, and what else is worth knowing, as JSON values.
+    """
+    log = _run(scene, policy, steps)
     effector = quantise(np.stack(log.effector), POSITION_BITS)
     wrench, contact = np.stack(log.wrench), np.array(log.contact)
     qpos = quantise(np.stack(log.qpos), ANGLE_BITS)
     touch = contact[:, None].astype(np.float32)
     return Episode(
-        task="door",
-        states=np.concatenate([np.broadcast_to(hinge, (steps, 2)), qpos[:, -1:]], axis=1),
+        task=task,
+        states=states(qpos),
         controls=hand_controls(effector, touch),
         observations={
             "image": np.stack(log.image),
@@ -65,11 +130,8 @@ def simulate_door(seed: int, index: int, steps: int) -> Episode:
         seed=seed,
         split=split_of(index),
         provenance={
-            "policy": name,
+            **provenance,
             "spawn_index": index,
-            "hinge": list(door.hinge),
-            "bar_height": door.bar_height,
-            "spring": door.spring,
             "beliefscope": beliefscope.__version__,
             "mujoco": mujoco.__version__,
         },
@@ -79,11 +141,6 @@ def simulate_door(seed: int, index: int, steps: int) -> Episode:
 def split_of(index: int) -> str:
     """Of every ten trajectories, number 8 is for validation and number 9 for the test."""
     return {8: "val", 9: "test"}.get(index % 10, "train")
-
-
-def policy_of(index: int) -> str:
-    """Alternates, and swaps every ten, so that every split holds both policies."""
-    return ("pull", "push")[(index + index // 10) % 2]
 
 
 def quantise(values: NDArray[np.float64], bits: int) -> FloatArray:
@@ -97,6 +154,16 @@ def hand_controls(position: FloatArray, touch: FloatArray) -> FloatArray:
     return np.concatenate([previous, position - previous, touch], axis=1)
 
 
+def random_speed(rng: Generator) -> float:
+    """3 to 25 cm/s, log-uniform."""
+    return float(0.03 * np.exp(rng.uniform(0.0, np.log(25 / 3))))
+
+
+def random_wait(rng: Generator) -> int:
+    """0 to 5 steps."""
+    return int(rng.integers(0, 6))
+
+
 @dataclass
 class _Log:
     """One entry a step. ``wrench`` is the mean over the step; ``contact`` is true if there was any during it."""
@@ -108,17 +175,16 @@ class _Log:
     qpos: list[Vector] = field(default_factory=list)
 
 
-def _run(door: DoorPhysics, policy: Policy, steps: int) -> _Log:
-    model = door_model(door)
+def _run(scene: Scene, policy: Policy, steps: int) -> _Log:
+    model = scene.model
     data = mujoco.MjData(model)
-    controller, sensors = HandController(model, data, IMPEDANCE), HandSensors(model, data)
-    camera, log = RayCaster(model, CAMERA), _Log()
-    hinge = int(model.joint("door").qposadr[0])
+    controller, sensors = HandController(model, data, scene.impedance), HandSensors(model, data)
+    camera, log = RayCaster(model, scene.camera), _Log()
     substeps = round(DT / model.opt.timestep)
 
-    data.qpos[hinge] = policy.start_angle
-    yaw = YAW_SHARE * policy.start_angle
-    # One push in eighty would start out of reach. It then starts as near as the arm gets, and goes on from there.
+    data.qpos[ROBOT_JOINTS:] = policy.object_start
+    yaw = policy.yaw(policy.object_start)
+    # One push of a door in eighty would start out of reach. It then starts as near as the arm gets, and goes on.
     controller.place(policy.start(), yaw)
     controller.set_fingers(policy.fingers, policy.squeeze)
     mujoco.mj_forward(model, data)
@@ -129,14 +195,13 @@ def _run(door: DoorPhysics, policy: Policy, steps: int) -> _Log:
 
     waypoint, left = Waypoint(set_point, 0.0, 0), 0
     for _ in range(steps):
-        angle = float(data.qpos[hinge])
+        joints = np.array(data.qpos[ROBOT_JOINTS:])
         if left == 0:
-            waypoint = policy.next(angle)
+            waypoint = policy.next(joints)
             left = waypoint.steps(set_point)
         left -= 1
         set_point = controller.command(waypoint.approach(set_point, DT), yaw)
-        # The hand turns with the door, gently: or its side would meet the panel before its fingertips do.
-        yaw += float(np.clip(YAW_SHARE * angle - yaw, -0.05, 0.05))
+        yaw += float(np.clip(policy.yaw(joints) - yaw, -TURN, TURN))
         wrench, touched = np.zeros(6), False
         for _ in range(substeps):
             mujoco.mj_step(model, data)

@@ -9,12 +9,21 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.control import HandController
-from beliefscope.datasets.door import DOOR, IMPEDANCE, MAX_ANGLE, DoorPhysics, door_model, panel_ghost
+from beliefscope.datasets.door import (
+    DOOR,
+    IMPEDANCE,
+    MAX_ANGLE,
+    DoorPhysics,
+    door_model,
+    panel_ghost,
+    policy_of,
+    simulate_door,
+)
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.replay import replay
 from beliefscope.datasets.sensors import HandSensors
-from beliefscope.datasets.simulate import hand_controls, policy_of, quantise, simulate_door, split_of
+from beliefscope.datasets.simulate import hand_controls, quantise, split_of
 
 STEPS = 60
 PHYSICS = DoorPhysics((0.8, -0.3), 0.6)
