@@ -19,7 +19,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.store import Dataset, open_dataset, sample_path
 from beliefscope.datasets.task import Task
-from beliefscope.filters.catalog import FILTERS
+from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
@@ -135,10 +135,10 @@ class Library:
         """The filter of that name. Raises BadInput for an unknown name or an unreadable file."""
         with self._lock:
             if (task, name) not in self._checkpoints:
-                find_task(task)
+                known = filters_of(find_task(task))
                 given = self.settings.checkpoints
-                if name not in given and name not in FILTERS:
-                    raise one_of("filter", name, [*given, *(f for f in FILTERS if f not in given)])
+                if name not in given and name not in known:
+                    raise one_of("filter", name, [*given, *(f for f in known if f not in given)])
                 checkpoint = load_checkpoint(given[name] if name in given else shipped(task, name))
                 if checkpoint.task.name != task:
                     raise BadInput(f"filter {name!r} is for task {checkpoint.task.name!r}, not for {task!r}.")
@@ -156,7 +156,7 @@ class Library:
                     problems.append(str(error))
                 continue
             filters = []
-            for filter_name in dict.fromkeys([*FILTERS, *self.settings.checkpoints]):
+            for filter_name in dict.fromkeys([*filters_of(data.task), *self.settings.checkpoints]):
                 try:
                     filters.append(_described(filter_name, self.checkpoint(name, filter_name)))
                 except BadInput as error:

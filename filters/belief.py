@@ -32,7 +32,15 @@ class Particles:
         return moments(self.states, self.log_weights)
 
 
-Belief = Gaussian | Particles
+@dataclass(frozen=True)
+class Recurrent:
+    """hidden (N, L, 2, H): output and cell of each of L layers. mean (N, n): the estimate. There is no covariance."""
+
+    hidden: Tensor
+    mean: Tensor
+
+
+Belief = Gaussian | Particles | Recurrent
 
 
 def moments(states: Tensor, log_weights: Tensor) -> Gaussian:
@@ -52,9 +60,10 @@ class Evidence:
     a slice.
 
     Attributes:
-        control: (T, N, u) the controls' part of the dynamics model.
-        observation: EKF: (T, N, K, n) virtual observations z. PF: (T, N, K, u) observations' part of the likelihood.
-        noise: EKF: (T, N, K, n) standard deviations of z, the square root of R's diagonal. PF: None.
+        control: (T, N, u) the controls' part of the dynamics model. LSTM: the encoded controls.
+        observation: EKF, UKF: (T, N, K, n) virtual observations z. PF: (T, N, K, u) observations' part of the
+            likelihood. LSTM: (T, N, 1, u) observations and controls, encoded and joined.
+        noise: EKF, UKF: (T, N, K, n) standard deviations of z, the square root of R's diagonal. Others: None.
         log_weights: (T, N, K, W) log beta, W = n for weights per component, 1 for scalars; None without a weight model.
     """
 
@@ -91,11 +100,12 @@ class StepTrace:
     """Everything one step knew and could not be computed later from the rest.
 
     Attributes:
-        predicted: belief after the dynamics and before the observation. EKF: bank (N, K, n); PF: particles with their
-            prior weights.
-        posterior: fused belief after the observation and, for a PF, before resampling. EKF: Gaussian (N, n).
-        estimate: Gaussian (N, n), (N, n, n): mean and covariance of the posterior, which the filter reports.
-        modality: EKF only: each unimodal filter's own posterior, Gaussian (N, K, n).
+        predicted: belief after the dynamics and before the observation. EKF, UKF: bank (N, K, n); PF: particles with
+            their prior weights; LSTM, which does not predict: the belief before the step.
+        posterior: fused belief after the observation and, for a PF, before resampling. EKF, UKF: Gaussian (N, n).
+        estimate: Gaussian (N, n), (N, n, n): mean and covariance of the posterior, which the filter reports. LSTM: the
+            covariance is NaN.
+        modality: EKF, UKF only: each unimodal filter's own posterior, Gaussian (N, K, n).
         log_likelihood: PF only: (N, K, M) of each predicted particle, not normalised.
         ancestors: PF only: (N, M) int64, index of the particle each resampled one came from.
     """

@@ -18,9 +18,10 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.task import Task
-from beliefscope.filters.catalog import FILTERS, build
+from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.filter import Architecture, Filter
 
 FORMAT = 1
@@ -108,9 +109,10 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def shipped(task: str, name: str) -> Path:
-    """The checkpoint that ships for a task and filter. Raises BadInput where none does."""
-    if name not in FILTERS:
-        raise one_of("filter", name, FILTERS)
+    """The checkpoint that ships for a task and filter. Raises BadInput for an unknown name and where none does."""
+    filters = filters_of(find_task(task))
+    if name not in filters:
+        raise one_of("filter", name, filters)
     path = PRETRAINED / f"{task}-{name}.safetensors"
     if not path.is_file():
         raise BadInput(

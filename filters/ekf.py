@@ -10,9 +10,10 @@ from torch import Tensor, nn
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
-from beliefscope.filters.filter import Architecture, Filter, WeightModel, model_shapes
+from beliefscope.filters.dynamics import Dynamics
+from beliefscope.filters.filter import Architecture, Filter, WeightModel, encoders
 from beliefscope.filters.fusion import product_of_experts, symmetric, weighted_average
-from beliefscope.filters.networks import Encoders, Residual, Stack
+from beliefscope.filters.networks import Residual, Stack
 
 
 def predict(belief: Gaussian, mean: Tensor, jacobian: Tensor, noise: Tensor) -> Gaussian:
@@ -46,10 +47,10 @@ def update(belief: Gaussian, observation: Tensor, noise: Tensor) -> Gaussian:
 class VirtualSensor(nn.Module):
     """Observations of one measurement model to a virtual observation of the state and its standard deviations."""
 
-    def __init__(self, task: Task, model: str, units: int, image_stride: int) -> None:
+    def __init__(self, task: Task, model: str, architecture: Architecture) -> None:
         super().__init__()
-        n = len(task.components)
-        self.encoders = Encoders(model_shapes(task, model), units, image_stride)
+        n, units = len(task.components), architecture.units
+        self.encoders = encoders(task, model.split("+"), architecture)
         self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(), Residual(units))
         self.state = nn.Linear(units, n)
         self.log_noise = nn.Sequential(nn.Linear(units, units), nn.ReLU(), nn.Linear(units, n))
@@ -69,10 +70,10 @@ class ExtendedKalmanFilter(Filter):
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
-        size = (architecture.units, architecture.image_stride)
-        self.virtual_sensors = nn.ModuleDict({m: VirtualSensor(self.task, m, *size) for m in self.names})
+        self.dynamics = Dynamics(self.n, self.task.control_size, architecture.units)
+        self.virtual_sensors = nn.ModuleDict({m: VirtualSensor(self.task, m, architecture) for m in self.names})
         if architecture.fusion == "crossmodal":
-            self.weight_model = WeightModel(self.task, self.names, self.n, *size)
+            self.weight_model = WeightModel(self.task, architecture, self.n)
 
     def encode(self, batch: Batch) -> Evidence:
         observations = self.observations(batch)
@@ -92,8 +93,7 @@ class ExtendedKalmanFilter(Filter):
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Gaussian, StepTrace]:
         assert isinstance(belief, Gaussian)
         assert evidence.noise is not None
-        mean, jacobian = self.dynamics.with_jacobian(belief.mean, evidence.control.unsqueeze(1))
-        predicted = predict(belief, mean, jacobian, self.dynamics.noise)
+        predicted = self.predict(belief, evidence.control.unsqueeze(1))
         bank = update(predicted, evidence.observation, evidence.noise)
         fused = self.fuse(bank, evidence.log_weights)
         trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)
@@ -103,6 +103,11 @@ class ExtendedKalmanFilter(Filter):
                 fused.covariance.unsqueeze(1).expand_as(bank.covariance),
             )
         return bank, trace
+
+    def predict(self, belief: Gaussian, control_part: Tensor) -> Gaussian:
+        """The bank (N, K, n) after the dynamics; ``control_part`` (N, 1, u)."""
+        mean, jacobian = self.dynamics.with_jacobian(belief.mean, control_part)
+        return predict(belief, mean, jacobian, self.dynamics.noise)
 
     def fuse(self, bank: Gaussian, log_weights: Tensor | None) -> Gaussian:
         """The fused belief (N, n) of a bank (N, K, n)."""

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor, nn
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Statistics
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.dynamics import Dynamics
 from beliefscope.filters.fusion import CovarianceRule
-from beliefscope.filters.networks import Encoders, Residual, Stack
+from beliefscope.filters.networks import Encoders, Pooling, Residual, Stack
+from beliefscope.filters.resample import Resampling
+
+Kind = Literal["ekf", "ukf", "pf", "lstm"]
+Fusion = Literal["crossmodal", "unimodal", "none"]
 
 
 @dataclass(frozen=True)
@@ -26,33 +30,48 @@ class Architecture:
 
     Attributes:
         task: name in ``TASKS``.
-        kind: ``ekf`` or ``pf``.
+        kind: ``ekf``, ``ukf``, ``pf`` or ``lstm``.
         fusion: how the measurement models' results are fused: ``crossmodal`` (learned weights beta), ``unimodal``
             (product of experts for an EKF, sum of likelihoods for a PF), or ``none`` (there is only one).
         models: one measurement model each: the modalities that it sees, joined by ``+``.
         units: width of all fully connected layers. image_stride: of the first convolution.
-        covariance: EKF: rule of the fused covariance. feedback: EKF: hand the fused belief back to every unimodal
-            filter (the paper's text leaves them independent).
+        pooling: from the last convolution to the first fully connected layer.
+        covariance: EKF, UKF: rule of the fused covariance. feedback: EKF, UKF: hand the fused belief back to every
+            unimodal filter (the paper's text leaves them independent).
         likelihoods: PF: ``normalised`` over the particles in each model before they are weighed, so that beta is the
             share a model has in the particle weights; or ``raw``: what finds all states likely outweighs the rest.
+        resampling: PF: how ancestors are drawn. soft_share: ``soft``: share of the weights in what is drawn from, the
+            rest is uniform; in (0, 1].
     """
 
     task: str
-    kind: Literal["ekf", "pf"]
-    fusion: Literal["crossmodal", "unimodal", "none"] = "crossmodal"
+    kind: Kind
+    fusion: Fusion = "crossmodal"
     models: tuple[str, ...] = ("image", "haptics")
     units: int = 64
     image_stride: int = 2
+    pooling: Pooling = "flatten"
     covariance: CovarianceRule = "paper"
     feedback: bool = False
     likelihoods: Literal["normalised", "raw"] = "normalised"
+    resampling: Resampling = "systematic"
+    soft_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Raises BadInput for a choice that does not exist."""
+        for name, kind in get_type_hints(Architecture).items():
+            value = getattr(self, name)
+            if get_origin(kind) is Literal and value not in get_args(kind):
+                raise one_of(f"{name} of a filter", value, get_args(kind))
+        if not 0.0 < self.soft_share <= 1.0:
+            raise BadInput(f"soft_share must be above 0 and at most 1, not {self.soft_share}")
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self) | {"models": list(self.models)}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Architecture:
-        """Raises BadInput when a name is unknown or missing."""
+        """What is missing takes its default. Raises BadInput for what is unknown, or without task, kind or models."""
         try:
             return cls(**{**values, "models": tuple(values["models"])})
         except (KeyError, TypeError) as error:
@@ -60,7 +79,15 @@ class Architecture:
 
 
 class Filter(nn.Module, ABC):
-    """A differentiable filter: ``encode`` once, then ``step`` through time. Standardised units throughout."""
+    """A differentiable filter: ``encode`` once, then ``step`` through time. Standardised units throughout.
+
+    Attributes:
+        has_covariance: whether its estimates come with one; else it is NaN.
+        dynamics: of all kinds but the LSTM.
+    """
+
+    has_covariance = True
+    dynamics: Dynamics
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
@@ -69,7 +96,6 @@ class Filter(nn.Module, ABC):
         self.task = task
         self.n = len(task.components)
         self.statistics = Statistics(task)
-        self.dynamics = Dynamics(self.n, task.control_size, architecture.units)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -105,16 +131,16 @@ class Filter(nn.Module, ABC):
         """One prediction and update. ``evidence`` is one step's: leading axis N. Draws only from ``generator``."""
 
 
-def model_shapes(task: Task, model: str) -> dict[str, tuple[int, ...]]:
-    """Input shapes by modality of a measurement model such as ``image`` or ``image+haptics``."""
+def encoders(task: Task, modalities: Iterable[str], architecture: Architecture) -> Encoders:
+    """Fresh encoders of these modalities. Raises BadInput for one that the task does not have."""
     shapes: dict[str, tuple[int, ...]] = {}
-    for modality in model.split("+"):
+    for modality in modalities:
         if modality not in task.modalities:
             raise BadInput(
                 f"Modality {modality!r} is not in task {task.name!r}. Available: {', '.join(task.modalities)}."
             )
         shapes[modality] = modality_shape(task, modality)
-    return shapes
+    return Encoders(shapes, architecture.units, architecture.image_stride, architecture.pooling)
 
 
 def modality_shape(task: Task, modality: str) -> tuple[int, ...]:
@@ -134,11 +160,12 @@ class WeightModel(nn.Module):
     0.0025 and 0.9975.
     """
 
-    def __init__(self, task: Task, models: tuple[str, ...], width: int, units: int, image_stride: int) -> None:
+    def __init__(self, task: Task, architecture: Architecture, width: int) -> None:
         super().__init__()
-        modalities = list(dict.fromkeys(m for model in models for m in model.split("+")))
+        models, units = architecture.models, architecture.units
         self.shape = (len(models), width)
-        self.encoders = Encoders({m: modality_shape(task, m) for m in modalities}, units, image_stride)
+        modalities = dict.fromkeys(m for model in models for m in model.split("+"))
+        self.encoders = encoders(task, modalities, architecture)
         self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(), Residual(units))
         self.output = nn.Linear(units, len(models) * width)
         nn.init.normal_(self.output.weight, std=1e-2)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+Pooling = Literal["flatten", "spatial-softmax", "mean"]
 
 PICTURES_AT_ONCE = 1024
 """Pictures encoded in one go: enough to keep the cores busy, few enough to stay in the caches."""
@@ -75,13 +78,35 @@ class ResidualConvolution(nn.Module):
         return functional.relu(x + self.second(functional.relu(self.first(x))))
 
 
-class ImageEncoder(nn.Module):
-    """Pictures (B, H, W), standardised, to features (B, units); the convolutions' output is flattened.
+class SpatialSoftmax(nn.Module):
+    """Channels (B, C, H, W) to where each is active: the mean x and y (B, 2 C) of its softmax, from -1 to 1.
 
-    The first layer has stride 2: a fifth of the time of full resolution at like accuracy (see docs/filters.md).
+    Levine et al., "End-to-End Training of Deep Visuomotor Policies", 2016.
     """
 
-    def __init__(self, shape: tuple[int, int], units: int, stride: int = 2) -> None:
+    def forward(self, x: Tensor) -> Tensor:
+        height, width = x.shape[-2:]
+        share = torch.softmax(x.flatten(2), dim=-1).unflatten(-1, (height, width))
+        along_x = torch.linspace(-1.0, 1.0, width, dtype=x.dtype, device=x.device)
+        along_y = torch.linspace(-1.0, 1.0, height, dtype=x.dtype, device=x.device)
+        return torch.cat([share.sum(-2) @ along_x, share.sum(-1) @ along_y], dim=-1)
+
+
+class ImageEncoder(nn.Module):
+    """Pictures (B, H, W), standardised, to features (B, units).
+
+    Pooling leads from the convolutions' 8 channels to the first full layer: ``flatten`` hands on every cell,
+    ``spatial-softmax`` where each channel is active, ``mean`` how much. A first layer of stride 2 takes a fifth of the
+    time of full resolution at like accuracy (see docs/filters.md).
+
+    Attributes:
+        table: (pictures + 1, units) what it says to each training picture and, last, to a black one; only while a
+            trainer leaves it as it is.
+    """
+
+    table: Tensor | None = None
+
+    def __init__(self, shape: tuple[int, int], units: int, stride: int = 2, pooling: Pooling = "flatten") -> None:
         super().__init__()
         self.convolutions = nn.Sequential(
             nn.Conv2d(1, 32, 5, stride=stride, padding=2),
@@ -93,22 +118,29 @@ class ImageEncoder(nn.Module):
             nn.ReLU(),
         )
         cells = -(-shape[0] // stride) * -(-shape[1] // stride)
-        self.output = Stack(nn.Linear(8 * cells, units), nn.ReLU(), Residual(units))
+        size, self.pooling = {
+            "flatten": (8 * cells, nn.Flatten()),
+            "spatial-softmax": (16, SpatialSoftmax()),
+            "mean": (8, nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten())),
+        }[pooling]
+        self.output = Stack(nn.Linear(size, units), nn.ReLU(), Residual(units))
 
     def forward(self, pictures: Tensor) -> Tensor:
-        features: Tensor = self.output(self.convolutions(pictures.unsqueeze(1)).flatten(1))
+        features: Tensor = self.output(self.pooling(self.convolutions(pictures.unsqueeze(1))))
         return features
 
 
 class Encoders(nn.Module):
     """One encoder a modality; their features joined: observations (T, N, ...) to (T, N, units x modalities)."""
 
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]], units: int, image_stride: int) -> None:
+    def __init__(
+        self, shapes: Mapping[str, tuple[int, ...]], units: int, image_stride: int, pooling: Pooling = "flatten"
+    ) -> None:
         super().__init__()
         self.by_modality = nn.ModuleDict()
         for modality, shape in shapes.items():
             if len(shape) == 2:
-                self.by_modality[modality] = ImageEncoder((shape[0], shape[1]), units, image_stride)
+                self.by_modality[modality] = ImageEncoder((shape[0], shape[1]), units, image_stride, pooling)
             else:
                 self.by_modality[modality] = vector_stack(shape[0], units)
         self.size = units * len(shapes)
@@ -117,7 +149,10 @@ class Encoders(nn.Module):
         features = []
         for modality, encoder in self.by_modality.items():
             observed = observations[modality]
-            if isinstance(encoder, ImageEncoder):
+            if isinstance(encoder, ImageEncoder) and observed.dtype == torch.int64:
+                assert encoder.table is not None
+                features.append(encoder.table[observed])
+            elif isinstance(encoder, ImageEncoder):
                 parts = [encoder(part) for part in observed.flatten(0, 1).split(PICTURES_AT_ONCE)]
                 features.append(torch.cat(parts).unflatten(0, observed.shape[:2]))
             else:

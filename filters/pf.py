@@ -11,23 +11,24 @@ from torch import Tensor, nn
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, Particles, StepTrace
-from beliefscope.filters.filter import Architecture, Filter, WeightModel, model_shapes
+from beliefscope.filters.dynamics import Dynamics
+from beliefscope.filters.filter import Architecture, Filter, WeightModel, encoders
 from beliefscope.filters.fusion import mixture
-from beliefscope.filters.networks import Encoders, Residual, Stack, vector_stack
-from beliefscope.filters.resample import systematic
+from beliefscope.filters.networks import Residual, Stack, vector_stack
+from beliefscope.filters.resample import resample
 
 
 class MeasurementModel(nn.Module):
     """log p(observation | state) up to a constant, from observations and the state of each particle.
 
-    The first layer that sees both is kept as two summands: ``observation_part`` is computed once a step,
-        ``state_part`` once
-    a particle, and ``log_likelihood`` needs only their sum.
+    The first layer that sees both is kept as two summands: ``observation_part`` is computed once a step, ``state_part``
+    once a particle, and ``log_likelihood`` needs only their sum.
     """
 
-    def __init__(self, task: Task, model: str, units: int, image_stride: int) -> None:
+    def __init__(self, task: Task, model: str, architecture: Architecture) -> None:
         super().__init__()
-        self.encoders = Encoders(model_shapes(task, model), units, image_stride)
+        units = architecture.units
+        self.encoders = encoders(task, model.split("+"), architecture)
         self.join_observation = nn.Linear(self.encoders.size, units)
         self.state_encoder = vector_stack(len(task.components), units)
         self.join_state = nn.Linear(units, units, bias=False)
@@ -52,15 +53,15 @@ class MeasurementModel(nn.Module):
 class ParticleFilter(Filter):
     """Sampling importance resampling with ``w_i = sum_k beta_k p_k(z | x_i) / s_k``.
 
-    The scale s_k is each model's evidence, or 1 (``architecture.likelihoods``). Systematic resampling at every step.
+    The scale s_k is each model's evidence, or 1 (``architecture.likelihoods``). Resampling at every step.
     """
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
-        size = (architecture.units, architecture.image_stride)
-        self.measurement_models = nn.ModuleDict({m: MeasurementModel(self.task, m, *size) for m in self.names})
+        self.dynamics = Dynamics(self.n, self.task.control_size, architecture.units)
+        self.measurement_models = nn.ModuleDict({m: MeasurementModel(self.task, m, architecture) for m in self.names})
         if architecture.fusion == "crossmodal":
-            self.weight_model = WeightModel(self.task, self.names, 1, *size)
+            self.weight_model = WeightModel(self.task, architecture, 1)
 
     def measurement_model(self, name: str) -> MeasurementModel:
         """The model of one modality, typed."""
@@ -111,12 +112,10 @@ class ParticleFilter(Filter):
         weighed = log_likelihood - self.scale(predicted.log_weights, log_likelihood)
         log_weights = predicted.log_weights + mixture(weighed, evidence.log_weights)
         posterior = Particles(predicted.states, torch.log_softmax(log_weights, dim=-1))
-        ancestors = systematic(posterior.log_weights.detach(), generator)
-        resampled = Particles(
-            posterior.states.gather(1, ancestors.unsqueeze(-1).expand_as(posterior.states)),
-            torch.full_like(posterior.log_weights, -math.log(ancestors.shape[-1])),
-        )
-        return resampled, StepTrace(
+        rule, share = self.architecture.resampling, self.architecture.soft_share
+        ancestors, log_weights = resample(posterior.log_weights, rule, share, generator)
+        states = posterior.states.gather(1, ancestors.unsqueeze(-1).expand_as(posterior.states))
+        return Particles(states, log_weights), StepTrace(
             predicted=predicted,
             posterior=posterior,
             estimate=posterior.moments(),

@@ -17,10 +17,11 @@ from beliefscope.app.server import Settings, create_app
 from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.store import write_dataset
 from beliefscope.filters.batch import Steps
-from beliefscope.filters.catalog import FILTERS, architecture, build
+from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import save_checkpoint
 
 ORIGIN = "http://localhost:8000"
+FILTERS = ("crossmodal-ekf", "crossmodal-pf")
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,6 @@ import pytest
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.catalog import FILTERS
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.trace import trace
@@ -19,7 +18,10 @@ def held_out() -> list[Episode]:
         return [dataset[s.index] for s in dataset.summaries if s.split == "test"]
 
 
-@pytest.fixture(scope="module", params=FILTERS)
+SHIPPED = sorted(path.stem.removeprefix("door-") for path in PRETRAINED.glob("door-*.safetensors"))
+
+
+@pytest.fixture(scope="module", params=SHIPPED)
 def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
     return load_checkpoint(shipped("door", request.param))
 

@@ -12,7 +12,6 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
-from beliefscope.filters.catalog import FILTERS
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import run
 from beliefscope.inspect.trace import ARRAYS, Trace, load_trace, save_trace, trace
@@ -25,7 +24,7 @@ def episode() -> Episode:
         return dataset[index]
 
 
-@pytest.fixture(scope="module", params=FILTERS)
+@pytest.fixture(scope="module", params=("crossmodal-ekf", "crossmodal-pf"))
 def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
     return load_checkpoint(shipped("door", request.param))
 
