@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -10,7 +11,7 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import one_of
 from beliefscope.datasets.task import Task
 from beliefscope.filters.ekf import ExtendedKalmanFilter
-from beliefscope.filters.filter import Architecture, Filter, Fusion, Kind
+from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.lstm import Lstm
 from beliefscope.filters.pf import ParticleFilter
 from beliefscope.filters.ukf import UnscentedKalmanFilter
@@ -22,20 +23,23 @@ KINDS: dict[Kind, type[Filter]] = {
     "lstm": Lstm,
 }
 
-FILTERS: dict[str, tuple[Kind, Fusion, Literal["each", "all", "one"]]] = {
-    "crossmodal-ekf": ("ekf", "crossmodal", "each"),
-    "crossmodal-pf": ("pf", "crossmodal", "each"),
-    "crossmodal-ukf": ("ukf", "crossmodal", "each"),
-    "unimodal-ekf": ("ekf", "unimodal", "each"),
-    "unimodal-pf": ("pf", "unimodal", "each"),
-    "feature-ekf": ("ekf", "none", "all"),
-    "feature-pf": ("pf", "none", "all"),
-    "{modality}-ekf": ("ekf", "none", "one"),
-    "{modality}-pf": ("pf", "none", "one"),
-    "lstm": ("lstm", "none", "all"),
+ANY = ""
+"""Stands for the task, and for the models after its modalities, in what ``FILTERS`` holds."""
+
+FILTERS: dict[str, tuple[Literal["each", "all", "one"], Architecture]] = {
+    "crossmodal-ekf": ("each", Architecture(ANY, "ekf", "crossmodal")),
+    "crossmodal-pf": ("each", Architecture(ANY, "pf", "crossmodal")),
+    "crossmodal-ukf": ("each", Architecture(ANY, "ukf", "crossmodal")),
+    "unimodal-ekf": ("each", Architecture(ANY, "ekf", "unimodal")),
+    "unimodal-pf": ("each", Architecture(ANY, "pf", "unimodal", likelihoods="raw")),
+    "feature-ekf": ("all", Architecture(ANY, "ekf", "none")),
+    "feature-pf": ("all", Architecture(ANY, "pf", "none")),
+    "{modality}-ekf": ("one", Architecture(ANY, "ekf", "none")),
+    "{modality}-pf": ("one", Architecture(ANY, "pf", "none")),
+    "lstm": ("all", Architecture(ANY, "lstm", "none")),
 }
-"""Name -> equations, fusion, and what the measurement models see: ``each`` modality has one, ``all`` share one, or
-there is only ``one`` modality, and such a filter for each of them (``image-pf``, ``haptics-pf``)."""
+"""Name -> what the measurement models see, and the filter for any task. ``each`` modality has a model, ``all`` share
+one, or there is only ``one`` modality, and such a filter for each of them (``image-pf``, ``haptics-pf``)."""
 
 
 def filters_of(task: Task) -> dict[str, Architecture]:
@@ -47,8 +51,8 @@ def filters_of(task: Task) -> dict[str, Architecture]:
         "one": [(modality,) for modality in each],
     }
     return {
-        name.format(modality=chosen[0]): Architecture(task.name, kind, fusion, chosen)
-        for name, (kind, fusion, sees) in FILTERS.items()
+        name.format(modality=chosen[0]): replace(of_any_task, task=task.name, models=chosen)
+        for name, (sees, of_any_task) in FILTERS.items()
         for chosen in models[sees]
     }
 

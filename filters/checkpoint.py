@@ -22,7 +22,7 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import build, filters_of
-from beliefscope.filters.filter import Architecture, Filter
+from beliefscope.filters.filter import Architecture, Filter, Kind
 
 FORMAT = 1
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -47,7 +47,7 @@ class Checkpoint:
         return self.filter.task
 
     @property
-    def kind(self) -> str:
+    def kind(self) -> Kind:
         return self.filter.architecture.kind
 
 

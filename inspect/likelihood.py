@@ -33,12 +33,12 @@ LARGEST = 1024
 class LikelihoodMap:
     """One map per modality and one fused, over offsets from the true position.
 
-    PF: the measurement models' log-likelihood, and their mixture as it is fused. EKF: log density of each unimodal
+    PF: the measurement models' log-likelihood, and their mixture as it is fused. EKF, UKF: log density of each unimodal
     posterior and of the fused one.
 
     Attributes:
         step: of the trace. angle: value of the one component that is held fixed (rad), NaN where there is none.
-        layers: names: the modalities, then ``fused``; L of them.
+        layers: names: the trace's modalities, then ``fused``; L of them.
         offsets_x, offsets_y: (S,) m, cell centres, increasing, relative to ``centre``. centre: (2,) m, the true
             position.
         log_likelihood: (L, S, S) natural log, not normalised; [l, iy, ix] belongs to offsets_y[iy], offsets_x[ix].
@@ -68,7 +68,12 @@ class MapEngine:
     """Maps of one trace. What depends on the observations is computed once, for all steps."""
 
     def __init__(self, checkpoint: Checkpoint, trace: Trace) -> None:
-        """Raises BadInput when the trace was made by another checkpoint."""
+        """Raises BadInput for an LSTM, which has no density, and when the trace was made by another checkpoint."""
+        if not checkpoint.filter.has_covariance:
+            raise BadInput(
+                f"filter {checkpoint.name!r} has no likelihood maps: an {checkpoint.kind.upper()} estimates the state, "
+                "but not how likely others are"
+            )
         if trace.checkpoint_hash != checkpoint.hash:
             raise BadInput(
                 f"the trace was made by checkpoint {trace.checkpoint_hash[:12]}, not by {checkpoint.hash[:12]}"
