@@ -22,6 +22,7 @@ from beliefscope.app.session import Views
 from beliefscope.app.vendor import cached_file
 from beliefscope.app.wire import header
 from beliefscope.datasets.catalog import TASKS
+from beliefscope.datasets.corrupt import Recipe
 from beliefscope.recordings.write import write_recording
 
 RECORDING = re.compile(r"(?P<task>.+)-(?P<filter>.+)-episode(?P<episode>\d+)-[0-9a-f]{8}")
@@ -35,7 +36,7 @@ class RecordingRequest(BaseModel):
     task: str
     filter: str
     episode: int
-    blackout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    recipe: str = ""
     maps: Annotated[int, Field(ge=0)] = 0
 
 
@@ -61,8 +62,8 @@ def routes(library: Library, views: Views) -> APIRouter:
         return {"version": __version__, **library.catalog()}
 
     @router.get("/api/trace/{task}/{filter}/{episode}")
-    def trace_header(task: str, filter: str, episode: int, blackout: float = 0.0) -> Response:
-        traced = library.traced(Selection(task, filter, episode, blackout))
+    def trace_header(task: str, filter: str, episode: int, recipe: str = "") -> Response:
+        traced = library.traced(Selection(task, filter, episode, Recipe.parse(recipe)))
         try:
             trace = traced.done.result(timeout=PATIENCE)
         except NotYet:
@@ -71,13 +72,13 @@ def routes(library: Library, views: Views) -> APIRouter:
         return JSONResponse(header(trace, traced.columns[0], components) | {"filter": filter})
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
-    def trace_columns(task: str, filter: str, episode: int, request: Request, blackout: float = 0.0) -> Response:
-        traced = library.traced(Selection(task, filter, episode, blackout))
+    def trace_columns(task: str, filter: str, episode: int, request: Request, recipe: str = "") -> Response:
+        traced = library.traced(Selection(task, filter, episode, Recipe.parse(recipe)))
         return _immutable(request, traced, "columns", lambda: traced.columns[1])
 
     @router.get("/api/trace/{task}/{filter}/{episode}/images")
-    def trace_images(task: str, filter: str, episode: int, request: Request, blackout: float = 0.0) -> Response:
-        traced = library.traced(Selection(task, filter, episode, blackout))
+    def trace_images(task: str, filter: str, episode: int, request: Request, recipe: str = "") -> Response:
+        traced = library.traced(Selection(task, filter, episode, Recipe.parse(recipe)))
         if "image" not in traced.trace.episode.observations:
             raise HTTPException(404, f"Task {task!r} has no pictures.")
         return _immutable(request, traced, "images", traced.trace.episode.observations["image"].tobytes)
@@ -90,7 +91,8 @@ def routes(library: Library, views: Views) -> APIRouter:
     @router.post("/api/recordings", status_code=201)
     def record(wanted: RecordingRequest) -> dict[str, Any]:
         started = time.perf_counter()
-        traced = library.traced(Selection(wanted.task, wanted.filter, wanted.episode, wanted.blackout))
+        selection = Selection(wanted.task, wanted.filter, wanted.episode, Recipe.parse(wanted.recipe))
+        traced = library.traced(selection)
         trace = traced.trace
         parts = hashlib.sha256(f"{traced.key} maps {wanted.maps}".encode()).hexdigest()[:8]
         path = recordings / f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}.rrd"

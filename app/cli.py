@@ -15,13 +15,14 @@ from beliefscope import __version__
 from beliefscope.app import console
 from beliefscope.app.commands.collect import collect
 from beliefscope.app.commands.evaluate import evaluate
+from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
 from beliefscope.app.commands.serve import serve
 from beliefscope.app.commands.trace import trace
 from beliefscope.app.commands.train import train
 from beliefscope.datasets.errors import BadInput
 
-COMMANDS = (serve, collect, train, evaluate, trace, record)
+COMMANDS = (serve, collect, train, evaluate, trace, record, recipes)
 
 cli = typer.Typer(
     name="beliefscope",

@@ -15,6 +15,7 @@ from typing import Any
 
 from beliefscope.app.wire import MAP_SIZES, columns
 from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.corrupt import WHOLE, Recipe, ready
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.store import Dataset, open_dataset, sample_path
@@ -51,19 +52,19 @@ class Settings:
 
 @dataclass(frozen=True)
 class Selection:
-    """What is being looked at: names of a task and a filter, an episode's index, the chance of a black picture."""
+    """What is being looked at: names of a task and a filter, an episode's index, how its sensors are broken."""
 
     task: str
     filter: str
     episode: int
-    blackout: float = 0.0
+    recipe: Recipe = WHOLE
 
 
 class Traced:
     """A trace that is being computed, or is there; and what is derived from it.
 
     Attributes:
-        key: hash of everything the trace depends on: checkpoint, episode, seed, particles, blackout.
+        key: hash of everything the trace depends on: checkpoint, episode, seed, particles, recipe.
         done: the trace, or the error that computing it ended in. progress: 0..1.
     """
 
@@ -181,19 +182,18 @@ class Library:
 
     def traced(self, selection: Selection) -> Traced:
         """The selection's trace, computed from now on if it is not there. Raises BadInput for what does not exist."""
-        if not 0.0 <= selection.blackout <= 1.0:
-            raise BadInput(f"blackout is a chance between 0 and 1, not {selection.blackout}.")
         with self._lock:
             known = self._traced.get(self._keys.get(selection, ""))
             if known is None or (known.done.done() and known.done.exception() is not None):
                 checkpoint = self.checkpoint(selection.task, selection.filter)
                 episode = self.episode(selection.task, selection.episode)
+                selection.recipe.check(checkpoint.task)
                 parts = (
                     checkpoint.hash,
                     episode.digest(),
                     self.settings.seed,
                     self.settings.particles,
-                    selection.blackout,
+                    str(selection.recipe),
                 )
                 key = hashlib.sha256(repr(parts).encode()).hexdigest()
                 self._keys[selection] = key
@@ -223,7 +223,7 @@ class Library:
                 episode_index=selection.episode,
                 seed=self.settings.seed,
                 particles=self.settings.particles,
-                blackout=selection.blackout,
+                recipe=selection.recipe,
                 progress=progress,
             )
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -263,6 +263,7 @@ def _task(task: Task, filters: list[dict[str, Any]], data: Dataset) -> dict[str,
         "dt": task.dt,
         "map": {"x": x, "y": y, "half_width": task.map_half_width},
         "data_hash": data.hash,
+        "recipes": [{"name": name, "recipe": text} for name, text in ready(task).items()],
         "filters": filters,
         "episodes": [
             {

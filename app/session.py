@@ -99,7 +99,7 @@ class View:
                 await _tell_error(websocket, wanted.serial, f"The server failed: {error}")
 
     async def _answer_one(self, websocket: WebSocket, wanted: Cursor) -> None:
-        selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.blackout)
+        selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.recipe)
         traced = await asyncio.to_thread(self._library.traced, selection)
         if not await self._ready_before_newer(traced):
             return

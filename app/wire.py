@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
@@ -22,7 +23,7 @@ SENSORS = ("effector_position", "force")
 class Cursor:
     """The page's whole selection, as one message of it says.
 
-    Serial: the page's own count of its cursors. Blackout: chance of a black picture. Scene: whether the 3D scene
+    Serial: the page's own count of its cursors. Recipe: how the sensors are broken. Scene: whether the 3D scene
     follows, or only the maps.
     """
 
@@ -33,7 +34,7 @@ class Cursor:
     step: int
     angle: float | None
     size: int
-    blackout: float = 0.0
+    recipe: Recipe = WHOLE
     scene: bool = True
 
 
@@ -46,9 +47,9 @@ def cursor(message: dict[str, Any]) -> Cursor:
     angle = message.get("angle")
     if angle is not None and not _is_number(angle):
         raise BadInput(f"cursor's 'angle' is a number of radians or null; got {angle!r}.")
-    blackout = message.get("blackout", 0.0)
-    if not _is_number(blackout):
-        raise BadInput(f"cursor's 'blackout' is a chance between 0 and 1; got {blackout!r}.")
+    recipe = message.get("recipe", "")
+    if not isinstance(recipe, str):
+        raise BadInput(f"cursor's 'recipe' is text; got {recipe!r}.")
     size = message.get("size", MAP_SIZES[0])
     if size not in MAP_SIZES:
         raise BadInput(f"cursor's 'size' is {' or '.join(map(str, MAP_SIZES))}; got {size!r}.")
@@ -60,7 +61,7 @@ def cursor(message: dict[str, Any]) -> Cursor:
         filter=message["filter"],
         angle=angle,
         size=size,
-        blackout=float(blackout),
+        recipe=Recipe.parse(recipe),
         scene=scene,
         **integers,
     )
@@ -127,6 +128,7 @@ def header(trace: Trace, described: list[dict[str, Any]], components: list[dict[
         "checkpoint_hash": trace.checkpoint_hash,
         "data_hash": trace.data_hash,
         "seed": trace.seed,
+        "recipe": str(trace.recipe),
         "settings": dict(trace.settings),
         "columns": described,
     }

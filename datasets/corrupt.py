@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -79,6 +80,8 @@ class Recipe:
         task, observations, digest = find_task(episode.task), dict(episode.observations), int(episode.digest()[:16], 16)
         for place, fault in enumerate(self.faults):
             for key in fault.keys(task):
+                if key not in observations:
+                    raise one_of("observation of the episode", key, observations)
                 # The same draws for all sensors of a modality: they are lost together.
                 rng = np.random.default_rng([seed, digest, place])
                 observations[key] = fault.apply(observations[key], episode.dt, rng)
@@ -102,12 +105,24 @@ READY: dict[str, str] = {
     "force saturated": "force_saturation=5",
     "force axis stuck": "force_stuck=x:from=20",
     "effector off by 2 cm": "effector_offset=0.02",
-    "contact flipped": "contact_flipped=1",
+    "contact flipped": "contact_flipped",
     "contact 5 steps late": "contact_late=5",
     "haptics 5 steps late": "delay=haptics:steps=5",
     "haptics dropped": "drop=haptics:from=20",
 }
 """What it is called -> recipe: the ones to try first."""
+
+
+def ready(task: Task) -> dict[str, str]:
+    """Those of ``READY`` that the task has the sensors for."""
+
+    def fits(text: str) -> bool:
+        with suppress(BadInput):
+            Recipe.parse(text).check(task)
+            return True
+        return False
+
+    return {name: text for name, text in READY.items() if fits(text)}
 
 
 def described() -> list[dict[str, Any]]:

@@ -94,12 +94,13 @@ class Fault:
         return {"fault": self.name} | {k: v for k, v in given.items() if v is not None and (k, v) != ("from", 0)}
 
     def __str__(self) -> str:
-        (first, *rest) = parameters(type(self)).items()
-        texts = [f"{self.name}={_written(getattr(self, first[1].name))}"]
-        for key, one in rest:
-            if (value := getattr(self, one.name)) != one.default:
-                texts.append(f"{key}={_written(value)}")
-        return ":".join(texts)
+        text, first = self.name, True
+        for key, one in parameters(type(self)).items():
+            value = getattr(self, one.name)
+            if value != one.default or isinstance(value, str):
+                text += f"={_written(value)}" if first else f":{key}={_written(value)}"
+            first = False
+        return text
 
 
 def parameters(fault: type[Fault]) -> dict[str, Field[Any]]:
@@ -215,7 +216,7 @@ class ForceBias(Fault):
     """The force is off by a constant."""
 
     name, sensor = "force_bias", "force"
-    x: float = _number(5.0, "N", "offset along x")
+    x: float = _number(0.0, "N", "offset along x")
     y: float = _number(0.0, "N", "offset along y")
     z: float = _number(0.0, "N", "offset along z")
 
@@ -239,7 +240,7 @@ class ForceDrift(Fault):
     """The force is off by what grows from the fault's first step on."""
 
     name, sensor = "force_drift", "force"
-    x: float = _number(1.0, "N/s", "growth along x")
+    x: float = _number(0.0, "N/s", "growth along x")
     y: float = _number(0.0, "N/s", "growth along y")
     z: float = _number(0.0, "N/s", "growth along z")
 
@@ -278,7 +279,7 @@ class EffectorOffset(Fault):
     """The end effector is told to be elsewhere."""
 
     name, sensor = "effector_offset", "effector_position"
-    x: float = _number(0.02, "m", "offset along x")
+    x: float = _number(0.0, "m", "offset along x")
     y: float = _number(0.0, "m", "offset along y")
     z: float = _number(0.0, "m", "offset along z")
 

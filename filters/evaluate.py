@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
-from beliefscope.filters.batch import Batch, Steps, black_out
+from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import rollout, start_at_truth
 
@@ -50,7 +51,7 @@ def evaluate(
     filter_: Filter,
     episodes: Sequence[Episode],
     *,
-    blackout: float = 0.0,
+    recipe: Recipe = WHOLE,
     only: str | None = None,
     particles: int = 300,
     seed: int = 0,
@@ -59,17 +60,21 @@ def evaluate(
     """Runs the filter over whole episodes, each started at the truth with covariance 0.1 I (standardised).
 
     Args:
-        blackout: chance that a picture is black. only: one modality's name: beta one-hot on it.
+        recipe: how the sensors are broken. only: one modality's name: beta one-hot on it.
+        seed: of the filter's randomness and of the recipe's.
+
+    Raises:
+        BadInput: no episode, one that does not fit the filter's task, or a recipe or modality that does not.
     """
     device = next(filter_.parameters()).device
-    steps = Steps.of(filter_.task, episodes, device)
+    steps = Steps.of(filter_.task, [recipe.apply(episode, seed) for episode in episodes], device)
     groups: dict[int, list[int]] = {}
     for number, length in enumerate(steps.length.tolist()):
         groups.setdefault(length, []).append(number)
     errors, covariances = [], []
     for done, (length, members) in enumerate(sorted(groups.items())):
         batch = steps.windows(steps.first[members], length)
-        error, covariance = run(filter_, batch, blackout, only, particles, seed)
+        error, covariance = run(filter_, batch, only, particles, seed)
         first = min(LEFT_OUT, length - 1)
         errors.append(error[first:].flatten(0, 1))
         covariances.append(covariance[first:].flatten(0, 1))
@@ -79,13 +84,9 @@ def evaluate(
 
 
 @torch.no_grad()
-def run(
-    filter_: Filter, batch: Batch, blackout: float, only: str | None, particles: int, seed: int
-) -> tuple[Tensor, Tensor]:
+def run(filter_: Filter, batch: Batch, only: str | None, particles: int, seed: int) -> tuple[Tensor, Tensor]:
     """Errors (T, N, n) and covariances (T, N, n, n) in SI units, on the CPU."""
     device = batch.states.device
-    if blackout:
-        batch = black_out(batch, torch.tensor(blackout), torch.Generator().manual_seed(seed))
     evidence = filter_.encode(batch)
     if only is not None:
         evidence = evidence.only(filter_.index(only))

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from beliefscope import __version__
+from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
@@ -128,7 +129,10 @@ def measure(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, Any]:
         names += filter_.names
     return {
         f"{blackout:g}": {
-            name or "fused": evaluate(filter_, episodes, blackout=blackout, only=name).to_dict() for name in names
+            name or "fused": evaluate(
+                filter_, episodes, recipe=Recipe.parse(f"blackout={blackout}"), only=name
+            ).to_dict()
+            for name in names
         }
         for blackout in BLACKOUTS
     }

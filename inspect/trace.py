@@ -15,9 +15,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
+from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.batch import Steps, black_out
+from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, moments
 from beliefscope.filters.checkpoint import Checkpoint, write_atomically
 from beliefscope.filters.filter import Filter
@@ -54,8 +55,9 @@ class Trace:
         log_likelihood: PF: (T, K, M), not normalised.
         ancestors: PF: (T, M) int32: the particle each resampled one came from.
         checkpoint_hash, data_hash: SHA-256 of the checkpoint's file and of the episode (``Episode.digest``).
-        episode_index: index in its data set. seed: of the filter's randomness.
-        settings: JSON values: particles, blackout, versions.
+        episode_index: index in its data set. seed: of the filter's randomness and of the recipe's.
+        recipe: how its sensors were broken; ``data_hash`` is of the episode before that.
+        settings: JSON values: particles, versions.
     """
 
     episode: Episode
@@ -83,6 +85,7 @@ class Trace:
     data_hash: str = ""
     episode_index: int = 0
     seed: int = 0
+    recipe: Recipe = WHOLE
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -100,7 +103,7 @@ def trace(
     episode_index: int = 0,
     seed: int = 0,
     particles: int = 300,
-    blackout: float = 0.0,
+    recipe: Recipe = WHOLE,
     progress: Callable[[float], None] | None = None,
 ) -> Trace:
     """Runs a filter over an episode from the true state, covariance 0.1 I (standardised), and keeps everything.
@@ -109,27 +112,22 @@ def trace(
     a step knew is kept instead of dropped.
 
     Args:
-        blackout: chance that a picture is black; the trace's episode then holds the pictures as the filter saw them.
+        recipe: how the sensors are broken; the trace's episode then holds what the filter was given.
         progress: called with the share done, 0..1.
 
     Raises:
-        BadInput: the episode does not fit the checkpoint's task, or a setting is out of range.
+        BadInput: the episode does not fit the checkpoint's task, the recipe does not, or a setting is out of range.
     """
     if particles < 1:
         raise BadInput(f"particles must be at least 1, not {particles}")
-    if not 0.0 <= blackout <= 1.0:
-        raise BadInput(f"blackout must be a chance between 0 and 1, not {blackout}")
     if episode.task != checkpoint.task.name:
         raise BadInput(
             f"filter {checkpoint.name!r} is for task {checkpoint.task.name!r}, the episode is of {episode.task!r}"
         )
     filter_ = checkpoint.filter
     data_hash = episode.digest()
-    steps = Steps.of(filter_.task, [episode])
-    batch = steps.episode(0)
-    if blackout:
-        batch = black_out(batch, torch.tensor(blackout), torch.Generator().manual_seed(seed))
-        episode = _as_seen(episode, filter_, batch.observations)
+    episode = recipe.apply(episode, seed)
+    batch = Steps.of(filter_.task, [episode]).episode(0)
     evidence = filter_.encode(batch)
     start = start_at_truth(filter_, batch)
     result = rollout(
@@ -158,18 +156,10 @@ def trace(
         data_hash=data_hash,
         episode_index=episode_index,
         seed=seed,
-        settings={"particles": particles, "blackout": blackout, "torch": torch.__version__},
+        recipe=recipe,
+        settings={"particles": particles, "torch": torch.__version__},
         **{name: np.ascontiguousarray(value.numpy()) for name, value in arrays.items()},
     )
-
-
-def _as_seen(episode: Episode, filter_: Filter, observations: Mapping[str, Tensor]) -> Episode:
-    """The episode with its pictures as the filter saw them."""
-    seen = dict(episode.observations)
-    for modality, keys in filter_.task.modalities.items():
-        if observations[modality].dtype == torch.uint8:
-            seen[keys[0]] = observations[modality][:, 0].numpy()
-    return Episode(**{f.name: getattr(episode, f.name) for f in fields(Episode)} | {"observations": seen})
 
 
 def _stack(filter_: Filter, beliefs: list[Gaussian]) -> tuple[Tensor, Tensor]:
@@ -228,9 +218,11 @@ def save_trace(trace: Trace, path: Path) -> None:
     }
     arrays |= {f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")}
     arrays |= {f"episode/observations/{key}": value for key, value in episode.observations.items()}
+    apart = (*ARRAYS, "episode", "recipe", "settings")
     header = {
         "format": FORMAT,
-        **{f.name: getattr(trace, f.name) for f in fields(Trace) if f.name not in (*ARRAYS, "episode", "settings")},
+        **{f.name: getattr(trace, f.name) for f in fields(Trace) if f.name not in apart},
+        "recipe": trace.recipe.to_json(),
         "settings": dict(trace.settings),
         "episode": {
             "task": episode.task,
@@ -267,6 +259,14 @@ def load_trace(path: Path) -> Trace:
             **{name: arrays.pop(f"episode/{name}") for name in ("states", "controls", "contact", "qpos")},
             observations={key.removeprefix(prefix): arrays.pop(key) for key in list(arrays) if key.startswith(prefix)},
         )
+        header["recipe"] = stored_recipe(header.get("recipe"), header["settings"])
         return Trace(**{**header, "modalities": tuple(header["modalities"])}, episode=episode, **arrays)
     except (KeyError, TypeError) as error:
         raise BadInput(f"{str(path)!r} is not a whole trace: {error}") from None
+
+
+def stored_recipe(recipe: Any, settings: Mapping[str, Any]) -> Recipe:
+    """The recipe of a file. Those from before there were recipes have none, and may name a chance of black pictures."""
+    if recipe is None and settings.get("blackout"):
+        recipe = {"blackout": settings["blackout"]}
+    return Recipe.of(recipe or [])

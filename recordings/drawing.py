@@ -246,11 +246,12 @@ def about(trace: Trace, task: Task) -> rr.TextDocument:
     components = ", ".join(component.name for component in task.components)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
+    broken = f"\nIts sensors are broken: `{trace.recipe}`.\n" if trace.recipe else ""
     text = f"""# {task.name}, episode {trace.episode_index}, {trace.filter}
 
 A {filter_kind} estimates {components} from {" and ".join(trace.modalities)}: {len(trace)} steps of
 {trace.episode.dt:g} s. It starts at the true state and weighs its modalities anew at every step.
-
+{broken}
 | name | colour | what it is |
 | --- | --- | --- |
 {legend}

@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.trace import Trace, stored_recipe
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, HEADER, PROPERTIES, STEP, TRACE_COMPONENT
 
 VALUES = (TRACE_COMPONENT, "Image:buffer", "Scalars:scalars")
@@ -35,7 +35,7 @@ def read_recording(path: str | Path) -> Trace:
     arrays = {
         name: _assemble(path, name, rows[name], steps, entry) for name, entry in json.loads(header["shapes"]).items()
     }
-    made = json.loads(header["episode"])
+    made, settings = json.loads(header["episode"]), json.loads(header["settings"])
     observations = {
         name.removeprefix("observations/"): array for name, array in arrays.items() if name.startswith("observations/")
     }
@@ -59,7 +59,8 @@ def read_recording(path: str | Path) -> Trace:
         data_hash=header["data_hash"],
         episode_index=int(header["episode_index"]),
         seed=int(header["seed"]),
-        settings=json.loads(header["settings"]),
+        recipe=stored_recipe(json.loads(header.get("recipe", "null")), settings),
+        settings=settings,
         **{name: fields_of[name] for name in fields_of.keys() - of_episode},
     )
 
@@ -94,7 +95,7 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
         raise BadInput(f"{path}: a Rerun recording, but not one that {APPLICATION} wrote.")
     if version != FORMAT_VERSION:
         raise BadInput(f"{path}: recording format {version}; this version reads format {FORMAT_VERSION}.")
-    if missing := PROPERTIES.keys() - header.keys():
+    if missing := PROPERTIES.keys() - header.keys() - {"recipe"}:
         raise BadInput(f"{path}: the recording lacks the properties {', '.join(sorted(missing))}.")
     return header, rows
 

@@ -13,6 +13,7 @@ import sys
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -26,6 +27,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import save_checkpoint
 from beliefscope.inspect.trace import load_trace
+from beliefscope.recordings.read import read_recording
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
@@ -33,10 +35,11 @@ NAMES = [command.__name__ for command in COMMANDS]
 OPTIONS = {
     "serve": "--port --host --workspace --open --no-open --seed",
     "collect": "--episodes --steps --seed --workers -o --json",
-    "train": "--filter --data --preset --seed -o --json",
-    "evaluate": "--filter --data --recipe --particles --seed --json",
-    "trace": "--filter --data --episode --seed -o --json",
-    "record": "--filter --data --episode --maps --seed -o --json",
+    "train": "--filter --data --preset --recipe --seed -o --json",
+    "evaluate": "--filter --data --recipe --only --particles --seed --json",
+    "trace": "--filter --data --episode --recipe --seed -o --json",
+    "record": "--filter --data --episode --maps --recipe --seed -o --json",
+    "recipes": "--json",
 }
 """What scripts outside the project may rely on."""
 
@@ -168,6 +171,14 @@ BAD = [
     f"evaluate {EKF} --recipe missing.json",
     f"evaluate {EKF} --recipe {{no}}",
     f"""evaluate {EKF} --recipe '{{"noise": 1}}'""",
+    f"evaluate {EKF} --recipe blackout=1.5",
+    f"evaluate {EKF} --recipe force_bias:w=5",
+    f"evaluate {EKF} --recipe drop=touch",
+    f"evaluate {EKF} --only touch",
+    f"trace {EKF} --recipe blackout=0.4: -o new.trace",
+    f"record {EKF} --recipe frozen -o new.rrd",
+    "train door --filter crossmodal-pf --recipe blackout=much -o new.safetensors",
+    "recipes --json file",
     f"""evaluate {EKF} --recipe '{{"blackout": "much"}}'""",
     f"""evaluate {EKF} --recipe '{{"blackout": 1.5}}'""",
     f"""evaluate {EKF} --recipe '{{"only": "touch"}}'""",
@@ -276,6 +287,52 @@ def test_collect_to_recording(run: Run, folder: Path) -> None:
     assert (folder / "one.rrd").stat().st_size > 10_000
 
 
+def test_one_option_breaks_any_sensor(run: Run, folder: Path) -> None:
+    run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
+    faults = json.loads(run("recipes --json -")[1])
+    names = [fault["fault"] for fault in faults["faults"]]
+    assert {"blackout", "force_stuck", "effector_offset", "contact_late", "delay", "drop"} <= set(names)
+    text = run("recipes")[1]
+    assert all(f"\n{name} " in f"\n{text}" for name in names)
+    everything = ",".join(names)
+    line = f"{EKF} --data one.h5 --episode 0 --recipe {everything} --json - -o"
+    traced = json.loads(run(f"trace {line} all.trace")[1])
+    assert [fault["fault"] for fault in traced["recipe"]] == names
+    assert load_trace(folder / "all.trace").recipe.to_json() == traced["recipe"]
+    recorded = json.loads(run(f"record {line} all.rrd --maps 0")[1])
+    assert recorded["recipe"] == traced["recipe"] == read_recording(folder / "all.rrd").recipe.to_json()
+    assert (
+        f"with {load_trace(folder / 'all.trace').recipe}" in run(f"trace {line.replace('--json -', '')} all.trace")[1]
+    )
+
+
+def test_every_way_to_write_a_recipe_is_the_same(run: Run, folder: Path) -> None:
+    run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
+    (folder / "recipe.json").write_text('[{"fault": "blackout", "probability": 0.4}]')
+
+    def evaluated(rest: str) -> dict[str, Any]:
+        code, out, _ = run(f"evaluate {EKF} --data one.h5 --json - {rest}")
+        assert code == 0
+        return dict(json.loads(out))
+
+    whole = evaluated("")
+    assert (whole["recipe"], whole["only"]) == ([], None)
+    asked = evaluated("--recipe blackout=0.4")
+    assert asked["recipe"] == [{"fault": "blackout", "probability": 0.4}]
+    assert asked["rmse"] != whole["rmse"]
+    for other in (
+        """'{"blackout": 0.4}'""",
+        "recipe.json",
+        "./recipe.json",
+        """'[{"fault": "blackout", "probability": 0.4}]'""",
+    ):
+        assert evaluated(f"--recipe {other}") == asked
+    alone = evaluated("--recipe blackout=0.4 --only image")
+    assert alone["only"] == "image"
+    assert alone["rmse"] != asked["rmse"]
+    assert evaluated("""--recipe '{"blackout": 0.4, "only": "image"}'""") == alone
+
+
 def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> None:
     run("collect door --episodes 10 --steps 20 --workers 1 -o ten.h5")
     line = "train door --filter crossmodal-pf --data ten.h5 --preset smoke -o pf.safetensors --json -"
@@ -284,6 +341,13 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert code == 0
     assert "dynamics" in err
     assert trained["record"]["command"].startswith("beliefscope train door --filter crossmodal-pf --data ten.h5")
+    assert trained["record"]["recipe"] == []
+    episodes = trained["record"]["episodes"]
+    hardened = json.loads(run(line.replace("--json", "--recipe force_bias:x=5,blackout=0.4 --json"))[1])["record"]
+    assert [fault["fault"] for fault in hardened["recipe"]] == ["force_bias", "blackout"]
+    assert hardened["episodes"] == episodes | {"train": 2 * episodes["train"]}
+    assert "--recipe force_bias=5,blackout=0.4" in hardened["command"]
+    trained = json.loads(run(line)[1])
     code, out, _ = run("evaluate door --filter pf.safetensors --data ten.h5 --particles 50 --json -")
     assert code == 0
     assert json.loads(out)["checkpoint_hash"] == trained["checkpoint_hash"]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -14,31 +13,27 @@ from beliefscope.app.commands.given import (
     FilterName,
     Json,
     Particles,
+    RecipeText,
     Seed,
     TaskName,
     check,
     checkpoint,
     dataset,
+    recipe,
+    recipe_text,
 )
 from beliefscope.datasets.errors import BadInput
-
-RECIPE = {"blackout": "number", "only": "string"}
-"""Key of a recipe -> what JSON calls its value."""
 
 
 def evaluate(
     task: TaskName,
     filter_: FilterName,
     data: DataPath = None,
-    recipe: Annotated[
-        str,
-        typer.Option(
-            "--recipe",
-            metavar="JSON",
-            help='What the filter is put through; JSON or a file of it. {"blackout": 0.4} blacks out that share of '
-            'the pictures, {"only": "image"} lets one modality decide alone.',
-        ),
-    ] = "{}",
+    recipe_: RecipeText = "",
+    only: Annotated[
+        str | None,
+        typer.Option("--only", metavar="MODALITY", help="Let one modality decide alone, whatever the weights say."),
+    ] = None,
     particles: Particles = 300,
     seed: Seed = 0,
     json: Json = None,
@@ -53,19 +48,22 @@ def evaluate(
     \b
     Examples:
       beliefscope evaluate door --filter crossmodal-pf
-      beliefscope evaluate door --filter crossmodal-pf --recipe '{"blackout": 0.8}' --json -
+      beliefscope evaluate door --filter crossmodal-pf --recipe blackout=0.8 --json -
+      beliefscope evaluate door --filter crossmodal-pf --recipe delay=haptics:steps=5 --only haptics
     """
     from beliefscope.filters.evaluate import evaluate as measure
 
     check(None, json)
-    options = read_recipe(recipe)
+    text, alone = without_only(recipe_text(recipe_))
     tested = checkpoint(task, filter_)
+    broken, only = recipe(text, tested.task), only or alone
     with dataset(tested.task, data) as episodes, console.progress("Evaluating") as advance:
         held_out = [s.index for s in episodes.summaries if s.split == "test"] or list(range(len(episodes)))
         metrics = measure(
             tested.filter,
             [episodes[i] for i in held_out],
-            **options,
+            recipe=broken,
+            only=only,
             particles=particles,
             seed=seed,
             progress=advance,
@@ -77,36 +75,28 @@ def evaluate(
         "checkpoint_hash": tested.hash,
         "data_hash": data_hash,
         "episodes": len(held_out),
-        "recipe": options,
+        "recipe": broken.to_json(),
+        "only": only,
         "particles": particles if tested.kind == "pf" else None,
         "seed": seed,
         **metrics,
     }
     rows = {f"rmse {name}": value for name, value in metrics["rmse"].items()}
     rows |= {name: value for name, value in metrics.items() if name != "rmse"}
-    text = console.table({name: f"{value:.2f}" for name, value in rows.items()})
-    console.result(document, f"{tested.name} ({tested.hash[:12]}) on {len(held_out)} episodes\n{text}", json)
+    table = console.table({name: f"{value:.2f}" for name, value in rows.items()})
+    what = f"{tested.name} ({tested.hash[:12]}) on {len(held_out)} episodes" + (f" with {broken}" if broken else "")
+    console.result(document, f"{what}\n{table}", json)
 
 
-def read_recipe(text: str) -> dict[str, Any]:
-    """The keyword arguments of ``filters.evaluate.evaluate`` that a recipe, or a file of one, stands for."""
-    if not text.lstrip().startswith("{"):
-        try:
-            text = Path(text).read_text()
-        except (OSError, UnicodeDecodeError):
-            raise BadInput(f"recipe {text!r} is neither a JSON object nor a file of one") from None
+def without_only(text: str) -> tuple[str, str | None]:
+    """A recipe, and the modality of ``--only``, which older scripts name in the recipe: ``{"only": "image"}``."""
     try:
-        recipe = json_format.loads(text)
-    except json_format.JSONDecodeError as error:
-        raise BadInput(f"recipe is not JSON: {error}") from None
-    if not isinstance(recipe, dict):
-        raise BadInput(f"recipe is {recipe!r}, not a JSON object")
-    for key, value in recipe.items():
-        if key not in RECIPE:
-            raise BadInput(f"recipe has the key {key!r}. Available: {', '.join(RECIPE)}.")
-        fits = isinstance(value, str) if RECIPE[key] == "string" else type(value) in (int, float)
-        if not fits:
-            raise BadInput(f"recipe's {key!r} is {value!r}, not a {RECIPE[key]}")
-    if not 0.0 <= recipe.get("blackout", 0.0) <= 1.0:
-        raise BadInput(f"recipe's 'blackout' is {recipe['blackout']}, not a share between 0 and 1")
-    return recipe
+        value = json_format.loads(text)
+    except (ValueError, RecursionError):
+        return text, None
+    if not isinstance(value, dict) or "only" not in value:
+        return text, None
+    only = value.pop("only")
+    if not isinstance(only, str):
+        raise BadInput(f"recipe's 'only' is {only!r}, not a modality's name")
+    return json_format.dumps(value), only

@@ -13,6 +13,7 @@ from beliefscope.app import console
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
+    from beliefscope.datasets.corrupt import Recipe
     from beliefscope.datasets.store import Dataset
     from beliefscope.datasets.task import Task
     from beliefscope.filters.checkpoint import Checkpoint
@@ -55,6 +56,15 @@ EpisodeIndex = Annotated[
         parser=whole(0),
         metavar="I",
         help="Index in the data set. Without it: the first that is kept for tests.",
+    ),
+]
+RecipeText = Annotated[
+    str,
+    typer.Option(
+        "--recipe",
+        metavar="FAULTS",
+        help="How the sensors are broken: blackout=0.4,force_bias:x=5:from=20, or JSON, or a .json file of it. "
+        "beliefscope recipes lists the faults.",
     ),
 ]
 Particles = Annotated[int, typer.Option("--particles", parser=whole(1), metavar="M", help="Of a particle filter.")]
@@ -103,14 +113,35 @@ def checkpoint(task: str, name_or_path: str) -> Checkpoint:
     return loaded
 
 
-def traced(checkpoint: Checkpoint, data: Path | None, index: int | None, particles: int, seed: int) -> Trace:
+def recipe_text(text: str) -> str:
+    """What the file says, where the text is a path: it ends in .json or holds a separator."""
+    if text.lstrip().startswith(("{", "[")) or not (text.endswith(".json") or os.sep in text):
+        return text
+    try:
+        return Path(text).read_text()
+    except (OSError, UnicodeDecodeError):
+        raise BadInput(f"recipe {text!r} is not a file that can be read") from None
+
+
+def recipe(text: str, task: Task) -> Recipe:
+    """The recipe that the text, or the file it names, stands for. Raises BadInput for one that does not fit."""
+    from beliefscope.datasets.corrupt import Recipe
+
+    found = Recipe.parse(recipe_text(text))
+    found.check(task)
+    return found
+
+
+def traced(
+    checkpoint: Checkpoint, data: Path | None, index: int | None, broken: Recipe, particles: int, seed: int
+) -> Trace:
     """The trace of one episode, with a bar. An index of None is the first test episode."""
     from beliefscope.inspect.trace import trace
 
     with dataset(checkpoint.task, data) as episodes, console.progress("Filtering") as advance:
         if index is None:
             index = next((s.index for s in episodes.summaries if s.split == "test"), 0)
-        return trace(checkpoint, episodes[index], index, seed=seed, particles=particles, progress=advance)
+        return trace(checkpoint, episodes[index], index, seed, particles, broken, advance)
 
 
 def described(trace: Trace, path: Path) -> dict[str, Any]:
@@ -120,6 +151,7 @@ def described(trace: Trace, path: Path) -> dict[str, Any]:
         "filter": trace.filter,
         "episode": trace.episode_index,
         "steps": len(trace),
+        "recipe": trace.recipe.to_json(),
         "seed": trace.seed,
         "checkpoint_hash": trace.checkpoint_hash,
         "data_hash": trace.data_hash,
@@ -131,7 +163,7 @@ def described(trace: Trace, path: Path) -> dict[str, Any]:
 def title(trace: Trace, path: Path) -> str:
     """The same in one line of text."""
     what = f"{trace.filter} over {len(trace)} steps of {trace.episode.task} episode {trace.episode_index}"
-    return f"{size(path)}: {what}"
+    return f"{size(path)}: {what}" + (f" with {trace.recipe}" if trace.recipe else "")
 
 
 def size(path: Path) -> str:

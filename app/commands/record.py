@@ -14,11 +14,13 @@ from beliefscope.app.commands.given import (
     FilterName,
     Json,
     Particles,
+    RecipeText,
     Seed,
     TaskName,
     check,
     checkpoint,
     described,
+    recipe,
     title,
     traced,
     whole,
@@ -37,6 +39,7 @@ def record(
             "--maps", parser=whole(0), metavar="STRIDE", help="Likelihood maps of each STRIDE-th step; 0: none."
         ),
     ] = 10,
+    recipe_: RecipeText = "",
     particles: Particles = 300,
     seed: Seed = 0,
     json: Json = None,
@@ -47,15 +50,16 @@ def record(
     maps, with their layout. Open it with: rerun run.rrd.
 
     \b
-    Example:
+    Examples:
       beliefscope record door --filter crossmodal-ekf --episode 9 --maps 5 -o run.rrd
+      beliefscope record door --filter crossmodal-pf --recipe image_frozen=20 -o frozen.rrd
     """
     from beliefscope.inspect.likelihood import MapEngine
     from beliefscope.recordings.write import write_recording
 
     check(output, json)
     loaded = checkpoint(task, filter_)
-    made = traced(loaded, data, episode, particles, seed)
+    made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed)
     layers = MapEngine(loaded, made).maps(range(0, len(made), maps)) if maps else None
     with console.progress("Recording") as advance:
         write_recording(made, output, maps=layers, progress=advance)

@@ -14,11 +14,13 @@ from beliefscope.app.commands.given import (
     FilterName,
     Json,
     Particles,
+    RecipeText,
     Seed,
     TaskName,
     check,
     checkpoint,
     described,
+    recipe,
     title,
     traced,
 )
@@ -30,6 +32,7 @@ def trace(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="TRACE", help="Where to write the trace.")],
     data: DataPath = None,
     episode: EpisodeIndex = None,
+    recipe_: RecipeText = "",
     particles: Particles = 300,
     seed: Seed = 0,
     json: Json = None,
@@ -41,12 +44,14 @@ def trace(
     keeps nothing. In Python: beliefscope.inspect.trace.load_trace.
 
     \b
-    Example:
+    Examples:
       beliefscope trace door --filter crossmodal-pf --episode 9 -o run.trace
+      beliefscope trace door --filter crossmodal-pf --recipe force_bias:x=5:from=20 -o biased.trace
     """
     from beliefscope.inspect.trace import save_trace
 
     check(output, json)
-    made = traced(checkpoint(task, filter_), data, episode, particles, seed)
+    loaded = checkpoint(task, filter_)
+    made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed)
     save_trace(made, output)
     console.result(described(made, output), title(made, output), json)

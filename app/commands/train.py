@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import DataPath, Json, Seed, TaskName, check, dataset, size
+from beliefscope.app.commands.given import DataPath, Json, RecipeText, Seed, TaskName, check, dataset, recipe, size
 from beliefscope.datasets.errors import one_of
 
 
@@ -25,6 +25,7 @@ def train(
             "--preset", metavar="NAME", help="cpu: about 10 minutes on 2 cores. full: for a GPU. smoke: a trial."
         ),
     ] = "cpu",
+    recipe_: RecipeText = "",
     seed: Seed = 0,
     json: Json = None,
 ) -> None:
@@ -32,14 +33,16 @@ def train(
 
     In the paper's order: dynamics, each modality's model, each modality alone through the filter, the weight model
     alone, everything together. Uses a CUDA GPU where there is one. The checkpoint tells how it was made and how
-    well it does on episodes it has not seen.
+    well it does on episodes it has not seen. With a recipe it also trains on a broken copy of each training episode.
 
     \b
     Examples:
       beliefscope train door --filter crossmodal-pf -o mine.safetensors
       beliefscope train door --filter crossmodal-ekf --data door.h5 --preset full -o mine.safetensors
+      beliefscope train door --filter crossmodal-pf --recipe force_bias:x=5,force_noise=3 -o hardened.safetensors
     """
     from beliefscope.datasets.catalog import find_task
+    from beliefscope.datasets.corrupt import broken_copies
     from beliefscope.filters.catalog import architecture
     from beliefscope.filters.checkpoint import save_checkpoint
     from beliefscope.filters.train import PLANS
@@ -51,26 +54,30 @@ def train(
         raise one_of("preset", preset, PLANS)
     # Where on this machine the data lie is no part of the record; their hash is.
     given = "" if data is None else f" --data {data.name}"
+    broken = recipe(recipe_, find_task(task))
+    given += f" --recipe {broken}" if broken else ""
     with dataset(find_task(task), data) as episodes, console.bars() as move:
+        whole = list(episodes)
         trained = train_filter(
             chosen,
-            list(episodes),
+            whole + (broken_copies(broken, whole, seed) if broken else []),
             data_hash=episodes.hash,
             plan=PLANS[preset],
             seed=seed,
             command=f"beliefscope train {task} --filter {filter_}{given} --preset {preset} --seed {seed}",
             report=lambda stage, done, count, loss: move(stage, done / count, f"loss {loss:.3g}"),
         )
-    checkpoint_hash = save_checkpoint(trained.filter, filter_, trained.record, output)
+    record = trained.record | {"recipe": broken.to_json()}
+    checkpoint_hash = save_checkpoint(trained.filter, filter_, record, output)
     document = {
         "task": task,
         "filter": filter_,
         "checkpoint_hash": checkpoint_hash,
         "path": str(output),
         "bytes": output.stat().st_size,
-        "record": trained.record,
+        "record": record,
     }
-    lines = [f"{size(output)}: {filter_}, trained in {trained.record['seconds']:.0f} s"]
-    for name, metrics in trained.record["metrics"].get("0", {}).items():
+    lines = [f"{size(output)}: {filter_}, trained in {record['seconds']:.0f} s"]
+    for name, metrics in record["metrics"].get("0", {}).items():
         lines.append(f"{name}: " + ", ".join(f"{key} {value:.2f}" for key, value in metrics["rmse"].items()))
     console.result(document, "\n".join(lines), json)

@@ -14,6 +14,7 @@ from starlette.testclient import TestClient
 
 from beliefscope import __version__
 from beliefscope.app.server import Settings
+from beliefscope.datasets.corrupt import Recipe
 from beliefscope.inspect.trace import load_trace
 from beliefscope.recordings.read import read_recording
 
@@ -93,6 +94,42 @@ def test_a_damaged_trace_file_is_computed_again(traced: str, settings: Settings,
     assert len(file.read_bytes()) == len(whole)
 
 
+def test_the_catalog_has_recipes_that_can_be_asked_for(client: TestClient, traced: str) -> None:
+    (door,) = client.get("/api/catalog").json()["tasks"]
+    recipes = {r["name"]: r["recipe"] for r in door["recipes"]}
+    assert recipes["40 % black pictures"] == "blackout=0.4"
+    assert {"force axis stuck", "effector off by 2 cm", "haptics dropped"} <= recipes.keys()
+    whole = client.get(f"{traced}/images").content
+    for recipe in ("blackout=0.8", '[{"fault": "image_frozen", "from": 20}]'):
+        query = {"recipe": recipe}
+        while (answer := client.get(traced, params=query)).status_code == 202:
+            pass
+        assert answer.json()["recipe"] == str(Recipe.parse(recipe))
+        broken = client.get(f"{traced}/images", params=query).content
+        assert len(broken) == len(whole)
+        assert broken != whole
+    assert client.get(traced).json()["recipe"] == ""
+    assert client.get(f"{traced}/images").content == whole
+
+
+@pytest.mark.parametrize(
+    ("recipe", "said"),
+    [
+        ("blakout", "fault 'blakout' does not exist. Available: blackout,"),
+        ("blackout=2", "blackout's 'probability' is 2, not a number from 0 to 1"),
+        ("drop=touch", "modality of task 'door' 'touch' does not exist. Available: image, haptics."),
+        ("[[", "recipe is not JSON"),
+        ("secret.json", "fault 'secret.json' does not exist"),
+    ],
+)
+def test_a_bad_recipe_is_one_readable_line(client: TestClient, traced: str, recipe: str, said: str) -> None:
+    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "recipe": recipe}
+    answers = [client.get(traced + part, params={"recipe": recipe}) for part in ("", "/columns", "/images")]
+    for answer in (*answers, client.post("/api/recordings", json=body)):
+        assert answer.status_code == 400
+        assert said in answer.json()["error"]
+
+
 @pytest.mark.parametrize("part", ["", "/columns", "/images"])
 @pytest.mark.parametrize(
     ("path", "said"),
@@ -126,7 +163,7 @@ def test_a_trace_is_fetched_once(client: TestClient, traced: str) -> None:
 
 
 def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str, settings: Settings) -> None:
-    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "maps": 20}
+    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "recipe": "", "maps": 20}
     answer = client.post("/api/recordings", json=wanted)
     assert answer.status_code == 201, answer.text
     made = answer.json()

@@ -59,6 +59,16 @@ def test_a_cursor_is_answered_with_maps_then_the_scene(
     np.testing.assert_allclose(header["effector"], trace.episode.observations["effector_position"][7, :2], rtol=1e-6)
 
 
+def test_a_recipe_changes_what_the_maps_show(socket: WebSocketTestSession) -> None:
+    shown = []
+    for serial, recipe in enumerate(("", "blackout", "")):
+        socket.send_json(cursor(serial=serial, recipe=recipe))
+        shown.append(maps(socket)[1])
+        assert socket.receive_json()["type"] == "drawn"
+    assert np.array_equal(shown[0], shown[2])
+    assert not np.array_equal(shown[0][0], shown[1][0])
+
+
 def test_the_newest_cursor_wins(
     socket: WebSocketTestSession, monkeypatch: pytest.MonkeyPatch, client: TestClient
 ) -> None:
@@ -99,6 +109,9 @@ def test_the_newest_cursor_wins(
         (json.dumps(cursor(step=-1)), "cursor needs 'step', an integer from 0; got -1."),
         (json.dumps(cursor(step=1.5)), "cursor needs 'step', an integer from 0; got 1.5."),
         (json.dumps(cursor(step=True)), "cursor needs 'step', an integer from 0; got True."),
+        (json.dumps(cursor(recipe=0.4)), "cursor's 'recipe' is text; got 0.4."),
+        (json.dumps(cursor(recipe="blakout")), "fault 'blakout' does not exist. Available: blackout,"),
+        (json.dumps(cursor(recipe="delay=touch")), "modality of task 'door' 'touch' does not exist."),
         (json.dumps(cursor(size=10**6)), "cursor's 'size' is 41 or 135; got 1000000."),
         (json.dumps(cursor(angle="wide")), "cursor's 'angle' is a number of radians or null; got 'wide'."),
         (json.dumps(cursor(angle=float("nan"))), "cursor's 'angle' is a number of radians or null; got nan."),

@@ -21,15 +21,19 @@ Array = np.ndarray[Any, Any]
 SPAN = ":from=20:to=60"
 BREAKS = {
     "blackout": {"image"},
-    "force_bias": {"force"},
-    "effector_offset": {"effector_position"},
+    "force_bias=5": {"force"},
+    "force_drift=1": {"force"},
+    "effector_offset=0.02": {"effector_position"},
     "contact_flipped": {"contact"},
     "contact_late": {"contact"},
     "delay=haptics": {"effector_position", "force", "torque", "contact"},
     "delay=image": {"image"},
     "drop=haptics": {"effector_position", "force", "torque", "contact"},
     "drop=image": {"image"},
-} | {name: {name.split("_")[0]} for name in FAULTS if name.startswith(("image_", "force_")) and name != "force_bias"}
+    "force_noise": {"force"},
+    "force_saturation": {"force"},
+    "force_stuck": {"force"},
+} | {name: {"image"} for name in FAULTS if name.startswith("image_")}
 """Fault -> observations it breaks."""
 
 
@@ -88,7 +92,7 @@ def test_draws_differ_by_seed_episode_and_place(text: str, episode: Episode) -> 
     assert not np.array_equal(first, broken(text, episode, 1).observations[key])
     other = broken(text, replace(episode, seed=episode.seed + 1)).observations[key]
     assert not np.array_equal(first, other)
-    assert not np.array_equal(first, broken(f"effector_offset,{text}", episode).observations[key])
+    assert not np.array_equal(first, broken(f"effector_offset=1,{text}", episode).observations[key])
 
 
 def test_controls_follow_what_is_reported(episode: Episode) -> None:
@@ -102,7 +106,7 @@ def test_controls_follow_what_is_reported(episode: Episode) -> None:
     jump = broken("effector_offset:x=0.02:from=20", episode)
     assert jump.controls[20, 3] - episode.controls[20, 3] == pytest.approx(0.02, abs=1e-6)
     others = replace(episode, controls=episode.controls + 1)
-    assert broken("effector_offset", others).controls is others.controls
+    assert broken("effector_offset=1", others).controls is others.controls
 
 
 def test_a_share_of_the_pictures_is_black_and_the_others_untouched(episode: Episode) -> None:
@@ -256,7 +260,8 @@ def test_short_forms() -> None:
         assert Recipe.parse(text) == asked
     assert Recipe.parse(" blackout=0.4 , force_bias:x=5 ") == asked + Recipe.of({"fault": "force_bias", "x": 5})
     assert str(asked) == "blackout=0.4"
-    assert str(Recipe.parse("force_bias:y=2:from=20:to=60")) == "force_bias=5:y=2:from=20:to=60"
+    assert str(Recipe.parse("force_bias=0:y=2:from=20:to=60")) == "force_bias:y=2:from=20:to=60"
+    assert str(Recipe.parse("delay:steps=3,blackout=1,image_frozen=7")) == "delay=image:steps=3,blackout,image_frozen=7"
     assert asked.to_json() == [{"fault": "blackout", "probability": 0.4}]
 
 
@@ -316,7 +321,7 @@ def test_a_fault_of_what_a_task_has_not(episode: Episode) -> None:
     with pytest.raises(BadInput, match=r"sensor of task 'door' 'image' does not exist\. Available: force\."):
         Recipe.parse("force_bias,blackout").check(blind)
     flat = replace(episode, observations=dict(episode.observations) | {"force": np.zeros((100, 2), np.float32)})
-    with pytest.raises(BadInput, match=r"force_bias=5:z=1 is of an axis that the sensor has not\. Available: x, y\."):
+    with pytest.raises(BadInput, match=r"force_bias:z=1 is of an axis that the sensor has not\. Available: x, y\."):
         broken("force_bias:z=1", flat)
     with pytest.raises(BadInput, match=r"axis of the force 'z' does not exist\. Available: x, y\."):
         broken("force_stuck=z", flat)

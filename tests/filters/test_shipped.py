@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint, shipped
@@ -45,22 +46,22 @@ def test_recorded_metrics_are_those_of_these_weights(checkpoint: Checkpoint, hel
     assert again.rmse["angle_deg"] == pytest.approx(recorded["rmse"]["angle_deg"], rel=0.5)
 
 
-@pytest.mark.parametrize("blackout", [0.0, 0.4])
-def test_fused_beats_each_modality_alone(checkpoint: Checkpoint, held_out: list[Episode], blackout: float) -> None:
+@pytest.mark.parametrize("recipe", ["", "blackout=0.4"])
+def test_fused_beats_each_modality_alone(checkpoint: Checkpoint, held_out: list[Episode], recipe: str) -> None:
     """On what moves, the angle; on the hinge it is no worse than the better one by more than a tenth.
 
     With 80 % black pictures the PF is not better than its image alone: filters/pretrained/README.md.
     """
-    fused = evaluate(checkpoint.filter, held_out, blackout=blackout).rmse
+    fused = evaluate(checkpoint.filter, held_out, recipe=Recipe.parse(recipe)).rmse
     for name in checkpoint.filter.names:
-        alone = evaluate(checkpoint.filter, held_out, blackout=blackout, only=name).rmse
+        alone = evaluate(checkpoint.filter, held_out, recipe=Recipe.parse(recipe), only=name).rmse
         assert fused["angle_deg"] < alone["angle_deg"]
         assert fused["position_cm"] < 1.1 * alone["position_cm"]
 
 
 def test_blackout_moves_beta_away_from_the_image(checkpoint: Checkpoint, held_out: list[Episode]) -> None:
     """On what moves, the angle: of the hinge, which stands still, an EKF remembers what the picture said."""
-    traces = [trace(checkpoint, e, particles=50, blackout=0.5) for e in held_out[:6]]
+    traces = [trace(checkpoint, e, particles=50, recipe=Recipe.parse("blackout=0.5")) for e in held_out[:6]]
     pictures = np.concatenate([t.episode.observations["image"] for t in traces])
     beta = np.concatenate([t.weights[..., -1] for t in traces if t.weights is not None])
     black = ~pictures.any(axis=(1, 2))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
@@ -37,7 +41,7 @@ def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
 def test_tracing_changes_no_bit_of_the_estimates(checkpoint: Checkpoint, episode: Episode, traced: Trace) -> None:
     filter_ = checkpoint.filter
     batch = Steps.of(filter_.task, [episode]).episode(0)
-    error, covariance = run(filter_, batch, blackout=0.0, only=None, particles=100, seed=7)
+    error, covariance = run(filter_, batch, only=None, particles=100, seed=7)
     si = torch.from_numpy(traced.estimate_mean)
     assert torch.equal(si - batch.states[:, 0], error[:, 0])
     assert torch.equal(torch.from_numpy(traced.estimate_covariance), covariance[:, 0])
@@ -87,18 +91,46 @@ def test_particle_weights_explain_the_estimate_and_the_ancestors(traced: Trace) 
     assert np.abs(counts - 100 * weights).max() < 1.001
 
 
-def test_blackout_is_kept_as_the_filter_saw_it(checkpoint: Checkpoint, episode: Episode) -> None:
-    dark = trace(checkpoint, episode, particles=20, blackout=1.0)
-    assert not dark.episode.observations["image"].any()
-    assert episode.observations["image"].any()
-    assert dark.data_hash == episode.digest()
+def test_a_broken_episode_is_kept_as_the_filter_saw_it(
+    checkpoint: Checkpoint, episode: Episode, traced: Trace, tmp_path: Path
+) -> None:
+    recipe = Recipe.parse("blackout,force_noise=3,contact_flipped:from=20")
+    broken = trace(checkpoint, episode, seed=7, particles=100, recipe=recipe)
+    assert not broken.episode.observations["image"].any()
+    assert broken.episode.digest() == recipe.apply(episode, 7).digest() != episode.digest()
+    assert broken.data_hash == episode.digest()
+    np.testing.assert_array_equal(broken.start_mean, traced.start_mean)
+    assert not np.array_equal(broken.estimate_mean, traced.estimate_mean)
+    assert np.array_equal(broken.episode.states, traced.episode.states)
+    save_trace(broken, tmp_path / "run.trace")
+    assert load_trace(tmp_path / "run.trace").recipe == recipe
+    assert traced.recipe == WHOLE
+
+
+@pytest.mark.parametrize(("chance", "recipe"), [(0.0, ""), (0.4, "blackout=0.4")])
+def test_a_trace_from_before_there_were_recipes(
+    traced: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chance: float, recipe: str
+) -> None:
+    older = replace(traced, settings={"particles": 100, "blackout": chance})
+    real = json.dumps
+
+    def without_recipe(header: Any, **options: Any) -> str:
+        return real({key: value for key, value in header.items() if key != "recipe"}, **options)
+
+    with monkeypatch.context() as before:
+        before.setattr(json, "dumps", without_recipe)
+        save_trace(older, tmp_path / "old.trace")
+    assert b'"recipe' not in (tmp_path / "old.trace").read_bytes()
+    again = load_trace(tmp_path / "old.trace")
+    assert again.recipe == Recipe.parse(recipe)
+    np.testing.assert_array_equal(again.estimate_mean, traced.estimate_mean)
 
 
 def test_a_running_filter_needs_sense(checkpoint: Checkpoint, episode: Episode) -> None:
     with pytest.raises(BadInput, match="particles must be at least 1, not 0"):
         trace(checkpoint, episode, particles=0)
-    with pytest.raises(BadInput, match=r"blackout must be a chance between 0 and 1, not 1\.5"):
-        trace(checkpoint, episode, blackout=1.5)
+    with pytest.raises(BadInput, match=r"modality of task 'door' 'touch' does not exist"):
+        trace(checkpoint, episode, recipe=Recipe.parse("drop=touch"))
 
 
 def test_bad_trace_files(traced: Trace, tmp_path: Path) -> None:

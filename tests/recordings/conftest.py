@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
@@ -79,6 +80,7 @@ def make_trace(kind: str, steps: int = 40, particles: int = 30, seed: int = 0) -
         "data_hash": episode.digest(),
         "episode_index": 3,
         "seed": 11,
+        "recipe": Recipe.parse("blackout=0.4,force_bias:x=5:from=3"),
         "settings": {"particles": particles, "versions": {"torch": "2"}},
     }
     if kind == "ekf":

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
 
+from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings import write
@@ -63,6 +65,18 @@ def test_another_format_version(
     monkeypatch.setattr(write, "FORMAT_VERSION", 2)
     path = write.write_recording(new_trace("ekf"), tmp_path / "newer.rrd")
     assert "recording format 2; this version reads format 1" in message(path)
+
+
+@pytest.mark.parametrize(("chance", "recipe"), [(0.0, ""), (0.4, "blackout=0.4")])
+def test_a_recording_from_before_there_were_recipes(
+    new_trace: Callable[..., Trace], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chance: float, recipe: str
+) -> None:
+    trace = replace(new_trace("ekf"), settings={"blackout": chance})
+    values = rr.AnyValues
+    monkeypatch.setattr(rr, "AnyValues", lambda recipe, **others: values(**others))
+    again = read_recording(write.write_recording(trace, tmp_path / "old.rrd"))
+    assert again.recipe == Recipe.parse(recipe)
+    np.testing.assert_array_equal(again.estimate_mean, trace.estimate_mean)
 
 
 def test_steps_that_are_missing(recording: Path, tmp_path: Path) -> None:
