@@ -14,6 +14,7 @@ import typer
 from beliefscope import __version__
 from beliefscope.app import console
 from beliefscope.app.commands.collect import collect
+from beliefscope.app.commands.convert import convert
 from beliefscope.app.commands.evaluate import evaluate
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
@@ -22,7 +23,7 @@ from beliefscope.app.commands.trace import trace
 from beliefscope.app.commands.train import train
 from beliefscope.datasets.errors import BadInput
 
-COMMANDS = (serve, collect, train, evaluate, trace, record, recipes)
+COMMANDS = (serve, collect, convert, train, evaluate, trace, record, recipes)
 
 cli = typer.Typer(
     name="beliefscope",

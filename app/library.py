@@ -16,9 +16,10 @@ from typing import Any
 from beliefscope.app.wire import MAP_SIZES, columns
 from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.corrupt import WHOLE, Recipe, ready
+from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.store import Dataset, open_dataset, sample_path
+from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -118,7 +119,7 @@ class Library:
         with self._lock:
             if task not in self._datasets:
                 known = find_task(task)
-                data = open_dataset(self.settings.data.get(known.name) or sample_path(known.name))
+                data = open_dataset(self.settings.data.get(known.name) or sample_path(known.name), known)
                 if data.task.name != known.name:
                     raise BadInput(f"The data given for task {known.name!r} are of task {data.task.name!r}.")
                 self._datasets[task] = data

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.errors import one_of
+from beliefscope.datasets.push_real import PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
 
-TASKS: dict[str, Task] = {task.name: task for task in (DOOR,)}
+TASKS: dict[str, Task] = {task.name: task for task in (DOOR, *PUSH_REAL_TASKS)}
 
 
 def find_task(name: str) -> Task:

@@ -6,118 +6,116 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.authors import AuthorsFiles, is_authors
 from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.dataset import DAMAGE, SPLITS, Dataset, EpisodeSummary, damaged, reason
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.mit_push import MitPushes, is_mit
+from beliefscope.datasets.push_real import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
 
 FORMAT = "beliefscope-episodes"
 VERSION = 1
-SPLITS = ("train", "val", "test")
 
 T = TypeVar("T")
 
-# What h5py raises on meeting a damaged file.
-_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 _SAMPLES = Path(__file__).parent / "samples"
-
-
-@dataclass(frozen=True)
-class EpisodeSummary:
-    """What a list of episodes shows of one. ``contact_fraction`` is the share of its steps in contact."""
-
-    index: int
-    steps: int
-    policy: str
-    split: str
-    seed: int
-    contact_fraction: float
 
 
 def sample_path(task_name: str) -> Path:
     """The sample set shipped for a task. Raises BadInput for an unknown task, or one that ships none."""
     path = _SAMPLES / f"{find_task(task_name).name}.h5"
     if not path.exists():
+        can_simulate = find_task(task_name).simulate is not None
         raise BadInput(
-            f"Task {task_name!r} ships no sample set. Give a file: beliefscope collect {task_name} makes one."
+            f"Task {task_name!r} ships no sample set. Give its data with --data"
+            + (f": beliefscope collect {task_name} makes some." if can_simulate else ".")
         )
     return path
 
 
-def open_dataset(path: str | Path) -> Dataset:
-    """Open a file of episodes for reading. Raises BadInput where it is missing, damaged, or not one of ours."""
-    return Dataset(Path(path))
+def open_dataset(path: str | Path, task: Task | None = None, skip_bad: bool = False) -> Dataset:
+    """Open episodes for reading, by what is found: a file of ours, or files of others, or a folder of these.
 
+    Args:
+        path: an HDF5 file of ours; a file or folder (searched to its bottom) of pushes of the MIT data set; a file or
+            folder of the HDF5 files of the paper's authors.
+        task: what they are wanted for, where the files leave a choice: which of the ``push-real`` tasks.
+        skip_bad: leave out trajectories that cannot be used, and say so in ``Dataset.left_out``.
 
-class Dataset:
-    """A file of episodes of one task: ``len``, ``[i]``, iteration; a context manager.
-
-    Opening reads only attributes; ``[i]`` reads one episode and checks it.
-
-    Attributes:
-        path: of the file. task: what it holds.
-        summaries: one ``EpisodeSummary`` an episode.
-        hash: SHA-256 over the episodes' digests, the same however they are stored.
+    Raises:
+        BadInput: where it is missing, damaged, of no known kind, or nothing in it can be used.
     """
+    path = Path(path)
+    files = data_files(path)
+    if is_mit(files[0]):
+        wanted = task if task in PUSH_REAL_TASKS else PUSH_REAL
+        return MitPushes(path, files, wanted, skip_bad)
+    if is_authors(files[0]):
+        return AuthorsFiles(path, files, skip_bad)
+    if path.is_dir():
+        raise BadInput(f"{path} holds sets of episodes, such as {files[0].name}: give one of the files.")
+    return EpisodeFile(path, skip_bad)
 
-    def __init__(self, path: Path) -> None:
+
+def data_files(path: Path) -> list[Path]:
+    """The file itself, or what a folder holds of data. Raises BadInput where there is none."""
+    if not path.exists():
+        raise BadInput(f"{path} does not exist.")
+    if not path.is_dir():
+        return [path]
+    files = sorted(file for file in path.rglob("*") if file.suffix in (".json", ".h5", ".hdf5") and file.is_file())
+    if not files:
+        raise BadInput(f"Folder {path} holds no data: expected files that end in .json, .h5 or .hdf5.")
+    return files
+
+
+class EpisodeFile(Dataset):
+    """A file of our own layout. Opening reads only attributes; ``[i]`` reads one episode and checks it: its arrays must
+    be of the task's shapes and types, finite, and match their digest."""
+
+    def __init__(self, path: Path, skip_bad: bool = False) -> None:
         self.path = path
         self._file = _open(path)
         try:
             self.task = self._read_task()
-            self._groups = self._find_groups()
-            self.summaries = tuple(self._summary(i) for i in range(len(self._groups)))
+            self._groups = self._usable_groups() if skip_bad else self._find_groups()
+            self.summaries = tuple(self._summary(group, i) for i, group in enumerate(self._groups))
             digests = "\n".join(self._attribute(group, "digest", str) for group in self._groups)
-            self.hash = hashlib.sha256(digests.encode()).hexdigest()
+            self._hash = hashlib.sha256(digests.encode()).hexdigest()
         except BadInput:
             self.close()
             raise
-        except _DAMAGE as error:
+        except DAMAGE as error:
             self.close()
-            raise _damaged(path, error) from None
+            raise damaged(path, error) from None
 
-    def __len__(self) -> int:
-        return len(self._groups)
+    @property
+    def hash(self) -> str:
+        return self._hash
 
-    def __iter__(self) -> Iterator[Episode]:
-        return (self[i] for i in range(len(self)))
+    def _episode(self, index: int) -> Episode:
+        return self._checked(self._groups[index])
 
-    def __getitem__(self, index: int) -> Episode:
-        """Read one episode.
-
-        Raises BadInput where there is none of that index, where an array is missing, of another shape or type than the
-        task's, or not finite, and where the whole does not match its digest.
-        """
-        if not 0 <= index < len(self):
-            raise BadInput(f"Episode {index} is not in {self.path}, which has episodes 0 to {len(self) - 1}.")
+    def _checked(self, group: h5py.Group) -> Episode:
         try:
-            return self._read(index)
+            return self._read(group)
         except BadInput:
             raise
-        except _DAMAGE as error:
-            raise _damaged(self.path, error) from None
+        except DAMAGE as error:
+            raise damaged(self.path, error) from None
 
     def close(self) -> None:
-        """Close the file. Episodes already read stay valid."""
         self._file.close()
-
-    def __enter__(self) -> Dataset:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _read_task(self) -> Task:
         found = self._file.attrs.get("format")
@@ -144,8 +142,28 @@ class Dataset:
                 raise BadInput(f"{self.path} has {count} trajectories, but no group 'trajectory{i}'.")
         return groups
 
-    def _summary(self, index: int) -> EpisodeSummary:
-        group = self._groups[index]
+    def _usable_groups(self) -> list[h5py.Group]:
+        """Those that can be read to the end; the others are left out."""
+        groups, left_out = [], []
+        for name in sorted((n for n in self._file if n.startswith("trajectory")), key=lambda n: (len(n), n)):
+            try:
+                group = self._file.get(name)
+                if not isinstance(group, h5py.Group):
+                    raise BadInput(f"{self.path}: {name} is not a group.")
+                self._checked(group)
+            except (BadInput, *DAMAGE) as error:
+                left_out.append(str(error if isinstance(error, BadInput) else damaged(self.path, error)))
+                continue
+            groups.append(group)
+        if not groups:
+            raise BadInput(
+                f"{self.path} holds no trajectory that can be used."
+                + (f" The first: {left_out[0]}" if left_out else "")
+            )
+        self.left_out = tuple(left_out)
+        return groups
+
+    def _summary(self, group: h5py.Group, index: int) -> EpisodeSummary:
         states = self._stored(group, "states")
         if not states.shape or states.shape[0] < 1:
             raise BadInput(f"{self._place(group, 'states')} has shape {states.shape}, expected at least one step.")
@@ -161,11 +179,11 @@ class Dataset:
             contact_fraction=self._attribute(group, "contact_fraction", float),
         )
 
-    def _read(self, index: int) -> Episode:
-        group, summary, task = self._groups[index], self.summaries[index], self.task
-        steps = summary.steps
-        dt = self._attribute(group, "dt", float)
-        if not math.isclose(dt, task.dt):
+    def _read(self, group: h5py.Group) -> Episode:
+        task, summary, provenance = self.task, self._summary(group, 0), self._provenance(group)
+        steps, dt = summary.steps, self._attribute(group, "dt", float)
+        # A reader of others' files says in the provenance that theirs have another step.
+        if not math.isclose(dt, task.dt) and dt != provenance.get("recorded_dt"):
             raise BadInput(f"{self._place(group, 'dt')} is {dt} s; task {task.name!r} has steps of {task.dt} s.")
         episode = Episode(
             task=task.name,
@@ -182,7 +200,7 @@ class Dataset:
             dt=dt,
             seed=summary.seed,
             split=summary.split,
-            provenance=self._provenance(group),
+            provenance=provenance,
         )
         if episode.digest() != self._attribute(group, "digest", str):
             raise BadInput(f"{self.path}: the arrays of {group.name[1:]} do not match its digest: they were changed.")
@@ -250,7 +268,7 @@ def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> 
                 _write_episode(file.create_group(f"trajectory{index}"), episode)
         os.replace(unfinished, path)
     except OSError as error:
-        raise BadInput(f"Cannot write {path}: {_reason(error)}.") from None
+        raise BadInput(f"Cannot write {path}: {reason(error)}.") from None
     finally:
         unfinished.unlink(missing_ok=True)
 
@@ -284,16 +302,7 @@ def _open(path: Path) -> h5py.File:
         return h5py.File(path, "r")
     except PermissionError:
         raise BadInput(f"No permission to read {path}.") from None
-    except _DAMAGE as error:
+    except DAMAGE as error:
         if not h5py.is_hdf5(path):
             raise BadInput(f"{path} is not an HDF5 file.") from None
-        raise _damaged(path, error) from None
-
-
-def _damaged(path: Path, error: Exception) -> BadInput:
-    return BadInput(f"{path} is damaged or cut short: {_reason(error)}. Collect or copy it again.")
-
-
-def _reason(error: Exception) -> str:
-    """HDF5's own words, in one line."""
-    return (getattr(error, "strerror", None) or " ".join(str(error).split())).strip(" '\".")
+        raise damaged(path, error) from None

@@ -35,10 +35,11 @@ NAMES = [command.__name__ for command in COMMANDS]
 OPTIONS = {
     "serve": "--port --host --workspace --open --no-open --seed",
     "collect": "--episodes --steps --seed --workers -o --json",
-    "train": "--filter --data --preset --recipe --seed -o --json",
-    "evaluate": "--filter --data --recipe --only --particles --seed --json",
-    "trace": "--filter --data --episode --recipe --seed -o --json",
-    "record": "--filter --data --episode --maps --recipe --seed -o --json",
+    "convert": "--data --skip-bad -o --json",
+    "train": "--filter --data --skip-bad --preset --recipe --seed -o --json",
+    "evaluate": "--filter --data --skip-bad --recipe --only --particles --seed --json",
+    "trace": "--filter --data --skip-bad --episode --recipe --seed -o --json",
+    "record": "--filter --data --skip-bad --episode --maps --recipe --seed -o --json",
     "recipes": "--json",
 }
 """What scripts outside the project may rely on."""

@@ -15,6 +15,7 @@ from beliefscope.app.commands.given import (
     Particles,
     RecipeText,
     Seed,
+    SkipBad,
     TaskName,
     check,
     checkpoint,
@@ -29,6 +30,7 @@ def evaluate(
     task: TaskName,
     filter_: FilterName,
     data: DataPath = None,
+    skip_bad: SkipBad = False,
     recipe_: RecipeText = "",
     only: Annotated[
         str | None,
@@ -40,15 +42,16 @@ def evaluate(
 ) -> None:
     """Measure a filter on held-out episodes.
 
-    On the episodes that are kept for tests; on all, where none are. Each starts at the true state with covariance
-    0.1 I in standardised units, and its first 30 steps do not count. Over all other steps: RMSE; nll, the negative
-    log-likelihood of the truth in nats; nees, the normalised squared error, 1 where the covariance is right;
-    coverage95, the share of steps whose truth lies within the 95 % ellipsoid.
+    On the episodes kept for tests; on those for validation, or all, where there are none. Each starts at the true state
+    with covariance 0.1 I in standardised units, and its first 30 steps do not count. Over all other steps: RMSE; nll,
+    the negative log-likelihood of the truth in nats; nees, the normalised squared error, 1 where the covariance is
+    right; coverage95, the share of steps whose truth lies within the 95 % ellipsoid.
 
     \b
     Examples:
       beliefscope evaluate door --filter crossmodal-pf
       beliefscope evaluate door --filter crossmodal-pf --recipe blackout=0.8 --json -
+      beliefscope evaluate push-real --filter crossmodal-pf --data mit_push/val
       beliefscope evaluate door --filter crossmodal-pf --recipe delay=haptics:steps=5 --only haptics
     """
     from beliefscope.filters.evaluate import evaluate as measure
@@ -57,8 +60,8 @@ def evaluate(
     text, alone = without_only(recipe_text(recipe_))
     tested = checkpoint(task, filter_)
     broken, only = recipe(text, tested.task), only or alone
-    with dataset(tested.task, data) as episodes, console.progress("Evaluating") as advance:
-        held_out = [s.index for s in episodes.summaries if s.split == "test"] or list(range(len(episodes)))
+    with dataset(tested.task, data, skip_bad) as episodes, console.progress("Evaluating") as advance:
+        held_out = episodes.held_out()
         metrics = measure(
             tested.filter,
             [episodes[i] for i in held_out],

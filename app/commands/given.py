@@ -14,7 +14,7 @@ from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
     from beliefscope.datasets.corrupt import Recipe
-    from beliefscope.datasets.store import Dataset
+    from beliefscope.datasets.dataset import Dataset
     from beliefscope.datasets.task import Task
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.inspect.trace import Trace
@@ -36,7 +36,13 @@ def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     return parse
 
 
-TaskName = Annotated[str, typer.Argument(metavar="TASK", help="Name of the task: door.")]
+TaskName = Annotated[
+    str,
+    typer.Argument(
+        metavar="TASK",
+        help="Name of the task: door, push, push-real; docs/data.md has its variants and how to add yours.",
+    ),
+]
 FilterName = Annotated[
     str,
     typer.Option(
@@ -47,7 +53,16 @@ FilterName = Annotated[
 ]
 DataPath = Annotated[
     Path | None,
-    typer.Option("--data", metavar="FILE.h5", help="Episodes to use. Without it: the sample set that ships."),
+    typer.Option(
+        "--data",
+        metavar="FILE.h5|DIR",
+        help="Episodes to use: a file of ours, or files of others as in docs/data.md. "
+        "Without it: the sample set that ships.",
+    ),
+]
+SkipBad = Annotated[
+    bool,
+    typer.Option("--skip-bad", help="Leave out trajectories that cannot be used, and say which and why."),
 ]
 EpisodeIndex = Annotated[
     int | None,
@@ -55,7 +70,7 @@ EpisodeIndex = Annotated[
         "--episode",
         parser=whole(0),
         metavar="I",
-        help="Index in the data set. Without it: the first that is kept for tests.",
+        help="Index in the data set. Without it: the first that is held out.",
     ),
 ]
 RecipeText = Annotated[
@@ -89,14 +104,16 @@ def check(output: Path | None, json: str | None) -> None:
         raise BadInput(f"folder {str(output.parent)!r} may not be written to")
 
 
-def dataset(task: Task, path: Path | None) -> Dataset:
-    """The file's episodes, or the sample set's. Raises BadInput when they are of another task."""
+def dataset(task: Task, path: Path | None, skip_bad: bool = False) -> Dataset:
+    """The path's episodes, or the sample set's; says what is left out. Raises BadInput for those of another task."""
     from beliefscope.datasets.store import open_dataset, sample_path
 
-    data = open_dataset(sample_path(task.name) if path is None else path)
+    data = open_dataset(sample_path(task.name) if path is None else path, task, skip_bad)
     if data.task.name != task.name:
         data.close()
         raise BadInput(f"{str(path)!r} holds episodes of task {data.task.name!r}, not of {task.name!r}")
+    for line in data.left_out:
+        console.say(f"left out: {line}")
     return data
 
 
@@ -133,14 +150,20 @@ def recipe(text: str, task: Task) -> Recipe:
 
 
 def traced(
-    checkpoint: Checkpoint, data: Path | None, index: int | None, broken: Recipe, particles: int, seed: int
+    checkpoint: Checkpoint,
+    data: Path | None,
+    index: int | None,
+    broken: Recipe,
+    particles: int,
+    seed: int,
+    skip_bad: bool = False,
 ) -> Trace:
-    """The trace of one episode, with a bar. An index of None is the first test episode."""
+    """The trace of one episode, with a bar. An index of None is the first that is held out."""
     from beliefscope.inspect.trace import trace
 
-    with dataset(checkpoint.task, data) as episodes, console.progress("Filtering") as advance:
+    with dataset(checkpoint.task, data, skip_bad) as episodes, console.progress("Filtering") as advance:
         if index is None:
-            index = next((s.index for s in episodes.summaries if s.split == "test"), 0)
+            index = episodes.held_out()[0]
         return trace(checkpoint, episodes[index], index, seed, particles, broken, advance)
 
 

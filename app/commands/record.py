@@ -16,6 +16,7 @@ from beliefscope.app.commands.given import (
     Particles,
     RecipeText,
     Seed,
+    SkipBad,
     TaskName,
     check,
     checkpoint,
@@ -32,6 +33,7 @@ def record(
     filter_: FilterName,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN.rrd", help="Where to write the recording.")],
     data: DataPath = None,
+    skip_bad: SkipBad = False,
     episode: EpisodeIndex = None,
     maps: Annotated[
         int,
@@ -59,7 +61,7 @@ def record(
 
     check(output, json)
     loaded = checkpoint(task, filter_)
-    made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed)
+    made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed, skip_bad)
     layers = MapEngine(loaded, made).maps(range(0, len(made), maps)) if maps else None
     with console.progress("Recording") as advance:
         write_recording(made, output, maps=layers, progress=advance)

@@ -16,6 +16,7 @@ from beliefscope.app.commands.given import (
     Particles,
     RecipeText,
     Seed,
+    SkipBad,
     TaskName,
     check,
     checkpoint,
@@ -31,6 +32,7 @@ def trace(
     filter_: FilterName,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="TRACE", help="Where to write the trace.")],
     data: DataPath = None,
+    skip_bad: SkipBad = False,
     episode: EpisodeIndex = None,
     recipe_: RecipeText = "",
     particles: Particles = 300,
@@ -52,6 +54,6 @@ def trace(
 
     check(output, json)
     loaded = checkpoint(task, filter_)
-    made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed)
+    made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed, skip_bad)
     save_trace(made, output)
     console.result(described(made, output), title(made, output), json)

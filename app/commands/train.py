@@ -8,7 +8,18 @@ from typing import Annotated
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import DataPath, Json, RecipeText, Seed, TaskName, check, dataset, recipe, size
+from beliefscope.app.commands.given import (
+    DataPath,
+    Json,
+    RecipeText,
+    Seed,
+    SkipBad,
+    TaskName,
+    check,
+    dataset,
+    recipe,
+    size,
+)
 from beliefscope.datasets.errors import one_of
 
 
@@ -19,6 +30,7 @@ def train(
         Path, typer.Option("-o", "--output", metavar="CHECKPOINT", help="The .safetensors file to write.")
     ],
     data: DataPath = None,
+    skip_bad: SkipBad = False,
     preset: Annotated[
         str,
         typer.Option(
@@ -56,7 +68,7 @@ def train(
     given = "" if data is None else f" --data {data.name}"
     broken = recipe(recipe_, find_task(task))
     given += f" --recipe {broken}" if broken else ""
-    with dataset(find_task(task), data) as episodes, console.bars() as move:
+    with dataset(find_task(task), data, skip_bad) as episodes, console.bars() as move:
         whole = list(episodes)
         trained = train_filter(
             chosen,

@@ -115,7 +115,7 @@ def test_missing_file(tmp_path: Path) -> None:
 
 
 def test_folder(tmp_path: Path) -> None:
-    refuse(tmp_path, "is not a file")
+    refuse(tmp_path, r"holds no data: expected files that end in \.json, \.h5 or \.hdf5")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")

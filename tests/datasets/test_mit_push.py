@@ -1,0 +1,354 @@
+"""Real pushes: clocks are brought together, contact is where the geometry says, stitching only moves things."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import mujoco
+import numpy as np
+import pytest
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.dataset import Dataset
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.mit_push import AREA, read_push, stitch
+from beliefscope.datasets.push_real import (
+    CAMERA,
+    CENTRE,
+    OUTLINES,
+    PUSH_REAL,
+    PUSH_REAL_TASKS,
+    TIP_RADIUS,
+    TOUCHING,
+    VIEW,
+    block_model,
+    gap,
+    pictures,
+)
+from beliefscope.datasets.replay import replay
+from beliefscope.datasets.store import open_dataset, write_dataset
+
+REAL = Path(__file__).parents[3] / "shared" / "data" / "mit_push"
+NAME = "motion_surface=plywood_shape={}_a=0_v=100_i=0.000_s=0.500_t={:.3f}.json"
+
+Rows = dict[str, Any]
+
+
+def rows(turn: float = 0.4, seconds: float = 1.0, start: float = 100.0) -> Rows:
+    """A push whose every quantity is linear in time; the three clocks have rates and ends of their own."""
+
+    def stream(rate: float, begin: float, end: float, *rates: tuple[float, float]) -> list[list[float]]:
+        t = np.arange(begin, end, 1 / rate)
+        return np.column_stack([start + t, *(a + b * t for a, b in rates)]).tolist()
+
+    return {
+        "object_pose": stream(140, -0.1, seconds, (0.35, 0.02), (-0.03, 0.03), (3.0, turn)),
+        "tip_pose": stream(250, 0.0, seconds + 0.1, (0.30, 0.02), (-0.02, 0.03), (0.0, 0.0)),
+        "ft_wrench": stream(250, 0.01, seconds + 0.1, (1.0, 2.0), (-1.0, 0.5), (0.01, 0.1)),
+    }
+
+
+def write(folder: Path, content: Rows, angle: float = 0.0, shape: str = "rect1") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / NAME.format(shape, angle)
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Pushes in ``train`` and ``val``, three of either."""
+    folder = tmp_path_factory.mktemp("pushes")
+    for number in range(6):
+        write(folder / ("train", "val")[number % 2], rows(turn=0.1 * number, seconds=0.9 + 0.05 * number), number)
+    return folder
+
+
+@pytest.mark.parametrize("rate", [18.0, 50.0])
+def test_clocks_are_brought_together(tmp_path: Path, rate: float) -> None:
+    push = read_push(write(tmp_path, rows()), rate)
+    t = 0.01 + np.arange(len(push)) / rate  # where the last of the three clocks starts
+    assert len(push) == {18.0: 18, 50.0: 50}[rate]
+    poses = np.column_stack([0.35 + 0.02 * t, -0.03 + 0.03 * t, 3.0 + 0.4 * t])
+    np.testing.assert_allclose(push.poses, poses, atol=1e-6)
+    np.testing.assert_allclose(push.tips, np.column_stack([0.30 + 0.02 * t, -0.02 + 0.03 * t]), atol=1e-6)
+    # The mean over a step is the value in its middle; before the first row there is nothing to take it over.
+    middle = (t + np.maximum(t - 1 / rate, 0.01)) / 2
+    np.testing.assert_allclose(push.force, np.column_stack([1 + 2 * middle, -1 + 0.5 * middle]), atol=1e-3)
+    np.testing.assert_allclose(push.torque, 0.01 + 0.1 * middle, atol=1e-4)
+
+
+def test_jumps_of_the_yaw_are_taken_out(tmp_path: Path) -> None:
+    content = rows()
+    expected = read_push(write(tmp_path, content), 18).poses[:, 2]
+    assert expected[-1] > np.pi
+    for row in content["object_pose"]:
+        row[3] = (row[3] + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(read_push(write(tmp_path, content), 18).poses[:, 2], expected, atol=1e-9)
+
+
+def test_rows_that_are_there_twice_or_late_are_dropped(tmp_path: Path) -> None:
+    content = rows()
+    expected = read_push(write(tmp_path, content), 18)
+    for key in content:
+        content[key].insert(20, content[key][19])
+        content[key].insert(40, content[key][10])
+    np.testing.assert_array_equal(read_push(write(tmp_path, content), 18).poses, expected.poses)
+
+
+def test_hdf5_is_read_as_json(tmp_path: Path) -> None:
+    path = write(tmp_path, rows())
+    other = path.with_suffix(".h5")
+    with h5py.File(other, "w") as file:
+        for key, value in rows().items():
+            file[key] = np.array(value)
+    one, two = read_push(path, 18), read_push(other, 18)
+    for name in ("poses", "tips", "force", "torque"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    with open_dataset(other) as data:
+        assert data.task is PUSH_REAL
+
+
+def test_gap_of_a_square() -> None:
+    poses = np.zeros((4, 3))
+    poses[1, 2] = np.pi / 4
+    poses[3, :2] = 0.2
+    tips = np.array([(0.06, 0.01), (0.0, 0.07), (0.05, 0.05), (0.2, 0.2)])
+    expected = np.array([0.015, 0.07 - 0.045 * np.sqrt(2), 0.005 * np.sqrt(2), -0.045]) - TIP_RADIUS
+    np.testing.assert_allclose(gap("rect1", poses, tips), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", OUTLINES)
+def test_picture_shows_the_outline(shape: str) -> None:
+    """A pixel is brighter or darker than the table where, and only where, the block's outline reaches it."""
+    pose = np.array([0.36, -0.02, 0.7])
+    picture = pictures(shape, np.array([[*pose, 0.9, 0.9]]))[0]
+    pixel = 2 * VIEW / CAMERA.size
+    ticks = VIEW - pixel * (np.arange(CAMERA.size) + 0.5)
+    x, y = np.meshgrid(CENTRE[0] + ticks, CENTRE[1] + ticks, indexing="ij")
+    away = gap(shape, np.tile(pose, (x.size, 1)), np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape) + TIP_RADIUS
+    table = picture[0, 0]
+    assert (picture[away < -0.75 * pixel] != table).all()
+    assert (picture[away > 1.0 * pixel] == table).all()
+
+
+def test_stitching_only_moves_things(folder: Path) -> None:
+    """The block goes on where it was; tip, force and torque stay what they were in the block's own axes."""
+    pushes = [read_push(path, 18) for path in sorted(folder.rglob("*.json"))]
+    whole = stitch(iter(pushes), 45, np.random.default_rng(3))
+    assert len(whole) == 45
+    assert whole.files == tuple(push.files[0] for push in pushes[: len(whole.files)])
+    assert abs(whole.poses[0, 2]) <= np.pi / 2
+    assert (np.abs(whole.poses[:, :2] - CENTRE) <= AREA).all()
+
+    def in_block_axes(poses: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        return np.column_stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]])
+
+    begin = 0
+    for push in pushes[: len(whole.files)]:
+        if begin:
+            np.testing.assert_allclose(whole.poses[begin], whole.poses[begin - 1], atol=1e-12)
+        steps = slice(begin, min(begin + len(push), 45))
+        part, count = whole.poses[steps], len(whole.poses[steps])
+        for mine, theirs in (
+            (whole.tips[steps] - part[:, :2], push.tips - push.poses[:, :2]),
+            (whole.force[steps], push.force),
+        ):
+            np.testing.assert_allclose(in_block_axes(part, mine), in_block_axes(push.poses, theirs)[:count], atol=1e-12)
+        np.testing.assert_array_equal(whole.torque[steps], push.torque[:count])
+        begin += len(push)
+
+
+def test_a_folder_is_a_data_set(folder: Path, tmp_path: Path) -> None:
+    with open_dataset(folder) as data:
+        assert [s.split for s in data.summaries] == ["train"] * 200 + ["val"] * 50
+        assert {s.steps for s in data.summaries} == {45}
+        assert data.task is PUSH_REAL
+        episode = data[3]
+        assert episode.provenance["shape"] == "rect1"
+        assert set(episode.provenance["pushes"]) <= {path.name for path in (folder / "train").iterdir()}
+        assert data.summaries[3].contact_fraction == pytest.approx(episode.contact.mean())
+        converted = tmp_path / "pushes.h5"
+        write_dataset(converted, data.task, data)
+        with open_dataset(converted) as stored:
+            assert stored.hash == data.hash
+            assert stored[3].digest() == episode.digest()
+    with open_dataset(folder) as again:
+        assert again.hash == data.hash
+    with open_dataset(folder / "val") as held_out:
+        assert {s.split for s in held_out.summaries} == {"val"}
+        with pytest.raises(BadInput, match=r"Episode 50 is not in .* 0 to 49"):
+            held_out[50]
+
+
+@pytest.mark.parametrize("task", PUSH_REAL_TASKS, ids=lambda task: task.name)
+def test_variants(folder: Path, task: Any) -> None:
+    assert find_task(task.name) is task
+    with open_dataset(folder / "val", task) as data:
+        episode = data[0]
+    steps = 45 if "50hz" not in task.name else 125
+    assert episode.states.shape == (steps, 3 if "yaw" in task.name else 2)
+    assert episode.dt * steps == pytest.approx(2.5)
+    np.testing.assert_array_equal(episode.states, episode.qpos[:, : episode.states.shape[1]])
+    for key, shape in task.observations.items():
+        assert episode.observations[key].shape == (steps, *shape)
+    # The replay's scene has the block where the state says, and the tip where the effector is.
+    shown = replay(task, episode)
+    assert shown is not None
+    block, tip = (mujoco.mj_name2id(shown.model, mujoco.mjtObj.mjOBJ_BODY, name) for name in ("block", "tip"))
+    np.testing.assert_allclose(shown.positions[:, block, :2], episode.states[:, :2], atol=1e-6)
+    np.testing.assert_allclose(shown.positions[:, tip, :2], episode.observations["effector_position"][:, :2], atol=1e-6)
+    ghost = task.ghost(episode.states)
+    np.testing.assert_allclose(ghost.position[:, :2], episode.states[:, :2], atol=1e-6)
+    if "yaw" in task.name:
+        turned = np.stack([shown.rotations[:, block, 0, 0], shown.rotations[:, block, 1, 0]], 1)
+        w, z = ghost.wxyz[:, 0], ghost.wxyz[:, 3]
+        np.testing.assert_allclose(np.stack([w * w - z * z, 2 * w * z], 1), turned, atol=1e-6)
+
+
+def test_each_push_is_used_equally_often(folder: Path) -> None:
+    with open_dataset(folder / "train") as data:
+        used = [name for i in range(len(data)) for name in data._trajectories[i][1].files]  # type: ignore[attr-defined]
+    counts = [used.count(name) for name in set(used)]
+    assert len(counts) == 3
+    assert max(counts) - min(counts) <= 1
+
+
+Edit = Callable[[Rows], object]
+
+
+def changed(key: str, row: int, column: int, value: object) -> Edit:
+    return lambda content: content[key][row].__setitem__(column, value)
+
+
+def later(key: str, by: float) -> Edit:
+    def edit(content: Rows) -> None:
+        for row in content[key]:
+            row[0] += by
+
+    return edit
+
+
+def silent(content: Rows) -> None:
+    content["tip_pose"] = content["tip_pose"][:20] + content["tip_pose"][170:]
+
+
+BAD: list[tuple[Edit, str]] = [
+    (lambda content: content.pop("tip_pose"), r"has no 'tip_pose'; expected the keys object_pose, tip_pose, ft_wrench"),
+    (
+        changed("ft_wrench", 7, 2, float("nan")),
+        r"'ft_wrench' is \[100\.0\d*, 1\.0\d*, nan, 0\.0\d*\] in row 7, expected fin",
+    ),
+    (lambda content: content["object_pose"][3].pop(), r"'object_pose' is not a list of rows of 4 numbers"),
+    (lambda content: content.update(tip_pose="none"), r"'tip_pose' is not a list of rows of 4 numbers"),
+    (lambda content: content.update(tip_pose=[]), r"'tip_pose' is not a list of rows of 4 numbers"),
+    (lambda content: content.update(tip_pose=content["tip_pose"][:1]), r"'tip_pose' has 1 rows of different times"),
+    (silent, r"'tip_pose' has nothing for 0\.60 s after 100\.08 s, expected 0\.5 s at most"),
+    (
+        later("tip_pose", 5.0),
+        r"the clocks do not overlap: 'object_pose' 99\.90 to 10\d\.\d\d s, 'tip_pose' 105\.00 to 106\.\d\d s, "
+        r"'ft_wrench' 100\.01 to 101\.\d\d s; expected 0\.06 s or more in common",
+    ),
+    (changed("object_pose", 30, 3, 4.6), r"'object_pose' jumps by 1\.6 rad after 100\.11 s, expected 0\.5 rad at most"),
+    (changed("tip_pose", 30, 1, 0.9), r"'tip_pose' jumps by 0\.6 m after 100\.12 s, expected 0\.05 m at most"),
+]
+
+
+@pytest.mark.parametrize(("edit", "message"), BAD)
+def test_what_is_wrong_is_named(tmp_path: Path, edit: Edit, message: str) -> None:
+    content = rows()
+    edit(content)
+    refuse(write(tmp_path, content), message)
+
+
+def refuse(path: Path, message: str) -> None:
+    with pytest.raises(BadInput, match=message) as error:
+        open_dataset(path)
+    assert "\n" not in str(error.value)
+    assert path.name in str(error.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
+def test_cut_short(tmp_path: Path, share: float) -> None:
+    path = write(tmp_path, rows())
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    refuse(path, "is not JSON or cut short")
+    other = path.with_suffix(".h5")
+    with h5py.File(other, "w") as file:
+        for key, value in rows().items():
+            file[key] = np.array(value)
+    whole = other.read_bytes()
+    other.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(BadInput, match=r"is damaged or cut short|is not an HDF5 file"):
+        open_dataset(other)
+
+
+def test_names_that_are_not_those_of_pushes(tmp_path: Path) -> None:
+    refuse(write(tmp_path, rows(), shape="butter"), r"shape 'butter' does not exist\. Available: rect1, rect2")
+    path = tmp_path / "push.json"
+    path.write_text(json.dumps(rows()))
+    refuse(path, r"push\.json is not named as a push: expected motion_surface=\.\.\._shape=")
+
+
+def test_good_pushes_of_a_bad_folder(folder: Path, tmp_path: Path) -> None:
+    for path in (folder / "val").iterdir():
+        write(tmp_path / "val", json.loads(path.read_text()), float(path.stem.rsplit("=", 1)[1]))
+    bad = rows()
+    del bad["ft_wrench"]
+    path = write(tmp_path / "val", bad, 9.0)
+    with pytest.raises(BadInput, match="has no 'ft_wrench'"):
+        open_dataset(tmp_path)
+    with open_dataset(tmp_path, skip_bad=True) as data, open_dataset(folder / "val") as good:
+        assert data.left_out == (f"{path} has no 'ft_wrench'; expected the keys object_pose, tip_pose, ft_wrench.",)
+        assert data.hash == good.hash
+    with pytest.raises(BadInput, match=r"has no push that can be used\. The first: .* has no 'ft_wrench'"):
+        open_dataset(path, skip_bad=True)
+
+
+@pytest.fixture(scope="module")
+def real() -> Dataset:
+    if not REAL.is_dir():
+        pytest.skip(f"needs the recorded pushes, which are not part of the project: {REAL}")
+    return open_dataset(REAL)
+
+
+def test_recorded_pushes(real: Dataset) -> None:
+    assert [s.split for s in real.summaries] == ["train"] * 200 + ["val"] * 50
+    assert {s.policy for s in real.summaries} == {"rect1 on plywood"}
+    for split, low, high in (("train", 0.75, 0.9), ("val", 0.85, 1.0)):
+        fraction = np.mean([s.contact_fraction for s in real.summaries if s.split == split])
+        assert low < fraction < high
+
+
+def test_recorded_block_moves_only_in_contact(real: Dataset) -> None:
+    """The proof of the geometry: with the tip away the block stands still; contact is told from no contact clearly."""
+    pushes = [read_push(path, 18) for path in sorted(REAL.rglob("*.json"))]
+    moved, distance = [], []
+    for push in pushes:
+        away = gap(push.shape, push.poses, push.tips)
+        distance.append(away)
+        free = (away[1:] > TOUCHING) & (away[:-1] > TOUCHING)
+        moved.append(np.linalg.norm(np.diff(push.poses[:, :2], axis=0), axis=1)[free])
+    assert len(np.concatenate(moved)) > 50
+    assert np.concatenate(moved).max() < 0.0015
+    away = np.concatenate(distance)
+    assert np.quantile(away[away < TOUCHING], 0.02) > -0.002
+    assert ((away > 0.0015) & (away < 0.003)).mean() < 0.01
+
+
+def test_block_model_is_as_large_as_the_outline() -> None:
+    model = block_model("rect3")
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0.3, 0.1, np.pi / 2, 0.9, 0.9]
+    mujoco.mj_forward(model, data)
+    geom = model.geom("block").id
+    hit = np.zeros(1, np.int32)
+    for point, expected in (((0.3 + 0.044, 0.1), True), ((0.3 + 0.046, 0.1), False), ((0.3, 0.1 + 0.067), True)):
+        mujoco.mj_ray(model, data, np.array([*point, 1.0]), np.array([0, 0, -1.0]), None, 1, -1, hit)
+        assert (hit[0] == geom) == expected
