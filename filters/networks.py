@@ -11,7 +11,7 @@ from torch.nn import functional
 
 Pooling = Literal["flatten", "spatial-softmax", "mean"]
 
-PICTURES_AT_ONCE = 1024
+PICTURES_AT_ONCE = 128
 """Pictures encoded in one go: enough to keep the cores busy, few enough to stay in the caches."""
 
 
@@ -75,7 +75,8 @@ class ResidualConvolution(nn.Module):
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        return functional.relu(x + self.second(functional.relu(self.first(x))))
+        y = self.second(functional.relu(self.first(x), inplace=True))
+        return functional.relu(y.add_(x), inplace=True)
 
 
 class SpatialSoftmax(nn.Module):
@@ -110,13 +111,15 @@ class ImageEncoder(nn.Module):
         super().__init__()
         self.convolutions = nn.Sequential(
             nn.Conv2d(1, 32, 5, stride=stride, padding=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             ResidualConvolution(32),
             nn.Conv2d(32, 16, 3, padding=1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(16, 8, 3, padding=1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
         )
+        # With the channels innermost, convolutions on a CPU take two thirds of the time.
+        self.convolutions.to(memory_format=torch.channels_last)
         cells = -(-shape[0] // stride) * -(-shape[1] // stride)
         size, self.pooling = {
             "flatten": (8 * cells, nn.Flatten()),
