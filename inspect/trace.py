@@ -21,7 +21,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, moments
 from beliefscope.filters.checkpoint import Checkpoint, write_atomically
-from beliefscope.filters.filter import Filter
+from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.pf import ParticleFilter
 from beliefscope.filters.rollout import rollout, start_at_truth
 
@@ -38,16 +38,18 @@ class Trace:
 
     Attributes:
         episode: what was filtered: truth, contact, observations as the filter saw them, replay.
-        modalities: the K modalities' names, in the order of every K axis.
-        kind: ``ekf`` or ``pf``.
+        modalities: names of the K measurement models, in the order of every K axis: each a modality, or several joined
+            by ``+`` that share one. None in an LSTM, which has no models: K is 0.
+        kind: ``ekf``, ``ukf``, ``pf`` or ``lstm``. What is said of EKFs here holds for UKFs as well.
         filter: its name.
-        estimate_mean, estimate_covariance: (T, n), (T, n, n) fused posterior.
+        estimate_mean, estimate_covariance: (T, n), (T, n, n) fused posterior. LSTM: the covariance is NaN.
         modality_mean, modality_covariance: (T, K, n), (T, K, n, n): what each modality alone believes after the step.
             EKF: its own filter's posterior; PF: the predicted particles weighted by its likelihood alone.
         start_mean, start_covariance: (n,), (n, n) belief before the first step.
         weights: (T, K, W) beta as the network gave it; W is n (per component) or 1.
-        acting: (T, K, W) share of each modality in the fused result as it acted; sums to one over K. EKF: beta over the
-            sum of betas; PF: prior weight x beta x likelihood as fused, over that of all, summed over particles.
+        acting: (T, K, W) share of each modality in the fused result as it acted; sums to one over K. Crossmodal EKF:
+            beta over the sum of betas; unimodal EKF, W = n: the diagonal of S S_k^-1, its share of each mean; PF:
+            prior weight x beta x likelihood as fused, over that of all, summed over particles. None where K < 2.
         predicted_mean, predicted_covariance: EKF: (T, K, n), (T, K, n, n): before the observation.
         observation_mean, observation_covariance: EKF: (T, K, n), (T, K, n, n): the virtual sensors' z and R.
         particles: PF: (T, M, n) predicted particles.
@@ -134,11 +136,7 @@ def trace(
         filter_, evidence, start, torch.Generator().manual_seed(seed), particles, keep=True, progress=progress
     )
     si = filter_.statistics
-    arrays = (
-        _ekf_arrays(filter_, result.steps, evidence)
-        if checkpoint.kind == "ekf"
-        else _pf_arrays(filter_, result.steps, evidence)
-    )
+    arrays = ARRAYS_OF[checkpoint.kind](filter_, result.steps, evidence)
     arrays |= {
         "estimate_mean": si.state_to_si(result.estimate.mean[:, 0]),
         "estimate_covariance": si.covariance_to_si(result.estimate.covariance[:, 0]),
@@ -149,7 +147,7 @@ def trace(
         arrays["weights"] = evidence.log_weights[:, 0].exp()
     return Trace(
         episode=episode,
-        modalities=filter_.names,
+        modalities=filter_.names[: arrays["modality_mean"].shape[1]],
         kind=checkpoint.kind,
         filter=checkpoint.name,
         checkpoint_hash=checkpoint.hash,
@@ -180,6 +178,10 @@ def _ekf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> 
     arrays["observation_mean"], arrays["observation_covariance"] = _stack(filter_, [z])
     if evidence.log_weights is not None:
         arrays["acting"] = torch.softmax(evidence.log_weights[:, 0], dim=1)
+    elif len(filter_.names) > 1:
+        information = torch.linalg.inv(torch.cat([belief.covariance for belief in modality]))
+        fused = torch.cat([s.estimate.covariance for s in steps])
+        arrays["acting"] = (fused.unsqueeze(1) @ information).diagonal(dim1=-2, dim2=-1)
     return arrays
 
 
@@ -202,12 +204,28 @@ def _pf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> d
         "modality_covariance": si.covariance_to_si(modality.covariance),
     }
     assert isinstance(filter_, ParticleFilter)
+    if len(filter_.names) == 1:
+        return arrays
     weighed = log_likelihood - filter_.scale(prior, log_likelihood)
     evidence_of_each = torch.logsumexp(prior.unsqueeze(1) + weighed, dim=-1, keepdim=True)
     if evidence.log_weights is not None:
         evidence_of_each = evidence_of_each + evidence.log_weights[:, 0]
     arrays["acting"] = torch.softmax(evidence_of_each, dim=1)
     return arrays
+
+
+def _lstm_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+    none = torch.zeros(len(steps), 0, filter_.n)
+    return {"modality_mean": none, "modality_covariance": none.unsqueeze(-1).expand(-1, -1, -1, filter_.n)}
+
+
+ARRAYS_OF: dict[Kind, Callable[[Filter, list[StepTrace], Evidence], dict[str, Tensor]]] = {
+    "ekf": _ekf_arrays,
+    "ukf": _ekf_arrays,
+    "pf": _pf_arrays,
+    "lstm": _lstm_arrays,
+}
+"""What each kind of filter knew at its steps, as arrays of a trace."""
 
 
 def save_trace(trace: Trace, path: Path) -> None:
