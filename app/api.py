@@ -22,7 +22,7 @@ from beliefscope.app.session import Views
 from beliefscope.app.vendor import cached_file
 from beliefscope.app.wire import header
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.corrupt import Recipe, described
 from beliefscope.recordings.write import write_recording
 
 RECORDING = re.compile(r"(?P<task>.+)-(?P<filter>.+)-episode(?P<episode>\d+)-[0-9a-f]{8}")
@@ -59,7 +59,7 @@ def routes(library: Library, views: Views) -> APIRouter:
 
     @router.get("/api/catalog")
     def catalog() -> dict[str, Any]:
-        return {"version": __version__, **library.catalog()}
+        return {"version": __version__, "faults": described(), **library.catalog()}
 
     @router.get("/api/trace/{task}/{filter}/{episode}")
     def trace_header(task: str, filter: str, episode: int, recipe: str = "") -> Response:

@@ -9,7 +9,10 @@ import { Trace } from './trace.js';
  * @property {string} name @property {Component[]} components @property {string[]} modalities @property {number} dt s
  * @property {{x: string, y: string, half_width: number}} map
  * @property {{name: string, kind: string, checkpoint_hash: string}[]} filters @property {Summary[]} episodes
- * @typedef {{version: string, tasks: Task[], problems?: string[]}} Catalog
+ * @property {{name: string, recipe: string}[]} recipes that are ready to be picked
+ * @typedef {{name: string, default: number | string | null, unit: string, meaning: string}} Parameter
+ * @typedef {{fault: string, meaning: string, parameters: Parameter[]}} Fault
+ * @typedef {{version: string, tasks: Task[], faults: Fault[], problems?: string[]}} Catalog
  * @typedef {{name: string, url: string, bytes: number, seconds: number}} Recording
  */
 
@@ -43,14 +46,23 @@ export const catalog = async () => (await ask('/api/catalog')).json();
 export const openView = async (dark) => (await post('/api/views', { dark })).json();
 
 /**
+ * Raises ServerError where there is no such trace: an unknown name, or a recipe that cannot be.
+ * @param {string} task @param {string} filter @param {number} episode @param {string} recipe
+ */
+export const check = (task, filter, episode, recipe) => ask(traceUrl(task, filter, episode) + asked(recipe));
+
+const traceUrl = (task, filter, episode) => `/api/trace/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}`;
+const asked = (recipe) => `?${new URLSearchParams({ recipe })}`;
+
+/**
  * A trace with all its numbers and pictures; the server computes it first if need be.
- * @param {Task} task @param {string} filter @param {number} episode @param {string} blackout chance of a black picture
+ * @param {Task} task @param {string} filter @param {number} episode @param {string} recipe how the sensors are broken
  * @param {(share: number) => void} progress @param {AbortSignal} signal
  * @returns {Promise<Trace>}
  */
-export async function loadTrace(task, filter, episode, blackout, progress, signal) {
-  const url = `/api/trace/${encodeURIComponent(task.name)}/${encodeURIComponent(filter)}/${episode}`;
-  const query = `?blackout=${blackout}`;
+export async function loadTrace(task, filter, episode, recipe, progress, signal) {
+  const url = traceUrl(task.name, filter, episode);
+  const query = asked(recipe);
   let response = await ask(url + query, { signal });
   while (response.status === 202) {
     progress((await response.json()).progress);
@@ -70,5 +82,5 @@ export async function loadTrace(task, filter, episode, blackout, progress, signa
 export async function record(trace) {
   const maps = Math.ceil(trace.steps / RECORDED_MAPS);
   const { task, filter, episode, header } = trace;
-  return (await post('/api/recordings', { task: task.name, filter, episode, blackout: header.settings.blackout, maps })).json();
+  return (await post('/api/recordings', { task: task.name, filter, episode, recipe: header.recipe, maps })).json();
 }

@@ -41,6 +41,10 @@ async function start() {
     throw new api.ServerError('There is nothing to show: no task has both episodes and a trained filter.');
   }
   const { state, problems } = resolve(location.search, catalog);
+  if (state.recipe) await api.check(state.task, state.filter, state.episode, state.recipe).catch((error) => {
+    problems.push(`The link asks for sensors broken by “${state.recipe}”: ${error.message}`);
+    state.recipe = '';
+  });
   messages.say('link', problems.join(' '));
   new Page(catalog, new Store(state));
 }
@@ -100,7 +104,7 @@ class Page {
   /** The state has changed: whatever depends on it is drawn in this frame. */
   #follow(state, changed) {
     const any = (...names) => names.some((name) => changed.has(name));
-    if (any('task', 'filter', 'episode', 'blackout')) this.#load();
+    if (any('task', 'filter', 'episode', 'recipe')) this.#load();
     if (any('tab')) this.#showTab(state.tab);
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
@@ -110,7 +114,7 @@ class Page {
 
   /** Loads the trace that the state names and shows it in every panel. */
   async #load() {
-    const { task: name, filter, episode, blackout } = this.#store.state;
+    const { task: name, filter, episode, recipe } = this.#store.state;
     this.#loading.abort();
     const loading = (this.#loading = new AbortController());
     this.#trace = null;
@@ -120,7 +124,7 @@ class Page {
     const progress = (share) => (clearTimeout(patience), wait(share));
     try {
       const task = this.#catalog.tasks.find((t) => t.name === name);
-      const trace = await api.loadTrace(task, filter, episode, blackout, progress, loading.signal);
+      const trace = await api.loadTrace(task, filter, episode, recipe, progress, loading.signal);
       clearTimeout(patience);
       this.#show(trace);
     } catch (error) {
@@ -163,11 +167,10 @@ class Page {
 
   #move() {
     const [trace, { state, origin, inputTime }] = [this.#trace, this.#store];
-    const { task, filter, episode, step, angle } = state;
-    const blackout = Number(state.blackout);
+    const { task, filter, episode, recipe, step, angle } = state;
     for (const panel of [this.timeline, this.camera, this.numbers, this.slice]) panel.move(step);
     this.rerun.move(step, origin === 'rerun');
-    this.socket.move({ task, filter, episode, blackout, step, angle }, inputTime);
+    this.socket.move({ task, filter, episode, recipe, step, angle }, inputTime);
     this.#read(state);
     const [count, time] = $('#readout').children;
     count.textContent = `${step} / ${trace.steps - 1}`;

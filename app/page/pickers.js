@@ -1,16 +1,17 @@
 /** What is shown: task, filter, episode, speed; and the small choices above the time line. */
 
-import { BLACKOUTS, SPEEDS } from './state.js';
+import { recipes } from './recipes.js';
+import { SPEEDS } from './state.js';
 import { percent } from './units.js';
 
 /** @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store */
 export function pickers(catalog, store) {
-  const ids = ['task', 'filter', 'episode', 'blackout', 'speed'];
-  const [task, filter, episode, blackout, speed] = ids.map((id) => document.getElementById(id));
+  const ids = ['task', 'filter', 'episode', 'speed'];
+  const [task, filter, episode, speed] = ids.map((id) => document.getElementById(id));
   const shown = catalog.tasks.filter((t) => t.filters.length && t.episodes.length);
   const current = () => shown.find((t) => t.name === store.state.task);
   fill(task, shown.map((t) => [t.name, t.name]));
-  fill(blackout, BLACKOUTS.map((chance) => [chance, `${percent(Number(chance))} black`]));
+  const showRecipe = recipes(document.getElementById('recipe'), document.getElementById('faults'), catalog, store);
   fill(speed, SPEEDS.map((s) => [s, `${s}×`]));
   const refill = () => {
     fill(filter, current().filters.map((f) => [f.name, f.name]));
@@ -22,11 +23,11 @@ export function pickers(catalog, store) {
   });
   filter.addEventListener('change', () => store.set({ filter: filter.value }));
   episode.addEventListener('change', () => store.set({ episode: Number(episode.value), step: 0, playing: false }));
-  blackout.addEventListener('change', () => store.set({ blackout: blackout.value }));
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
   const show = (state, changed = new Set(['task'])) => {
     if (changed.has('task')) refill();
-    for (const select of [task, filter, episode, blackout, speed]) select.value = state[select.id];
+    if (changed.has('task') || changed.has('recipe')) showRecipe();
+    for (const select of [task, filter, episode, speed]) select.value = state[select.id];
   };
   show(store.state);
   store.listen(show);

@@ -45,8 +45,8 @@ export class Rerun {
 
   /** The recording of a trace: written once, however often it is asked for. @param {import('./trace.js').Trace} trace */
   recording(trace) {
-    const { checkpoint_hash, data_hash, seed, settings } = trace.header;
-    const key = [checkpoint_hash, data_hash, seed, settings.blackout].join(' ');
+    const { checkpoint_hash, data_hash, seed, recipe } = trace.header;
+    const key = [checkpoint_hash, data_hash, seed, recipe].join(' ');
     if (!this.#recordings.has(key)) {
       const made = record(trace);
       this.#recordings.set(key, made);

@@ -5,7 +5,7 @@ import { spoken } from './units.js';
 /**
  * @typedef {object} State
  * @property {string} task @property {string} filter @property {number} episode index in the data set
- * @property {string} blackout chance that the filter gets a black picture at a step, one of BLACKOUTS
+ * @property {string} recipe how the sensors are broken, as text (docs/data.md); empty where they are not
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
  * @property {'scene' | 'rerun'} tab
  * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
@@ -14,7 +14,6 @@ import { spoken } from './units.js';
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
-export const BLACKOUTS = ['0', '0.4', '0.8'];
 const CHOICES = { tab: ['scene', 'rerun'], weights: ['raw', 'acting'], track: ['error', 'particles'] };
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
@@ -67,8 +66,9 @@ export class Store {
 
 /** @param {State} state @returns {string} what follows the `?` says all of it that a link should keep. */
 export function address(state) {
-  const { task, filter, episode, blackout, step, angle, tab, component, weights, track } = state;
-  const kept = { task, filter, episode, blackout, step, component, weights, track, tab };
+  const { task, filter, episode, recipe, step, angle, tab, component, weights, track } = state;
+  const kept = { task, filter, episode, step, component, weights, track, tab };
+  if (recipe) kept.recipe = recipe;
   if (angle !== null) kept.angle = Number(angle.toFixed(4));
   return `?${new URLSearchParams(kept)}`;
 }
@@ -95,7 +95,7 @@ export function resolve(search, catalog) {
     task: task.name,
     filter: pick('filter', names, names.includes('crossmodal-pf') ? 'crossmodal-pf' : names[0]),
     episode: number(asked, 'episode', firstUnseen.index, task.episodes.map((e) => e.index), problems),
-    blackout: pick('blackout', BLACKOUTS, BLACKOUTS[0]),
+    recipe: asked.get('recipe')?.trim() ?? '',
     step: number(asked, 'step', 0, null, problems),
     angle: asked.has('angle') && Number.isFinite(Number(asked.get('angle'))) ? Number(asked.get('angle')) : null,
     component: pick('component', task.components.map((c) => c.name), task.map.x),
