@@ -22,7 +22,8 @@ class Batch:
     """T steps of N trajectories in SI units; pictures stay uint8 until they are encoded.
 
     Attributes:
-        observations: modality -> (T, N, H, W) uint8 or (T, N, d) float32.
+        observations: modality -> (T, N, H, W) uint8, (T, N, d) float32, or (T, N) int64: numbers of pictures that the
+            encoders remember (``Steps.numbered``), -1 for a black one.
         controls: (T, N, c). states: (T, N, n). contact: (T, N) bool.
         previous: (N, n) true state one step before the first (that of step 0 where the trajectory starts there).
     """
@@ -94,6 +95,22 @@ class Steps:
         episode = torch.searchsorted(ends, draw, right=True)
         return self.windows(self.first[episode] + draw - (ends - room)[episode], steps)
 
+    def part(self, first: int, last: int) -> Steps:
+        """Episodes ``first`` to ``last - 1``; shares the arrays."""
+        return replace(self, first=self.first[first:last], length=self.length[first:last])
+
+    def rows(self) -> Tensor:
+        """(R,) where these episodes' steps are in the arrays."""
+        spans = zip(self.first.tolist(), self.length.tolist(), strict=True)
+        return torch.cat([torch.arange(a, a + n, device=self.first.device) for a, n in spans])
+
+    def numbered(self) -> Steps:
+        """The same steps with each picture replaced by its number, for encoders that remember them."""
+        number = torch.arange(len(self.states), device=self.states.device)
+        return replace(
+            self, observations={m: number if v.dtype == torch.uint8 else v for m, v in self.observations.items()}
+        )
+
     def episode(self, number: int) -> Batch:
         """One whole episode, N = 1."""
         return self.windows(self.first[number : number + 1], int(self.length[number]))
@@ -144,8 +161,10 @@ class Statistics(nn.Module):
         return self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
 
     def fit(self, steps: Steps) -> None:
-        """Takes the statistics of these steps."""
+        """Takes the statistics of these episodes' steps."""
+        rows = steps.rows()
         values = {"state": steps.states, "control": steps.controls, **steps.observations}
+        values = {name: array[rows] for name, array in values.items()}
         for name, array in values.items():
             flat = array.flatten()[:, None] if array.dtype == torch.uint8 else array
             mean, std = self.mean_std(name)
@@ -159,7 +178,11 @@ class Statistics(nn.Module):
         return (values.to(mean.dtype) - mean) / std
 
     def standardise_observations(self, observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {m: self.standardise(m, observations[m]) for m in self.modalities}
+        """Modality -> standardised observations; numbers of remembered pictures stay numbers."""
+        return {
+            m: observations[m] if observations[m].dtype == torch.int64 else self.standardise(m, observations[m])
+            for m in self.modalities
+        }
 
     def state_to_si(self, mean: Tensor) -> Tensor:
         """Standardised states (..., n) to m and rad."""
@@ -177,10 +200,47 @@ def black_out(batch: Batch, probability: Tensor, generator: torch.Generator) -> 
     Args:
         probability: (N,) or () chance of a black picture. generator: on the CPU.
     """
-    shape = batch.states.shape[:2]
-    black = (torch.rand(shape, generator=generator) < probability).to(batch.states.device)
-    observations = {
-        m: values.masked_fill(black[..., None, None], 0) if values.dtype == torch.uint8 else values
-        for m, values in batch.observations.items()
-    }
+    black = (torch.rand(batch.states.shape[:2], generator=generator) < probability).to(batch.states.device)
+    observations = dict(batch.observations)
+    for modality, values in observations.items():
+        if values.dtype == torch.uint8:
+            observations[modality] = values.masked_fill(black[..., None, None], 0)
+        elif values.dtype == torch.int64:
+            observations[modality] = values.masked_fill(black, -1)
     return replace(batch, observations=observations)
+
+
+def shift(batch: Batch, task: Task, scale: Tensor, generator: torch.Generator) -> Batch:
+    """The batch with each trajectory moved on the map: object and hand alike, by a normal offset.
+
+    What the hand feels does not change, so that few places become many. Pictures stay as they are: not for whoever
+    looks at them.
+
+    Args:
+        scale: (n,) standard deviations, of which the map components' are used. generator: on the CPU.
+    """
+    where = list(task.map_indices)
+    offset = torch.randn(batch.states.shape[1], 2, generator=generator).to(scale) * scale[where]
+
+    def moved(values: Tensor, channels: Sequence[int]) -> Tensor:
+        values = values.clone()
+        values[..., list(channels)] += offset
+        return values
+
+    observations, controls = dict(batch.observations), batch.controls
+    for modality, keys in task.modalities.items():
+        first = 0
+        for key in keys:
+            if key in task.positions:
+                channels = [first + channel for channel in task.positions[key]]
+                observations[modality] = moved(observations[modality], channels)
+            first += task.observations[key][0]
+    if "control" in task.positions:
+        controls = moved(controls, task.positions["control"])
+    return replace(
+        batch,
+        observations=observations,
+        controls=controls,
+        states=moved(batch.states, where),
+        previous=moved(batch.previous, where),
+    )

@@ -25,9 +25,17 @@ class Dynamics(nn.Module):
         self.join_control = nn.Linear(units, units)
         self.shared = Stack(nn.ReLU(), Residual(units), Residual(units), Residual(units))
         self.output = nn.Linear(units, n + 1)
+        self.log_noise = nn.Parameter(torch.empty(n))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Fresh weights: the state hardly changes, with little noise."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                module.reset_parameters()
         nn.init.normal_(self.output.weight, std=1e-2)
         nn.init.zeros_(self.output.bias)
-        self.log_noise = nn.Parameter(torch.full((n,), -3.0))
+        nn.init.constant_(self.log_noise, -3.0)
 
     @property
     def noise(self) -> Tensor:

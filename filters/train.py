@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,50 +19,60 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Architecture, Filter
+from beliefscope.filters.kept import Partial, Parts, key_of
 from beliefscope.filters.trainer import BLACKOUTS, Report, Trainer
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How long and how each stage trains. Counts are optimiser steps.
+    """How long and how each stage trains. Counts are optimiser steps, and the most there are: see ``patience``.
 
     Attributes:
-        dynamics: for each of the lengths 1, 4, 8, 16. measurement: for each virtual sensor, and for a likelihood's
-            picture encoders. likelihood: PF: for the layers after these, and for a likelihood without pictures.
-            alone: for each modality through the filter. weights: weight model alone.
-            together: for each of the lengths.
-        batch: windows a step. lengths: of the subsequences of the last stage. particles: in training.
+        dynamics: for each of the lengths 1, 4, 8, 16. pictures: for the picture encoders. models: for each virtual
+            sensor or likelihood. alone: for each modality through the filter. weights: weight model alone.
+        together: for each of the lengths. fine: for everything, picture encoders included.
+        lengths: of the subsequences of the stages together. window: where a modality or the weight model trains alone.
+        batch: subsequences of 16 steps that are averaged; more of shorter ones. particles: in training.
         rate, fine_rate: Adam's learning rate, the fine one where whole filters train end to end.
         likelihood_weight: of the negative log-likelihood beside the squared error of the mean, end to end: the squared
             error alone, as in the authors' code, leaves covariances without a meaning.
+        check: steps between two looks at the validation loss. patience: looks without a better one that end a stage.
     """
 
-    dynamics: int = 100
-    measurement: int = 300
-    likelihood: int = 1500
-    alone: int = 80
-    weights: int = 120
-    together: tuple[int, ...] = (80, 100, 300)
+    dynamics: int = 150
+    pictures: int = 500
+    models: int = 1500
+    alone: int = 300
+    weights: int = 300
+    together: tuple[int, ...] = (100, 100, 300)
+    fine: int = 60
     lengths: tuple[int, ...] = (4, 8, 16)
+    window: int = 32
     batch: int = 32
     particles: int = 30
     rate: float = 1e-3
     fine_rate: float = 3e-4
-    likelihood_weight: float = 0.02
+    likelihood_weight: float = 0.05
+    check: int = 50
+    patience: int = 6
 
 
 PLANS = {
     "cpu": Plan(),
     "full": Plan(
         dynamics=2000,
-        measurement=8000,
-        likelihood=20_000,
+        pictures=8000,
+        models=20_000,
         alone=1500,
         weights=1500,
         together=(1500, 1500, 4000),
+        fine=2000,
         batch=64,
+        check=250,
     ),
-    "smoke": Plan(dynamics=2, measurement=2, likelihood=2, alone=1, weights=1, together=(1,), lengths=(4,), batch=4),
+    "smoke": Plan(
+        dynamics=2, pictures=2, models=2, alone=1, weights=1, together=(1,), fine=1, lengths=(4,), window=4, batch=4
+    ),
 }
 
 
@@ -80,45 +91,93 @@ def train(
     data_hash: str,
     plan: Plan = PLANS["cpu"],
     seed: int = 0,
+    blackouts: Sequence[float] = BLACKOUTS,
     command: str = "",
     report: Report | None = None,
     device: str | None = None,
+    partial: Path | None = None,
+    parts: Path | None = None,
 ) -> Trained:
     """Trains a filter on the ``train`` episodes and measures it on ``test`` ones (``val`` where there are none).
 
-    CUDA is used where there is one. The same seed on the same machine gives the same weights.
+    Every stage keeps the weights that do best on ``val``. CUDA is used where there is one. The same seed on the same
+    machine gives the same weights, killed and resumed or not.
+
+    Args:
+        blackouts: chances of a black picture, one of which is drawn for each training window.
+        partial: file of the finished stages, from which a training that was killed goes on; removed at the end.
+        parts: folder of what other filters of the same task can use: dynamics, picture encoders.
 
     Raises:
         BadInput: no training episode, or one whose arrays do not fit the task.
     """
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     by_split = {s: [e for e in episodes if e.split == s] for s in ("train", "val", "test")}
-    if not by_split["train"]:
+    training, validation = by_split["train"], by_split["val"]
+    if not training:
         raise BadInput("the data set has no episode of split 'train'")
     began = time.monotonic()
     filter_ = build(architecture, seed).to(device)
-    steps = Steps.of(filter_.task, by_split["train"], device)
-    filter_.statistics.fit(steps)
-    trainer = Trainer(filter_, steps, plan, torch.Generator().manual_seed(seed), report)
-    trainer.run()
+    steps = Steps.of(filter_.task, [*training, *validation], device)
+    fitted = steps.part(0, len(training))
+    filter_.statistics.fit(fitted)
+    versions = {"beliefscope": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}
+    name = torch.cuda.get_device_name() if device == "cuda" else "cpu"
+    # The number of episodes stands for copies with broken sensors, which the data's hash does not know.
+    common = {
+        "task": architecture.task,
+        "data": data_hash,
+        "steps": len(steps.states),
+        "plan": asdict(plan),
+        "seed": seed,
+        "versions": versions,
+        "device": name,
+    }
+    trainer = Trainer(
+        filter_,
+        fitted,
+        plan,
+        seed,
+        steps.part(len(training), len(steps.length)) if validation else None,
+        report,
+        blackouts,
+        None if parts is None else Parts(parts),
+        key_of(**common),
+    )
+    kept = (
+        Partial(partial, key_of(architecture=architecture.to_json(), blackouts=list(blackouts), **common))
+        if partial
+        else None
+    )
+    done: list[str] = []
+    spent = 0.0
+    if kept is not None and (found := kept.load()) is not None:
+        tensors, done, spent = found
+        filter_.load_state_dict(tensors)
+
+    def finished(stage: str) -> None:
+        done.append(stage)
+        if kept is not None:
+            kept.save(filter_.state_dict(), done, spent + time.monotonic() - began)
+
+    trainer.run(tuple(done), finished)
     filter_.eval().requires_grad_(False)
-    seconds = time.monotonic() - began
+    seconds = spent + time.monotonic() - began
     held_out = by_split["test"] or by_split["val"]
     record = {
         "command": command,
         "seed": seed,
         "plan": asdict(plan),
+        "blackouts": list(blackouts),
         "data_hash": data_hash,
         "episodes": {split: len(members) for split, members in by_split.items()},
         "seconds": round(seconds, 1),
-        "versions": {
-            "beliefscope": __version__,
-            "torch": torch.__version__,
-            "python": sys.version.split()[0],
-        },
-        "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
+        "versions": versions,
+        "device": name,
         "metrics": measure(filter_, held_out) if held_out else {},
     }
+    if kept is not None:
+        kept.drop()
     return Trained(filter_.cpu(), record)
 
 

@@ -1,0 +1,73 @@
+"""What a training keeps on the way: finished stages, to go on after a kill, and parts that several filters share."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from beliefscope.filters.checkpoint import write_atomically
+
+
+def key_of(**what: Any) -> str:
+    """A hash of JSON values: of all that a result depends on."""
+    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+
+class Partial:
+    """The weights after the last finished stage of one training, in one file beside its checkpoint.
+
+    Args:
+        path: of the file. key: of the training; a file with another key is of no use to this one.
+    """
+
+    def __init__(self, path: Path, key: str) -> None:
+        self.path, self.key = path, key
+
+    def load(self) -> tuple[dict[str, Tensor], list[str], float] | None:
+        """Tensors, names of the finished stages, and seconds they took; None where there is nothing to go on from."""
+        found = _read(self.path, self.key)
+        return found and (found[0], list(found[1]["done"]), float(found[1]["seconds"]))
+
+    def save(self, tensors: Mapping[str, Tensor], done: list[str], seconds: float) -> None:
+        _write(self.path, tensors, {"key": self.key, "done": done, "seconds": seconds})
+
+    def drop(self) -> None:
+        self.path.unlink(missing_ok=True)
+
+
+class Parts:
+    """A folder of trained modules that do not depend on the filter they sit in: dynamics, picture encoders."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def load(self, key: str) -> dict[str, Tensor] | None:
+        found = _read(self._folder / f"{key}.safetensors", key)
+        return found and found[0]
+
+    def save(self, key: str, tensors: Mapping[str, Tensor]) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        _write(self._folder / f"{key}.safetensors", tensors, {"key": key})
+
+
+def _read(path: Path, key: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get("kept", "{}"))
+            if header.get("key") != key:
+                return None
+            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError, ValueError):
+        return None
+
+
+def _write(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    write_atomically(path, save(contiguous, metadata={"kept": json.dumps(header)}))
