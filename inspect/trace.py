@@ -93,6 +93,11 @@ class Trace:
     def __len__(self) -> int:
         return len(self.estimate_mean)
 
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the estimates come with a covariance: an LSTM's do not."""
+        return self.kind != "lstm"
+
 
 ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type))
 """Names of the array fields of a trace."""

@@ -117,7 +117,8 @@ def _estimate(trace: Trace, task: Task, component: Component) -> rrb.TimeSeriesV
     values = np.concatenate([trace.episode.states[:, i], mean - sigma, mean + sigma])
     low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
     margin = 0.1 * (high - low)
-    name = f"{component.name} ({SHOWN_UNIT[component.unit]}): truth green, fused red, thin lines 2 sigma"
+    name = f"{component.name} ({SHOWN_UNIT[component.unit]}): truth green, fused red"
+    name += ", thin lines 2 sigma" if trace.has_covariance else ""
     return _plot(f"states/{component.name}", name, (low - margin, high + margin), legend=False)
 
 

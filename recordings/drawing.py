@@ -23,6 +23,12 @@ CONTACT_NAMES = ("free", "contact")
 SIGMAS = 2.0
 COLOUR_OF_ROBOT = "#B0B0B0"
 MODALITY = "this modality alone, its weight"
+KINDS = {
+    "ekf": "An extended Kalman filter for each measurement model",
+    "ukf": "An unscented Kalman filter for each measurement model",
+    "pf": "A particle filter",
+    "lstm": "An LSTM, which knows no covariance and no likelihood,",
+}
 MEANINGS = {
     "truth": "what the filter should find",
     "fused": "the filter's estimate from all modalities",
@@ -89,12 +95,13 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     for source in sources(trace):
         hue, width = _hex(source, trace), 2.5 if source == "fused" else 1.2
         yield f"world/plane/{source}/mean", _marker(hue, 3.5 if source == "fused" else 2.5)
-        yield (
-            f"world/plane/{source}/ellipse",
-            rr.Ellipsoids3D.from_fields(
-                colors=rgba(hue), line_radii=rr.Radius.ui_points(width), fill_mode="MajorWireframe"
-            ),
-        )
+        if trace.has_covariance:
+            yield (
+                f"world/plane/{source}/ellipse",
+                rr.Ellipsoids3D.from_fields(
+                    colors=rgba(hue), line_radii=rr.Radius.ui_points(width), fill_mode="MajorWireframe"
+                ),
+            )
         yield f"errors/position/{source}", _line(hue, width, f"{source} (cm)")
         for component in angles(task):
             yield f"errors/{component.name}/{source}", _line(hue, width, f"{source} (deg)")
@@ -103,8 +110,9 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     for component in task.components:
         truth = _line(_hex("truth", trace), 2.0, "truth")
         yield f"states/{component.name}/truth", truth
-        band = ["fused - 2 sigma", "fused + 2 sigma"]
-        yield f"states/{component.name}/two_sigma", _line(_hex("fused", trace), 1.0, *band, opacity=0.5)
+        if trace.has_covariance:
+            band = ["fused - 2 sigma", "fused + 2 sigma"]
+            yield f"states/{component.name}/two_sigma", _line(_hex("fused", trace), 1.0, *band, opacity=0.5)
     for name in ("weights", "acting"):
         values = getattr(trace, name)
         if values is None:
@@ -135,13 +143,14 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
     if effector is not None:
         yield "world/effector", rr.Points3D.columns(positions=effector[steps])
     for source, mean, covariance in _estimates(trace, steps):
-        centre, spread = mean[:, plane], covariance[:, plane][:, :, plane]
+        centre = mean[:, plane]
         yield f"world/plane/{source}/mean", rr.Points3D.columns(positions=_lift(centre))
-        axes, turn = _ellipses(spread)
-        yield (
-            f"world/plane/{source}/ellipse",
-            rr.Ellipsoids3D.columns(centers=_lift(centre), half_sizes=_lift(axes), quaternions=turn),
-        )
+        if trace.has_covariance:
+            axes, turn = _ellipses(covariance[:, plane][:, :, plane])
+            yield (
+                f"world/plane/{source}/ellipse",
+                rr.Ellipsoids3D.columns(centers=_lift(centre), half_sizes=_lift(axes), quaternions=turn),
+            )
     if task.ghost is not None:
         for name, states in (("truth", trace.episode.states), ("fused", trace.estimate_mean)):
             ghost = task.ghost(states[steps])
@@ -164,7 +173,7 @@ def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
         yield f"states/{component.name}/truth", series(trace.episode.states[steps, i] * scale)
         for source, mean, covariance in _estimates(trace, steps):
             yield f"states/{component.name}/{source}", series(mean[:, i] * scale)
-            if source == "fused":
+            if source == "fused" and trace.has_covariance:
                 sigma = SIGMAS * np.sqrt(covariance[:, i, i])
                 band = np.stack([mean[:, i] - sigma, mean[:, i] + sigma], axis=1)
                 yield f"states/{component.name}/two_sigma", series(band * scale)
@@ -242,15 +251,16 @@ def _marker(hue: str, points: float) -> rr.Points3D:
 
 def about(trace: Trace, task: Task) -> rr.TextDocument:
     """What is shown, in words: a recording is read by people who have nothing else at hand."""
-    filter_kind = "particle filter" if trace.kind == "pf" else "bank of extended Kalman filters"
+    senses = " and ".join(task.modalities if not trace.modalities else trace.modalities).replace("+", " with ")
+    weighs = " and weighs its modalities anew at every step" if trace.weights is not None else ""
     components = ", ".join(component.name for component in task.components)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
     broken = f"\nIts sensors are broken: `{trace.recipe}`.\n" if trace.recipe else ""
     text = f"""# {task.name}, episode {trace.episode_index}, {trace.filter}
 
-A {filter_kind} estimates {components} from {" and ".join(trace.modalities)}: {len(trace)} steps of
-{trace.episode.dt:g} s. It starts at the true state and weighs its modalities anew at every step.
+{KINDS[trace.kind]} estimates {components} from {senses}: {len(trace)} steps of
+{trace.episode.dt:g} s. It starts at the true state{weighs}.
 {broken}
 | name | colour | what it is |
 | --- | --- | --- |

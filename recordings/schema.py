@@ -31,7 +31,7 @@ COLOURS: dict[str, str] = {
 SPARE_COLOURS: tuple[str, ...] = ("#0072B2", "#F0E442", "#999999")
 """For modalities that ``COLOURS`` does not name, in the order of the trace's modalities."""
 
-Needs = Literal["always", "weights", "acting", "ekf", "pf", "maps", "replay", "ghost"]
+Needs = Literal["always", "modalities", "covariance", "weights", "acting", "ekf", "pf", "maps", "replay", "ghost"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Entity:
         shape: of one step; T steps, K modalities, n components, M particles, c controls, S cells a side of a map,
             W weights a modality.
         unit: of the numbers as stored.
-        needs: what the trace must have for the path to be there.
+        needs: what the trace must have for the path to be there; ``ekf`` is a UKF as well.
         meaning: one line for the documentation.
     """
 
@@ -72,9 +72,16 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("trace/contact", "Trace", "()", "bool", "always", "whether the robot truly touched the object"),
     Entity("trace/qpos", "Trace", "(nq,)", "m, rad", "replay", "joint positions for the replay"),
     Entity("trace/estimate_mean", "Trace", "(n,)", "m, rad", "always", "fused posterior mean"),
-    Entity("trace/estimate_covariance", "Trace", "(n, n)", "m, rad", "always", "fused posterior covariance"),
-    Entity("trace/modality_mean", "Trace", "(K, n)", "m, rad", "always", "each modality's own mean"),
-    Entity("trace/modality_covariance", "Trace", "(K, n, n)", "m, rad", "always", "each modality's own covariance"),
+    Entity(
+        "trace/estimate_covariance",
+        "Trace",
+        "(n, n)",
+        "m, rad",
+        "always",
+        "fused posterior covariance; NaN without one",
+    ),
+    Entity("trace/modality_mean", "Trace", "(K, n)", "m, rad", "modalities", "each modality's own mean"),
+    Entity("trace/modality_covariance", "Trace", "(K, n, n)", "m, rad", "modalities", "each modality's own covariance"),
     Entity("trace/start_mean", "Trace", "(n,), static", "m, rad", "always", "mean before step 0"),
     Entity("trace/start_covariance", "Trace", "(n, n), static", "m, rad", "always", "covariance before step 0"),
     Entity("trace/weights", "Trace", "(K, W)", "1", "weights", "fusion weights beta as the network gave them"),
@@ -95,14 +102,14 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("world/plane", "Transform3D", "static", "m", "always", "height at which the belief is drawn"),
     Entity("world/plane/truth", "Points3D", "(1, 3)", "m", "always", "true position"),
     Entity("world/plane/{source}/mean", "Points3D", "(1, 3)", "m", "always", "estimated position"),
-    Entity("world/plane/{source}/ellipse", "Ellipsoids3D", "(1, 3)", "m", "always", "2 sigma contour and its axes"),
+    Entity("world/plane/{source}/ellipse", "Ellipsoids3D", "(1, 3)", "m", "covariance", "2 sigma contour and its axes"),
     Entity("world/object/{state}", "Boxes3D", "(1, 3)", "m", "ghost", "the object at the state `truth` or `fused`"),
     Entity("world/plane/particles", "Points3D", "(M, 3)", "m", "pf", "coloured by posterior weight"),
     Entity("world/plane/map", "GridMap", "(S, S)", "u8", "maps", "fused map, laid where it belongs"),
     # The plots: degrees and centimetres.
     Entity("states/{component}/truth", "Scalars", "()", "cm or deg", "always", "true value"),
     Entity("states/{component}/{source}", "Scalars", "()", "cm or deg", "always", "estimated value"),
-    Entity("states/{component}/two_sigma", "Scalars", "(2,)", "cm or deg", "always", "fused mean - and + 2 sigma"),
+    Entity("states/{component}/two_sigma", "Scalars", "(2,)", "cm or deg", "covariance", "fused mean - and + 2 sigma"),
     Entity("errors/position/{source}", "Scalars", "()", "cm", "always", "distance from the true position"),
     Entity("errors/{angle}/{source}", "Scalars", "()", "deg", "always", "absolute error of each angle"),
     Entity("weights/{modality}", "Scalars", "(W,)", "1", "weights", "beta, one series a column"),
@@ -122,7 +129,7 @@ PROPERTIES: dict[str, str] = {
     "versions": "JSON: versions of beliefscope, rerun-sdk and numpy that wrote the file",
     "task": "name of the task",
     "filter": "name of the filter",
-    "kind": "`ekf` or `pf`",
+    "kind": "`ekf`, `ukf`, `pf` or `lstm`",
     "modalities": "JSON list: the K modalities in order",
     "episode_index": "index in its data set",
     "steps": "T, rows of every path under `trace/` and `observations/` that is not static",

@@ -109,7 +109,11 @@ def _send_header(stream: rr.RecordingStream, trace: Trace) -> None:
     shapes |= {
         f"observations/{key}": [list(array.shape[1:]), array.dtype.str] for key, array in episode.observations.items()
     }
+    # What every trace has is said even where it is empty, so that it is read back as such.
     shapes.setdefault("trace/qpos", [list(episode.qpos.shape[1:]), episode.qpos.dtype.str])
+    for name in ("modality_mean", "modality_covariance"):
+        array = getattr(trace, name)
+        shapes.setdefault(f"trace/{name}", [list(array.shape[1:]), array.dtype.str])
     versions = {name: importlib.metadata.version(name) for name in ("rerun-sdk", "numpy")}
     text = json.dumps
     stream.send_property(

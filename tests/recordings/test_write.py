@@ -31,9 +31,11 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
     task = find_task(trace.episode.task)
     there = {
         "always": True,
+        "modalities": len(trace.modalities) > 0,
+        "covariance": trace.has_covariance,
         "weights": trace.weights is not None,
         "acting": trace.acting is not None,
-        "ekf": trace.kind == "ekf",
+        "ekf": trace.kind in ("ekf", "ukf"),
         "pf": trace.kind == "pf",
         "maps": maps,
         "replay": trace.episode.qpos.size > 0,
@@ -53,7 +55,7 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
     paths = {entity.path}
     for name, choices in values.items():
         paths = {path.replace(name, choice) for path in paths for choice in choices}
-    return paths
+    return {path.replace("+", "\\+") for path in paths}
 
 
 def written(path: Path) -> Iterator[tuple[str, list[str]]]:

@@ -1,0 +1,86 @@
+"""Every filter of the catalog, with fresh weights on a real episode: traced, mapped, recorded, and read back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.batch import Steps
+from beliefscope.filters.catalog import build, filters_of
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
+from beliefscope.recordings.read import read_recording
+from beliefscope.recordings.write import write_recording
+
+
+@pytest.fixture(scope="module")
+def episode() -> Episode:
+    assert DOOR.simulate is not None
+    return DOOR.simulate(3, 0, 24)
+
+
+@pytest.fixture(scope="module", params=filters_of(DOOR))
+def checkpoint(
+    request: pytest.FixtureRequest, episode: Episode, tmp_path_factory: pytest.TempPathFactory
+) -> Checkpoint:
+    filter_ = build(filters_of(DOOR)[request.param])
+    filter_.statistics.fit(Steps.of(DOOR, [episode]))
+    path = tmp_path_factory.mktemp("checkpoint") / f"{request.param}.safetensors"
+    save_checkpoint(filter_, request.param, {}, path)
+    return load_checkpoint(path)
+
+
+@pytest.fixture(scope="module")
+def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
+    return trace(checkpoint, episode, particles=40)
+
+
+def test_a_trace_has_what_its_kind_knows(checkpoint: Checkpoint, traced: Trace) -> None:
+    kind, names = checkpoint.kind, checkpoint.filter.names
+    n, k = 3, 0 if kind == "lstm" else len(names)
+    assert traced.modalities == (() if kind == "lstm" else names)
+    assert traced.modality_mean.shape == (24, k, n)
+    assert traced.modality_covariance.shape == (24, k, n, n)
+    assert np.isfinite(traced.estimate_mean).all()
+    assert (np.isnan if kind == "lstm" else np.isfinite)(traced.estimate_covariance).all()
+    assert (traced.observation_mean is not None) == (kind in ("ekf", "ukf"))
+    assert (traced.log_likelihood is not None) == (kind == "pf")
+    # What is weighed has shares, and they make a whole.
+    assert (traced.weights is not None) == checkpoint.name.startswith("crossmodal")
+    assert (traced.acting is not None) == (k > 1)
+    if traced.acting is not None:
+        np.testing.assert_allclose(traced.acting.sum(1), 1.0, atol=1e-5)
+    if k == 1 and kind != "pf":
+        np.testing.assert_array_equal(traced.modality_mean[:, 0], traced.estimate_mean)
+
+
+def test_maps_and_a_recording(
+    checkpoint: Checkpoint, traced: Trace, assert_same: Callable[[Trace, Trace], None], tmp_path: Path
+) -> None:
+    maps = None
+    if checkpoint.kind == "lstm":
+        with pytest.raises(BadInput, match="'lstm' has no likelihood maps: an LSTM estimates the state"):
+            MapEngine(checkpoint, traced)
+    else:
+        maps = list(MapEngine(checkpoint, traced).maps([0, 12], size=21))
+        assert maps[0].layers == (*traced.modalities, "fused")
+        assert np.isfinite(maps[1].log_likelihood).all()
+        if len(traced.modalities) == 1:
+            one, fused = maps[1].normalised().astype(int)
+            assert np.abs(one - fused).max() <= 1
+    save_trace(traced, tmp_path / "run.trace")
+    assert_same(traced, load_trace(tmp_path / "run.trace"))
+    path = write_recording(traced, tmp_path / "run.rrd", maps)
+    assert_same(traced, read_recording(path))
+    drawn = {chunk.entity_path for chunk in RrdReader(path).stream()}
+    assert ("/world/plane/fused/ellipse" in drawn) == traced.has_covariance
+    assert ("/states/hinge_x/two_sigma" in drawn) == traced.has_covariance
+    assert ("/maps/fused" in drawn) == (maps is not None)
