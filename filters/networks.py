@@ -119,7 +119,7 @@ class ImageEncoder(nn.Module):
             nn.ReLU(inplace=True),
         )
         # With the channels innermost, convolutions on a CPU take two thirds of the time.
-        self.convolutions.to(memory_format=torch.channels_last)
+        self.convolutions.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         cells = -(-shape[0] // stride) * -(-shape[1] // stride)
         size, self.pooling = {
             "flatten": (8 * cells, nn.Flatten()),
