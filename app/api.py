@@ -6,6 +6,7 @@ import hashlib
 import re
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import TimeoutError as NotYet
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,9 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from beliefscope import __version__
 from beliefscope.app.library import Library, Selection, Traced
-from beliefscope.app.proxy import CLIENT_PAGE
+from beliefscope.app.proxy import client_page
 from beliefscope.app.session import Views
-from beliefscope.app.vendor import cached_file
 from beliefscope.app.wire import header
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.corrupt import Recipe, described
@@ -52,6 +52,8 @@ def routes(library: Library, views: Views) -> APIRouter:
     router = APIRouter()
     recordings = library.settings.workspace / "recordings"
     writing = threading.Lock()
+    scene = client_page("/static/frame.js")
+    scene_tag = hashlib.sha256(scene).hexdigest()[:24]
 
     @router.get("/healthz")
     async def health() -> dict[str, str]:
@@ -135,7 +137,7 @@ def routes(library: Library, views: Views) -> APIRouter:
             views[name]
         except KeyError:
             raise HTTPException(404, f"View {name!r} is not open.") from None
-        return cached_file(request, CLIENT_PAGE, "text/html; charset=utf-8", {})
+        return _tagged(request, scene_tag, lambda: scene, "text/html; charset=utf-8")
 
     @router.websocket("/scene/{name}")
     async def scene_socket(websocket: WebSocket, name: str) -> None:
@@ -149,13 +151,17 @@ def routes(library: Library, views: Views) -> APIRouter:
     return router
 
 
-def _immutable(request: Request, traced: Traced, part: str, content: Any) -> Response:
+def _immutable(request: Request, traced: Traced, part: str, content: Callable[[], bytes]) -> Response:
     """A part of a trace: its key says all that it depends on, so it can be an ETag."""
     traced.trace  # noqa: B018 - wait for it, or raise what it raised, before anything is answered
-    headers = {"etag": f'"{traced.key[:24]}-{part}"', "cache-control": "no-cache"}
+    return _tagged(request, f"{traced.key[:24]}-{part}", content, "application/octet-stream")
+
+
+def _tagged(request: Request, tag: str, content: Callable[[], bytes], media_type: str) -> Response:
+    headers = {"etag": f'"{tag}"', "cache-control": "no-cache"}
     if headers["etag"] in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
-    return Response(content(), media_type="application/octet-stream", headers=headers)
+    return Response(content(), media_type=media_type, headers=headers)
 
 
 def _listed(path: Path) -> dict[str, Any]:

@@ -22,9 +22,17 @@ import websockets.asyncio.server
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.exceptions import ConnectionClosedOK
 
-CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
+CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
 # Construction and stop both touch what the whole process shares: one at a time.
 _process_wide = threading.Lock()
+
+
+def client_page(script: str) -> bytes:
+    """viser's page with a script of ours, from that address, before its own. Raises RuntimeError if it has no head."""
+    before, head, after = CLIENT.read_bytes().partition(b"<head>")
+    if not head:
+        raise RuntimeError(f"The page of viser {viser.__version__} is not as app/proxy.py knows it: it has no <head>.")
+    return before + head + f'<script src="{script}"></script>'.encode() + after
 
 
 class _Connection:

@@ -83,6 +83,7 @@ class Page {
   #handlers() {
     return {
       view: ({ scene }) => this.scene.open(scene),
+      pace: (times) => this.scene.pace(times),
       maps: (maps, inputTime) => {
         if (!this.#trace) return;
         this.heatmaps.draw(maps, this.#trace);

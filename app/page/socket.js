@@ -1,7 +1,6 @@
 /** The view's socket: sends the cursor, receives maps (docs/api.md). Never more than one cursor in flight. */
 
 import { openView } from './api.js';
-import { Pace, SHARE } from './pace.js';
 
 /**
  * @typedef {{task: string, filter: string, episode: number, step: number, angle: number | null, size: number}} Cursor
@@ -12,6 +11,7 @@ import { Pace, SHARE } from './pace.js';
  * @property {number[] | null} effector m @property {Uint8Array[]} values by layer; row 0 is the smallest y offset
  * @typedef {object} Handlers
  * @property {(view: {view: string, scene: string}) => void} view a new view has been opened
+ * @property {(times: number) => boolean} pace of the scene: see frame.js
  * @property {(maps: Maps, inputTime: number | null) => void} maps @property {(step: number, cause: object) => void} drawn
  * @property {(step: number) => void} moved in the 3D scene
  * @property {(line: string) => void} error @property {(problem: string | null) => void} connection
@@ -21,6 +21,8 @@ const COARSE = 41;
 const FINE = 135;
 const REST = 120; // ms without a move after which the fine maps are asked for
 const PATIENCE = 10_000; // ms until an answer is taken for lost
+/** Where the scene is drawn slowly, it waits so many times as long as it takes: for a hand until it rests. */
+const PAUSE = { hand: Infinity, clock: 3, rest: 0 };
 const RETRY = { first: 500, most: 8000 }; // ms
 const decoder = new TextDecoder();
 
@@ -37,7 +39,6 @@ export class ViewSocket {
   #rest = 0;
   #lost = 0;
   #pause = RETRY.first;
-  #pace = new Pace();
 
   /** @param {Handlers} handlers @param {() => boolean} dark */
   constructor(handlers, dark) {
@@ -48,7 +49,7 @@ export class ViewSocket {
   /** The cursor has moved: coarse maps now; fine ones and the scene when it rests. @param {Cursor} cursor without its size. */
   move(cursor, inputTime = null) {
     this.#last = cursor;
-    const scene = this.#pace.mayDraw(inputTime === null ? SHARE.clock : SHARE.hand);
+    const scene = this.#handlers.pace(inputTime === null ? PAUSE.clock : PAUSE.hand);
     this.#want({ ...cursor, size: COARSE, scene }, inputTime);
     clearTimeout(this.#rest);
     this.#rest = setTimeout(() => this.#want({ ...cursor, size: FINE, scene: true }, null), REST);
@@ -73,7 +74,6 @@ export class ViewSocket {
     this.#inFlight = ++this.#serial;
     this.#sent.set(this.#serial, { ...cursor, inputTime });
     this.#send({ type: 'cursor', serial: this.#serial, ...cursor });
-    if (cursor.scene) this.#pace.taken();
     this.#lost = setTimeout(() => this.#answered(this.#inFlight), PATIENCE);
   }
 
@@ -117,6 +117,7 @@ export class ViewSocket {
       clearTimeout(this.#lost);
       this.#inFlight = null;
       this.#sent.clear();
+      this.#handlers.pace(PAUSE.rest);
       this.#retry('The server has gone.');
     };
     this.#socket = socket;
@@ -140,7 +141,9 @@ export class ViewSocket {
     const message = JSON.parse(data);
     if (message.type === 'cursor') this.#handlers.moved(message.step);
     if (message.type === 'drawn') {
-      this.#handlers.drawn(message.step, this.#sent.get(message.serial) ?? {});
+      const sent = this.#sent.get(message.serial) ?? {};
+      if (sent.size === FINE && message.serial === this.#serial) this.#handlers.pace(PAUSE.rest);
+      this.#handlers.drawn(message.step, sent);
       for (const serial of this.#sent.keys()) if (serial <= message.serial) this.#sent.delete(serial);
     }
     if (message.type === 'error') {

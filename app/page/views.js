@@ -23,6 +23,11 @@ export class Scene {
     if (!this.#frame.isConnected) this.#host.append(this.#frame);
   }
 
+  /** Whether a drawing may be now, and the pause after each where drawing is slow (frame.js). @param {number} times of its cost */
+  pace(times) {
+    return this.#frame.contentWindow?.drawing?.pause(times) ?? true;
+  }
+
   /** The server has drawn a cursor. */
   drawn() {
     if (this.#host.dataset.state !== 'ready') say(this.#host, 'ready');

@@ -107,7 +107,7 @@ class Watched:
 
     def open(self, link: str = "") -> Watched:
         """Opens a link of the page's and waits for the fine maps."""
-        self.page.goto(self.url + link)
+        self.page.goto(self.url + link, timeout=1000 * PATIENCE)
         self.until("() => window.beliefscope?.stats.maps?.size === 135")
         return self
 

@@ -263,6 +263,7 @@ def test_the_scenes_own_slider_moves_the_page(open_page: Any) -> None:
     if not slider.is_visible():
         scene.get_by_text("Connected").first.click(timeout=60_000)
     slider.focus(timeout=60_000)
+    assert page.page.frames[-1].evaluate("() => drawing.pause(0)")  # the page's hold on viser's drawing
     page.page.keyboard.press("ArrowRight")
     page.until("() => beliefscope.state().step === 21")
     page.settle(21)
