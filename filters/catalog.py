@@ -27,9 +27,9 @@ ANY = ""
 """Stands for the task, and for the models after its modalities, in what ``FILTERS`` holds."""
 
 FILTERS: dict[str, tuple[Literal["each", "all", "one"], Architecture]] = {
-    "crossmodal-ekf": ("each", Architecture(ANY, "ekf", "crossmodal")),
+    "crossmodal-ekf": ("each", Architecture(ANY, "ekf", "crossmodal", feedback=True)),
     "crossmodal-pf": ("each", Architecture(ANY, "pf", "crossmodal")),
-    "crossmodal-ukf": ("each", Architecture(ANY, "ukf", "crossmodal")),
+    "crossmodal-ukf": ("each", Architecture(ANY, "ukf", "crossmodal", feedback=True)),
     "unimodal-ekf": ("each", Architecture(ANY, "ekf", "unimodal")),
     "unimodal-pf": ("each", Architecture(ANY, "pf", "unimodal", likelihoods="raw")),
     "feature-ekf": ("all", Architecture(ANY, "ekf", "none")),
