@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import beliefscope
 from beliefscope.datasets.corrupt import READY, WHOLE, Recipe, broken_copies, described
 from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
@@ -241,11 +244,11 @@ def test_copies_of_training_episodes(episode: Episode) -> None:
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=list(FAULTS))
 def test_a_fault_prints_and_travels(fault: type[Fault]) -> None:
-    odd = {"number": 0.37, "whole": 3}
-    given = {
-        one.name: {float: odd["number"], int: odd["whole"], str: one.default}[one.metadata["kind"]]
-        for one in parameters(fault).values()
-    } | {"from_": 2, "to": 9}
+    odd = {float: 0.37, int: 3}
+    given = {one.name: odd.get(one.metadata["kind"], one.default) for one in parameters(fault).values()} | {
+        "from_": 2,
+        "to": 9,
+    }
     for recipe in (Recipe((fault(),)), Recipe((fault(**given), fault()))):
         assert Recipe.parse(str(recipe)) == recipe
         assert Recipe.of(json.loads(json.dumps(recipe.to_json()))) == recipe
@@ -277,6 +280,17 @@ def test_every_parameter_is_described() -> None:
         assert fault["meaning"].endswith(".")
         assert all(p["unit"] and p["meaning"] for p in fault["parameters"])
     assert json.dumps(described())
+
+
+def test_every_fault_is_documented() -> None:
+    page = (Path(beliefscope.__file__).resolve().parents[2] / "docs" / "data.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*\.) \|$", page.split("## Broken sensors")[1], re.MULTILINE))
+    assert list(rows) == list(FAULTS)
+    for fault in described():
+        own = [p["name"] for p in fault["parameters"][:-2]]
+        shown = rows[fault["fault"]].split("`")[1].split() if own else []
+        assert [one.split("=")[0] for one in shown] == own
+        assert rows[fault["fault"]].endswith(f"| {fault['meaning']}")
 
 
 BAD = {
