@@ -102,7 +102,7 @@ READY: dict[str, str] = {
     "force off by 5 N": "force_bias=5",
     "force noisy": "force_noise=5",
     "force drifting": "force_drift=1",
-    "force saturated": "force_saturation=5",
+    "force saturated at 2 N": "force_saturation=2",
     "force axis stuck": "force_stuck=x:from=20",
     "effector off by 2 cm": "effector_offset=0.02",
     "contact flipped": "contact_flipped",
