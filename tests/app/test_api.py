@@ -95,8 +95,8 @@ def test_a_damaged_trace_file_is_computed_again(traced: str, settings: Settings,
 
 
 def test_the_catalog_has_recipes_that_can_be_asked_for(client: TestClient, traced: str) -> None:
-    (door,) = client.get("/api/catalog").json()["tasks"]
-    recipes = {r["name"]: r["recipe"] for r in door["recipes"]}
+    tasks = {t["name"]: t for t in client.get("/api/catalog").json()["tasks"]}
+    recipes = {r["name"]: r["recipe"] for r in tasks["door"]["recipes"]}
     assert recipes["40 % black pictures"] == "blackout=0.4"
     assert {"force axis stuck", "effector off by 2 cm", "haptics dropped"} <= recipes.keys()
     whole = client.get(f"{traced}/images").content
