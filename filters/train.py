@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -44,9 +44,9 @@ class Plan:
     models: int = 1500
     alone: int = 300
     weights: int = 300
-    together: tuple[int, ...] = (100, 100, 300)
+    together: tuple[int, ...] = (100, 150, 250)
     fine: int = 60
-    lengths: tuple[int, ...] = (4, 8, 16)
+    lengths: tuple[int, ...] = (4, 16, 32)
     window: int = 32
     batch: int = 32
     particles: int = 30
@@ -94,6 +94,8 @@ def train(
     blackouts: Sequence[float] = BLACKOUTS,
     command: str = "",
     report: Report | None = None,
+    validated: Report | None = None,
+    resumed: Callable[[str], None] | None = None,
     device: str | None = None,
     partial: Path | None = None,
     parts: Path | None = None,
@@ -105,6 +107,8 @@ def train(
 
     Args:
         blackouts: chances of a black picture, one of which is drawn for each training window.
+        validated: called like ``report`` at each look at the validation loss.
+        resumed: called with the name of the last finished stage, where the training goes on from one.
         partial: file of the finished stages, from which a training that was killed goes on; removed at the end.
         parts: folder of what other filters of the same task can use: dynamics, picture encoders.
 
@@ -121,7 +125,6 @@ def train(
     steps = Steps.of(filter_.task, [*training, *validation], device)
     fitted = steps.part(0, len(training))
     filter_.statistics.fit(fitted)
-    versions = {"beliefscope": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}
     name = torch.cuda.get_device_name() if device == "cuda" else "cpu"
     # The number of episodes stands for copies with broken sensors, which the data's hash does not know.
     common = {
@@ -130,7 +133,7 @@ def train(
         "steps": len(steps.states),
         "plan": asdict(plan),
         "seed": seed,
-        "versions": versions,
+        "versions": versions(),
         "device": name,
     }
     trainer = Trainer(
@@ -144,8 +147,11 @@ def train(
         None if parts is None else Parts(parts),
         key_of(**common),
     )
+    trainer.validated = validated or trainer.validated
     kept = (
-        Partial(partial, key_of(architecture=architecture.to_json(), blackouts=list(blackouts), **common))
+        Partial(
+            partial, key_of(architecture=architecture.to_json(), blackouts=list(blackouts), command=command, **common)
+        )
         if partial
         else None
     )
@@ -154,6 +160,8 @@ def train(
     if kept is not None and (found := kept.load()) is not None:
         tensors, done, spent = found
         filter_.load_state_dict(tensors)
+        if resumed is not None:
+            resumed(done[-1])
 
     def finished(stage: str) -> None:
         done.append(stage)
@@ -172,13 +180,18 @@ def train(
         "data_hash": data_hash,
         "episodes": {split: len(members) for split, members in by_split.items()},
         "seconds": round(seconds, 1),
-        "versions": versions,
+        "versions": versions(),
         "device": name,
         "metrics": measure(filter_, held_out) if held_out else {},
     }
     if kept is not None:
         kept.drop()
     return Trained(filter_.cpu(), record)
+
+
+def versions() -> dict[str, str]:
+    """Of what the same seed depends on for the same weights."""
+    return {"beliefscope": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}
 
 
 def measure(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, Any]:

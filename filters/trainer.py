@@ -74,6 +74,7 @@ class Trainer:
         parts_key: str = "",
     ) -> None:
         self.filter, self.plan, self.seed, self.report = filter_, plan, seed, report
+        self.validated: Report = lambda *look: None  # like report, at each look at the validation loss
         self.sets = {"train": train, "val": val}
         self.blackouts = torch.tensor(blackouts)
         self.parts, self.parts_key = parts, parts_key
@@ -108,6 +109,9 @@ class Trainer:
             # A model that is hardly weighed gets hardly a gradient, but Adam's steps are of one size: it would wander
             # off and be no filter of its own any more. So each decides alone now and then.
             deciding = (None, None, *range(len(filter_.names)))
+        else:
+            name = "through the filter"
+            add(name, self.end_to_end, name, everything, plan.alone, plan.window, plan.fine_rate)
         for length, count in zip(plan.lengths, plan.together, strict=True):
             name = f"together, {length} steps"
             add(name, self.end_to_end, name, everything, count, length, plan.fine_rate, deciding)
@@ -295,7 +299,7 @@ class Trainer:
         def loss(part: str) -> Tensor:
             k = deciding[int(torch.randint(len(deciding), (), generator=self.generator))]
             batch = self.sample(part, length, max(1, 16 * plan.batch // length))
-            if k is not None and not self.sees(filter_.names[k]):
+            if not any(self.sees(name) for name in (filter_.names if k is None else [filter_.names[k]])):
                 batch = self.shifted(batch)
             evidence = filter_.encode(batch)
             if k is not None:
@@ -367,6 +371,7 @@ class Trainer:
             if not looks or ((done + 1) % self.plan.check and done + 1 < count):
                 continue
             checked = self.checked(stage, loss)
+            self.validated(stage, done + 1, count, checked)
             since += 1
             if checked < best:
                 best, kept, since = checked, [p.detach().clone() for p in chosen], 0
