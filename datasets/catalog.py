@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
 from beliefscope.datasets.door import DOOR
-from beliefscope.datasets.errors import one_of
+from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.push import PUSH
 from beliefscope.datasets.push_real import PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
@@ -12,7 +18,80 @@ TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, *PUSH_REAL_TA
 
 
 def find_task(name: str) -> Task:
-    """The task of that name. Raises BadInput for an unknown one."""
-    if name not in TASKS:
-        raise one_of("task", name, TASKS)
-    return TASKS[name]
+    """The task of that name.
+
+    ``path/to/file.py:NAME`` and ``package.module:NAME`` stand for a task of the user's own: the file is run, and its
+    task is from then on in ``TASKS`` under its own name.
+
+    Raises:
+        BadInput: for an unknown name, and where a file cannot be run, holds no such task, or one that is not coherent.
+    """
+    if name in TASKS:
+        return TASKS[name]
+    if ":" in name:
+        return _foreign(name)
+    unknown = one_of("task", name, TASKS)
+    raise BadInput(f"{unknown} One of your own is named by its file: path/to/file.py:NAME.")
+
+
+_FOREIGN: dict[tuple[str, str], Task] = {}
+"""(file or module, attribute) -> the task that was found there."""
+
+
+def _foreign(name: str) -> Task:
+    place, _, attribute = name.rpartition(":")
+    is_file = place.endswith(".py")
+    key = (str(Path(place).resolve()) if is_file else place, attribute)
+    if key not in _FOREIGN:
+        module = _run_file(Path(place)) if is_file else _run_module(place)
+        task = getattr(module, attribute, None)
+        if not isinstance(task, Task):
+            found = ", ".join(n for n, value in vars(module).items() if isinstance(value, Task)) or "none"
+            raise BadInput(f"{place} holds no task {attribute!r}. Tasks in it: {found}.")
+        _check(task, name)
+        _FOREIGN[key] = TASKS[task.name] = task
+    return _FOREIGN[key]
+
+
+def _run_file(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist.")
+    spec = spec_from_file_location(f"beliefscope_task_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[module.__name__] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[module.__name__]
+        raise BadInput(f"{path} cannot be run: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _run_module(name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except Exception as error:
+        raise BadInput(f"module {name!r} cannot be imported: {type(error).__name__}: {error}") from error
+
+
+def _check(task: Task, name: str) -> None:
+    """Raises BadInput where a task's fields do not fit each other."""
+    if task.name in TASKS:
+        raise BadInput(f"{name} is named {task.name!r}, which is taken. Tasks there are: {', '.join(TASKS)}.")
+    if not task.name or set(task.name) & set("/\\: "):
+        raise BadInput(f"{name} is named {task.name!r}, expected a name without spaces, colons and slashes.")
+    for component in task.map_components:
+        task.index(component)
+    for modality, keys in task.modalities.items():
+        missing = [key for key in keys if key not in task.observations]
+        if missing:
+            raise BadInput(f"{name}: modality {modality!r} has {missing[0]!r}, which is not among its observations.")
+        ranks = [len(task.observations[key]) for key in keys]
+        if ranks != [2] and set(ranks) != {1}:
+            raise BadInput(
+                f"{name}: modality {modality!r} has {', '.join(keys)}, expected one picture or only vectors."
+            )
+    if task.dt <= 0 or task.map_half_width <= 0:
+        raise BadInput(f"{name}: dt is {task.dt} s and map_half_width {task.map_half_width} m, expected more than 0.")

@@ -111,7 +111,7 @@ class _Parts:
 
     def _part(self, index: int) -> Path:
         made_by = f"{beliefscope.__version__}-mujoco{mujoco.__version__}"
-        return self._folder / f"{self.task}-seed{self.seed}-steps{self.steps}-{index}-{made_by}.h5"
+        return self._folder / f"{find_task(self.task).name}-seed{self.seed}-steps{self.steps}-{index}-{made_by}.h5"
 
     def _read(self, index: int) -> Episode:
         with open_dataset(self._part(index)) as part:

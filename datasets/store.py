@@ -286,7 +286,10 @@ def _write_episode(group: h5py.Group, episode: Episode) -> None:
     for key, array in arrays.items():
         # One HDF5 element a step: the shuffle filter then lays the bytes of each pixel or component out over time,
         # which takes a fifth off the pictures.
-        element = np.dtype((array.dtype, array.shape[1:])) if array.ndim > 1 and array.size else array.dtype
+        if not array.size:
+            group.create_dataset(key, data=array)  # no joint positions where there is no replay
+            continue
+        element = np.dtype((array.dtype, array.shape[1:])) if array.ndim > 1 else array.dtype
         stored = group.create_dataset(
             key, (len(array),), element, chunks=(len(array),), compression="gzip", compression_opts=9, shuffle=True
         )

@@ -1,0 +1,147 @@
+"""A task from plain arrays, as the example of docs/data.md adds one, goes the whole way with no other change."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import runpy
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from beliefscope.app.cli import main
+from beliefscope.app.library import Library, Settings
+from beliefscope.datasets import catalog
+from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset
+from beliefscope.inspect.trace import load_trace
+
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_task.py"
+SPEC = f"{EXAMPLE}:TASK"
+
+
+@contextlib.contextmanager
+def fresh() -> Iterator[None]:
+    """As in a new process: tasks that are found meanwhile are forgotten afterwards."""
+    known = dict(TASKS)
+    yield
+    TASKS.clear()
+    TASKS.update(known)
+    catalog._FOREIGN.clear()
+
+
+def run(*arguments: object) -> tuple[int, str, str]:
+    """A command line, as in a process of its own: exit code, standard output, standard error."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, fresh():
+        patch.setattr(sys, "argv", ["beliefscope", *map(str, arguments)])
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.raises(SystemExit) as end:
+            main()
+    return int(end.value.code or 0), out.getvalue(), err.getvalue()
+
+
+def result(*arguments: object) -> Any:
+    code, out, err = run(*arguments, "--json", "-")
+    assert code == 0, err
+    return json.loads(out)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data, a filter, a trace and a recording, each made as a user would."""
+    folder = tmp_path_factory.mktemp("own")
+    data, trained = folder / "own.h5", folder / "own.safetensors"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(EXAMPLE), str(data)])
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
+    result("train", SPEC, "--filter", "crossmodal-ekf", "--data", data, "--preset", "smoke", "-o", trained)
+    for command, name in (("trace", "own.trace"), ("record", "own.rrd")):
+        result(command, SPEC, "--filter", trained, "--data", data, "-o", folder / name)
+    return folder
+
+
+def test_example_is_short() -> None:
+    assert len(EXAMPLE.read_text().splitlines()) < 60
+
+
+def test_whole_way(folder: Path) -> None:
+    measured = result("evaluate", SPEC, "--filter", folder / "own.safetensors", "--data", folder / "own.h5")
+    assert set(measured["rmse"]) == {"x_cm", "y_cm", "position_cm"}
+    with fresh():
+        find_task(SPEC)
+        with open_dataset(folder / "own.h5") as data:
+            assert measured["data_hash"] == data.hash
+            traced = load_trace(folder / "own.trace")
+            assert traced.data_hash == data[data.held_out()[0]].digest()
+    assert traced.modalities == ("image", "sound")
+    assert (folder / "own.rrd").stat().st_size > 10_000
+
+
+def test_page_shows_it(folder: Path, tmp_path: Path) -> None:
+    settings = Settings(tmp_path, data={"ball": folder / "own.h5"}, checkpoints={"own": folder / "own.safetensors"})
+    library = Library(settings)
+    with fresh():
+        find_task(SPEC)
+        (shown,) = [entry for entry in library.catalog()["tasks"] if entry["name"] == "ball"]
+        library.close()
+    assert [one["name"] for one in shown["filters"]] == ["own"]
+    assert len(shown["episodes"]) == 100
+
+
+def test_its_filter_says_whose_it_is(folder: Path) -> None:
+    code, _, err = run("evaluate", "door", "--filter", folder / "own.safetensors")
+    assert code == 2
+    assert "task 'ball' does not exist. Available: door, " in err
+    assert "One of your own is named by its file: path/to/file.py:NAME." in err
+    _, _, err = run("evaluate", SPEC, "--filter", folder / "own.safetensors")
+    assert "Task 'ball' ships no sample set. Give its data with --data." in err
+
+
+TASK_FILE = """
+from beliefscope.datasets.task import Component, Task
+NUMBER = 3
+TASK = Task(
+    name="{name}", components=(Component("x", "m"), Component("y", "m")),
+    observations={{"image": (8, 8), "felt": (2,)}}, modalities={{"image": ("image",), "haptics": {keys}}},
+    control_size=1, dt=0.1, map_components=("x", "{y}"),
+    map_half_width=0.1,
+)
+"""
+
+
+@pytest.mark.parametrize(
+    ("content", "spec", "message"),
+    [
+        ("", "nothing.py:TASK", r"nothing\.py does not exist"),
+        ("", "own.py:TASK", r"own\.py holds no task 'TASK'\. Tasks in it: none\."),
+        (TASK_FILE, "own.py:NUMBER", r"own\.py holds no task 'NUMBER'\. Tasks in it: TASK\."),
+        ("1 / 0", "own.py:TASK", r"own\.py cannot be run: ZeroDivisionError: division by zero"),
+        ("def", "own.py:TASK", r"own\.py cannot be run: SyntaxError"),
+        ("", "no.such.module:TASK", r"module 'no\.such\.module' cannot be imported: ModuleNotFoundError: No module"),
+        ("", "json:TASK", r"json holds no task 'TASK'"),
+        (TASK_FILE, "own.py:TASK|door", r"own\.py:TASK is named 'door', which is taken"),
+        (TASK_FILE, "own.py:TASK|a b", r"own\.py:TASK is named 'a b', expected a name without spaces"),
+        (TASK_FILE, "own.py:TASK||('touch',)", r"modality 'haptics' has 'touch', which is not among its observations"),
+        (
+            TASK_FILE,
+            "own.py:TASK||('felt', 'image')",
+            r"modality 'haptics' has felt, image, expected one picture or only",
+        ),
+        (TASK_FILE, "own.py:TASK||('felt',)|z", r"component of task 'mine' 'z' does not exist\. Available: x, y"),
+    ],
+)
+def test_files_that_are_no_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, spec: str, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    spec, name, keys, y, *_ = [*spec.split("|"), "", "", ""]
+    (tmp_path / "own.py").write_text(content.format(name=name or "mine", keys=keys or "('felt',)", y=y or "y"))
+    before = dict(TASKS)
+    with pytest.raises(BadInput, match=message):
+        find_task(spec)
+    assert before == TASKS
