@@ -19,11 +19,12 @@ from beliefscope.app.commands.evaluate import evaluate
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
 from beliefscope.app.commands.serve import serve
+from beliefscope.app.commands.study import study
 from beliefscope.app.commands.trace import trace
 from beliefscope.app.commands.train import train
 from beliefscope.datasets.errors import BadInput
 
-COMMANDS = (serve, collect, convert, train, evaluate, trace, record, recipes)
+COMMANDS = (serve, collect, convert, train, evaluate, study, trace, record, recipes)
 
 cli = typer.Typer(
     name="beliefscope",

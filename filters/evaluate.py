@@ -36,6 +36,8 @@ class Metrics:
         nll: mean negative log-likelihood of the truth under the posterior Gaussian, in nats, m and rad.
         nees: mean normalised estimation error squared over n: 1 when consistent, more when over-confident.
         coverage95: share of steps whose truth lies in the 95 % ellipsoid.
+
+    The last three are NaN, and null in JSON, for an estimator that gives no covariance.
     """
 
     rmse: dict[str, float]
@@ -44,7 +46,8 @@ class Metrics:
     coverage95: float
 
     def to_dict(self) -> dict[str, Any]:
-        return {"rmse": self.rmse, "nll": self.nll, "nees": self.nees, "coverage95": self.coverage95}
+        of_covariance = {"nll": self.nll, "nees": self.nees, "coverage95": self.coverage95}
+        return {"rmse": self.rmse} | {k: None if math.isnan(value) else value for k, value in of_covariance.items()}
 
 
 def evaluate(
@@ -97,13 +100,15 @@ def run(filter_: Filter, batch: Batch, only: str | None, particles: int, seed: i
 
 
 def metrics(task: Task, error: Tensor, covariance: Tensor) -> Metrics:
-    """Metrics of errors (S, n) with covariances (S, n, n), SI units."""
+    """Metrics of errors (S, n) with covariances (S, n, n), SI units; covariances all NaN where there are none."""
     error, covariance = error.double(), covariance.double()
     rmse = {}
     for i, component in enumerate(task.components):
         unit, factor = UNITS[component.unit]
         rmse[f"{component.name}_{unit}"] = factor * float(error[:, i].square().mean().sqrt())
     rmse["position_cm"] = 100.0 * float(error[:, list(task.map_indices)].square().sum(-1).mean().sqrt())
+    if covariance.isnan().all():
+        return Metrics(rmse, math.nan, math.nan, math.nan)
     n = error.shape[-1]
     # A particle set that has collapsed onto one point has no inverse: a floor of (0.1 mm, 0.1 mrad)^2.
     covariance = covariance + 1e-8 * torch.eye(n, dtype=torch.float64)

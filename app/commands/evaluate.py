@@ -86,7 +86,7 @@ def evaluate(
     }
     rows = {f"rmse {name}": value for name, value in metrics["rmse"].items()}
     rows |= {name: value for name, value in metrics.items() if name != "rmse"}
-    table = console.table({name: f"{value:.2f}" for name, value in rows.items()})
+    table = console.table({name: "none" if value is None else f"{value:.2f}" for name, value in rows.items()})
     what = f"{tested.name} ({tested.hash[:12]}) on {len(held_out)} episodes" + (f" with {broken}" if broken else "")
     console.result(document, f"{what}\n{table}", json)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +22,7 @@ from beliefscope.app.commands.given import (
     recipe,
     size,
 )
-from beliefscope.datasets.errors import one_of
+from beliefscope.datasets.errors import BadInput, one_of
 
 
 def train(
@@ -39,6 +41,10 @@ def train(
     ] = "cpu",
     recipe_: RecipeText = "",
     seed: Seed = 0,
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="DIR", help="Write training and validation loss there, for TensorBoard."),
+    ] = None,
     json: Json = None,
 ) -> None:
     """Train a filter and write its checkpoint.
@@ -46,6 +52,7 @@ def train(
     In the paper's order: dynamics, each modality's model, each modality alone through the filter, the weight model
     alone, everything together. Uses a CUDA GPU where there is one. The checkpoint tells how it was made and how
     well it does on episodes it has not seen. With a recipe it also trains on a broken copy of each training episode.
+    What is finished lies in CHECKPOINT.partial: the same command, run again after a kill, goes on from there.
 
     \b
     Examples:
@@ -61,14 +68,22 @@ def train(
     from beliefscope.filters.train import train as train_filter
 
     check(output, json)
+    if log is not None and (log.exists() and not log.is_dir()):
+        raise BadInput(f"--log {str(log)!r} is a file; give the name of a folder")
     chosen = architecture(find_task(task).name, filter_)
     if preset not in PLANS:
         raise one_of("preset", preset, PLANS)
     # Where on this machine the data lie is no part of the record; their hash is.
     given = "" if data is None else f" --data {data.name}"
     broken = recipe(recipe_, find_task(task))
+    partial = output.with_name(f"{output.name}.partial")
     given += f" --recipe {broken}" if broken else ""
-    with dataset(find_task(task), data, skip_bad) as episodes, console.bars() as move:
+    with dataset(find_task(task), data, skip_bad) as episodes, console.bars() as move, losses(log) as write:
+
+        def report(stage: str, done: int, count: int, loss: float) -> None:
+            move(stage, done / count, f"loss {loss:.3g}")
+            write("training", stage, done, loss)
+
         whole = list(episodes)
         trained = train_filter(
             chosen,
@@ -77,7 +92,10 @@ def train(
             plan=PLANS[preset],
             seed=seed,
             command=f"beliefscope train {task} --filter {filter_}{given} --preset {preset} --seed {seed}",
-            report=lambda stage, done, count, loss: move(stage, done / count, f"loss {loss:.3g}"),
+            report=report,
+            validated=lambda stage, done, count, loss: write("validation", stage, done, loss),
+            resumed=lambda stage: console.say(f"goes on after stage {stage!r}, from {partial.name}"),
+            partial=partial,
         )
     record = trained.record | {"recipe": broken.to_json()}
     checkpoint_hash = save_checkpoint(trained.filter, filter_, record, output)
@@ -93,3 +111,15 @@ def train(
     for name, metrics in record["metrics"].get("0", {}).items():
         lines.append(f"{name}: " + ", ".join(f"{key} {value:.2f}" for key, value in metrics["rmse"].items()))
     console.result(document, "\n".join(lines), json)
+
+
+@contextmanager
+def losses(folder: Path | None) -> Iterator[Callable[[str, str, int, float], None]]:
+    """Yields (kind of loss, stage, step, loss) -> None, which writes TensorBoard's event file into the folder."""
+    if folder is None:
+        yield lambda kind, stage, step, loss: None
+        return
+    from tensorboardX import SummaryWriter
+
+    with SummaryWriter(str(folder)) as writer:
+        yield lambda kind, stage, step, loss: writer.add_scalar(f"{stage}/{kind}", loss, step)
