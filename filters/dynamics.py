@@ -23,7 +23,7 @@ class Dynamics(nn.Module):
         self.control_encoder = vector_stack(control_size, units)
         self.join_state = nn.Linear(units, units, bias=False)
         self.join_control = nn.Linear(units, units)
-        self.shared = Stack(nn.ReLU(), Residual(units), Residual(units), Residual(units))
+        self.shared = Stack(nn.ReLU(inplace=True), Residual(units), Residual(units), Residual(units))
         self.output = nn.Linear(units, n + 1)
         self.log_noise = nn.Parameter(torch.empty(n))
         self.reset_parameters()

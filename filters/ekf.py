@@ -51,7 +51,7 @@ class VirtualSensor(nn.Module):
         super().__init__()
         n, units = len(task.components), architecture.units
         self.encoders = encoders(task, model.split("+"), architecture)
-        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(), Residual(units))
+        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), Residual(units))
         self.state = nn.Linear(units, n)
         self.log_noise = nn.Sequential(nn.Linear(units, units), nn.ReLU(), nn.Linear(units, n))
 

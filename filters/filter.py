@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -130,6 +130,12 @@ class Filter(nn.Module, ABC):
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         """One prediction and update. ``evidence`` is one step's: leading axis N. Draws only from ``generator``."""
 
+    def steps(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> Iterator[StepTrace]:
+        """The traces of all T steps of ``evidence``, each step from the belief that the one before left."""
+        for t in range(len(evidence)):
+            belief, trace = self.step(belief, evidence[t], generator)
+            yield trace
+
 
 def encoders(task: Task, modalities: Iterable[str], architecture: Architecture) -> Encoders:
     """Fresh encoders of these modalities. Raises BadInput for one that the task does not have."""
@@ -166,7 +172,7 @@ class WeightModel(nn.Module):
         self.shape = (len(models), width)
         modalities = dict.fromkeys(m for model in models for m in model.split("+"))
         self.encoders = encoders(task, modalities, architecture)
-        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(), Residual(units))
+        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), Residual(units))
         self.output = nn.Linear(units, len(models) * width)
         nn.init.normal_(self.output.weight, std=1e-2)
         nn.init.zeros_(self.output.bias)

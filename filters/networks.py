@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 import torch
@@ -15,6 +15,16 @@ PICTURES_AT_ONCE = 128
 """Pictures encoded in one go: enough to keep the cores busy, few enough to stay in the caches."""
 
 
+ROWS_AT_ONCE = 1024
+"""Particles or map cells that go through full layers in one go: their activations stay in the caches."""
+
+
+def in_groups(function: Callable[[Tensor], Tensor], states: Tensor) -> Tensor:
+    """``function`` of states (N, M, n), so many particles at a time; results (N, M, ...) are joined again."""
+    groups = states.split(max(1, ROWS_AT_ONCE // len(states)), dim=1)
+    return function(states) if len(groups) == 1 else torch.cat([function(group) for group in groups], dim=1)
+
+
 class Residual(nn.Module):
     """``relu(x + W2 relu(W1 x + b1) + b2)``, two layers of ``units``."""
 
@@ -24,7 +34,8 @@ class Residual(nn.Module):
         self.second = nn.Linear(units, units)
 
     def forward(self, x: Tensor) -> Tensor:
-        return functional.relu(x + self.second(functional.relu(self.first(x))))
+        y = self.second(functional.relu(self.first(x), inplace=True))
+        return functional.relu(y.add_(x), inplace=True)
 
     def dual(self, x: Tensor) -> Tensor:
         return dual_relu(x + dual_linear(self.second, dual_relu(dual_linear(self.first, x))))
@@ -63,7 +74,7 @@ class Stack(nn.Sequential):
 
 def vector_stack(inputs: int, units: int) -> Stack:
     """Three layers from ``inputs`` to ``units``."""
-    return Stack(nn.Linear(inputs, units), nn.ReLU(), Residual(units))
+    return Stack(nn.Linear(inputs, units), nn.ReLU(inplace=True), Residual(units))
 
 
 class ResidualConvolution(nn.Module):
@@ -126,7 +137,7 @@ class ImageEncoder(nn.Module):
             "spatial-softmax": (16, SpatialSoftmax()),
             "mean": (8, nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten())),
         }[pooling]
-        self.output = Stack(nn.Linear(size, units), nn.ReLU(), Residual(units))
+        self.output = Stack(nn.Linear(size, units), nn.ReLU(inplace=True), Residual(units))
 
     def forward(self, pictures: Tensor) -> Tensor:
         features: Tensor = self.output(self.pooling(self.convolutions(pictures.unsqueeze(1))))

@@ -14,7 +14,7 @@ from beliefscope.filters.belief import Belief, Evidence, Gaussian, Particles, St
 from beliefscope.filters.dynamics import Dynamics
 from beliefscope.filters.filter import Architecture, Filter, WeightModel, encoders
 from beliefscope.filters.fusion import mixture
-from beliefscope.filters.networks import Residual, Stack, vector_stack
+from beliefscope.filters.networks import Residual, Stack, in_groups, vector_stack
 from beliefscope.filters.resample import resample
 
 
@@ -32,7 +32,7 @@ class MeasurementModel(nn.Module):
         self.join_observation = nn.Linear(self.encoders.size, units)
         self.state_encoder = vector_stack(len(task.components), units)
         self.join_state = nn.Linear(units, units, bias=False)
-        self.head = Stack(nn.ReLU(), Residual(units), nn.Linear(units, 1))
+        self.head = Stack(nn.ReLU(inplace=True), Residual(units), nn.Linear(units, 1))
 
     def observation_part(self, observations: Mapping[str, Tensor]) -> Tensor:
         """(T, N, units)."""
@@ -81,10 +81,10 @@ class ParticleFilter(Filter):
 
     def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
         """Of each modality, for particles (N, M, n) at one step: (N, K, M), not normalised."""
-        values = [
-            model.log_likelihood(evidence.observation[:, k, None], model.state_part(states))
-            for k, model in enumerate(self.measurement_model(m) for m in self.names)
-        ]
+        values = []
+        for k, name in enumerate(self.names):
+            model, part = self.measurement_model(name), evidence.observation[:, k, None]
+            values.append(in_groups(lambda x, m=model, p=part: m.log_likelihood(p, m.state_part(x)), states))
         return torch.stack(values, dim=1)
 
     def scale(self, log_weights: Tensor, log_likelihood: Tensor) -> Tensor:
@@ -105,7 +105,8 @@ class ParticleFilter(Filter):
 
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Particles, StepTrace]:
         assert isinstance(belief, Particles)
-        moved = self.dynamics(belief.states, evidence.control.unsqueeze(1))
+        control = evidence.control.unsqueeze(1)
+        moved = in_groups(lambda states: self.dynamics(states, control), belief.states)
         unit = torch.randn(moved.shape, generator=generator, device=moved.device)
         predicted = Particles(moved + unit * self.dynamics.noise, belief.log_weights)
         log_likelihood = self.log_likelihood(evidence, predicted.states)

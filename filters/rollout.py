@@ -43,8 +43,7 @@ def rollout(
     belief = filter_.start(start, particles, generator)
     estimates: list[Gaussian] = []
     steps: list[StepTrace] = []
-    for t in range(len(evidence)):
-        belief, trace = filter_.step(belief, evidence[t], generator)
+    for t, trace in enumerate(filter_.steps(belief, evidence, generator)):
         estimates.append(trace.estimate)
         if keep:
             steps.append(trace)

@@ -22,9 +22,6 @@ from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float32]
 
-CELLS_AT_ONCE = 2048
-"""Cells that go through a network in one go: their activations stay in the caches."""
-
 LARGEST = 1024
 """Cells along a side that a map may have."""
 
@@ -155,8 +152,7 @@ class MapEngine:
         assert self.evidence is not None
         evidence = self.evidence[step]
         standard = filter_.statistics.standardise("state", states).unsqueeze(0)
-        chunks = [filter_.log_likelihood(evidence, part) for part in standard.split(CELLS_AT_ONCE, dim=1)]
-        each = torch.cat(chunks, dim=-1)[0]
+        each = filter_.log_likelihood(evidence, standard)[0]
         trace = self.trace
         assert trace.prior_log_weights is not None
         assert trace.log_likelihood is not None
