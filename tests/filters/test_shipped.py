@@ -8,7 +8,7 @@ import pytest
 from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.trace import trace
 
@@ -19,17 +19,20 @@ def held_out() -> list[Episode]:
         return [dataset[s.index] for s in dataset.summaries if s.split == "test"]
 
 
-SHIPPED = sorted(path.stem.removeprefix("door-") for path in PRETRAINED.glob("door-*.safetensors"))
+SHIPPED = sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
 
 
-@pytest.fixture(scope="module", params=SHIPPED)
+@pytest.fixture(scope="module", params=[name for name in SHIPPED if name.startswith("door-crossmodal")])
 def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
-    return load_checkpoint(shipped("door", request.param))
+    return load_checkpoint(PRETRAINED / f"{request.param}.safetensors")
 
 
-def test_the_record_says_how_to_make_it_again(checkpoint: Checkpoint) -> None:
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_record_says_how_to_make_it_again(name: str) -> None:
+    checkpoint = load_checkpoint(PRETRAINED / f"{name}.safetensors")
     record = checkpoint.record
-    assert record["command"].startswith(f"beliefscope train door --filter {checkpoint.name}")
+    assert name == f"{checkpoint.task.name}-{checkpoint.name}"
+    assert record["command"].startswith(f"beliefscope train {checkpoint.task.name} --filter {checkpoint.name}")
     written = (PRETRAINED / "README.md").read_text()
     assert checkpoint.hash in written
     assert record["data_hash"] in written
@@ -46,17 +49,16 @@ def test_recorded_metrics_are_those_of_these_weights(checkpoint: Checkpoint, hel
     assert again.rmse["angle_deg"] == pytest.approx(recorded["rmse"]["angle_deg"], rel=0.5)
 
 
-@pytest.mark.parametrize("recipe", ["", "blackout=0.4"])
-def test_fused_beats_each_modality_alone(checkpoint: Checkpoint, held_out: list[Episode], recipe: str) -> None:
-    """On what moves, the angle; on the hinge it is no worse than the better one by more than a tenth.
-
-    With 80 % black pictures the PF is not better than its image alone: filters/pretrained/README.md.
-    """
+@pytest.mark.parametrize("recipe", ["", "blackout=0.4", "blackout=0.8"])
+def test_fused_is_no_worse_than_the_better_modality(
+    checkpoint: Checkpoint, held_out: list[Episode], recipe: str
+) -> None:
+    """By more than 5 %, which 14 episodes cannot tell apart; on what moves, with most pictures black, it is better."""
     fused = evaluate(checkpoint.filter, held_out, recipe=Recipe.parse(recipe)).rmse
     for name in checkpoint.filter.names:
         alone = evaluate(checkpoint.filter, held_out, recipe=Recipe.parse(recipe), only=name).rmse
-        assert fused["angle_deg"] < alone["angle_deg"]
-        assert fused["position_cm"] < 1.1 * alone["position_cm"]
+        assert fused["angle_deg"] < (1.0 if "0.8" in recipe else 1.05) * alone["angle_deg"]
+        assert fused["position_cm"] < 1.05 * alone["position_cm"]
 
 
 def test_blackout_moves_beta_away_from_the_image(checkpoint: Checkpoint, held_out: list[Episode]) -> None:
