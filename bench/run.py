@@ -11,6 +11,7 @@ import os
 import platform
 import sys
 
+import collect
 import filters
 import maps
 import page
@@ -19,7 +20,13 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-PARTS = {"filters": filters.measure, "maps": maps.measure, "recordings": recordings.measure, "page": page.measure}
+PARTS = {
+    "collect": collect.measure,
+    "filters": filters.measure,
+    "maps": maps.measure,
+    "recordings": recordings.measure,
+    "page": page.measure,
+}
 
 
 def main() -> None:

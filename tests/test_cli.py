@@ -258,6 +258,21 @@ def test_other_failures_are_code_1_and_explain_themselves_on_demand(
         main()
 
 
+@pytest.mark.parametrize("task", ["door", "push"])
+def test_collect_shows_the_authors_statistics_beside_its_own(run: Run, folder: Path, task: str) -> None:
+    from beliefscope.datasets.statistics import AUTHORS
+
+    code, out, _ = run(f"collect {task} --episodes 1 --steps 4 --workers 1 -o one.h5")
+    assert code == 0
+    head, empty, title, *rows = out.splitlines()
+    assert (empty, title.split()) == ("", ["this", "set", "authors", "ratio"])
+    assert head.startswith("one.h5")
+    row = next(row for row in rows if row.startswith("contact fraction"))
+    assert row.split()[3] == str(AUTHORS[task].statistics["contact_fraction"])
+    force = next(row for row in rows if row.startswith("force std, N"))
+    assert len(force.split()) == 3 + 3 * 3, "three axes each"
+
+
 def test_collect_to_recording(run: Run, folder: Path) -> None:
     """The whole line: what one command writes, the next one reads, and the JSON agrees with the files."""
     code, out, _ = run("collect door --episodes 2 --steps 12 --seed 3 --workers 1 -o few.h5 --json -")
@@ -266,7 +281,9 @@ def test_collect_to_recording(run: Run, folder: Path) -> None:
     with open_dataset(folder / "few.h5") as data:
         assert collected["data_hash"] == data.hash
         assert (collected["episodes"], [len(episode) for episode in data]) == (2, [12, 12])
+        assert collected["contact_fraction"] == np.mean([episode.contact for episode in data])
         digest = data[1].digest()
+    assert collected["statistics"].keys() > collected["authors"].keys() > {"force_std_N", "angle_std_deg"}
 
     code, out, err = run("evaluate door --filter ekf.safetensors --data few.h5 --json -")
     evaluated = json.loads(out)
