@@ -44,6 +44,12 @@ FAN = np.array([(64, i, (i + 1) % 64) for i in range(64)])
 # Corners of the unit box are numbered by their three bits; an edge joins two that differ in one bit.
 BOX = np.array([[bit >> axis & 1 for axis in range(3)] for bit in range(8)], np.float32) - 0.5
 EDGES = np.array([(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1])
+_RIM = np.stack([DISC[:-1], np.roll(DISC[:-1], -1, axis=0)], axis=1) / 2.0
+OUTLINES = {
+    "box": BOX[EDGES],
+    "cylinder": np.concatenate([_RIM + 0.5 * UP, _RIM - 0.5 * UP, _RIM[::16, :1] + np.array([0.5 * UP, -0.5 * UP])]),
+}
+"""Shape of a ghost -> (E, 2, 3) its edges, for size 1."""
 
 
 class Drawing:
@@ -139,20 +145,18 @@ class Drawing:
             outlines[i] = self._server.scene.add_frame(f"/belief/{name}/ghost", show_axes=False)
             self._server.scene.add_line_segments(
                 f"/belief/{name}/ghost/edges",
-                (BOX * (size + 0.004))[EDGES],
+                (OUTLINES[self._ghost.shape] * (size + 0.004)).astype(np.float32),
                 hue,
                 thickness=2.0,
                 thickness_units="screen",
             )
             if name == "fused":
-                self._server.scene.add_box(
-                    f"/belief/{name}/ghost/panel",
-                    hue,
-                    tuple(size),
-                    opacity=0.25,
-                    cast_shadow=False,
-                    receive_shadow=False,
-                )
+                fill, x, z = f"/belief/{name}/ghost/{self._ghost.shape}", float(size[0]), float(size[2])
+                look: dict[str, Any] = {"opacity": 0.25, "cast_shadow": False, "receive_shadow": False}
+                if self._ghost.shape == "cylinder":
+                    self._server.scene.add_cylinder(fill, x / 2, z, color=hue, **look)
+                else:
+                    self._server.scene.add_box(fill, hue, tuple(size), **look)
         return outlines
 
     def _add_particles(self) -> Any:

@@ -139,6 +139,7 @@ def puck_ghost(states: ArrayLike) -> Ghost:
         wxyz=np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*states.shape[:-1], 4)),
         size=(2 * RADIUS, 2 * RADIUS, HEIGHT),
         anchor=np.concatenate([states, 2 * height], -1),
+        shape="cylinder",
     )
 
 

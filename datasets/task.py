@@ -26,18 +26,20 @@ class Component:
 
 @dataclass(frozen=True)
 class Ghost:
-    """The object at given states, as a box to draw: true or estimated.
+    """The object at given states, to draw: true or estimated.
 
     Attributes:
-        position: (..., 3) m, world: the box's centre. wxyz: (..., 4) its orientation.
+        position: (..., 3) m, world: the object's centre. wxyz: (..., 4) its orientation.
         size: (3,) m, along its own axes.
         anchor: (..., 3) m, world: the point whose x and y are the map components (the hinge), where it is best seen.
+        shape: a cylinder stands along its own z; the first two sizes are its diameter.
     """
 
     position: Array
     wxyz: Array
     size: tuple[float, float, float]
     anchor: Array
+    shape: Literal["box", "cylinder"] = "box"
 
 
 @dataclass(frozen=True)
