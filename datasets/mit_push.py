@@ -262,10 +262,11 @@ class MitPushes(Dataset):
         if not groups:
             raise BadInput(f"{path} has no push that can be used. The first: {left_out[0]}")
         self.left_out = tuple(left_out)
+        numbers = {split: count(SPLITS.index(split)) for split in SPLITS}
         self._trajectories = [
             (split, push)
-            for number, ((split, *_), pushes) in enumerate(sorted(groups.items()))
-            for push in _trajectories(pushes, split, round(SECONDS * rate), _rng(seed, split, number))
+            for (split, *_), pushes in sorted(groups.items())
+            for push in _trajectories(pushes, split, round(SECONDS * rate), _rng(seed, split, next(numbers[split])))
         ]
         self._touching = [gap(p.shape, p.poses, p.tips) < TOUCHING for _, p in self._trajectories]
         self._built: dict[int, Episode] = {}
@@ -317,6 +318,7 @@ def _policy(push: Push) -> str:
 
 
 def _rng(seed: int, split: str, number: int) -> Generator:
+    """By split and number within it, so that a split is the same alone and beside others."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SPLITS.index(split), number)))
 
 
