@@ -376,6 +376,8 @@ class Trainer:
             if checked < best:
                 best, kept, since = checked, [p.detach().clone() for p in chosen], 0
             elif since >= self.plan.patience:
+                if self.report is not None:
+                    self.report(stage, count, count, float(value.detach()))
                 break
         if looks:
             with torch.no_grad():
