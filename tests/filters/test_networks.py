@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from beliefscope.filters.dynamics import Dynamics
-from beliefscope.filters.resample import effective_sample_size, systematic
+from beliefscope.filters.resample import effective_sample_size, multinomial, resample, soft, systematic
 
 
 def test_jacobian_agrees_with_finite_differences() -> None:
@@ -56,6 +56,50 @@ def test_systematic_resampling_is_unbiased() -> None:
     mean_count = torch.stack([(ancestors == i).float().sum(-1).mean() for i in range(8)])
     # Counts differ from their mean by less than 1, so 20,000 runs give it to 1 / sqrt(20000) = 0.007; four of those.
     torch.testing.assert_close(mean_count, 8 * log_weights[0].exp(), rtol=0, atol=0.03)
+
+
+def test_multinomial_resampling_draws_each_particle_with_its_weight() -> None:
+    generator = torch.Generator().manual_seed(7)
+    log_weights = torch.log_softmax(torch.randn(1, 8, generator=generator), dim=-1).expand(20_000, 8)
+    counts = torch.nn.functional.one_hot(multinomial(log_weights, generator), 8).float().sum(1)
+    share = log_weights[0].exp()
+    # Binomial: mean 8 w and variance 8 w (1 - w); 20,000 runs give the mean to 0.01 and the variance to 1-2 %.
+    torch.testing.assert_close(counts.mean(0), 8 * share, rtol=0, atol=0.05)
+    torch.testing.assert_close(counts.var(0), 8 * share * (1 - share), rtol=0.1, atol=0.01)
+
+
+def test_soft_resampling_is_unbiased() -> None:
+    generator = torch.Generator().manual_seed(8)
+    log_weights = torch.log_softmax(2.0 * torch.randn(1, 8, generator=generator), dim=-1).expand(20_000, 8)
+    values = torch.randn(8, generator=generator)
+    before = (log_weights[0].exp() * values).sum()
+    ancestors, corrected = soft(log_weights, 0.5, generator)
+    after = (corrected.exp() * values[ancestors]).sum(-1)
+    # One draw is off by about 0.2, the mean of 20,000 by 0.0015. Unweighted, the particles are off by far more.
+    assert (after.mean() - before).abs() < 0.006
+    assert (values[ancestors].mean() - before).abs() > 0.05
+    torch.testing.assert_close(corrected.exp().sum(-1).mean(), torch.tensor(1.0), rtol=0, atol=0.01)
+
+
+def test_soft_resampling_weighs_by_what_was_not_drawn_from() -> None:
+    # w = (0.9, 0.1): q = (0.7, 0.3) with share 0.5, so a copy weighs w / (2 q) = 9/14 or 1/6.
+    log_weights = torch.tensor([[0.9, 0.1]]).log()
+    ancestors, corrected = soft(log_weights, 0.5, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(corrected.exp(), torch.tensor([9 / 14, 1 / 6])[ancestors])
+    # Drawn from the weights alone, all copies weigh the same.
+    _, equal = soft(log_weights, 1.0, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(equal.exp(), torch.full((1, 2), 0.5))
+
+
+def test_only_soft_resampling_lets_gradients_pass_and_all_weights_are_normalised() -> None:
+    for rule in ("systematic", "hard", "soft"):
+        logits = torch.randn(3, 10, requires_grad=True)
+        _, weights = resample(torch.log_softmax(logits, dim=-1), rule, 0.5, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
+        torch.testing.assert_close(torch.logsumexp(weights, dim=-1), torch.zeros(3), rtol=0, atol=1e-6)
+        assert weights.requires_grad == (rule == "soft")
+    weights.square().sum().backward()
+    assert logits.grad is not None
+    assert logits.grad.abs().sum() > 0
 
 
 def test_effective_sample_size_of_uniform_and_of_one() -> None:

@@ -1,0 +1,315 @@
+"""Every filter of the catalog, for any task, and every option: laws that hold whatever the weights are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from beliefscope.datasets.catalog import TASKS
+from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Component, Task
+from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Evidence, Gaussian, Particles
+from beliefscope.filters.catalog import architecture, build, filters_of
+from beliefscope.filters.ekf import ExtendedKalmanFilter
+from beliefscope.filters.filter import Architecture, Filter
+from beliefscope.filters.lstm import Lstm
+from beliefscope.filters.networks import ImageEncoder, SpatialSoftmax
+from beliefscope.filters.pf import ParticleFilter
+from beliefscope.filters.rollout import Rollout, rollout, start_at_truth
+from beliefscope.filters.ukf import sigma_points, unscented
+
+MakeWindow = Callable[..., Batch]
+NAMES = tuple(filters_of(DOOR))
+FUSED = [name for name in NAMES if name.startswith("crossmodal")]
+
+
+def run(filter_: Filter, batch: Batch, evidence: Evidence | None = None, keep: bool = False) -> Rollout:
+    evidence = filter_.encode(batch) if evidence is None else evidence
+    start = start_at_truth(filter_, batch)
+    return rollout(filter_, evidence, start, torch.Generator().manual_seed(0), particles=20, keep=keep)
+
+
+def lively(filter_: Filter) -> Filter:
+    """Fresh weights, with outputs large enough to be seen."""
+    torch.manual_seed(1)
+    for name, module in filter_.named_modules():
+        if isinstance(module, nn.Linear) and name in ("dynamics.output", "weight_model.output"):
+            nn.init.normal_(module.weight, std=0.5)
+    return filter_
+
+
+# The catalog.
+
+
+def test_names_are_those_of_the_paper_and_a_ukf() -> None:
+    fused = {f"{how}-{kind}" for how in ("feature", "unimodal", "crossmodal") for kind in ("ekf", "pf")}
+    alone = {f"{modality}-{kind}" for modality in ("image", "haptics") for kind in ("ekf", "pf")}
+    assert set(NAMES) == fused | alone | {"lstm", "crossmodal-ukf"}
+
+
+@pytest.fixture
+def foreign(monkeypatch: pytest.MonkeyPatch) -> Task:
+    """A task of one's own: two components and three modalities with names of their own, no picture."""
+    task = Task(
+        name="foreign",
+        components=(Component("x", "m"), Component("y", "m")),
+        observations={"depth": (4,), "sound": (2,), "skin": (3,), "heat": (1,)},
+        modalities={"sight": ("depth",), "hearing": ("sound",), "touch": ("skin", "heat")},
+        control_size=2,
+        dt=0.1,
+        map_components=("x", "y"),
+        map_half_width=0.1,
+    )
+    monkeypatch.setitem(TASKS, task.name, task)
+    return task
+
+
+def test_a_foreign_task_has_them_all_over_its_own_modalities(foreign: Task) -> None:
+    filters = filters_of(foreign)
+    assert {"sight-ekf", "hearing-pf", "touch-ekf"} <= filters.keys()
+    assert "image-ekf" not in filters
+    assert filters["crossmodal-pf"].models == ("sight", "hearing", "touch")
+    assert filters["feature-ekf"].models == ("sight+hearing+touch",)
+    sizes = {"sight": 4, "hearing": 2, "touch": 4}
+    observations = {m: torch.randn(5, 2, size) for m, size in sizes.items()}
+    states = torch.randn(5, 2, 2)
+    batch = Batch(observations, torch.randn(5, 2, 2), states, torch.zeros(5, 2, dtype=torch.bool), states[0])
+    for name in filters:
+        result = run(build(architecture("foreign", name)), batch, keep=True)
+        assert torch.isfinite(result.estimate.mean).all(), name
+        if name.startswith("crossmodal"):
+            modality = result.steps[0].modality
+            assert modality is None or modality.mean.shape == (2, 3, 2)
+
+
+def test_unknown_names_are_refused_with_those_there_are(foreign: Task) -> None:
+    with pytest.raises(BadInput, match=r"filter 'image-ekf' does not exist\. Available: .*sight-ekf.*lstm"):
+        architecture("foreign", "image-ekf")
+    with pytest.raises(BadInput, match=r"task 'dor' does not exist\. Available: door"):
+        architecture("dor", "lstm")
+
+
+# JSON.
+
+
+def test_architectures_survive_json() -> None:
+    odd = Architecture(
+        "door", "pf", "unimodal", ("image",), 32, 1, "mean", "moments", True, "raw", "soft", soft_share=0.25
+    )
+    for one in (*filters_of(DOOR).values(), odd):
+        assert Architecture.from_json(one.to_json()) == one
+
+
+def test_what_an_older_checkpoint_does_not_say_takes_its_default() -> None:
+    older = {"task": "door", "kind": "pf", "fusion": "crossmodal", "models": ["image", "haptics"], "units": 64}
+    assert Architecture.from_json(older) == Architecture("door", "pf")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "kf"}, "kind of a filter 'kf' does not exist. Available: ekf, ukf, pf, lstm."),
+        ({"pooling": "max"}, "pooling of a filter 'max' does not exist. Available: flatten, spatial-softmax, mean."),
+        ({"resampling": "none"}, "resampling of a filter 'none' does not exist. Available: systematic, hard, soft."),
+        ({"soft_share": 0.0}, "soft_share must be above 0 and at most 1, not 0.0"),
+        ({"colour": "red"}, "not an architecture of this version: .*'colour'"),
+        ({"models": ["smell"]}, r"Modality 'smell' is not in task 'door'\. Available: image, haptics\."),
+    ],
+)
+def test_bad_architectures(change: dict, message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        build(Architecture.from_json(Architecture("door", "ekf").to_json() | change))
+
+
+# Laws of all filters.
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_flow_through_16_steps_to_every_weight(name: str, window: MakeWindow) -> None:
+    filter_, batch = build(architecture("door", name)), window(16, 2)
+    estimate = run(filter_, batch).estimate
+    loss = (estimate.mean - batch.states).square().mean()
+    if filter_.has_covariance:
+        loss = loss + estimate.covariance.square().mean()
+    loss.backward()
+    for parameter_name, parameter in filter_.named_parameters():
+        assert parameter.grad is not None, parameter_name
+        assert torch.isfinite(parameter.grad).all(), parameter_name
+        assert parameter.grad.abs().sum() > 0, parameter_name
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith(("crossmodal", "unimodal"))])
+def test_the_order_of_modalities_does_not_matter(name: str, window: MakeWindow) -> None:
+    filter_, batch = lively(build(architecture("door", name))), window(8, 3)
+    turned = build(replace(filter_.architecture, models=filter_.names[::-1]))
+    state = {key: value for key, value in filter_.state_dict().items() if not key.startswith("weight_model.")}
+    turned.load_state_dict(state, strict=False)
+    with torch.no_grad():
+        evidence = filter_.encode(batch)
+        flip = {"control": evidence.control, "observation": evidence.observation.flip(2)}
+        noise, weights = evidence.noise, evidence.log_weights
+        flipped = Evidence(
+            **flip,
+            noise=None if noise is None else noise.flip(2),
+            log_weights=None if weights is None else weights.flip(2),
+        )
+        here, there = run(filter_, batch, evidence).estimate, run(turned, batch, flipped).estimate
+    # Sums are taken in another order; a particle's ancestor may change where a pointer lies on an edge, not here.
+    torch.testing.assert_close(there.mean, here.mean, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(there.covariance, here.covariance, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+@pytest.mark.parametrize("k", [0, 1])
+@pytest.mark.parametrize("name", FUSED)
+def test_one_hot_beta_is_the_filter_on_that_modality_alone(
+    name: str, k: int, feedback: bool, window: MakeWindow
+) -> None:
+    filter_ = lively(build(replace(architecture("door", name), feedback=feedback)))
+    alone = build(replace(filter_.architecture, fusion="none", models=(filter_.names[k],)))
+    alone.load_state_dict({key: filter_.state_dict()[key] for key in alone.state_dict()})
+    batch = window(8, 3)
+    with torch.no_grad():
+        fused, single = run(filter_, batch, filter_.encode(batch).only(k)).estimate, run(alone, batch).estimate
+    torch.testing.assert_close(fused.mean, single.mean, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(fused.covariance, single.covariance, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "lstm"])
+def test_covariances_are_positive_definite(name: str, window: MakeWindow) -> None:
+    with torch.no_grad():
+        covariance = run(lively(build(architecture("door", name))), window(12, 4)).estimate.covariance
+    torch.testing.assert_close(covariance, covariance.transpose(-1, -2))
+    assert torch.linalg.eigvalsh(covariance.double()).min() > 0
+
+
+# Options.
+
+
+def banks(feedback: bool, window: MakeWindow) -> tuple[Gaussian, Gaussian]:
+    """The bank that goes on after one step, and the fused belief."""
+    filter_ = lively(build(replace(architecture("door", "crossmodal-ekf"), feedback=feedback)))
+    assert isinstance(filter_, ExtendedKalmanFilter)
+    batch = window(1, 3)
+    with torch.no_grad():
+        start = filter_.start(start_at_truth(filter_, batch), 0, torch.Generator())
+        bank, trace = filter_.step(start, filter_.encode(batch)[0], torch.Generator())
+    return bank, trace.estimate
+
+
+def test_feedback_hands_every_filter_the_fused_belief(window: MakeWindow) -> None:
+    bank, fused = banks(True, window)
+    for k in range(2):
+        assert torch.equal(bank.mean[:, k], fused.mean)
+        assert torch.equal(bank.covariance[:, k], fused.covariance)
+    bank, fused = banks(False, window)
+    assert (bank.mean[:, 0] - bank.mean[:, 1]).abs().min() > 1e-3
+
+
+def posterior(likelihoods: str, offset: float, window: MakeWindow) -> Tensor:
+    """Log-weights after a step whose haptics log-likelihood is higher by a constant."""
+
+    class Shifted(ParticleFilter):
+        def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
+            return super().log_likelihood(evidence, 20.0 * states) + torch.tensor([0.0, offset]).unsqueeze(-1)
+
+    torch.manual_seed(0)
+    options = replace(architecture("door", "crossmodal-pf"), likelihoods=likelihoods)  # type: ignore[arg-type]
+    filter_, batch = Shifted(options), window(1, 2)
+    with torch.no_grad():
+        step = run(filter_, batch, keep=True).steps[0].posterior
+    assert isinstance(step, Particles)
+    return step.log_weights
+
+
+def test_normalised_likelihoods_do_not_depend_on_their_scale_and_raw_ones_do(window: MakeWindow) -> None:
+    torch.testing.assert_close(
+        posterior("normalised", 9.0, window), posterior("normalised", 0.0, window), rtol=1e-4, atol=1e-4
+    )
+    assert (posterior("raw", 9.0, window) - posterior("raw", 0.0, window)).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("pooling", ["flatten", "spatial-softmax", "mean"])
+def test_encoders_of_every_pooling_learn(pooling: str, stride: int) -> None:
+    encoder = ImageEncoder((32, 32), 16, stride, pooling)  # type: ignore[arg-type]
+    features = encoder(torch.randn(3, 32, 32))
+    assert features.shape == (3, 16)
+    features.square().sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in encoder.parameters())
+
+
+def test_the_spatial_softmax_says_where_a_channel_is_active() -> None:
+    channels = torch.zeros(1, 2, 5, 9)
+    channels[0, 0, 1, 6] = 100.0  # row 1 of 0..4 is y = -0.5, column 6 of 0..8 is x = 0.5
+    torch.testing.assert_close(SpatialSoftmax()(channels), torch.tensor([[0.5, 0.0, -0.5, 0.0]]))
+
+
+# The unscented transform.
+
+
+def test_sigma_points_have_the_moments_they_were_made_from() -> None:
+    root = torch.randn(4, 3, 3, dtype=torch.float64)
+    belief = Gaussian(torch.randn(4, 3, dtype=torch.float64), root @ root.transpose(-1, -2))
+    again = unscented(sigma_points(belief))
+    torch.testing.assert_close(again.mean, belief.mean)
+    torch.testing.assert_close(again.covariance, belief.covariance)
+
+
+def test_the_square_of_a_gaussian_by_hand() -> None:
+    # x ~ N(m, s^2): x^2 has mean m^2 + s^2 and variance 4 m^2 s^2 + 2 s^4; here m = 3, s = 2: 13 and 176.
+    belief = Gaussian(torch.tensor([[3.0]]), torch.tensor([[[4.0]]]))
+    squared = unscented(sigma_points(belief).square())
+    assert squared.mean.item() == pytest.approx(13.0)
+    assert squared.covariance.item() == pytest.approx(176.0)
+
+
+# The LSTM.
+
+
+@pytest.fixture
+def lstm() -> Lstm:
+    filter_ = build(architecture("door", "lstm"))
+    assert isinstance(filter_, Lstm)
+    return filter_.requires_grad_(False)
+
+
+def test_the_lstm_is_pytorchs_own(lstm: Lstm, window: MakeWindow) -> None:
+    reference = nn.LSTM(64, 512, 2).requires_grad_(False)
+    for i, cell in enumerate(lstm.layers):
+        getattr(reference, f"weight_ih_l{i}").copy_(cell.weight_x.T)
+        getattr(reference, f"weight_hh_l{i}").copy_(cell.weight_h.T)
+        getattr(reference, f"bias_ih_l{i}").copy_(cell.bias)
+        getattr(reference, f"bias_hh_l{i}").zero_()
+    batch = window(10, 3)
+    evidence = lstm.encode(batch)
+    hidden = lstm.start(start_at_truth(lstm, batch), 0, torch.Generator()).hidden
+    first = tuple(hidden[:, :, i].transpose(0, 1).contiguous() for i in range(2))
+    expected = lstm.output(reference(evidence.observation.squeeze(2), first)[0])
+    torch.testing.assert_close(run(lstm, batch, evidence).estimate.mean, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_lstm_takes_the_same_steps_one_by_one(lstm: Lstm, window: MakeWindow) -> None:
+    batch, generator = window(10, 3), torch.Generator()
+    evidence = lstm.encode(batch)
+    belief = lstm.start(start_at_truth(lstm, batch), 0, generator)
+    at_once = list(lstm.steps(belief, evidence, generator))
+    for t, trace in enumerate(at_once):
+        assert trace.predicted.hidden.equal(belief.hidden)  # type: ignore[union-attr]
+        belief, step = lstm.step(belief, evidence[t], generator)
+        assert step.estimate.mean.equal(trace.estimate.mean)
+        assert step.posterior.hidden.equal(trace.posterior.hidden)  # type: ignore[union-attr]
+
+
+def test_the_lstm_starts_at_the_first_belief_and_knows_no_covariance(lstm: Lstm, window: MakeWindow) -> None:
+    batch = window(3, 2)
+    elsewhere = run(lstm, replace(batch, previous=batch.previous + 1.0)).estimate
+    assert (elsewhere.mean[0] - run(lstm, batch).estimate.mean[0]).abs().max() > 1e-4
+    assert elsewhere.covariance.shape == (3, 2, 3, 3)
+    assert torch.isnan(elsewhere.covariance).all()

@@ -1,0 +1,100 @@
+"""Step by step against FilterPy, which shares no line with this project."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from beliefscope.filters.belief import Gaussian
+from beliefscope.filters.catalog import KINDS
+from beliefscope.filters.dynamics import Dynamics
+from beliefscope.filters.filter import Architecture
+from beliefscope.filters.resample import systematic
+from beliefscope.filters.rollout import rollout
+from beliefscope.filters.ukf import ALPHA, BETA, KAPPA
+
+sys.path.insert(0, str(Path(__file__).parent))
+import linear
+
+kalman = pytest.importorskip("filterpy.kalman", reason="FilterPy is not installed: pip install -e '.[dev]'")
+monte_carlo = pytest.importorskip("filterpy.monte_carlo")
+
+Array = NDArray[np.float64]
+STEPS = 30
+R = np.diag(linear.R_STD**2)
+
+
+@pytest.fixture
+def dynamics() -> Dynamics:
+    """A network that bends: its fresh output layer would be almost zero."""
+    torch.manual_seed(7)
+    model = Dynamics(n=3, control_size=3, units=16).double()
+    torch.nn.init.normal_(model.output.weight, std=0.6)
+    torch.nn.init.constant_(model.log_noise, -1.5)
+    return model.requires_grad_(False)
+
+
+class Extended(kalman.ExtendedKalmanFilter):  # type: ignore[misc, name-defined]
+    """FilterPy's, whose Jacobian comes from reverse-mode differentiation."""
+
+    def __init__(self, dynamics: Dynamics) -> None:
+        super().__init__(dim_x=3, dim_z=3)
+        self.dynamics = dynamics
+
+    def predict_x(self, u: Tensor) -> None:  # type: ignore[override]
+        x = torch.from_numpy(self.x)
+        self.F = torch.autograd.functional.jacobian(lambda state: self.dynamics(state, u), x).numpy()
+        self.x = self.dynamics(x, u).numpy()
+
+
+def extended(dynamics: Dynamics, parts: Tensor, observations: Array) -> Iterator[tuple[Array, Array]]:
+    oracle = Extended(dynamics)
+    oracle.x, oracle.P, oracle.Q, oracle.R = np.zeros(3), linear.START, np.diag(dynamics.noise.numpy() ** 2), R
+    for u, z in zip(parts, observations, strict=True):
+        oracle.predict(u)
+        oracle.update(z, HJacobian=lambda x: np.eye(3), Hx=lambda x: x)
+        yield oracle.x, oracle.P
+
+
+def unscented(dynamics: Dynamics, parts: Tensor, observations: Array) -> Iterator[tuple[Array, Array]]:
+    points = kalman.MerweScaledSigmaPoints(3, ALPHA, BETA, KAPPA)
+    oracle = kalman.UnscentedKalmanFilter(
+        3, 3, 1.0, hx=lambda x: x, fx=lambda x, dt, u: dynamics(torch.from_numpy(x), u).numpy(), points=points
+    )
+    oracle.x, oracle.P, oracle.Q, oracle.R = np.zeros(3), linear.START, np.diag(dynamics.noise.numpy() ** 2), R
+    for u, z in zip(parts, observations, strict=True):
+        oracle.predict(u=u)
+        oracle.update(z)
+        yield oracle.x, oracle.P
+
+
+@pytest.mark.parametrize(("kind", "oracle"), [("ekf", extended), ("ukf", unscented)])
+def test_nonlinear_kalman_filters(kind: str, oracle: object, dynamics: Dynamics) -> None:
+    controls, observations = linear.simulate(STEPS, seed=5)
+    evidence = linear.evidence(controls, observations)
+    parts = dynamics.control_part(evidence.control)
+    filter_ = KINDS[kind](Architecture("door", kind, "none", ("haptics",)))  # type: ignore[index, arg-type]
+    filter_.dynamics = dynamics
+    start = Gaussian(torch.zeros(1, 3, dtype=torch.float64), torch.from_numpy(linear.START)[None])
+    from_parts = type(evidence)(parts, evidence.observation, evidence.noise, None)
+    estimate = rollout(filter_, from_parts, start, torch.Generator()).estimate
+    means, covariances = zip(*oracle(dynamics, parts[:, 0], observations), strict=True)  # type: ignore[operator]
+    np.testing.assert_allclose(estimate.mean[:, 0].numpy(), np.array(means), rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(estimate.covariance[:, 0].numpy(), np.array(covariances), rtol=1e-8, atol=1e-11)
+
+
+def test_systematic_resampling_with_the_same_offset(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(1)
+    log_weights = torch.log_softmax(2.0 * torch.randn(20, 64, generator=generator, dtype=torch.float64), dim=-1)
+    ours = systematic(log_weights, torch.Generator().manual_seed(2))
+    offsets = iter(torch.rand(20, 1, generator=torch.Generator().manual_seed(2)).flatten().tolist())
+    monkeypatch.setattr("filterpy.monte_carlo.resampling.random", lambda: next(offsets))
+    theirs = [monte_carlo.systematic_resample(row) for row in log_weights.exp().numpy()]
+    np.testing.assert_array_equal(ours.numpy(), theirs)
