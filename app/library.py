@@ -141,16 +141,25 @@ class Library:
                 given = self.settings.checkpoints
                 if name not in given and name not in known:
                     raise one_of("filter", name, [*given, *(f for f in known if f not in given)])
-                checkpoint = load_checkpoint(given[name] if name in given else shipped(task, name))
-                if checkpoint.task.name != task:
-                    raise BadInput(f"filter {name!r} is for task {checkpoint.task.name!r}, not for {task!r}.")
-                self._checkpoints[task, name] = checkpoint
+                checkpoint = load_checkpoint(given[name]) if name in given else None
+                if checkpoint is not None and checkpoint.task.name != task:
+                    if name not in known:
+                        raise BadInput(f"filter {name!r} is for task {checkpoint.task.name!r}, not for {task!r}.")
+                    checkpoint = None  # the one that ships for this task
+                self._checkpoints[task, name] = checkpoint or load_checkpoint(shipped(task, name))
             return self._checkpoints[task, name]
 
     def catalog(self) -> dict[str, Any]:
         """``tasks`` that can be shown, and ``problems``: one line for each thing given that cannot be."""
         tasks, problems = [], []
-        for name in TASKS:
+        of_task: dict[str, list[str]] = {}
+        for filter_name, path in self.settings.checkpoints.items():
+            try:
+                of_task.setdefault(load_checkpoint(path).task.name, []).append(filter_name)
+            except BadInput as error:
+                problems.append(str(error))
+        # What was given comes first.
+        for name in sorted(TASKS, key=lambda name: name not in self.settings.data):
             try:
                 data = self.dataset(name)
             except BadInput as error:
@@ -158,12 +167,9 @@ class Library:
                     problems.append(str(error))
                 continue
             filters = []
-            for filter_name in dict.fromkeys([*filters_of(data.task), *self.settings.checkpoints]):
-                try:
+            for filter_name in dict.fromkeys([*of_task.get(name, []), *filters_of(data.task)]):
+                with suppress(BadInput):  # most do not ship; one that was given and is bad is a problem already
                     filters.append(_described(filter_name, self.checkpoint(name, filter_name)))
-                except BadInput as error:
-                    if filter_name in self.settings.checkpoints:
-                        problems.append(str(error))
             tasks.append(_task(data.task, filters, data))
         return {"tasks": tasks, "problems": problems}
 
@@ -177,8 +183,7 @@ class Library:
             names = [f["name"] for f in task["filters"]]
             if names:
                 name = DEFAULT_FILTER if DEFAULT_FILTER in names else names[0]
-                tested = (e["index"] for e in task["episodes"] if e["split"] == "test")
-                return Selection(task["name"], name, next(tested, 0))
+                return Selection(task["name"], name, self.dataset(task["name"]).held_out()[0])
         raise BadInput("; ".join(catalog["problems"]) or "no trained filter is there to show; train one first.")
 
     def traced(self, selection: Selection) -> Traced:

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 
 from beliefscope.app.cli import main
-from beliefscope.app.library import Library, Settings
+from beliefscope.app.commands.serve import named, tasks_of
+from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.datasets import catalog
 from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.errors import BadInput
@@ -83,14 +84,22 @@ def test_whole_way(folder: Path) -> None:
 
 
 def test_page_shows_it(folder: Path, tmp_path: Path) -> None:
-    settings = Settings(tmp_path, data={"ball": folder / "own.h5"}, checkpoints={"own": folder / "own.safetensors"})
-    library = Library(settings)
     with fresh():
-        find_task(SPEC)
-        (shown,) = [entry for entry in library.catalog()["tasks"] if entry["name"] == "ball"]
-        library.close()
-    assert [one["name"] for one in shown["filters"]] == ["own"]
-    assert len(shown["episodes"]) == 100
+        data = tasks_of([folder / "own.h5"], [SPEC])
+        library = Library(Settings(tmp_path, data, checkpoints=named([folder / "own.safetensors"])))
+        try:
+            catalog = library.catalog()
+            assert catalog["problems"] == []
+            shown = catalog["tasks"][0]
+            assert (shown["name"], len(shown["episodes"])) == ("ball", 100)
+            assert [one["name"] for one in shown["filters"]] == ["own"]
+            assert library.default() == Selection("ball", "own", 9)
+            traced = library.traced(library.default())
+            assert traced.trace.modalities == ("image", "sound")
+            assert len(traced.columns[1]) > 0
+            assert traced.map(3, None, 41).layers == ("image", "sound", "fused")
+        finally:
+            library.close()
 
 
 def test_its_filter_says_whose_it_is(folder: Path) -> None:
