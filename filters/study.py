@@ -204,7 +204,7 @@ def run_ray(cells: Sequence[Cell], folder: Path) -> Iterator[tuple[Cell, Documen
         raise BadInput("engine 'ray' needs Ray: pip install 'beliefscope[ray]'") from None
     ours = not ray.is_initialized()
     if ours:
-        quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
         try:
             ray.init("auto", **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
@@ -288,7 +288,8 @@ def rows_of(documents: Mapping[Cell, Document | None]) -> list[Row]:
 def _numbers(document: Document, blackout: float) -> dict[str, float | None]:
     fused = document["metrics"][f"{blackout:g}"]["fused"]
     rest = {key: fused[key] for key in ("nll", "nees", "coverage95")}
-    return fused["rmse"] | rest | {"seconds": document["seconds"]}
+    rmse = {key: fused["rmse"][key] for key in document["trivial"]}
+    return rmse | rest | {"seconds": document["seconds"]}
 
 
 def _over_seeds(numbers: Sequence[Mapping[str, float | None]]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -54,6 +54,9 @@ WIDTH = 7.16
 TALLEST = 2.0
 """Times the trivial predictor's error: taller bars are cut off there, and say their value."""
 
+HIGHEST = 2.0
+"""Times the tallest bar: above, the trivial predictor's line would press all bars flat; its error is in the title."""
+
 
 def write_results(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Writes ``results.svg`` and ``results.png`` (300 dpi) of a study's table; see ``results``."""
@@ -71,8 +74,8 @@ def write_results(rows: Sequence[Row], folder: Path) -> list[Path]:
 def results(rows: Sequence[Row]) -> Figure:
     """RMSE by chance of black pictures: a panel for each task and quantity, a bar for each filter, spread on top.
 
-    The dashed line is the error of always predicting the training mean. A filter without a finished seed has a cross
-    in its place.
+    The dashed line is the error of always predicting the training mean; far above all bars, it is told in the title. A
+    filter without a finished seed has a cross in its place.
     """
     filters = list(dict.fromkeys(row.filter for row in rows if row.filter != TRIVIAL))
     panels = [(task, key, title) for task in dict.fromkeys(r.task for r in rows) for key, title in shown(task)]
@@ -89,7 +92,8 @@ def results(rows: Sequence[Row]) -> Figure:
         bars(axis, [r for r in rows if r.task == task], key, look)
         axis.set_title(f"{task}: {title}", loc="left")
     handles: list[Patch | Line2D] = [Patch(label=name, **look[name]) for name in filters]
-    handles.append(Line2D([], [], color="black", linestyle="--", linewidth=0.8, label=TRIVIAL))
+    if any(line.get_linestyle() == "--" for axis in axes for line in axis.lines):
+        handles.append(Line2D([], [], color="black", linestyle="--", linewidth=0.8, label=TRIVIAL))
     if any(not row.seeds for row in rows if row.filter != TRIVIAL):
         handles.append(Line2D([], [], color="gray", linestyle="", marker="x", markersize=3, label="missing"))
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, handlelength=1.6)
@@ -124,12 +128,17 @@ def bars(axis: Axes, rows: Sequence[Row], key: str, look: Mapping[str, Mapping[s
     filters = [name for name in look if any(row.filter == name for row in rows)]
     blackouts = list(dict.fromkeys(row.blackout for row in rows if row.blackout is not None))
     width = 0.84 / len(filters)
-    known = [value + (row.spread.get(key) or 0.0) for row in rows if (value := row.mean.get(key)) is not None]
     mean = next((row.mean[key] for row in rows if row.filter == TRIVIAL), None)
-    top = max(known, default=1.0)
+    unit = key.rsplit("_", 1)[1]
+    rows = [row for row in rows if row.filter != TRIVIAL]
+    known = [value + (row.spread.get(key) or 0.0) for row in rows if (value := row.mean.get(key)) is not None]
+    top = max(known, default=mean or 1.0)
     if mean is not None:
-        top = min(top, TALLEST * mean)
-        axis.axhline(mean, color="black", linestyle="--", linewidth=0.8, zorder=3)
+        top = min(max(top, mean) if mean < HIGHEST * top else top, TALLEST * mean)
+        if mean <= top:
+            axis.axhline(mean, color="black", linestyle="--", linewidth=0.8, zorder=3)
+        else:
+            axis.set_title(f"{TRIVIAL}: {mean:.1f} {unit}", loc="right", fontsize=7, color="#555555")
     for row in rows:
         if row.blackout is None:
             continue
@@ -149,6 +158,6 @@ def bars(axis: Axes, rows: Sequence[Row], key: str, look: Mapping[str, Mapping[s
     axis.set_xticks(range(len(blackouts)), [f"{b:.0%} black pictures" for b in blackouts])
     axis.tick_params(axis="x", length=0)
     axis.tick_params(axis="y", width=0.6, length=2)
-    axis.set_ylabel(f"RMSE ({key.rsplit('_', 1)[1]})")
+    axis.set_ylabel(f"RMSE ({unit})")
     axis.set_axisbelow(True)
     axis.grid(axis="y", linewidth=0.3, color="#cccccc")

@@ -70,7 +70,8 @@ def study(
     cells = matrix(preset, tasks or [], filters or [], seeds, data or [], skip_bad)
     folder = output.resolve()
     folder.mkdir(exist_ok=True)
-    done: list[Cell] = []
+    finished = [cell for cell in cells if cell.finished(folder) is not None]
+    left, done = [cell for cell in cells if cell not in finished], list(finished)
 
     with console.bars() as move:
 
@@ -78,14 +79,13 @@ def study(
             move("Cells", len(done) / len(cells), f"{len(done) + 1} of {len(cells)}: {cell}")
             return lambda stage, step, count, loss: move("Stage", step / count, f"{stage}, loss {loss:.3g}")
 
-        write(folder, cells, preset)
-        for cell, document in run_ray(cells, folder) if engine == "ray" else run_local(cells, folder, report):
+        rows, overview = write(folder, cells, preset)
+        for cell, document in run_ray(left, folder) if engine == "ray" else run_local(left, folder, report):
             done.append(cell)
             move("Cells", len(done) / len(cells), f"{len(done)} of {len(cells)}: {cell}")
             if "error" in document:
                 console.say(f"failed: {cell}: {document['error']}")
-            write(folder, cells, preset)
-        rows, overview = write(folder, cells, preset)
+            rows, overview = write(folder, cells, preset)
     failed = {name: state for name, state in overview["cells"].items() if state != "finished"}
     title = f"{folder / 'table.md'}: {len(cells) - len(failed)} of {len(cells)} cells finished"
     console.result(overview | {"path": str(output)}, f"{title}\n\n{to_markdown(rows)}", json)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -122,4 +123,7 @@ def losses(folder: Path | None) -> Iterator[Callable[[str, str, int, float], Non
     from tensorboardX import SummaryWriter
 
     with SummaryWriter(str(folder)) as writer:
-        yield lambda kind, stage, step, loss: writer.add_scalar(f"{stage}/{kind}", loss, step)
+        # Tags hold neither spaces nor commas.
+        yield lambda kind, stage, step, loss: writer.add_scalar(
+            f"{re.sub('[^a-z0-9]+', '_', stage)}/{kind}", loss, step
+        )
