@@ -32,6 +32,10 @@ HEAVY = {
     "mjviser": ("app",),
     "typer": ("app",),
     "rich": ("app",),
+    "tensorboardX": ("app",),
+    "scipy": ("filters", "inspect"),
+    "ray": ("filters",),
+    "matplotlib": ("recordings",),
 }
 """Distribution's top-level module -> folders that may import it."""
 

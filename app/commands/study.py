@@ -80,6 +80,7 @@ def study(
             return lambda stage, step, count, loss: move("Stage", step / count, f"{stage}, loss {loss:.3g}")
 
         rows, overview = write(folder, cells, preset)
+        move("Cells", len(done) / len(cells), f"{len(done)} of {len(cells)}")
         for cell, document in run_ray(left, folder) if engine == "ray" else run_local(left, folder, report):
             done.append(cell)
             move("Cells", len(done) / len(cells), f"{len(done)} of {len(cells)}: {cell}")
