@@ -172,3 +172,13 @@ class Encoders(nn.Module):
             else:
                 features.append(encoder(observed))
         return torch.cat(features, dim=-1)
+
+
+def fresh(module: nn.Module) -> None:
+    """New weights for a module, drawn from torch's global generator."""
+    reset = getattr(module, "reset_parameters", None)
+    if callable(reset):
+        reset()
+    else:
+        for child in module.children():
+            fresh(child)

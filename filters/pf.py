@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -81,11 +82,12 @@ class ParticleFilter(Filter):
 
     def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
         """Of each modality, for particles (N, M, n) at one step: (N, K, M), not normalised."""
-        values = []
-        for k, name in enumerate(self.names):
-            model, part = self.measurement_model(name), evidence.observation[:, k, None]
-            values.append(in_groups(lambda x, m=model, p=part: m.log_likelihood(p, m.state_part(x)), states))
-        return torch.stack(values, dim=1)
+
+        def of(k: int, states: Tensor) -> Tensor:
+            model = self.measurement_model(self.names[k])
+            return model.log_likelihood(evidence.observation[:, k, None], model.state_part(states))
+
+        return torch.stack([in_groups(partial(of, k), states) for k in range(len(self.names))], dim=1)
 
     def scale(self, log_weights: Tensor, log_likelihood: Tensor) -> Tensor:
         """(N, K, 1) what is taken off each model's log-likelihoods (N, K, M) before they are fused.

@@ -15,11 +15,10 @@ from torch import Tensor, nn
 from beliefscope.filters import losses
 from beliefscope.filters.batch import Batch, Steps, black_out, shift
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.dynamics import Dynamics
 from beliefscope.filters.ekf import VirtualSensor
 from beliefscope.filters.filter import Filter, modality_shape
 from beliefscope.filters.kept import Parts, key_of
-from beliefscope.filters.networks import PICTURES_AT_ONCE, ImageEncoder
+from beliefscope.filters.networks import PICTURES_AT_ONCE, ImageEncoder, fresh
 from beliefscope.filters.pf import MeasurementModel
 from beliefscope.filters.rollout import START_VARIANCE, rollout, start_at_truth
 
@@ -393,12 +392,3 @@ class Trainer:
         self.generator.set_state(states[0])
         self.noise.set_state(states[1])
         return total
-
-
-def fresh(module: nn.Module) -> None:
-    """New weights for a module, drawn from torch's global generator."""
-    if isinstance(module, Dynamics | nn.Linear | nn.Conv2d):
-        module.reset_parameters()
-    else:
-        for child in module.children():
-            fresh(child)
