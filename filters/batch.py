@@ -166,10 +166,12 @@ class Statistics(nn.Module):
         values = {"state": steps.states, "control": steps.controls, **steps.observations}
         values = {name: array[rows] for name, array in values.items()}
         for name, array in values.items():
-            flat = array.flatten()[:, None] if array.dtype == torch.uint8 else array
             mean, std = self.mean_std(name)
-            mean.copy_(flat.double().mean(0))
-            deviation = flat.double().std(0)
+            if array.dtype == torch.uint8:
+                average, deviation = _gray_mean_std(array)
+            else:
+                average, deviation = array.double().mean(0), array.double().std(0)
+            mean.copy_(average)
             std.copy_(torch.where(deviation > SMALLEST_STD, deviation, torch.ones_like(deviation)))
 
     def standardise(self, name: str, values: Tensor) -> Tensor:
@@ -192,6 +194,16 @@ class Statistics(nn.Module):
         """Standardised covariances (..., n, n) to m^2, m rad, rad^2."""
         std = self.get_buffer("state_std")
         return covariance * std * std[:, None]
+
+
+def _gray_mean_std(pictures: Tensor) -> tuple[Tensor, Tensor]:
+    """(1,), (1,) over all pixels, from how often each gray is there: doubles would take eight times the memory."""
+    counts = torch.zeros(256, dtype=torch.float64, device=pictures.device)
+    for part in pictures.split(4096):
+        counts += torch.bincount(part.flatten(), minlength=256)
+    gray = torch.arange(256, dtype=torch.float64, device=pictures.device)
+    mean = (counts @ gray) / counts.sum()
+    return mean[None], (counts @ (gray - mean).square() / (counts.sum() - 1)).sqrt()[None]
 
 
 def black_out(batch: Batch, probability: Tensor, generator: torch.Generator) -> Batch:
