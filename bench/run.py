@@ -13,6 +13,7 @@ import sys
 
 import collect
 import filters
+import loading
 import maps
 import page
 import recordings
@@ -24,6 +25,7 @@ PARTS = {
     "collect": collect.measure,
     "filters": filters.measure,
     "maps": maps.measure,
+    "loading": loading.measure,
     "recordings": recordings.measure,
     "page": page.measure,
 }

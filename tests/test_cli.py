@@ -356,6 +356,16 @@ def test_every_way_to_write_a_recipe_is_the_same(run: Run, folder: Path) -> None
     assert evaluated("""--recipe '{"blackout": 0.4, "only": "image"}'""") == alone
 
 
+def test_what_is_bad_can_be_left_out(run: Run, folder: Path) -> None:
+    line = f"trace {EKF} --data shape.h5 -o some.trace"
+    assert run(line)[0] == 2
+    code, out, err = run(f"{line} --skip-bad --json -")
+    assert code == 0
+    left_out = "left out: shape.h5: 'states' of trajectory9 has shape (100, 2), expected (100, 3)."
+    assert err.splitlines()[0] == left_out
+    assert json.loads(out)["episode"] == 18, "the first of the held-out ones, now that the tenth is gone"
+
+
 def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> None:
     run("collect door --episodes 10 --steps 20 --workers 1 -o ten.h5")
     line = "train door --filter crossmodal-pf --data ten.h5 --preset smoke -o pf.safetensors --json -"

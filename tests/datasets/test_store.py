@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -242,6 +243,31 @@ def test_what_is_wrong_is_named(path: Path, edit: Edit, message: str) -> None:
     with h5py.File(path, "r+") as file:
         edit(file)
     refuse(path, message)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (without("trajectory0/states"), r"trajectory0 has no 'states'"),
+        (replaced("trajectory0", np.zeros(3)), "trajectory0 is not a group"),
+        (attribute("trajectory0", "dt", 0.05), r"'dt' of trajectory0 is 0\.05 s"),
+        (replaced("trajectory0/observations/torque", with_nan((STEPS, 3))), r"is \[nan nan nan\] at step 3"),
+        (attribute("trajectory0", "split", "val"), "the arrays of trajectory0 do not match its digest"),
+    ],
+)
+def test_the_good_trajectories_of_a_bad_file_can_be_used(path: Path, edit: Edit, message: str) -> None:
+    with h5py.File(path, "r+") as file:
+        edit(file)
+    with open_dataset(path, skip_bad=True) as data:
+        (line,) = data.left_out
+        assert re.search(message, line)
+        assert str(path) in line
+        assert [episode.digest() for episode in data] == [made_up(1, "val").digest()]
+        assert [(s.index, s.split) for s in data.summaries] == [(0, "val")]
+    with h5py.File(path, "r+") as file:
+        del file["trajectory1/controls"]
+    with pytest.raises(BadInput, match=r"holds no trajectory that can be used\. The first: "):
+        open_dataset(path, skip_bad=True)
 
 
 def test_a_foreign_file_is_told_what_it_lacks(tmp_path: Path) -> None:
