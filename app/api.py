@@ -11,8 +11,9 @@ from concurrent.futures import TimeoutError as NotYet
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import quote
 
-from fastapi import APIRouter, Body, HTTPException, Request, WebSocket
+from fastapi import APIRouter, Body, Depends, HTTPException, Request, WebSocket
 from fastapi.responses import FileResponse, JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -20,9 +21,10 @@ from beliefscope import __version__
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.proxy import client_page
 from beliefscope.app.session import Views
-from beliefscope.app.wire import header
+from beliefscope.app.wire import header, pictures
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.corrupt import Recipe, described
+from beliefscope.inspect.likelihood import no_maps
 from beliefscope.recordings.write import write_recording
 
 RECORDING = re.compile(r"(?P<task>.+)-(?P<filter>.+)-episode(?P<episode>\d+)-[0-9a-f]{8}")
@@ -37,6 +39,7 @@ class RecordingRequest(BaseModel):
     filter: str
     episode: int
     recipe: str = ""
+    data: str = ""
     maps: Annotated[int, Field(ge=0)] = 0
 
 
@@ -45,6 +48,14 @@ class ViewRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
     dark: bool = False
+
+
+def _selection(task: str, filter: str, episode: int, recipe: str = "", data: str = "") -> Selection:
+    return Selection(task, filter, episode, Recipe.parse(recipe), data)
+
+
+Asked = Annotated[Selection, Depends(_selection)]
+"""What a path and its query name."""
 
 
 def routes(library: Library, views: Views) -> APIRouter:
@@ -64,26 +75,28 @@ def routes(library: Library, views: Views) -> APIRouter:
         return {"version": __version__, "faults": described(), **library.catalog()}
 
     @router.get("/api/trace/{task}/{filter}/{episode}")
-    def trace_header(task: str, filter: str, episode: int, recipe: str = "") -> Response:
-        traced = library.traced(Selection(task, filter, episode, Recipe.parse(recipe)))
+    def trace_header(asked: Asked) -> Response:
+        traced = library.traced(asked)
         try:
             trace = traced.done.result(timeout=PATIENCE)
         except NotYet:
             return JSONResponse({"progress": traced.progress}, status_code=202)
         components = [{"name": c.name, "unit": c.unit} for c in traced.checkpoint.task.components]
-        return JSONResponse(header(trace, traced.columns[0], components) | {"filter": filter})
+        described = header(trace, traced.columns[0], components, no_maps(traced.checkpoint))
+        return JSONResponse(described | {"filter": asked.filter})
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
-    def trace_columns(task: str, filter: str, episode: int, request: Request, recipe: str = "") -> Response:
-        traced = library.traced(Selection(task, filter, episode, Recipe.parse(recipe)))
+    def trace_columns(asked: Asked, request: Request) -> Response:
+        traced = library.traced(asked)
         return _immutable(request, traced, "columns", lambda: traced.columns[1])
 
     @router.get("/api/trace/{task}/{filter}/{episode}/images")
-    def trace_images(task: str, filter: str, episode: int, request: Request, recipe: str = "") -> Response:
-        traced = library.traced(Selection(task, filter, episode, Recipe.parse(recipe)))
-        if "image" not in traced.trace.episode.observations:
-            raise HTTPException(404, f"Task {task!r} has no pictures.")
-        return _immutable(request, traced, "images", traced.trace.episode.observations["image"].tobytes)
+    def trace_images(asked: Asked, request: Request) -> Response:
+        traced = library.traced(asked)
+        shown = pictures(traced.trace)
+        if shown is None:
+            raise HTTPException(404, f"Task {asked.task!r} has no pictures.")
+        return _immutable(request, traced, "images", shown.tobytes)
 
     @router.get("/api/recordings")
     def list_recordings() -> list[dict[str, Any]]:
@@ -91,23 +104,26 @@ def routes(library: Library, views: Views) -> APIRouter:
         return [_listed(path) for path in sorted(paths, key=lambda p: -p.stat().st_mtime)]
 
     @router.post("/api/recordings", status_code=201)
-    def record(wanted: RecordingRequest) -> dict[str, Any]:
+    def record(wanted: RecordingRequest, response: Response) -> dict[str, Any]:
         started = time.perf_counter()
-        selection = Selection(wanted.task, wanted.filter, wanted.episode, Recipe.parse(wanted.recipe))
-        traced = library.traced(selection)
+        traced = library.traced(_selection(wanted.task, wanted.filter, wanted.episode, wanted.recipe, wanted.data))
         trace = traced.trace
-        parts = hashlib.sha256(f"{traced.key} maps {wanted.maps}".encode()).hexdigest()[:8]
+        # The name says all that the file depends on, so one that is there is this one.
+        parts = hashlib.sha256(f"{traced.key} maps {wanted.maps} version {__version__}".encode()).hexdigest()[:8]
         path = recordings / f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}.rrd"
-        steps = range(0, len(trace), wanted.maps) if wanted.maps else ()
+        steps = range(0, len(trace), wanted.maps) if wanted.maps and not no_maps(traced.checkpoint) else ()
         with writing:
-            recordings.mkdir(parents=True, exist_ok=True)
-            write_recording(trace, path, maps=traced.maps(steps) if steps else None)
-        seconds = time.perf_counter() - started
+            there = path.is_file()
+            if not there:
+                recordings.mkdir(parents=True, exist_ok=True)
+                write_recording(trace, path, maps=traced.maps(steps) if steps else None)
+        if there:
+            response.status_code = 200
         return {
             "name": path.name,
-            "url": f"/api/recordings/{path.name}",
+            "url": f"/api/recordings/{quote(path.name)}",
             "bytes": path.stat().st_size,
-            "seconds": seconds,
+            "seconds": None if there else time.perf_counter() - started,
         }
 
     @router.get("/api/recordings/{name}.rrd")

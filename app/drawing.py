@@ -15,6 +15,7 @@ from viser import ViserServer
 
 from beliefscope.app.library import Traced
 from beliefscope.datasets.replay import Replay, replay
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import colour
 
@@ -28,8 +29,10 @@ BELIEF_ABOVE = 0.10  # m from the anchor to the plane on which particles and con
 FORCE_SCALE = 0.004  # m an N
 FORCE_LENGTH = 0.30  # m, the longest arrow
 PALE = 130.0  # gray of a particle without weight
-EYE = np.array([-0.28, -1.32, 1.22])  # m from what the camera looks at
+EYE = np.array([-0.28, -1.32, 1.22])  # m from what the camera looks at, for what is 1 m high
 UP = np.array([0.0, 0.0, 1.0])
+CELL = 0.05  # m between the lines of a bare plane
+BARE_EYE = np.array([-0.7, -1.1, 1.0])  # from the middle of a bare plane, in its sides
 
 MUJOCO_PLANE = 0  # mjtGeom.mjGEOM_PLANE
 FLOOR_GRAY = (125, 125, 125)
@@ -64,6 +67,8 @@ class Drawing:
         server.scene.world_axes.visible = False
         server.scene.configure_default_lights(cast_shadow=False)
         self._robot = None if self._replay is None else _add_replay(server, self._replay)
+        if self._replay is None:
+            _add_plane(server, task, trace)
         x, y = task.map_indices
         self._plane = [x, y]
         self._believed = list(_believed(trace))
@@ -71,9 +76,10 @@ class Drawing:
         self._ghost = None if task.ghost is None else task.ghost(states)
         flat = np.concatenate([states[..., self._plane], np.zeros_like(states[..., :1])], axis=-1)
         self._anchors = flat if self._ghost is None else self._ghost.anchor  # (T, S, 3)
-        self._level = float(self._anchors[0, 0, 2]) + BELIEF_ABOVE
+        self._above = BELIEF_ABOVE if self._ghost is not None else 0.0
+        self._level = float(self._anchors[0, 0, 2]) + self._above
         self._markers = [self._add_marker(i, name) for i, (name, _, _) in enumerate(self._believed)]
-        self._discs = self._add_discs()
+        self._discs = self._add_discs() if trace.has_covariance else None
         self._outlines = self._add_outlines()
         self._particles = None if trace.particles is None else self._add_particles()
         self._arrow = server.scene.add_arrows(
@@ -95,8 +101,9 @@ class Drawing:
             foot = np.array([*self._anchors[step, i, :2], 0.0])
             pole.position = foot + pole.height / 2.0 * UP
             label.position = foot + pole.height * UP
-        pose = self._contours(step)
-        self._discs.batched_positions, self._discs.batched_wxyzs, self._discs.batched_scales = pose
+        if self._discs is not None:
+            pose = self._contours(step)
+            self._discs.batched_positions, self._discs.batched_wxyzs, self._discs.batched_scales = pose
         for i, outline in self._outlines.items():
             assert self._ghost is not None
             outline.position, outline.wxyz = self._ghost.position[step, i], self._ghost.wxyz[step, i]
@@ -106,12 +113,13 @@ class Drawing:
 
     def _add_marker(self, index: int, name: str) -> tuple[Any, Any]:
         trace, scene = self._trace, self._server.scene
-        height = float(self._anchors[0, index, 2]) + BELIEF_ABOVE + POLE_STEP * (len(self._believed) - index)
+        height = float(self._anchors[0, index, 2]) + self._above + POLE_STEP * (len(self._believed) - index)
         pole = scene.add_cylinder(
             f"/belief/{name}/pole", POLE_RADIUS, height, color=_rgb(name, trace), cast_shadow=False
         )
+        called = "estimate" if name == "fused" and len(trace.modalities) < 2 else name
         label = scene.add_label(
-            f"/belief/{name}/label", name, font_screen_scale=0.7, anchor="bottom-center", depth_test=False
+            f"/belief/{name}/label", called, font_screen_scale=0.7, anchor="bottom-center", depth_test=False
         )
         return pole, label
 
@@ -181,7 +189,7 @@ class Drawing:
         """Positions (S, 3), orientations (S, 4) and scales (S, 3) of the unit disc for each source but the truth."""
         plane = np.ix_(range(len(self._believed) - 1), self._plane)
         means = np.stack([mean[step] for _, mean, _ in self._believed[1:]])[plane]
-        covariances = np.stack([c[step] for _, _, c in self._believed[1:] if c is not None]).astype(float)
+        covariances = np.stack([covariance[step] for _, _, covariance in self._believed[1:]]).astype(float)
         values, vectors = np.linalg.eigh(covariances[:, self._plane][:, :, self._plane])
         count = len(means)
         # Millimetres apart, the fused one on top: discs in one plane would flicker.
@@ -204,10 +212,16 @@ class Drawing:
 
     def _place_camera(self) -> None:
         """Where robot, object and belief are seen. A browser that has moved its camera keeps it."""
-        at = self._anchors[:, 0].mean(axis=0)
+        at, eye = self._anchors[:, 0].mean(axis=0), EYE
+        if self._replay is None:
+            low, high = _extent(self._task, self._trace)
+            eye = BARE_EYE * (high - low).max()
+        else:
+            eye = EYE * (0.6 + 0.4 * min(1.0, at[2]))
+            at = at * [0.62, 0.3, 0.68] + [0.0, 0.0, 0.2 * max(0.0, 1.0 - at[2])]
         camera = self._server.initial_camera
-        camera.look_at = at * [0.62, 0.3, 0.68]
-        camera.position = at * [0.62, 0.3, 0.68] + EYE
+        camera.look_at = at
+        camera.position = at + eye
         camera.fov = np.deg2rad(45.0)
 
 
@@ -226,12 +240,36 @@ def _add_replay(server: ViserServer, replayed: Replay) -> ViserMujocoScene:
     return robot
 
 
-def _believed(trace: Trace) -> Iterator[tuple[str, Array, Array | None]]:
-    """(name, states (T, n), covariances (T, n, n)): the truth, the fused estimate, each modality's."""
-    yield "truth", trace.episode.states, None
+def _add_plane(server: ViserServer, task: Task, trace: Trace) -> None:
+    """Where there is no replay: a grid under the belief, and the axes of the two components that span it."""
+    low, high = _extent(task, trace)
+    at = [np.arange(a, b + CELL / 2, CELL) for a, b in zip(low, high, strict=True)]
+    lines = [((x, low[1], 0), (x, high[1], 0)) for x in at[0]] + [((low[0], y, 0), (high[0], y, 0)) for y in at[1]]
+    server.scene.add_line_segments(
+        "/plane", np.array(lines, np.float32), FLOOR_GRAY, thickness=1.0, thickness_units="screen"
+    )
+    ends = np.array([(high[0], low[1], 0.0), (low[0], high[1], 0.0)])
+    axes = np.array([((*low, 0.0), end) for end in ends], np.float32)
+    server.scene.add_line_segments("/plane/axes", axes, FLOOR_GRAY, thickness=3.0, thickness_units="screen")
+    for name, end, edge in zip(task.map_components, ends, high, strict=True):
+        text = f"{name.replace('_', ' ')} {100 * edge:.0f} cm"
+        server.scene.add_label(f"/plane/{name}", text, position=end, font_screen_scale=0.7, depth_test=False)
+
+
+def _extent(task: Task, trace: Trace) -> tuple[Array, Array]:
+    """Lower and upper corner (2,), m, of the whole cells in which the truth and its maps lie."""
+    truth = trace.episode.states[:, list(task.map_indices)]
+    low, high = truth.min(axis=0) - task.map_half_width, truth.max(axis=0) + task.map_half_width
+    return np.floor(low / CELL) * CELL, np.ceil(high / CELL) * CELL
+
+
+def _believed(trace: Trace) -> Iterator[tuple[str, Array, Array]]:
+    """(name, states (T, n), covariances (T, n, n)): the truth, the fused estimate, each modality's if it is another."""
+    yield "truth", trace.episode.states, np.zeros_like(trace.estimate_covariance)
     yield "fused", trace.estimate_mean, trace.estimate_covariance
-    for k, name in enumerate(trace.modalities):
-        yield name, trace.modality_mean[:, k], trace.modality_covariance[:, k]
+    if len(trace.modalities) > 1:
+        for k, name in enumerate(trace.modalities):
+            yield name, trace.modality_mean[:, k], trace.modality_covariance[:, k]
 
 
 def _rgb(source: str, trace: Trace) -> RGB:

@@ -1,4 +1,4 @@
-"""Data sets, checkpoints and traces of one server, each loaded or computed once, when first asked for."""
+"""Traces of one server, each computed once, when first asked for; and the catalog of what there is to trace."""
 
 from __future__ import annotations
 
@@ -13,21 +13,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from beliefscope.app.shelf import Shelf, shelves
 from beliefscope.app.wire import MAP_SIZES, columns
-from beliefscope.datasets.catalog import TASKS, find_task
-from beliefscope.datasets.corrupt import WHOLE, Recipe, ready
-from beliefscope.datasets.dataset import Dataset
+from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.datasets.task import Task
-from beliefscope.filters.catalog import filters_of
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 
 TRACES_IN_MEMORY = 8
-DEFAULT_FILTER = "crossmodal-pf"
 FINE = max(MAP_SIZES)
 
 
@@ -37,8 +32,8 @@ class Settings:
 
     Attributes:
         workspace: folder for recordings, traces and caches; made when needed.
-        data: task -> HDF5 file; the shipped sample set where a task is not named.
-        checkpoints: filter's name as shown -> file, beside (or in place of) the shipped ones.
+        data: name as shown -> file or folder of episodes, before the sample sets that ship.
+        checkpoints: filter's name as shown -> file, before (or in place of) those that ship.
         hosts: names the server answers to beside the loopback's.
         particles: of particle filters. seed: of the filters' randomness.
     """
@@ -53,12 +48,16 @@ class Settings:
 
 @dataclass(frozen=True)
 class Selection:
-    """What is being looked at: names of a task and a filter, an episode's index, how its sensors are broken."""
+    """What is being looked at: names of a task and a filter, an episode's index, how its sensors are broken.
+
+    Data: name of the data set; empty for the task's first.
+    """
 
     task: str
     filter: str
     episode: int
     recipe: Recipe = WHOLE
+    data: str = ""
 
 
 class Traced:
@@ -107,92 +106,45 @@ class Library:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self._lock = threading.RLock()
-        self._datasets: dict[str, Dataset] = {}
-        self._checkpoints: dict[tuple[str, str], Checkpoint] = {}
         self._keys: dict[Selection, str] = {}
         self._traced: OrderedDict[str, Traced] = OrderedDict()
         self._tracing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="tracing")
         self._closing = False
 
-    def dataset(self, task: str) -> Dataset:
-        """The task's data set. Raises BadInput for an unknown task or an unreadable file."""
-        with self._lock:
-            if task not in self._datasets:
-                known = find_task(task)
-                data = open_dataset(self.settings.data.get(known.name) or sample_path(known.name), known)
-                if data.task.name != known.name:
-                    raise BadInput(f"The data given for task {known.name!r} are of task {data.task.name!r}.")
-                self._datasets[task] = data
-            return self._datasets[task]
+    @cached_property
+    def _stock(self) -> tuple[dict[str, Shelf], list[str]]:
+        return shelves(self.settings.checkpoints, self.settings.data)
 
-    def episode(self, task: str, index: int) -> Episode:
-        """Raises BadInput for an index outside the data set."""
+    def problems(self) -> list[str]:
+        """One line for each thing given that cannot be shown."""
         with self._lock:
-            data = self.dataset(task)
-            if not 0 <= index < len(data):
-                raise BadInput(f"episode {index} does not exist. Available: 0 to {len(data) - 1}.")
-            return data[index]
-
-    def checkpoint(self, task: str, name: str) -> Checkpoint:
-        """The filter of that name. Raises BadInput for an unknown name or an unreadable file."""
-        with self._lock:
-            if (task, name) not in self._checkpoints:
-                known = filters_of(find_task(task))
-                given = self.settings.checkpoints
-                if name not in given and name not in known:
-                    raise one_of("filter", name, [*given, *(f for f in known if f not in given)])
-                checkpoint = load_checkpoint(given[name]) if name in given else None
-                if checkpoint is not None and checkpoint.task.name != task:
-                    if name not in known:
-                        raise BadInput(f"filter {name!r} is for task {checkpoint.task.name!r}, not for {task!r}.")
-                    checkpoint = None  # the one that ships for this task
-                self._checkpoints[task, name] = checkpoint or load_checkpoint(shipped(task, name))
-            return self._checkpoints[task, name]
+            return self._stock[1]
 
     def catalog(self) -> dict[str, Any]:
-        """``tasks`` that can be shown, and ``problems``: one line for each thing given that cannot be."""
-        tasks, problems = [], []
-        of_task: dict[str, list[str]] = {}
-        for filter_name, path in self.settings.checkpoints.items():
-            try:
-                of_task.setdefault(load_checkpoint(path).task.name, []).append(filter_name)
-            except BadInput as error:
-                problems.append(str(error))
-        # What was given comes first.
-        for name in sorted(TASKS, key=lambda name: name not in self.settings.data):
-            try:
-                data = self.dataset(name)
-            except BadInput as error:
-                if name in self.settings.data:
-                    problems.append(str(error))
-                continue
-            filters = []
-            for filter_name in dict.fromkeys([*of_task.get(name, []), *filters_of(data.task)]):
-                with suppress(BadInput):  # most do not ship; one that was given and is bad is a problem already
-                    filters.append(_described(filter_name, self.checkpoint(name, filter_name)))
-            tasks.append(_task(data.task, filters, data))
-        return {"tasks": tasks, "problems": problems}
+        """``tasks`` that can be shown, and the ``problems``."""
+        with self._lock:
+            found, problems = self._stock
+            tasks = [shelf.describe() for shelf in found.values() if not shelf.missing]
+            return {"tasks": tasks, "problems": problems}
 
     def default(self) -> Selection:
-        """What a page shows first: the first task, the crossmodal PF if there is one, the first episode for tests.
-
-        Raises BadInput where there is no filter to show.
-        """
-        catalog = self.catalog()
-        for task in catalog["tasks"]:
-            names = [f["name"] for f in task["filters"]]
-            if names:
-                name = DEFAULT_FILTER if DEFAULT_FILTER in names else names[0]
-                return Selection(task["name"], name, self.dataset(task["name"]).held_out()[0])
-        raise BadInput("; ".join(catalog["problems"]) or "no trained filter is there to show; train one first.")
+        """What a page shows first: the first of everything. Raises BadInput where there is nothing to show."""
+        with self._lock:
+            found, problems = self._stock
+            shelf = next((shelf for shelf in found.values() if not shelf.missing), None)
+            if shelf is None:
+                raise BadInput("; ".join(problems) or "no trained filter is there to show; train one first.")
+            (data, episodes), *_ = shelf.data.items()
+            return Selection(shelf.task.name, next(iter(shelf.filters)), episodes.held_out()[0], data=data)
 
     def traced(self, selection: Selection) -> Traced:
         """The selection's trace, computed from now on if it is not there. Raises BadInput for what does not exist."""
         with self._lock:
             known = self._traced.get(self._keys.get(selection, ""))
             if known is None or (known.done.done() and known.done.exception() is not None):
-                checkpoint = self.checkpoint(selection.task, selection.filter)
-                episode = self.episode(selection.task, selection.episode)
+                shelf = self._shelf(selection.task)
+                checkpoint = shelf.filter(selection.filter)
+                episode = shelf.episode(selection.data, selection.episode)
                 selection.recipe.check(checkpoint.task)
                 parts = (
                     checkpoint.hash,
@@ -209,6 +161,12 @@ class Library:
             while len(self._traced) > TRACES_IN_MEMORY:
                 self._traced.popitem(last=False)
             return known
+
+    def _shelf(self, task: str) -> Shelf:
+        found, _ = self._stock
+        if task not in found:
+            raise one_of("task", task, found)
+        return found[task]
 
     def _compute(self, traced: Traced, selection: Selection, episode: Episode) -> None:
         def progress(fraction: float) -> None:
@@ -243,43 +201,6 @@ class Library:
         self._closing = True
         self._tracing.shutdown(wait=True, cancel_futures=True)
         with self._lock:
-            for data in self._datasets.values():
-                data.close()
-            self._datasets.clear()
-
-
-def _described(name: str, checkpoint: Checkpoint) -> dict[str, Any]:
-    record = dict(checkpoint.record)
-    metrics = record.pop("metrics", {})
-    return {
-        "name": name,
-        "kind": checkpoint.kind,
-        "checkpoint_hash": checkpoint.hash,
-        "training": record,
-        "metrics": metrics,
-    }
-
-
-def _task(task: Task, filters: list[dict[str, Any]], data: Dataset) -> dict[str, Any]:
-    x, y = task.map_components
-    return {
-        "name": task.name,
-        "components": [{"name": c.name, "unit": c.unit} for c in task.components],
-        "modalities": list(task.modalities),
-        "dt": task.dt,
-        "map": {"x": x, "y": y, "half_width": task.map_half_width},
-        "data_hash": data.hash,
-        "recipes": [{"name": name, "recipe": text} for name, text in ready(task).items()],
-        "filters": filters,
-        "episodes": [
-            {
-                "index": e.index,
-                "steps": e.steps,
-                "policy": e.policy,
-                "split": e.split,
-                "seed": e.seed,
-                "contact_fraction": e.contact_fraction,
-            }
-            for e in data.summaries
-        ],
-    }
+            if "_stock" in vars(self):
+                for shelf in self._stock[0].values():
+                    shelf.close()

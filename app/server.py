@@ -85,16 +85,20 @@ def serve(
         host, port: address to listen on; port 0 takes any free one.
         listening: called with the URL once connections are accepted; the default prints it.
 
-    Raises BadInput when the address cannot be had.
+    Raises BadInput when the address cannot be had, or something given cannot be shown.
     """
     if listening is None:
         listening = _print_url
+    app = create_app(settings)
+    problems = app.state.library.problems()
+    if problems:
+        raise BadInput("; ".join(problems))
     with _bound(host, port) as listener:
         shown = f"[{host}]" if ":" in host else host
         url = f"http://{shown}:{listener.getsockname()[1]}/"
         logging.getLogger("uvicorn.error").addFilter(_no_false_alarm)
         config = uvicorn.Config(
-            create_app(settings),
+            app,
             log_level="warning",
             access_log=False,
             server_header=False,

@@ -16,6 +16,7 @@ from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.scene import Scene
 from beliefscope.app.wire import Cursor, cursor, maps_message
 from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.likelihood import no_maps
 
 log = logging.getLogger("beliefscope.app")
 
@@ -99,15 +100,18 @@ class View:
                 await _tell_error(websocket, wanted.serial, f"The server failed: {error}")
 
     async def _answer_one(self, websocket: WebSocket, wanted: Cursor) -> None:
-        selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.recipe)
+        selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.recipe, wanted.data)
         traced = await asyncio.to_thread(self._library.traced, selection)
         if not await self._ready_before_newer(traced):
             return
         trace = traced.trace
         if wanted.step >= len(trace):
             raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(trace) - 1}.")
-        maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)
-        await websocket.send_bytes(maps_message(wanted.serial, trace, maps))
+        if no_maps(traced.checkpoint):
+            await websocket.send_json({"type": "no_maps", "serial": wanted.serial, "step": wanted.step})
+        else:
+            maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)
+            await websocket.send_bytes(maps_message(wanted.serial, trace, maps))
         if not wanted.scene:
             return
         await asyncio.to_thread(self.scene.show, traced, wanted.step)

@@ -24,7 +24,7 @@ class Cursor:
     """The page's whole selection, as one message of it says.
 
     Serial: the page's own count of its cursors. Recipe: how the sensors are broken. Scene: whether the 3D scene
-    follows, or only the maps.
+    follows, or only the maps. Data: name of the data set; empty for the task's first.
     """
 
     serial: int
@@ -36,6 +36,7 @@ class Cursor:
     size: int
     recipe: Recipe = WHOLE
     scene: bool = True
+    data: str = ""
 
 
 def cursor(message: dict[str, Any]) -> Cursor:
@@ -47,9 +48,10 @@ def cursor(message: dict[str, Any]) -> Cursor:
     angle = message.get("angle")
     if angle is not None and not _is_number(angle):
         raise BadInput(f"cursor's 'angle' is a number of radians or null; got {angle!r}.")
-    recipe = message.get("recipe", "")
-    if not isinstance(recipe, str):
-        raise BadInput(f"cursor's 'recipe' is text; got {recipe!r}.")
+    recipe, data = message.get("recipe", ""), message.get("data", "")
+    for key, text in (("recipe", recipe), ("data", data)):
+        if not isinstance(text, str):
+            raise BadInput(f"cursor's {key!r} is text; got {text!r}.")
     size = message.get("size", MAP_SIZES[0])
     if size not in MAP_SIZES:
         raise BadInput(f"cursor's 'size' is {' or '.join(map(str, MAP_SIZES))}; got {size!r}.")
@@ -63,6 +65,7 @@ def cursor(message: dict[str, Any]) -> Cursor:
         size=size,
         recipe=Recipe.parse(recipe),
         scene=scene,
+        data=data,
         **integers,
     )
 
@@ -87,9 +90,9 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
     arrays: dict[str, NDArray[Any] | None] = {
         "truth": trace.episode.states,
         "estimate_mean": trace.estimate_mean,
-        "estimate_sigma": _sigma(trace.estimate_covariance),
-        "modality_mean": trace.modality_mean,
-        "modality_sigma": _sigma(trace.modality_covariance),
+        "estimate_sigma": _sigma(trace.estimate_covariance) if trace.has_covariance else None,
+        "modality_mean": trace.modality_mean if trace.modalities else None,
+        "modality_sigma": _sigma(trace.modality_covariance) if trace.modalities else None,
         "weights": trace.weights,
         "acting": trace.acting,
         "contact": trace.episode.contact,
@@ -114,8 +117,17 @@ def effective_sample_size(trace: Trace) -> NDArray[np.float32] | None:
     return np.asarray(np.exp(-np.logaddexp.reduce(2.0 * trace.log_weights, axis=1)), dtype=np.float32)
 
 
-def header(trace: Trace, described: list[dict[str, Any]], components: list[dict[str, str]]) -> dict[str, Any]:
-    """What the page must know of a trace before it reads its columns."""
+def pictures(trace: Trace) -> NDArray[np.uint8] | None:
+    """(T, H, W): the first of the observations that is a picture, as the filter saw it; None where none is."""
+    seen = trace.episode.observations.values()
+    return next((array for array in seen if array.ndim == 3 and array.dtype == np.uint8), None)
+
+
+def header(
+    trace: Trace, described: list[dict[str, Any]], components: list[dict[str, str]], no_maps: str | None
+) -> dict[str, Any]:
+    """What the page must know of a trace before it reads its columns. No_maps: why there are none, where so."""
+    shown = pictures(trace)
     return {
         "steps": len(trace),
         "dt": trace.episode.dt,
@@ -130,6 +142,8 @@ def header(trace: Trace, described: list[dict[str, Any]], components: list[dict[
         "seed": trace.seed,
         "recipe": str(trace.recipe),
         "settings": dict(trace.settings),
+        "no_maps": no_maps,
+        "pictures": None if shown is None else list(shown.shape[1:]),
         "columns": described,
     }
 

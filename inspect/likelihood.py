@@ -61,16 +61,25 @@ class LikelihoodMap:
         return np.stack([self.offsets_x[ix], self.offsets_y[iy]], axis=1)
 
 
+def no_maps(checkpoint: Checkpoint) -> str | None:
+    """Why a filter has no likelihood maps, in one line; None where it has them."""
+    task, what = checkpoint.task, "has no likelihood maps"
+    if not checkpoint.filter.has_covariance:
+        kind = checkpoint.kind.upper()
+        return f"filter {checkpoint.name!r} {what}: an {kind} estimates the state, but not how likely others are"
+    off = [c.name for i, c in enumerate(task.components) if i not in task.map_indices]
+    if len(off) > 1:
+        return f"task {task.name!r} {what}: {', '.join(off)} are off the map; one at most can be held fixed"
+    return None
+
+
 class MapEngine:
     """Maps of one trace. What depends on the observations is computed once, for all steps."""
 
     def __init__(self, checkpoint: Checkpoint, trace: Trace) -> None:
-        """Raises BadInput for an LSTM, which has no density, and when the trace was made by another checkpoint."""
-        if not checkpoint.filter.has_covariance:
-            raise BadInput(
-                f"filter {checkpoint.name!r} has no likelihood maps: an {checkpoint.kind.upper()} estimates the state, "
-                "but not how likely others are"
-            )
+        """Raises BadInput where there are none (``no_maps``), and when the trace was made by another checkpoint."""
+        if why := no_maps(checkpoint):
+            raise BadInput(why)
         if trace.checkpoint_hash != checkpoint.hash:
             raise BadInput(
                 f"the trace was made by checkpoint {trace.checkpoint_hash[:12]}, not by {checkpoint.hash[:12]}"
@@ -80,10 +89,6 @@ class MapEngine:
         self.task = checkpoint.task
         self.evidence = self._encode()
         rest = [i for i in range(len(self.task.components)) if i not in self.task.map_indices]
-        if len(rest) > 1:
-            raise BadInput(
-                f"task {self.task.name!r} has {len(rest)} components off the map; one at most can be held fixed"
-            )
         self.fixed = rest[0] if rest else None
         self._grid = lru_cache(maxsize=4)(self._compute_grid)
 

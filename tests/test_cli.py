@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
 NAMES = [command.__name__ for command in COMMANDS]
 OPTIONS = {
-    "serve": "--port --host --workspace --task --data --filter --open --no-open --seed",
+    "serve": "--port --host --workspace --task --data --filter --checkpoint --open --no-open --seed",
     "collect": "--episodes --steps --seed --workers -o --json",
     "convert": "--data --skip-bad -o --json",
     "train": "--filter --data --skip-bad --preset --recipe --seed --log -o --json",
@@ -204,10 +204,12 @@ BAD = [
     "serve --port 70000",
     "serve --workspace notes.txt",
     "serve --workspace missing/deep",
+    "serve --task dor",
     "serve --task missing.py:TASK",
     "serve --data missing.h5",
+    "serve --data other.h5 --data cut.h5",
     "serve --filter other.safetensors",
-    "serve --filter ekf.safetensors --filter taken/../ekf.safetensors",
+    "serve --checkpoint ./missing",
 ]
 
 

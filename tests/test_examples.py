@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from beliefscope.app.cli import main
-from beliefscope.app.commands.serve import named, tasks_of
 from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.datasets import catalog
 from beliefscope.datasets.catalog import TASKS, find_task
@@ -85,15 +84,15 @@ def test_whole_way(folder: Path) -> None:
 
 def test_page_shows_it(folder: Path, tmp_path: Path) -> None:
     with fresh():
-        data = tasks_of([folder / "own.h5"], [SPEC])
-        library = Library(Settings(tmp_path, data, checkpoints=named([folder / "own.safetensors"])))
+        find_task(SPEC)
+        library = Library(Settings(tmp_path, {"own": folder / "own.h5"}, {"own": folder / "own.safetensors"}))
         try:
             catalog = library.catalog()
             assert catalog["problems"] == []
             shown = catalog["tasks"][0]
-            assert (shown["name"], len(shown["episodes"])) == ("ball", 100)
+            assert (shown["name"], len(shown["data"][0]["episodes"])) == ("ball", 100)
             assert [one["name"] for one in shown["filters"]] == ["own"]
-            assert library.default() == Selection("ball", "own", 9)
+            assert library.default() == Selection("ball", "own", 9, data="own")
             traced = library.traced(library.default())
             assert traced.trace.modalities == ("image", "sound")
             assert len(traced.columns[1]) > 0

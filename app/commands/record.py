@@ -56,12 +56,15 @@ def record(
       beliefscope record door --filter crossmodal-ekf --episode 9 --maps 5 -o run.rrd
       beliefscope record door --filter crossmodal-pf --recipe image_frozen=20 -o frozen.rrd
     """
-    from beliefscope.inspect.likelihood import MapEngine
+    from beliefscope.inspect.likelihood import MapEngine, no_maps
     from beliefscope.recordings.write import write_recording
 
     check(output, json)
     loaded = checkpoint(task, filter_)
     made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed, skip_bad)
+    if maps and (why := no_maps(loaded)):
+        console.say(f"without maps: {why}")
+        maps = 0
     layers = MapEngine(loaded, made).maps(range(0, len(made), maps)) if maps else None
     with console.progress("Recording") as advance:
         write_recording(made, output, maps=layers, progress=advance)

@@ -28,14 +28,15 @@ def serve(
     ] = None,
     data: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--data", metavar="FILE|DIR", help="Episodes to show instead of a task's sample set; may be given again."
-        ),
+        typer.Option("--data", metavar="FILE|DIR", help="Episodes to show beside those that ship; may be given again."),
     ] = None,
     filter_: Annotated[
         list[Path] | None,
         typer.Option(
-            "--filter", metavar="CHECKPOINT", help="A filter to show beside those that ship; may be given again."
+            "--filter",
+            "--checkpoint",
+            metavar="CHECKPOINT",
+            help="A filter to show beside those that ship; may be given again.",
         ),
     ] = None,
     open_page: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = False,
@@ -43,9 +44,9 @@ def serve(
 ) -> None:
     """Serve the page: replay, maps and weights.
 
-    Shows the filters and the episodes that ship, and what else it is given. Prints the page's address on one line once
-    it listens; Ctrl-C ends it. For the page of another machine, leave the host as it is and forward the port:
-    ssh -L 8000:127.0.0.1:8000 MACHINE.
+    Shows the filters and the episodes that ship, and before them those that are given. Prints the page's address on
+    one line once it listens; Ctrl-C ends it. For the page of another machine, leave the host as it is and forward
+    the port: ssh -L 8000:127.0.0.1:8000 MACHINE.
 
     \b
     Examples:
@@ -56,6 +57,9 @@ def serve(
     """
     from beliefscope.app.library import Settings
     from beliefscope.app.server import serve as serve_until_signal
+    from beliefscope.app.shelf import SAMPLE, short_names
+    from beliefscope.datasets.catalog import TASKS, find_task
+    from beliefscope.filters.catalog import filters_of
 
     if workspace.exists() and not workspace.is_dir():
         raise BadInput(f"workspace {str(workspace)!r} is a file, not a folder")
@@ -72,40 +76,14 @@ def serve(
 
             webbrowser.open(url)
 
+    for name in task or ():
+        find_task(name)
+    shipped = {name for known in TASKS.values() for name in filters_of(known)}
     settings = Settings(
         workspace=workspace,
-        data=tasks_of(data or [], task or []),
-        checkpoints=named(filter_ or []),
+        data=short_names(data or (), {SAMPLE}),
+        checkpoints=short_names(filter_ or (), shipped),
         hosts=(host,),
         seed=seed,
     )
     serve_until_signal(settings, host=host, port=port, listening=listening)
-
-
-def tasks_of(paths: list[Path], own: list[str]) -> dict[str, Path]:
-    """Task -> its data. Raises BadInput for data that cannot be opened, or two of one task."""
-    from beliefscope.datasets.catalog import find_task
-    from beliefscope.datasets.store import open_dataset
-
-    for name in own:
-        find_task(name)
-    found: dict[str, Path] = {}
-    for path in paths:
-        with open_dataset(path) as data:
-            if data.task.name in found:
-                raise BadInput(f"{str(found[data.task.name])!r} and {str(path)!r} are both of task {data.task.name!r}")
-            found[data.task.name] = path
-    return found
-
-
-def named(paths: list[Path]) -> dict[str, Path]:
-    """Filter's name, after its file -> file. Raises BadInput for one that is no checkpoint, or two of one name."""
-    from beliefscope.filters.checkpoint import load_checkpoint
-
-    found: dict[str, Path] = {}
-    for path in paths:
-        load_checkpoint(path)
-        if path.stem in found:
-            raise BadInput(f"{str(found[path.stem])!r} and {str(path)!r} would both be called {path.stem!r}")
-        found[path.stem] = path
-    return found

@@ -8,12 +8,14 @@ import { Trace } from './trace.js';
  * @typedef {object} Task
  * @property {string} name @property {Component[]} components @property {string[]} modalities @property {number} dt s
  * @property {{x: string, y: string, half_width: number}} map
- * @property {{name: string, kind: string, checkpoint_hash: string}[]} filters @property {Summary[]} episodes
+ * @property {{name: string, kind: string, checkpoint_hash: string}[]} filters
+ * @property {{name: string, first: number, episodes: Summary[]}[]} data sets of episodes; the index to begin with
  * @property {{name: string, recipe: string}[]} recipes that are ready to be picked
  * @typedef {{name: string, default: number | string | null, unit: string, meaning: string}} Parameter
  * @typedef {{fault: string, meaning: string, parameters: Parameter[]}} Fault
  * @typedef {{version: string, tasks: Task[], faults: Fault[], problems?: string[]}} Catalog
- * @typedef {{name: string, url: string, bytes: number, seconds: number}} Recording
+ * @typedef {{task: string, filter: string, data: string, episode: number, recipe: string}} Selection names of what is looked at
+ * @typedef {{name: string, url: string, bytes: number, seconds: number | null}} Recording seconds: null if it was there
  */
 
 const AGAIN = 150; // ms until a trace that is being computed is asked for again
@@ -45,42 +47,33 @@ export const catalog = async () => (await ask('/api/catalog')).json();
 /** @param {boolean} dark @returns {Promise<{view: string, scene: string, socket: string}>} */
 export const openView = async (dark) => (await post('/api/views', { dark })).json();
 
-/**
- * Raises ServerError where there is no such trace: an unknown name, or a recipe that cannot be.
- * @param {string} task @param {string} filter @param {number} episode @param {string} recipe
- */
-export const check = (task, filter, episode, recipe) => ask(traceUrl(task, filter, episode) + asked(recipe));
+/** Raises ServerError where there is no such trace: an unknown name, or a recipe that cannot be. @param {Selection} selection */
+export const check = (selection) => ask(traceUrl(selection));
 
-const traceUrl = (task, filter, episode) => `/api/trace/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}`;
-const asked = (recipe) => `?${new URLSearchParams({ recipe })}`;
+const traceUrl = ({ task, filter, data, episode, recipe }, part = '') =>
+  `/api/trace/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}${part}?${new URLSearchParams({ data, recipe })}`;
 
 /**
  * A trace with all its numbers and pictures; the server computes it first if need be.
- * @param {Task} task @param {string} filter @param {number} episode @param {string} recipe how the sensors are broken
+ * @param {Task} task @param {Selection} selection
  * @param {(share: number) => void} progress @param {AbortSignal} signal
  * @returns {Promise<Trace>}
  */
-export async function loadTrace(task, filter, episode, recipe, progress, signal) {
-  const url = traceUrl(task.name, filter, episode);
-  const query = asked(recipe);
-  let response = await ask(url + query, { signal });
+export async function loadTrace(task, selection, progress, signal) {
+  let response = await ask(traceUrl(selection), { signal });
   while (response.status === 202) {
     progress((await response.json()).progress);
     await new Promise((resolve) => setTimeout(resolve, AGAIN));
-    response = await ask(url + query, { signal });
+    response = await ask(traceUrl(selection), { signal });
   }
   const header = await response.json();
-  const hasPictures = task.modalities.includes('image');
-  const [columns, pictures] = await Promise.all([
-    ask(`${url}/columns${query}`, { signal }).then((r) => r.arrayBuffer()),
-    hasPictures ? ask(`${url}/images${query}`, { signal }).then((r) => r.arrayBuffer()) : null,
-  ]);
-  return new Trace(task, filter, episode, header, columns, pictures);
+  const buffer = async (part) => (await ask(traceUrl(selection, part), { signal })).arrayBuffer();
+  const [columns, pictures] = await Promise.all([buffer('/columns'), header.pictures && buffer('/images')]);
+  return new Trace(task, selection, header, columns, pictures);
 }
 
 /** Writes a recording of a trace, with maps at even steps. @param {Trace} trace @returns {Promise<Recording>} */
 export async function record(trace) {
   const maps = Math.ceil(trace.steps / RECORDED_MAPS);
-  const { task, filter, episode, header } = trace;
-  return (await post('/api/recordings', { task: task.name, filter, episode, recipe: header.recipe, maps })).json();
+  return (await post('/api/recordings', { ...trace.selection, maps })).json();
 }

@@ -11,6 +11,7 @@ import { colour, line, translucent } from './palette.js';
  * @property {[number, number]} [limits] of the y axis; fitted to what is in view otherwise
  * @property {boolean} [fromZero]
  * @property {number} [digits] of the values in the legend
+ * @property {string} [note] said in place of a plot
  * @typedef {{contact: [number, number][], black: [number, number][]}} Shading stretches of steps
  */
 

@@ -33,6 +33,7 @@
       ended = performance.now();
       costs = [costs[1], ended - began > SLOW ? Math.min(ended - began, MOST) : 0];
       drew = false;
+      drawing.told?.(drawing.slow());
       pause(times);
     }
     if (performance.now() >= until) run(now);
@@ -74,6 +75,15 @@
   };
   // To a hidden page viser applies what it is told as it comes, else as it draws, and then the first picture is half old.
   const { get: hidden } = Object.getOwnPropertyDescriptor(Document.prototype, 'hidden');
-  Object.defineProperty(document, 'hidden', { get: () => cost() > 0 || hidden.call(document) });
-  window.drawing = { pause };
+  Object.defineProperty(document, 'hidden', { get: () => drawing.slow() || hidden.call(document) });
+  // viser warns of drawing without a GPU, across the scene, each time; the page says what follows from it.
+  const { getExtension } = WebGL2RenderingContext.prototype;
+  WebGL2RenderingContext.prototype.getExtension = function (name) {
+    return name === 'WEBGL_debug_renderer_info' ? null : getExtension.call(this, name);
+  };
+  // Where the frame is narrow, viser takes it for a telephone's screen and covers a quarter of it with its panel.
+  const { matchMedia } = window;
+  window.matchMedia = (query) => matchMedia.call(window, query.includes('max-width') ? 'not all' : query);
+  /** `told`, if somebody sets it, is called after each drawing with whether drawing is slow. */
+  const drawing = (window.drawing = { pause, slow: () => cost() > 0, told: null });
 })();

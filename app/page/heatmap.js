@@ -1,6 +1,6 @@
 /** The likelihood maps, one a layer, side by side: offsets in cm from the true position, each relative to its own peak. */
 
-import { COLOUR_TABLE, colour, line } from './palette.js';
+import { COLOUR_TABLE, colour, line, variable } from './palette.js';
 import { fixed, signed } from './units.js';
 
 const MARGIN = { left: 34, bottom: 30, top: 1, right: 5, gap: 9 }; // px around a map's square
@@ -26,7 +26,8 @@ export class Heatmaps {
   draw(maps, trace) {
     const first = this.#maps === null || this.#maps.layers.join() !== maps.layers.join();
     [this.#maps, this.#trace] = [maps, trace];
-    if (first) this.#figures = this.#build(maps.layers);
+    // Of one measurement model alone the fused map is the same again.
+    if (first) this.#figures = this.#build(trace.fuses ? maps.layers : trace.modalities);
     this.redraw();
   }
 
@@ -38,12 +39,13 @@ export class Heatmaps {
 
   #build(layers) {
     this.#host.querySelectorAll('figure').forEach((figure) => figure.remove());
+    const fuses = layers.length > 1;
     return layers.map((name, layer) => {
       const figure = document.createElement('figure');
       figure.innerHTML = '<h3></h3><canvas role="img"></canvas><figcaption></figcaption>';
-      figure.style.setProperty('--line', `var(--${name}, var(--other))`);
+      figure.style.setProperty('--line', `var(${variable(fuses ? name : 'fused', layer)})`);
       const [title, canvas, caption] = figure.children;
-      title.textContent = name;
+      title.textContent = name.replaceAll('+', ' + ');
       canvas.addEventListener('pointermove', (event) => this.#point(event, layer));
       canvas.addEventListener('pointerleave', () => this.#point(null, layer));
       this.#host.append(figure);
@@ -87,7 +89,7 @@ export class Heatmaps {
     pen.beginPath();
     pen.rect(0, 0, side, side);
     pen.clip();
-    this.#drawMarks(pen, side, name);
+    this.#drawMarks(pen, side, name, layer);
     pen.restore();
     const [dx, dy] = maps.peak[layer].map((v) => signed(100 * v));
     canvas.setAttribute('aria-label', `${name}: likelihood over offsets from the truth, peak at ${dx}, ${dy} cm`);
@@ -130,7 +132,7 @@ export class Heatmaps {
   }
 
   /** Truth, estimates and the line to the end effector; y is up. */
-  #drawMarks(pen, side, name) {
+  #drawMarks(pen, side, name, layer) {
     const { half_width: half, centre, estimate, effector, step } = this.#maps;
     const place = ([x, y]) => [((x - centre[0] + half) / (2 * half)) * side, ((centre[1] - y + half) / (2 * half)) * side];
     const positionOf = (source) => this.#trace.position.map((i) => this.#trace.mean(source, i)[step] / 100);
@@ -155,9 +157,9 @@ export class Heatmaps {
         pen.lineTo(tx + 10 * dx, ty + 10 * dy);
       }
     });
-    if (this.#trace.modalities.includes(name)) {
+    if (name !== 'fused' && this.#trace.fuses) {
       const [x, y] = place(positionOf(name));
-      outlined([HALO, [line(name).stroke, 2]], () => pen.arc(x, y, 5, 0, 2 * Math.PI));
+      outlined([HALO, [line(name, layer).stroke, 2]], () => pen.arc(x, y, 5, 0, 2 * Math.PI));
     }
     const [x, y] = place(this.#trace.position.map((i) => estimate[i]));
     outlined([HALO, [line('fused').stroke, 2]], () => {

@@ -16,7 +16,7 @@ import { Slice } from './slice.js';
 import { ViewSocket } from './socket.js';
 import { Store, resolve } from './state.js';
 import { TimeLine } from './timeline.js';
-import { fixed, spoken } from './units.js';
+import { fixed, sentence, spoken } from './units.js';
 import { Scene, tabs } from './views.js';
 
 const $ = (selector) => document.querySelector(selector);
@@ -37,11 +37,11 @@ start().catch((error) => {
 async function start() {
   const catalog = await api.catalog();
   messages.say('catalog', catalog.problems?.join(' '));
-  if (!catalog.tasks.some((t) => t.filters.length && t.episodes.length)) {
+  if (!catalog.tasks.length) {
     throw new api.ServerError('There is nothing to show: no task has both episodes and a trained filter.');
   }
   const { state, problems } = resolve(location.search, catalog);
-  if (state.recipe) await api.check(state.task, state.filter, state.episode, state.recipe).catch((error) => {
+  if (state.recipe) await api.check(state).catch((error) => {
     problems.push(`The link asks for sensors broken by “${state.recipe}”: ${error.message}`);
     state.recipe = '';
   });
@@ -70,7 +70,7 @@ class Page {
     this.rerun = new Rerun($('#rerun'), (step) => store.set({ step, playing: false }, { origin: 'rerun' }));
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
-    this.save = saving($('#save'), $('#saved'), () => this.rerun.recording(this.#trace), () => store.set({ tab: 'rerun' }));
+    this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
     store.listen((state, changed) => this.#follow(state, changed));
     this.#takeKeys();
     this.#takeButtons();
@@ -91,6 +91,7 @@ class Page {
         stats.maps = { serial: maps.serial, step: maps.step, size: maps.size };
         if (inputTime !== null) keep(stats.scrub, performance.now() - inputTime);
       },
+      noMaps: (step, size) => (stats.maps = { step, size }),
       drawn: (step, { inputTime }) => {
         this.scene.drawn();
         stats.drawn = { step };
@@ -105,7 +106,7 @@ class Page {
   /** The state has changed: whatever depends on it is drawn in this frame. */
   #follow(state, changed) {
     const any = (...names) => names.some((name) => changed.has(name));
-    if (any('task', 'filter', 'episode', 'recipe')) this.#load();
+    if (any('task', 'filter', 'data', 'episode', 'recipe')) this.#load();
     if (any('tab')) this.#showTab(state.tab);
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
@@ -115,7 +116,7 @@ class Page {
 
   /** Loads the trace that the state names and shows it in every panel. */
   async #load() {
-    const { task: name, filter, episode, recipe } = this.#store.state;
+    const { task: name, filter, data, episode, recipe } = this.#store.state;
     this.#loading.abort();
     const loading = (this.#loading = new AbortController());
     this.#trace = null;
@@ -125,7 +126,8 @@ class Page {
     const progress = (share) => (clearTimeout(patience), wait(share));
     try {
       const task = this.#catalog.tasks.find((t) => t.name === name);
-      const trace = await api.loadTrace(task, filter, episode, recipe, progress, loading.signal);
+      const selection = { task: name, filter, data, episode, recipe };
+      const trace = await api.loadTrace(task, selection, progress, loading.signal);
       clearTimeout(patience);
       this.#show(trace);
     } catch (error) {
@@ -145,10 +147,14 @@ class Page {
     }
     bodies.slice(1).forEach((body) => say(body, 'ready'));
     for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun]) panel.show(trace);
-    $('#maps-what').textContent = spoken(trace.task.map.x).replace(/ x$/, '') || 'position';
+    $('#maps-what').textContent = spoken(trace.task.map.x).replace(/(^| )x$/, '') || 'position';
+    $('#maps').classList.toggle('one', !trace.fuses);
+    $('#maps').classList.toggle('none', Boolean(trace.header.no_maps));
+    if (trace.header.no_maps) say($('#heatmaps'), 'empty', sentence(trace.header.no_maps));
     $('#black-key').hidden = !trace.black.some(Boolean);
     $('#worst').disabled = false;
-    $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s, i) => [swatch(s, i - 1), ` ${s}  `]));
+    $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s, i) => [swatch(s, i - 1), ` ${trace.called(s)}  `]));
+    $('#sigma-key').hidden = !trace.has('estimate_sigma');
     this.#choose();
     this.#move();
   }
@@ -168,10 +174,10 @@ class Page {
 
   #move() {
     const [trace, { state, origin, inputTime }] = [this.#trace, this.#store];
-    const { task, filter, episode, recipe, step, angle } = state;
+    const { step, angle } = state;
     for (const panel of [this.timeline, this.camera, this.numbers, this.slice]) panel.move(step);
     this.rerun.move(step, origin === 'rerun');
-    this.socket.move({ task, filter, episode, recipe, step, angle }, inputTime);
+    this.socket.move({ ...trace.selection, step, angle }, inputTime);
     this.#read(state);
     const [count, time] = $('#readout').children;
     count.textContent = `${step} / ${trace.steps - 1}`;

@@ -1,6 +1,6 @@
 /** The numbers of a step: a row for each modality alone and one for the fused belief. */
 
-import { swatch } from './palette.js';
+import { swatch, variable } from './palette.js';
 import { fixed, percent, spoken } from './units.js';
 
 /**
@@ -26,12 +26,13 @@ export class Numbers {
     const top = element('tr', {}, element('td', {}), ...head);
     this.#cells = [];
     const rows = trace.sources.map((source, index) => {
+      const line = `--line: var(${variable(source, index)})`;
       const cells = this.#columns.map((column) => element('td', column.title === 'share' ? { class: 'share' } : {}));
       this.#cells.push(cells);
-      return element('tr', { class: source }, element('th', { scope: 'row' }, swatch(source, index), source), ...cells);
+      const title = element('th', { scope: 'row' }, swatch(source, index), trace.called(source));
+      return element('tr', { class: source, style: line }, title, ...cells);
     });
     this.#table.replaceChildren(element('thead', {}, top), element('tbody', {}, ...rows));
-    for (const row of this.#table.tBodies[0].rows) row.style.setProperty('--line', `var(--${row.className}, var(--other))`);
   }
 
   move(step) {
@@ -48,15 +49,16 @@ export class Numbers {
 
 /** @param {import('./trace.js').Trace} trace @returns {Column[]} */
 function columns(trace, component) {
+  const sure = trace.has('estimate_sigma');
   const list = [
     { title: 'error', unit: 'cm', help: 'Distance to the true position', value: (s, t) => fixed(trace.error(s, 'position')[t], 2) },
-    { title: 'σ', unit: 'cm', help: 'Claimed standard deviation of the position: root of the summed variances', value: (s, t) => fixed(trace.radius(s)[t], 2) },
+    sure && { title: 'σ', unit: 'cm', help: 'Claimed standard deviation of the position: root of the summed variances', value: (s, t) => fixed(trace.radius(s)[t], 2) },
   ];
   for (const angle of trace.angles) {
     const name = spoken(trace.components[angle].name);
     list.push(
       { title: name, unit: 'err. °', help: `Error of the ${name}`, value: (s, t) => fixed(trace.error(s, angle)[t], 1) },
-      { title: 'σ', unit: '°', help: `Claimed standard deviation of the ${name}`, value: (s, t) => fixed(trace.sigma(s, angle)[t], 1) },
+      sure && { title: 'σ', unit: '°', help: `Claimed standard deviation of the ${name}`, value: (s, t) => fixed(trace.sigma(s, angle)[t], 1) },
     );
   }
   if (trace.has('weights')) {
@@ -66,7 +68,7 @@ function columns(trace, component) {
   if (trace.has('acting')) {
     list.push({ title: 'share', unit: 'acting', component, help: 'Share of the modality in the fused belief, as it acted', value: (s, t) => percent(trace.weight('acting', s, component)?.[t]) });
   }
-  return list;
+  return list.filter(Boolean);
 }
 
 function element(tag, attributes, ...children) {

@@ -30,10 +30,10 @@ function colourTable() {
 export const COLOUR_TABLE = colourTable();
 
 /** @param {string} name of a colour in page.css. @returns {string} as it is now, light or dark. */
-export function colour(name) {
-  const style = getComputedStyle(document.documentElement);
-  return style.getPropertyValue(`--${name}`) || style.getPropertyValue('--other');
-}
+export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+
+/** The colour's name in CSS of truth, fused or a modality. @param {string} name @param {number} index of the modality */
+export const variable = (name, index = 0) => (name in DASHES ? `--${name}` : `--spare-${index % SPARE_DASHES.length}`);
 
 /** @param {string} colour `rgb(...)` as the browser gives it. @param {number} alpha 0..1. */
 export function translucent(colour, alpha) {
@@ -46,7 +46,7 @@ export function translucent(colour, alpha) {
  */
 export function line(name, index = 0) {
   const dash = DASHES[name] ?? SPARE_DASHES[index % SPARE_DASHES.length];
-  return { stroke: colour(name), dash, width: WIDTHS[name] ?? 1.5 };
+  return { stroke: colour(variable(name, index).slice(2)), dash, width: WIDTHS[name] ?? 1.5 };
 }
 
 /** A short piece of the line, for legends. @returns {SVGElement} */
@@ -60,7 +60,7 @@ export function swatch(name, index = 0) {
   path.setAttribute('d', 'M0 4h20');
   path.setAttribute('stroke-dasharray', dash.join(' '));
   path.setAttribute('stroke-width', String(width));
-  path.style.stroke = `var(--${name}, var(--other))`;
+  path.style.stroke = `var(${variable(name, index)})`;
   svg.append(path);
   return svg;
 }

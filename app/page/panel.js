@@ -2,7 +2,7 @@
 
 /**
  * @param {HTMLElement} body of a panel, with a `.note` inside
- * @param {'ready' | 'loading' | 'error'} state @param {string} [text] @param {number | null} [share] done, 0..1
+ * @param {'ready' | 'loading' | 'empty' | 'error'} state @param {string} [text] @param {number | null} [share] done, 0..1
  */
 export function say(body, state, text = '', share = null) {
   body.dataset.state = state;

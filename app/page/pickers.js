@@ -6,28 +6,37 @@ import { percent } from './units.js';
 
 /** @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store */
 export function pickers(catalog, store) {
-  const ids = ['task', 'filter', 'episode', 'speed'];
-  const [task, filter, episode, speed] = ids.map((id) => document.getElementById(id));
-  const shown = catalog.tasks.filter((t) => t.filters.length && t.episodes.length);
-  const current = () => shown.find((t) => t.name === store.state.task);
-  fill(task, shown.map((t) => [t.name, t.name]));
+  const ids = ['task', 'filter', 'data', 'episode', 'speed'];
+  const [task, filter, data, episode, speed] = ids.map((id) => document.getElementById(id));
+  const named = (list, name) => list.find((one) => one.name === name);
+  const current = () => named(catalog.tasks, store.state.task);
+  const names = (list) => list.map(({ name }) => [name, name]);
+  fill(task, names(catalog.tasks));
   const showRecipe = recipes(document.getElementById('recipe'), document.getElementById('faults'), catalog, store);
   fill(speed, SPEEDS.map((s) => [s, `${s}×`]));
   const refill = () => {
-    fill(filter, current().filters.map((f) => [f.name, f.name]));
-    fill(episode, current().episodes.map((e) => [e.index, described(e)]));
+    fill(filter, names(current().filters));
+    fill(data, names(current().data));
+    fill(episode, named(current().data, store.state.data).episodes.map((e) => [e.index, described(e)]));
+    // A choice of one is none.
+    for (const select of [task, data]) select.parentElement.hidden = select.length < 2;
   };
   task.addEventListener('change', () => {
-    const { name, filters, episodes, map } = shown.find((t) => t.name === task.value);
-    store.set({ task: name, filter: filters[0].name, episode: episodes[0].index, step: 0, angle: null, component: map.x });
+    const { name, filters, data: [{ name: data, first }], recipes, map } = named(catalog.tasks, task.value);
+    const filter = (named(filters, store.state.filter) ?? filters[0]).name;
+    const recipe = recipes.some((r) => r.recipe === store.state.recipe) ? store.state.recipe : '';
+    store.set({ task: name, filter, data, episode: first, recipe, step: 0, angle: null, component: map.x, playing: false });
+  });
+  data.addEventListener('change', () => {
+    store.set({ data: data.value, episode: named(current().data, data.value).first, step: 0, playing: false });
   });
   filter.addEventListener('change', () => store.set({ filter: filter.value }));
   episode.addEventListener('change', () => store.set({ episode: Number(episode.value), step: 0, playing: false }));
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
   const show = (state, changed = new Set(['task'])) => {
-    if (changed.has('task')) refill();
+    if (changed.has('task') || changed.has('data')) refill();
     if (changed.has('task') || changed.has('recipe')) showRecipe();
-    for (const select of [task, filter, episode, speed]) select.value = state[select.id];
+    for (const select of [task, filter, data, episode, speed]) select.value = state[select.id];
   };
   show(store.state);
   store.listen(show);

@@ -9,16 +9,12 @@ const FEW = 0.05; // of the particles
 
 /**
  * @param {import('./trace.js').Trace} trace @param {number} step @param {number} component whose shares count
- * @returns {{tone: 'good' | 'warn' | 'bad', text: string}}
+ * @returns {{tone: 'good' | 'warn' | 'bad' | 'none', text: string}}
  */
 export function reading(trace, step, component) {
   const error = trace.error('fused', 'position')[step];
-  const [sigmas, worst] = trace.surprise(step);
-  const said = [];
-  const sure = sigmas <= SURE;
-  const far = sigmas > 2 * SURE;
-  const verdict = sure ? 'within what it expects' : far ? 'overconfident' : 'more than it expects';
-  said.push(`Fused belief is ${fixed(error, 1)} cm off; worst in ${spoken(worst)}, ${fixed(sigmas, 1)}σ: ${verdict}.`);
+  const [tone, judged] = judge(trace, step);
+  const said = [`${trace.fuses ? 'Fused belief' : 'The estimate'} is ${fixed(error, 1)} cm off; ${judged}.`];
 
   const [best, leader] = [closest(trace, step), leading(trace, step, component)];
   const blind = (leader?.name === 'image' && trace.black[step] && 'the picture is black') || (leader?.name === 'haptics' && !trace.contact[step] && 'there is no contact to feel');
@@ -31,7 +27,16 @@ export function reading(trace, step, component) {
   const particles = trace.particles?.[step];
   const count = trace.header.settings?.particles;
   if (particles && count && particles < FEW * count) said.push(`${fixed(particles, 0)} of ${count} particles carry the weight.`);
-  return { tone: sure ? 'good' : far ? 'bad' : 'warn', text: said.join(' ') };
+  return { tone, text: said.join(' ') };
+}
+
+/** How good the belief is by its own measure. */
+function judge(trace, step) {
+  const surprise = trace.surprise(step);
+  if (!surprise) return ['none', 'how sure it is, this filter does not say'];
+  const [sigmas, worst] = surprise;
+  const [tone, verdict] = sigmas <= SURE ? ['good', 'within what it expects'] : sigmas <= 2 * SURE ? ['warn', 'more than it expects'] : ['bad', 'overconfident'];
+  return [tone, `worst in ${spoken(worst)}, ${fixed(sigmas, 1)}σ: ${verdict}`];
 }
 
 function closest(trace, step) {

@@ -25,10 +25,9 @@ export function recipes(select, sheet, catalog, store) {
   sheet.querySelector('form').addEventListener('submit', async (event) => {
     if (event.submitter?.value === 'cancel') return;
     event.preventDefault();
-    const { task, filter, episode } = store.state;
     const recipe = text.value.trim();
     try {
-      await check(task, filter, episode, recipe);
+      await check({ ...store.state, recipe });
     } catch (error) {
       return tell(error.message);
     }

@@ -28,7 +28,8 @@ export function saving(button, host, write, open) {
       const view = document.createElement('button');
       [view.type, view.className, view.textContent] = ['button', 'text', 'Open in Rerun tab'];
       view.addEventListener('click', open);
-      tell(link, ` ${bytes(recording.bytes)}, written in ${fixed(recording.seconds)} s `, view);
+      const when = recording.seconds === null ? 'written before' : `written in ${fixed(recording.seconds)} s`;
+      tell(link, ` ${bytes(recording.bytes)}, ${when} `, view);
     } catch (error) {
       tell(`The recording was not written: ${error.message}`);
     } finally {

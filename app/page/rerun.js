@@ -11,7 +11,6 @@ export class Rerun {
   #moved;
   #viewer = null;
   #starting = null;
-  #recordings = new Map(); // trace's key -> promise of its recording
   #shown = null; // the trace whose recording is open
   #trace = null;
   #step = 0;
@@ -43,18 +42,6 @@ export class Rerun {
     if (!fromRerun) this.#seek(step);
   }
 
-  /** The recording of a trace: written once, however often it is asked for. @param {import('./trace.js').Trace} trace */
-  recording(trace) {
-    const { checkpoint_hash, data_hash, seed, recipe } = trace.header;
-    const key = [checkpoint_hash, data_hash, seed, recipe].join(' ');
-    if (!this.#recordings.has(key)) {
-      const made = record(trace);
-      this.#recordings.set(key, made);
-      made.catch(() => this.#recordings.delete(key));
-    }
-    return this.#recordings.get(key);
-  }
-
   /** What the viewer shows: for tests. */
   async getState() {
     return this.#viewer ? this.#viewer.get_state() : null;
@@ -69,7 +56,7 @@ export class Rerun {
     this.#shown = trace;
     try {
       say(this.#host, 'loading', 'Writing the recording …');
-      const [recording] = await Promise.all([this.recording(trace), this.#start()]);
+      const [recording] = await Promise.all([record(trace), this.#start()]);
       if (this.#shown !== trace) return;
       say(this.#host, 'loading', 'Opening the recording …');
       const before = (await this.#viewer.get_state()).recordings ?? [];

@@ -3,7 +3,7 @@
 import { openView } from './api.js';
 
 /**
- * @typedef {{task: string, filter: string, episode: number, step: number, angle: number | null, size: number}} Cursor
+ * @typedef {import('./api.js').Selection & {step: number, angle: number | null, size: number}} Cursor
  * @typedef {object} Maps
  * @property {number} serial @property {number} step @property {number} size cells a side @property {number | null} angle
  * @property {string[]} layers @property {number} half_width m @property {number[]} centre m @property {number[]} truth
@@ -13,7 +13,7 @@ import { openView } from './api.js';
  * @property {(view: {view: string, scene: string}) => void} view a new view has been opened
  * @property {(times: number) => boolean} pace of the scene: see frame.js
  * @property {(maps: Maps, inputTime: number | null) => void} maps @property {(step: number, cause: object) => void} drawn
- * @property {(step: number) => void} moved in the 3D scene
+ * @property {(step: number, size: number) => void} noMaps of a filter that has none @property {(step: number) => void} moved in the 3D scene
  * @property {(line: string) => void} error @property {(problem: string | null) => void} connection
  */
 
@@ -140,6 +140,10 @@ export class ViewSocket {
     }
     const message = JSON.parse(data);
     if (message.type === 'cursor') this.#handlers.moved(message.step);
+    if (message.type === 'no_maps') {
+      this.#handlers.noMaps(message.step, this.#sent.get(message.serial)?.size);
+      this.#answered(message.serial);
+    }
     if (message.type === 'drawn') {
       const sent = this.#sent.get(message.serial) ?? {};
       if (sent.size === FINE && message.serial === this.#serial) this.#handlers.pace(PAUSE.rest);

@@ -4,7 +4,8 @@ import { spoken } from './units.js';
 
 /**
  * @typedef {object} State
- * @property {string} task @property {string} filter @property {number} episode index in the data set
+ * @property {string} task @property {string} filter @property {string} data set of episodes
+ * @property {number} episode index in it
  * @property {string} recipe how the sensors are broken, as text (docs/data.md); empty where they are not
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
  * @property {'scene' | 'rerun'} tab
@@ -66,8 +67,8 @@ export class Store {
 
 /** @param {State} state @returns {string} what follows the `?` says all of it that a link should keep. */
 export function address(state) {
-  const { task, filter, episode, recipe, step, angle, tab, component, weights, track } = state;
-  const kept = { task, filter, episode, step, component, weights, track, tab };
+  const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track } = state;
+  const kept = { task, filter, data, episode, step, component, weights, track, tab };
   if (recipe) kept.recipe = recipe;
   if (angle !== null) kept.angle = Number(angle.toFixed(4));
   return `?${new URLSearchParams(kept)}`;
@@ -75,7 +76,7 @@ export function address(state) {
 
 /**
  * The state that an address asks for, as far as the catalog has it.
- * @param {string} search @param {import('./api.js').Catalog} catalog with at least one task, filter and episode.
+ * @param {string} search @param {import('./api.js').Catalog} catalog with at least one task.
  * @returns {{state: State, problems: string[]}} a line for each part that was not to be had.
  */
 export function resolve(search, catalog) {
@@ -87,14 +88,14 @@ export function resolve(search, catalog) {
     problems.push(`The link asks for ${kind} “${name}”, which does not exist. Available: ${names.join(', ')}.`);
     return fallback;
   };
-  const shown = catalog.tasks.filter((t) => t.filters.length && t.episodes.length);
-  const task = shown.find((t) => t.name === pick('task', shown.map((s) => s.name), shown[0].name));
-  const names = task.filters.map((f) => f.name);
-  const firstUnseen = task.episodes.find((e) => e.split === 'test') ?? task.episodes[0];
+  const pickOf = (key, all) => all.find(({ name }) => name === pick(key, all.map((one) => one.name), all[0].name));
+  const task = pickOf('task', catalog.tasks);
+  const data = pickOf('data', task.data);
   const state = {
     task: task.name,
-    filter: pick('filter', names, names.includes('crossmodal-pf') ? 'crossmodal-pf' : names[0]),
-    episode: number(asked, 'episode', firstUnseen.index, task.episodes.map((e) => e.index), problems),
+    filter: pickOf('filter', task.filters).name,
+    data: data.name,
+    episode: number(asked, 'episode', data.first, data.episodes.map((e) => e.index), problems),
     recipe: asked.get('recipe')?.trim() ?? '',
     step: number(asked, 'step', 0, null, problems),
     angle: asked.has('angle') && Number.isFinite(Number(asked.get('angle'))) ? Number(asked.get('angle')) : null,

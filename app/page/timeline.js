@@ -7,7 +7,7 @@ import { shownError, tracks } from './tracks.js';
 import { fixed } from './units.js';
 
 const CLOSEST = 8; // steps that the strongest zoom still shows
-
+const NOTE = 26; // px of a line in place of a plot
 
 export class TimeLine {
   #element;
@@ -107,13 +107,15 @@ export class TimeLine {
     if (!this.#trace || height < 60) return;
     const trace = this.#trace;
     const shading = { contact: stretches(trace.contact), black: stretches(trace.black) };
-    const each = Math.floor((height - GUTTER.axis) / this.#tracks.length);
+    const noted = this.#tracks.filter((track) => track.note).length;
+    const each = Math.floor((height - GUTTER.axis - noted * NOTE) / (this.#tracks.length - noted));
     this.#tracks.forEach((track, i) => {
       const withAxis = i === this.#tracks.length - 1;
       const row = document.createElement('div');
       row.className = 'track';
-      row.append(legend(track));
+      row.append(legend(track, trace));
       this.#host.append(row);
+      if (track.note) return row.append(note(track.note));
       this.#charts.push(
         chart(row, track, shading, {
           width: this.#host.clientWidth - legendWidth(),
@@ -200,7 +202,13 @@ function mark(kind) {
 
 const place = (element, x) => (element.style.transform = `translateX(${x.toFixed(2)}px)`);
 
-function legend(track) {
+function note(text) {
+  const element = document.createElement('p');
+  [element.className, element.style.height, element.textContent] = ['why', `${NOTE}px`, text];
+  return element;
+}
+
+function legend(track, trace) {
   const element = document.createElement('div');
   element.className = 'legend';
   const title = document.createElement('h3');
@@ -208,7 +216,7 @@ function legend(track) {
   const list = document.createElement('dl');
   for (const { name, index } of track.series) {
     const term = document.createElement('dt');
-    term.append(swatch(name, index), name);
+    term.append(swatch(name, index), trace.called(name));
     list.append(term, document.createElement('dd'));
   }
   element.append(title, list);

@@ -9,18 +9,18 @@ export class Trace {
   #cache = new Map();
 
   /**
-   * @param {import('./api.js').Task} task @param {string} filter @param {number} episode
+   * @param {import('./api.js').Task} task @param {import('./api.js').Selection} selection
    * @param {object} header as the server sent it @param {ArrayBuffer} buffer its columns, end to end
-   * @param {ArrayBuffer | null} pictures T x 32 x 32 bytes
+   * @param {ArrayBuffer | null} pictures T x H x W bytes
    */
-  constructor(task, filter, episode, header, buffer, pictures) {
-    [this.task, this.filter, this.episode, this.header] = [task, filter, episode, header];
+  constructor(task, selection, header, buffer, pictures) {
+    [this.task, this.selection, this.header] = [task, selection, header];
     this.steps = header.steps;
     this.dt = header.dt;
     this.components = header.components;
     this.modalities = header.modalities;
-    /** Whose estimates there are: each modality alone, and all of them. */
-    this.sources = [...header.modalities, FUSED];
+    /** Whose estimates there are: each modality alone, and all of them; one alone is the same as all. */
+    this.sources = this.fuses ? [...header.modalities, FUSED] : [FUSED];
     this.pictures = pictures && new Uint8Array(pictures);
     for (const { name, shape, offset } of header.columns) {
       const size = shape.reduce((a, b) => a * b, 1);
@@ -34,13 +34,23 @@ export class Trace {
     this.black = this.#blackPictures();
   }
 
+  /** Whether several modalities are fused, or one measurement model, or none, decides alone. */
+  get fuses() {
+    return this.modalities.length > 1;
+  }
+
+  /** What a source is called. */
+  called(source) {
+    return source === FUSED && !this.fuses ? 'estimate' : source;
+  }
+
   has(column) {
     return this.#columns.has(column);
   }
 
   /** The number of weights a modality has: one, or one for each component. */
   get weightWidth() {
-    return this.#columns.get('weights')?.shape[2] ?? 0;
+    return (this.#columns.get('weights') ?? this.#columns.get('acting'))?.shape[2] ?? 0;
   }
 
   /** The state component's unit as shown, and what m or rad must be multiplied by. */
@@ -58,7 +68,7 @@ export class Trace {
     return this.#of('mean', source, component);
   }
 
-  /** (T,) Its standard deviation. */
+  /** (T,) Its standard deviation; undefined where the filter knows none, as `radius` and `surprise`. */
   sigma(source, component) {
     return this.#of('sigma', source, component);
   }
@@ -90,12 +100,13 @@ export class Trace {
   radius(source) {
     return this.#cached(`radius ${source}`, () => {
       const [x, y] = this.position.map((i) => this.sigma(source, i));
-      return x.map((sx, t) => Math.hypot(sx, y[t]));
+      return x?.map((sx, t) => Math.hypot(sx, y[t]));
     });
   }
 
   /** The fused belief's largest error of any component at a step, in its own standard deviations, and whose it is. */
   surprise(step) {
+    if (!this.has('estimate_sigma')) return undefined;
     const each = this.components.map(({ name }, i) => {
       const off = this.mean(FUSED, i)[step] - this.truth(i)[step];
       const error = this.shown(i).unit === '°' ? wrapped(off) : off;
@@ -104,9 +115,10 @@ export class Trace {
     return each.sort((a, b) => b[0] - a[0])[0];
   }
 
-  /** The 32 x 32 picture of a step, or null. */
+  /** The picture of a step, H x W bytes, or null. */
   picture(step) {
-    return this.pictures && this.pictures.subarray(step * 1024, (step + 1) * 1024);
+    const [height, width] = this.header.pictures ?? [0, 0];
+    return this.pictures && this.pictures.subarray(step * height * width, (step + 1) * height * width);
   }
 
   #of(kind, source, component) {
@@ -116,7 +128,7 @@ export class Trace {
 
   #scaled(name, component, ...index) {
     const { scale } = this.shown(component);
-    return this.#cached(`${name} ${index}`, () => this.#slice(name, ...index).map((v) => v * scale));
+    return this.#cached(`${name} ${index}`, () => this.#slice(name, ...index)?.map((v) => v * scale));
   }
 
   /** (T,) of a column: one place of its other axes. */

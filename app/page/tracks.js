@@ -8,18 +8,25 @@ import { spoken } from './units.js';
  */
 export function tracks(trace, state) {
   const component = trace.components.findIndex((c) => c.name === state.component);
-  return [weights(trace, state.weights, component), estimates(trace, component), lowest(trace, state.track, component)].filter(Boolean);
+  return [weights(trace, state.weights, component), estimates(trace, component), lowest(trace, state.track, component)];
 }
 
-function weights(trace, kind, component) {
+/** @returns {import('./chart.js').Track} or, where nothing is weighed, a line that says so. */
+function weights(trace, chosen, component) {
+  const kind = trace.has('weights') ? chosen : 'acting';
   const series = trace.modalities
     .map((name, index) => ({ name, index, values: trace.weight(kind, name, component) }))
     .filter((s) => s.values);
-  if (!series.length) return null;
+  if (!series.length) return { title: 'Weights', unit: '', series, note: unweighed(trace) };
   const what = trace.weightWidth > 1 ? `, ${spoken(trace.components[component].name)}` : '';
   const title = kind === 'raw' ? `Weight β${what}` : `Acting share${what}`;
   const most = Math.max(1, ...series.map((s) => s.values.reduce((a, b) => Math.max(a, b), 0)));
   return { title, unit: '', series, limits: [-0.04 * most, 1.06 * most], digits: 2 };
+}
+
+function unweighed({ modalities: [model] }) {
+  if (model) return `None: ${model.replaceAll('+', ' and ')} ${model.includes('+') ? 'go into one measurement model, which' : 'alone'} decides.`;
+  return 'None: the network takes all senses in at once and does not say which it follows.';
 }
 
 function estimates(trace, component) {

@@ -5,6 +5,9 @@ export const SHOWN = { m: { unit: 'cm', scale: 100 }, rad: { unit: '°', scale: 
 /** @param {string} name as in the state: hinge_x. */
 export const spoken = (name) => name.replaceAll('_', ' ');
 
+/** A line as a sentence. */
+export const sentence = (line) => `${line[0].toUpperCase()}${line.slice(1)}${/[.!?]$/.test(line) ? '' : '.'}`;
+
 /** A number with a true minus sign and a fixed number of digits; a dash where there is none. */
 export function fixed(value, digits = 1) {
   if (value === null || value === undefined || !Number.isFinite(value)) return '–';

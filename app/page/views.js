@@ -12,7 +12,11 @@ export class Scene {
   /** @param {HTMLElement} host */
   constructor(host) {
     this.#host = host;
-    this.#frame.title = '3D scene: robot, door, true and estimated hinge';
+    this.#frame.addEventListener('load', () => {
+      const { drawing } = this.#frame.contentWindow;
+      if (drawing) drawing.told = (slow) => (document.querySelector('#slow').hidden = !slow);
+    });
+    this.#frame.title = '3D scene: the robot, the truth and the estimates';
     say(host, 'loading', 'Starting the 3D scene …');
   }
 

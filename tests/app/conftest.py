@@ -43,7 +43,7 @@ def given(tmp_path_factory: pytest.TempPathFactory, steps: int) -> Settings:
         filter_.statistics.fit(Steps.of(DOOR, episodes))
         save_checkpoint(filter_, name, {"command": "none", "metrics": {"position_cm": 1.5}}, folder / name)
     checkpoints = {name: folder / name for name in FILTERS}
-    return Settings(folder, data={"door": folder / "door.h5"}, checkpoints=checkpoints, particles=30)
+    return Settings(folder, data={"mine": folder / "door.h5"}, checkpoints=checkpoints, particles=30)
 
 
 @pytest.fixture

@@ -34,12 +34,15 @@ def test_the_catalog_says_what_there_is(client: TestClient, steps: int) -> None:
     catalog = client.get("/api/catalog").json()
     assert catalog["version"] == __version__
     assert catalog["problems"] == []
-    door, *_ = catalog["tasks"]  # what was given comes first
+    door = catalog["tasks"][0]
     assert [c["name"] for c in door["components"]] == ["hinge_x", "hinge_y", "angle"]
     assert door["map"] == {"x": "hinge_x", "y": "hinge_y", "half_width": 0.135}
-    assert [(f["name"], f["kind"]) for f in door["filters"]] == [("crossmodal-ekf", "ekf"), ("crossmodal-pf", "pf")]
-    assert door["filters"][0]["metrics"] == {"position_cm": 1.5}
-    assert [(e["index"], e["steps"], e["split"]) for e in door["episodes"]] == [(0, steps, "train"), (1, steps, "test")]
+    given = [(f["name"], f["kind"], f["metrics"]) for f in door["filters"][:2]]
+    assert given == [(f"crossmodal-{kind}", kind, {"position_cm": 1.5}) for kind in ("ekf", "pf")]
+    mine, sample = door["data"]
+    assert (mine["name"], mine["first"], sample["name"]) == ("mine", 1, "sample")
+    assert [(e["index"], e["steps"], e["split"]) for e in mine["episodes"]] == [(0, steps, "train"), (1, steps, "test")]
+    assert sample["episodes"][sample["first"]]["split"] == "test"
 
 
 def test_a_trace_comes_as_its_own_numbers(client: TestClient, traced: str, settings: Settings, steps: int) -> None:
@@ -181,6 +184,32 @@ def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str,
     )
 
 
+def test_a_recording_that_is_there_is_not_written_again(client: TestClient, traced: str, settings: Settings) -> None:
+    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
+    first = client.post("/api/recordings", json=wanted).json()
+    path = settings.workspace / "recordings" / first["name"]
+    before = path.stat().st_mtime_ns
+    again = client.post("/api/recordings", json=wanted)
+    assert (again.status_code, again.json()) == (200, first | {"seconds": None})
+    assert path.stat().st_mtime_ns == before
+    other = client.post("/api/recordings", json=wanted | {"recipe": "blackout=0.5"})
+    assert other.status_code == 201
+    assert other.json()["name"] != first["name"]
+
+
+def test_data_sets_are_told_apart(client: TestClient, traced: str) -> None:
+    mine = columns(client, traced)["truth"]
+    url = "/api/trace/door/crossmodal-pf/1?data="
+    while (answer := client.get(f"{url}sample")).status_code == 202:
+        pass
+    assert answer.json()["data_hash"] != client.get(traced).json()["data_hash"]
+    assert client.get(f"{url}mine").json()["data_hash"] == client.get(traced).json()["data_hash"]
+    assert answer.json()["steps"] != len(mine)
+    answer = client.get(f"{url}yours")
+    assert answer.status_code == 400
+    assert answer.json()["error"] == "data 'yours' does not exist. Available: mine, sample."
+
+
 @pytest.mark.parametrize(
     "name", ["../traces/x", "..%2ftraces%2fx", "..%5cx", "%2fetc%2fpasswd", ".hidden", "door-crossmodal-pf-episode1-zz"]
 )
@@ -218,21 +247,21 @@ def test_a_corrupt_file_is_told_and_the_server_goes_on(
     bad = tmp_path / "bad"
     bad.write_bytes(b"not what it should be")
     if broken == "data":
-        settings = replace(settings, data={"door": bad})
+        settings = replace(settings, data=settings.data | {"bad": bad})
     else:
-        settings = replace(settings, checkpoints={**settings.checkpoints, "crossmodal-pf": bad})
+        settings = replace(settings, checkpoints={**settings.checkpoints, "bad": bad})
     with open_client(settings, warm=True) as client:
         (problem,) = client.get("/api/catalog").json()["problems"]
         assert str(bad) in problem
-        answer = client.get("/api/trace/door/crossmodal-pf/0")
+        answer = client.get("/api/trace/door/crossmodal-pf/0?data=bad" if broken == "data" else "/api/trace/door/bad/0")
         assert answer.status_code == 400
-        assert str(bad) in answer.json()["error"]
-        assert client.get("/healthz").status_code == 200
+        assert "'bad' does not exist. Available: " in answer.json()["error"]
+        assert client.get("/api/trace/door/crossmodal-pf/0").status_code in (200, 202)
 
 
 def test_the_first_trace_is_ready_before_it_is_asked_for(settings: Settings, open_client: OpenClient) -> None:
     with open_client(settings, warm=True):
         deadline = time.monotonic() + 30.0
-        while not list((settings.workspace / "traces").glob("door-crossmodal-pf-episode1-*.trace")):
+        while not list((settings.workspace / "traces").glob("door-crossmodal-ekf-episode1-*.trace")):
             assert time.monotonic() < deadline
             time.sleep(0.05)

@@ -109,7 +109,7 @@ def test_an_impossible_address_is_one_clear_line(settings: Settings, host: str, 
 def test_a_signal_ends_the_server_in_peace(settings: Settings, number: signal.Signals) -> None:
     code = (
         "from pathlib import Path; from beliefscope.app.server import Settings, serve; "
-        f"data = {{'door': Path({str(settings.data['door'])!r})}}; "
+        f"data = {{'mine': Path({str(settings.data['mine'])!r})}}; "
         f"serve(Settings(Path({str(settings.workspace)!r}), data=data), port=0)"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
