@@ -28,9 +28,10 @@ def sha(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_one_and_two_workers_write_the_same_bytes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("task", ["door", "push"])
+def test_one_and_two_workers_write_the_same_bytes(task: str, tmp_path: Path) -> None:
     for workers in (1, 2):
-        collect("door", 3, 6, 5, workers, tmp_path / f"{workers}.h5")
+        collect(task, 3, 6, 5, workers, tmp_path / f"{workers}.h5")
     assert sha(tmp_path / "1.h5") == sha(tmp_path / "2.h5")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1.h5", "2.h5"], "nothing else is left"
 
