@@ -103,7 +103,7 @@ def train(
     """Trains a filter on the ``train`` episodes and measures it on ``test`` ones (``val`` where there are none).
 
     Every stage keeps the weights that do best on ``val``. CUDA is used where there is one. The same seed on the same
-    machine gives the same weights, killed and resumed or not.
+    machine with as many threads gives the same weights, killed and resumed or not.
 
     Args:
         blackouts: chances of a black picture, one of which is drawn for each training window.
@@ -182,6 +182,7 @@ def train(
         "seconds": round(seconds, 1),
         "versions": versions(),
         "device": name,
+        "threads": torch.get_num_threads(),
         "metrics": measure(filter_, held_out) if held_out else {},
     }
     if kept is not None:

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.stats import chi2
 from tensorboardX.proto.event_pb2 import Event
@@ -76,7 +77,9 @@ def run(words: list[str]) -> int:
 def killed_when(words: list[str], reached: Callable[[], bool]) -> None:
     """Runs a command line in another process and ends that with SIGKILL as soon as it has got that far."""
     words = [sys.executable, "-m", "beliefscope", *words]
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    # As many threads as here: sums in another order differ in their last bits.
+    env = os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())}
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=env)
     try:
         for _ in range(60_000):
             if reached():

@@ -119,7 +119,7 @@ def test_the_best_weights_on_the_validation_set_are_kept() -> None:
         return float((z - truth).square().mean().detach())
 
     trainer.model("haptics", module)
-    assert taken[-1] < 40
+    assert len(taken) < 40
     assert error() < 3.0
 
 
