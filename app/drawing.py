@@ -213,7 +213,8 @@ class Drawing:
     def _place_camera(self) -> None:
         """Where robot, object and belief are seen. A browser that has moved its camera keeps it."""
         at, eye = self._anchors[:, 0].mean(axis=0), EYE
-        if self._replay is None:
+        # A robot is about a meter long; without one, all there is lies around the belief.
+        if self._replay is None or np.ptp(self._replay.positions[:, 1:], axis=(0, 1)).max() < 0.5:
             low, high = _extent(self._task, self._trace)
             eye = BARE_EYE * (high - low).max()
         else:
