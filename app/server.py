@@ -89,11 +89,11 @@ def serve(
     """
     if listening is None:
         listening = _print_url
-    app = create_app(settings)
-    problems = app.state.library.problems()
-    if problems:
-        raise BadInput("; ".join(problems))
-    with _bound(host, port) as listener:
+    with _bound(host, port) as listener:  # first of all: without an address nothing is to be made
+        app = create_app(settings)
+        problems = app.state.library.problems()
+        if problems:
+            raise BadInput("; ".join(problems))
         shown = f"[{host}]" if ":" in host else host
         url = f"http://{shown}:{listener.getsockname()[1]}/"
         logging.getLogger("uvicorn.error").addFilter(_no_false_alarm)
