@@ -31,8 +31,9 @@ FORCE_LENGTH = 0.30  # m, the longest arrow
 PALE = 130.0  # gray of a particle without weight
 EYE = np.array([-0.28, -1.32, 1.22])  # m from what the camera looks at, for what is 1 m high
 UP = np.array([0.0, 0.0, 1.0])
-CELL = 0.05  # m between the lines of a bare plane
-BARE_EYE = np.array([-0.7, -1.1, 1.0])  # from the middle of a bare plane, in its sides
+CELLS = (0.05, 0.1, 0.25, 1.0)  # m between the lines of a bare plane, of which it has MOST_CELLS along a side
+MOST_CELLS = 14
+BARE_EYE = np.array([-0.5, -1.2, 1.1])  # from the middle of a bare plane, in its sides
 
 MUJOCO_PLANE = 0  # mjtGeom.mjGEOM_PLANE
 FLOOR_GRAY = (125, 125, 125)
@@ -215,8 +216,8 @@ class Drawing:
         at, eye = self._anchors[:, 0].mean(axis=0), EYE
         # A robot is about a meter long; without one, all there is lies around the belief.
         if self._replay is None or np.ptp(self._replay.positions[:, 1:], axis=(0, 1)).max() < 0.5:
-            low, high = _extent(self._task, self._trace)
-            eye = BARE_EYE * (high - low).max()
+            low, high, _ = _extent(self._task, self._trace)
+            at, eye = np.array([*(low + high) / 2.0, 0.0]), BARE_EYE * (high - low).max()
         else:
             eye = EYE * (0.6 + 0.4 * min(1.0, at[2]))
             at = at * [0.62, 0.3, 0.68] + [0.0, 0.0, 0.2 * max(0.0, 1.0 - at[2])]
@@ -243,8 +244,8 @@ def _add_replay(server: ViserServer, replayed: Replay) -> ViserMujocoScene:
 
 def _add_plane(server: ViserServer, task: Task, trace: Trace) -> None:
     """Where there is no replay: a grid under the belief, and the axes of the two components that span it."""
-    low, high = _extent(task, trace)
-    at = [np.arange(a, b + CELL / 2, CELL) for a, b in zip(low, high, strict=True)]
+    low, high, cell = _extent(task, trace)
+    at = [np.arange(a, b + cell / 2, cell) for a, b in zip(low, high, strict=True)]
     lines = [((x, low[1], 0), (x, high[1], 0)) for x in at[0]] + [((low[0], y, 0), (high[0], y, 0)) for y in at[1]]
     server.scene.add_line_segments(
         "/plane", np.array(lines, np.float32), FLOOR_GRAY, thickness=1.0, thickness_units="screen"
@@ -257,11 +258,12 @@ def _add_plane(server: ViserServer, task: Task, trace: Trace) -> None:
         server.scene.add_label(f"/plane/{name}", text, position=end, font_screen_scale=0.7, depth_test=False)
 
 
-def _extent(task: Task, trace: Trace) -> tuple[Array, Array]:
-    """Lower and upper corner (2,), m, of the whole cells in which the truth and its maps lie."""
+def _extent(task: Task, trace: Trace) -> tuple[Array, Array, float]:
+    """Lower and upper corner (2,), m, of the whole cells in which the truth and its maps lie, and a cell's side, m."""
     truth = trace.episode.states[:, list(task.map_indices)]
     low, high = truth.min(axis=0) - task.map_half_width, truth.max(axis=0) + task.map_half_width
-    return np.floor(low / CELL) * CELL, np.ceil(high / CELL) * CELL
+    cell = next((side for side in CELLS if (high - low).max() <= MOST_CELLS * side), CELLS[-1])
+    return np.floor(low / cell) * cell, np.ceil(high / cell) * cell, cell
 
 
 def _believed(trace: Trace) -> Iterator[tuple[str, Array, Array]]:

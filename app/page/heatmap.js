@@ -4,6 +4,8 @@ import { COLOUR_TABLE, colour, line, variable } from './palette.js';
 import { fixed, signed } from './units.js';
 
 const MARGIN = { left: 34, bottom: 30, top: 1, right: 5, gap: 9 }; // px around a map's square
+const SPACINGS = [1, 2, 5, 10, 20, 50, 100]; // cm between ticks
+const APART = 26; // px between them at least
 const SMALLEST = Math.log(0.5 / 255); // below this a byte is 0
 const HALO = ['rgb(255 255 255 / 0.55)', 3.5];
 const FONT = '10px system-ui, sans-serif';
@@ -99,7 +101,7 @@ export class Heatmaps {
 
   #drawAxes(pen, side, withY) {
     const half = 100 * this.#maps.half_width;
-    const spacing = half > 8 ? 5 : 2;
+    const spacing = SPACINGS.find((cm) => (cm / (2 * half)) * side > APART) ?? 2 * half;
     pen.font = FONT;
     pen.fillStyle = colour('muted');
     pen.strokeStyle = colour('muted');
@@ -111,14 +113,14 @@ export class Heatmaps {
       const at = Math.round(((cm + half) / (2 * half)) * side) + 0.5;
       pen.moveTo(at, side);
       pen.lineTo(at, side + 3);
-      if (side > 150 || cm % (2 * spacing) === 0) pen.fillText(fixed(cm, 0), at, side + 5);
+      pen.fillText(fixed(cm, 0), at, side + 5);
       if (!withY) continue;
       pen.moveTo(0, side - at);
       pen.lineTo(-3, side - at);
       pen.save();
       pen.textAlign = 'right';
       pen.textBaseline = 'middle';
-      if (side > 150 || cm % (2 * spacing) === 0) pen.fillText(fixed(cm, 0), -5, side - at);
+      pen.fillText(fixed(cm, 0), -5, side - at);
       pen.restore();
     }
     pen.stroke();

@@ -149,6 +149,7 @@ class Page {
     for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun]) panel.show(trace);
     $('#maps-what').textContent = spoken(trace.task.map.x).replace(/(^| )x$/, '') || 'position';
     $('#maps').classList.toggle('one', !trace.fuses);
+    $('#maps').classList.toggle('handless', !trace.has('effector_position'));
     $('#maps').classList.toggle('none', Boolean(trace.header.no_maps));
     if (trace.header.no_maps) say($('#heatmaps'), 'empty', sentence(trace.header.no_maps));
     $('#black-key').hidden = !trace.black.some(Boolean);

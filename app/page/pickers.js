@@ -43,7 +43,7 @@ export function pickers(catalog, store) {
 }
 
 function described({ index, policy, split, steps, contact_fraction }) {
-  return `${index} · ${policy} · ${split} · ${steps} steps · contact ${percent(contact_fraction)}`;
+  return [index, policy, split, `${steps} steps`, `contact ${percent(contact_fraction)}`].filter((part) => part !== '').join(' · ');
 }
 
 function fill(select, options) {
