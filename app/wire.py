@@ -96,7 +96,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "weights": trace.weights,
         "acting": trace.acting,
         "contact": trace.episode.contact,
-        "effective_sample_size": effective_sample_size(trace),
+        "effective_sample_size": trace.effective_sample_size,
     }
     arrays |= {key: trace.episode.observations.get(key) for key in SENSORS}
     described: list[dict[str, Any]] = []
@@ -108,13 +108,6 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
             buffers.append(np.ascontiguousarray(array, dtype="<f4").tobytes())
             offset += len(buffers[-1])
     return described, b"".join(buffers)
-
-
-def effective_sample_size(trace: Trace) -> NDArray[np.float32] | None:
-    """(T,): 1 / sum of the squared posterior weights, between 1 and M; None for a filter without particles."""
-    if trace.log_weights is None:
-        return None
-    return np.asarray(np.exp(-np.logaddexp.reduce(2.0 * trace.log_weights, axis=1)), dtype=np.float32)
 
 
 def pictures(trace: Trace) -> NDArray[np.uint8] | None:

@@ -23,6 +23,7 @@ from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace,
 from beliefscope.filters.checkpoint import Checkpoint, write_atomically
 from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.pf import ParticleFilter
+from beliefscope.filters.resample import effective_sample_size
 from beliefscope.filters.rollout import rollout, start_at_truth
 
 Array = NDArray[np.float32]
@@ -97,6 +98,11 @@ class Trace:
     def has_covariance(self) -> bool:
         """Whether the estimates come with a covariance: an LSTM's do not."""
         return self.kind != "lstm"
+
+    @property
+    def effective_sample_size(self) -> Array | None:
+        """(T,) ``1 / sum w_i^2`` of the posterior weights, between 1 and M; None for a filter without particles."""
+        return None if self.log_weights is None else effective_sample_size(torch.from_numpy(self.log_weights)).numpy()
 
 
 ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type))

@@ -64,10 +64,8 @@ def columns(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
         if values is not None:
             for k, modality in enumerate(trace.modalities):
                 yield f"{name}/{modality}", series(values[steps, k])
-    if trace.log_weights is not None:
-        weights = np.exp(trace.log_weights[steps].astype(np.float64))
-        size = weights.sum(axis=1) ** 2 / np.square(weights).sum(axis=1)
-        yield "diagnostics/effective_sample_size", series(size)
+    if trace.effective_sample_size is not None:
+        yield "diagnostics/effective_sample_size", series(trace.effective_sample_size[steps])
 
 
 def series(values: Array) -> Any:

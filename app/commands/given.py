@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -48,7 +50,7 @@ FilterName = Annotated[
     typer.Option(
         "--filter",
         metavar="NAME|CHECKPOINT",
-        help="A filter that ships trained (crossmodal-ekf, crossmodal-pf), or the path of a .safetensors file.",
+        help="A filter that ships trained, such as crossmodal-pf, or the path of a .safetensors file.",
     ),
 ]
 DataPath = Annotated[
@@ -149,22 +151,51 @@ def recipe(text: str, task: Task) -> Recipe:
     return found
 
 
-def traced(
-    checkpoint: Checkpoint,
-    data: Path | None,
-    index: int | None,
-    broken: Recipe,
-    particles: int,
-    seed: int,
-    skip_bad: bool = False,
-) -> Trace:
-    """The trace of one episode, with a bar. An index of None is the first that is held out."""
+def of_one_run(command: Callable[..., None]) -> Callable[..., None]:
+    """Puts the options that name one episode through one filter before a command's own.
+
+    The command is called with the checkpoint, the trace, and its own options, among them ``output`` and ``json``, which
+    are looked at before anything is computed.
+    """
+    signatures = [inspect.signature(function) for function in (_one_run, command)]
+    shared, own = (list(signature.parameters.values()) for signature in signatures)
+    hints = _hints(_one_run) | _hints(command)
+    options = [p.replace(kind=p.KEYWORD_ONLY, annotation=hints[p.name]) for p in (*shared, *own[2:])]
+
+    @wraps(command)
+    def run(**values: Any) -> None:
+        check(values["output"], values["json"])
+        named = {p.name: values.pop(p.name) for p in shared}
+        command(*_one_run(**named), **values)
+
+    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in options}
+    return run
+
+
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    # These two are not imported before a command runs.
+    return get_type_hints(function, localns={"Checkpoint": Any, "Trace": Any}, include_extras=True)
+
+
+def _one_run(
+    task: TaskName,
+    filter_: FilterName,
+    data: DataPath = None,
+    skip_bad: SkipBad = False,
+    episode: EpisodeIndex = None,
+    recipe_: RecipeText = "",
+    particles: Particles = 300,
+    seed: Seed = 0,
+) -> tuple[Checkpoint, Trace]:
+    """The checkpoint and the trace of one episode, with a bar. Without an index, of the first that is held out."""
     from beliefscope.inspect.trace import trace
 
-    with dataset(checkpoint.task, data, skip_bad) as episodes, console.progress("Filtering") as advance:
-        if index is None:
-            index = episodes.held_out()[0]
-        return trace(checkpoint, episodes[index], index, seed, particles, broken, advance)
+    loaded = checkpoint(task, filter_)
+    broken = recipe(recipe_, loaded.task)
+    with dataset(loaded.task, data, skip_bad) as episodes, console.progress("Filtering") as advance:
+        index = episodes.held_out()[0] if episode is None else episode
+        return loaded, trace(loaded, episodes[index], index, seed, particles, broken, advance)
 
 
 def described(trace: Trace, path: Path) -> dict[str, Any]:

@@ -3,47 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import (
-    DataPath,
-    EpisodeIndex,
-    FilterName,
-    Json,
-    Particles,
-    RecipeText,
-    Seed,
-    SkipBad,
-    TaskName,
-    check,
-    checkpoint,
-    described,
-    recipe,
-    title,
-    traced,
-    whole,
-)
+from beliefscope.app.commands.given import Json, described, of_one_run, title, whole
+
+if TYPE_CHECKING:
+    from beliefscope.filters.checkpoint import Checkpoint
+    from beliefscope.inspect.trace import Trace
 
 
+@of_one_run
 def record(
-    task: TaskName,
-    filter_: FilterName,
+    checkpoint: Checkpoint,
+    made: Trace,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN.rrd", help="Where to write the recording.")],
-    data: DataPath = None,
-    skip_bad: SkipBad = False,
-    episode: EpisodeIndex = None,
     maps: Annotated[
         int,
         typer.Option(
             "--maps", parser=whole(0), metavar="STRIDE", help="Likelihood maps of each STRIDE-th step; 0: none."
         ),
     ] = 10,
-    recipe_: RecipeText = "",
-    particles: Particles = 300,
-    seed: Seed = 0,
     json: Json = None,
 ) -> None:
     """Write one episode as a Rerun recording.
@@ -59,13 +41,10 @@ def record(
     from beliefscope.inspect.likelihood import MapEngine, no_maps
     from beliefscope.recordings.write import write_recording
 
-    check(output, json)
-    loaded = checkpoint(task, filter_)
-    made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed, skip_bad)
-    if maps and (why := no_maps(loaded)):
+    if maps and (why := no_maps(checkpoint)):
         console.say(f"without maps: {why}")
         maps = 0
-    layers = MapEngine(loaded, made).maps(range(0, len(made), maps)) if maps else None
+    layers = MapEngine(checkpoint, made).maps(range(0, len(made), maps)) if maps else None
     with console.progress("Recording") as advance:
         write_recording(made, output, maps=layers, progress=advance)
     console.result(described(made, output) | {"maps": maps}, title(made, output), json)

@@ -3,40 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import (
-    DataPath,
-    EpisodeIndex,
-    FilterName,
-    Json,
-    Particles,
-    RecipeText,
-    Seed,
-    SkipBad,
-    TaskName,
-    check,
-    checkpoint,
-    described,
-    recipe,
-    title,
-    traced,
-)
+from beliefscope.app.commands.given import Json, described, of_one_run, title
+
+if TYPE_CHECKING:
+    from beliefscope.filters.checkpoint import Checkpoint
+    from beliefscope.inspect.trace import Trace
 
 
+@of_one_run
 def trace(
-    task: TaskName,
-    filter_: FilterName,
+    checkpoint: Checkpoint,
+    made: Trace,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="TRACE", help="Where to write the trace.")],
-    data: DataPath = None,
-    skip_bad: SkipBad = False,
-    episode: EpisodeIndex = None,
-    recipe_: RecipeText = "",
-    particles: Particles = 300,
-    seed: Seed = 0,
     json: Json = None,
 ) -> None:
     """Keep all a filter knew, step by step.
@@ -52,8 +35,5 @@ def trace(
     """
     from beliefscope.inspect.trace import save_trace
 
-    check(output, json)
-    loaded = checkpoint(task, filter_)
-    made = traced(loaded, data, episode, recipe(recipe_, loaded.task), particles, seed, skip_bad)
     save_trace(made, output)
     console.result(described(made, output), title(made, output), json)

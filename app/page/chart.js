@@ -4,7 +4,7 @@ import { colour, line, translucent } from './palette.js';
 
 /**
  * @typedef {object} Series
- * @property {string} name truth, fused, a modality @property {number} index of the modality @property {ArrayLike<number>} values
+ * @property {string} name truth, fused, a modality @property {ArrayLike<number>} values
  * @property {ArrayLike<number>} [sigma] draws a band of two of them on either side
  * @typedef {object} Track
  * @property {string} title @property {string} unit @property {Series[]} series
@@ -31,16 +31,16 @@ export function chart(parent, track, shading, frame) {
   const data = [steps];
   const series = [{}];
   const bands = [];
-  for (const { name, index, values, sigma } of track.series) {
+  for (const { name, values, sigma } of track.series) {
     if (!sigma) continue;
     const edge = { points: { show: false }, width: 0, stroke: 'transparent' };
     data.push(values.map((v, t) => v + 2 * sigma[t]), values.map((v, t) => v - 2 * sigma[t]));
     series.push({ ...edge }, { ...edge });
-    bands.push({ series: [data.length - 2, data.length - 1], fill: translucent(line(name, index).stroke, name === 'fused' ? 0.2 : 0.08) });
+    bands.push({ series: [data.length - 2, data.length - 1], fill: translucent(line(name).stroke, name === 'fused' ? 0.2 : 0.08) });
   }
-  for (const { name, index, values } of track.series) {
+  for (const { name, values } of track.series) {
     data.push(values);
-    series.push({ ...line(name, index), points: { show: false } });
+    series.push({ ...line(name), points: { show: false } });
   }
   return new uPlot(
     {

@@ -45,7 +45,7 @@ export class Heatmaps {
     return layers.map((name, layer) => {
       const figure = document.createElement('figure');
       figure.innerHTML = '<h3></h3><canvas role="img"></canvas><figcaption></figcaption>';
-      figure.style.setProperty('--line', `var(${variable(fuses ? name : 'fused', layer)})`);
+      figure.style.setProperty('--line', `var(${variable(fuses ? name : 'fused')})`);
       const [title, canvas, caption] = figure.children;
       title.textContent = name.replaceAll('+', ' + ');
       canvas.addEventListener('pointermove', (event) => this.#point(event, layer));
@@ -91,7 +91,7 @@ export class Heatmaps {
     pen.beginPath();
     pen.rect(0, 0, side, side);
     pen.clip();
-    this.#drawMarks(pen, side, name, layer);
+    this.#drawMarks(pen, side, name);
     pen.restore();
     const [dx, dy] = maps.peak[layer].map((v) => signed(100 * v));
     canvas.setAttribute('aria-label', `${name}: likelihood over offsets from the truth, peak at ${dx}, ${dy} cm`);
@@ -134,7 +134,7 @@ export class Heatmaps {
   }
 
   /** Truth, estimates and the line to the end effector; y is up. */
-  #drawMarks(pen, side, name, layer) {
+  #drawMarks(pen, side, name) {
     const { half_width: half, centre, estimate, effector, step } = this.#maps;
     const place = ([x, y]) => [((x - centre[0] + half) / (2 * half)) * side, ((centre[1] - y + half) / (2 * half)) * side];
     const positionOf = (source) => this.#trace.position.map((i) => this.#trace.mean(source, i)[step] / 100);
@@ -161,7 +161,7 @@ export class Heatmaps {
     });
     if (name !== 'fused' && this.#trace.fuses) {
       const [x, y] = place(positionOf(name));
-      outlined([HALO, [line(name, layer).stroke, 2]], () => pen.arc(x, y, 5, 0, 2 * Math.PI));
+      outlined([HALO, [line(name).stroke, 2]], () => pen.arc(x, y, 5, 0, 2 * Math.PI));
     }
     const [x, y] = place(this.#trace.position.map((i) => estimate[i]));
     outlined([HALO, [line('fused').stroke, 2]], () => {

@@ -6,7 +6,7 @@ import { Clock } from './clock.js';
 import { Heatmaps, paintColourBar } from './heatmap.js';
 import { keys } from './keys.js';
 import { Numbers } from './numbers.js';
-import { Theme, swatch } from './palette.js';
+import { Theme, swatch, tellApart } from './palette.js';
 import { Messages, say } from './panel.js';
 import { choice, pickers } from './pickers.js';
 import { reading } from './reading.js';
@@ -145,6 +145,7 @@ class Page {
       messages.say('step', `Step ${step} does not exist: this episode has steps 0 to ${trace.steps - 1}.`);
       this.#store.set({ step: trace.steps - 1 });
     }
+    tellApart(trace.modalities);
     bodies.slice(1).forEach((body) => say(body, 'ready'));
     for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun]) panel.show(trace);
     $('#maps-what').textContent = spoken(trace.task.map.x).replace(/(^| )x$/, '') || 'position';
@@ -154,7 +155,7 @@ class Page {
     if (trace.header.no_maps) say($('#heatmaps'), 'empty', sentence(trace.header.no_maps));
     $('#black-key').hidden = !trace.black.some(Boolean);
     $('#worst').disabled = false;
-    $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s, i) => [swatch(s, i - 1), ` ${trace.called(s)}  `]));
+    $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s) => [swatch(s), ` ${trace.called(s)}  `]));
     $('#sigma-key').hidden = !trace.has('estimate_sigma');
     this.#choose();
     this.#move();

@@ -25,11 +25,11 @@ export class Numbers {
     const head = this.#columns.map(({ title, unit, help }) => element('th', { scope: 'col', title: help }, title, element('small', {}, unit || ' ')));
     const top = element('tr', {}, element('td', {}), ...head);
     this.#cells = [];
-    const rows = trace.sources.map((source, index) => {
-      const line = `--line: var(${variable(source, index)})`;
+    const rows = trace.sources.map((source) => {
+      const line = `--line: var(${variable(source)})`;
       const cells = this.#columns.map((column) => element('td', column.title === 'share' ? { class: 'share' } : {}));
       this.#cells.push(cells);
-      const title = element('th', { scope: 'row' }, swatch(source, index), trace.called(source));
+      const title = element('th', { scope: 'row' }, swatch(source), trace.called(source));
       return element('tr', { class: source, style: line }, title, ...cells);
     });
     this.#table.replaceChildren(element('thead', {}, top), element('tbody', {}, ...rows));

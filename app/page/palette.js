@@ -32,8 +32,15 @@ export const COLOUR_TABLE = colourTable();
 /** @param {string} name of a colour in page.css. @returns {string} as it is now, light or dark. */
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
 
-/** The colour's name in CSS of truth, fused or a modality. @param {string} name @param {number} index of the modality */
-export const variable = (name, index = 0) => (name in DASHES ? `--${name}` : `--spare-${index % SPARE_DASHES.length}`);
+let unnamed = []; // modalities that have no colour of their own
+
+/** Gives each modality that is not known here a colour and a dash to spare. @param {string[]} modalities of what is shown */
+export const tellApart = (modalities) => (unnamed = modalities.filter((name) => !Object.hasOwn(DASHES, name)));
+
+const spare = (name) => Math.max(0, unnamed.indexOf(name)) % SPARE_DASHES.length;
+
+/** The colour's name in CSS. @param {string} name truth, fused or a modality */
+export const variable = (name) => (Object.hasOwn(DASHES, name) ? `--${name}` : `--spare-${spare(name)}`);
 
 /** @param {string} colour `rgb(...)` as the browser gives it. @param {number} alpha 0..1. */
 export function translucent(colour, alpha) {
@@ -41,17 +48,17 @@ export function translucent(colour, alpha) {
 }
 
 /**
- * @param {string} name truth, fused or a modality. @param {number} index of the modality, for names not known here.
+ * @param {string} name truth, fused or a modality.
  * @returns {{stroke: string, dash: number[], width: number}} how its line is drawn.
  */
-export function line(name, index = 0) {
-  const dash = DASHES[name] ?? SPARE_DASHES[index % SPARE_DASHES.length];
-  return { stroke: colour(variable(name, index).slice(2)), dash, width: WIDTHS[name] ?? 1.5 };
+export function line(name) {
+  const dash = DASHES[name] ?? SPARE_DASHES[spare(name)];
+  return { stroke: colour(variable(name).slice(2)), dash, width: WIDTHS[name] ?? 1.5 };
 }
 
 /** A short piece of the line, for legends. @returns {SVGElement} */
-export function swatch(name, index = 0) {
-  const { dash, width } = line(name, index);
+export function swatch(name) {
+  const { dash, width } = line(name);
   const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');
   svg.setAttribute('class', 'swatch');
   svg.setAttribute('viewBox', '0 0 20 8');
@@ -60,7 +67,7 @@ export function swatch(name, index = 0) {
   path.setAttribute('d', 'M0 4h20');
   path.setAttribute('stroke-dasharray', dash.join(' '));
   path.setAttribute('stroke-width', String(width));
-  path.style.stroke = `var(${variable(name, index)})`;
+  path.style.stroke = `var(${variable(name)})`;
   svg.append(path);
   return svg;
 }

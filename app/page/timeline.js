@@ -214,9 +214,9 @@ function legend(track, trace) {
   const title = document.createElement('h3');
   title.textContent = track.unit ? `${track.title} (${track.unit})` : track.title;
   const list = document.createElement('dl');
-  for (const { name, index } of track.series) {
+  for (const { name } of track.series) {
     const term = document.createElement('dt');
-    term.append(swatch(name, index), trace.called(name));
+    term.append(swatch(name), trace.called(name));
     list.append(term, document.createElement('dd'));
   }
   element.append(title, list);

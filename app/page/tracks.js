@@ -15,7 +15,7 @@ export function tracks(trace, state) {
 function weights(trace, chosen, component) {
   const kind = trace.has('weights') ? chosen : 'acting';
   const series = trace.modalities
-    .map((name, index) => ({ name, index, values: trace.weight(kind, name, component) }))
+    .map((name) => ({ name, values: trace.weight(kind, name, component) }))
     .filter((s) => s.values);
   if (!series.length) return { title: 'Weights', unit: '', series, note: unweighed(trace) };
   const what = trace.weightWidth > 1 ? `, ${spoken(trace.components[component].name)}` : '';
@@ -32,25 +32,24 @@ function unweighed({ modalities: [model] }) {
 function estimates(trace, component) {
   const { name } = trace.components[component];
   const { unit } = trace.shown(component);
-  const sources = trace.sources.map((source, index) => ({
+  const sources = trace.sources.map((source) => ({
     name: source,
-    index,
     values: trace.mean(source, component),
     sigma: trace.sigma(source, component),
   }));
-  const truth = { name: 'truth', index: 0, values: trace.truth(component) };
+  const truth = { name: 'truth', values: trace.truth(component) };
   return { title: capital(spoken(name)), unit, series: [truth, ...sources], digits: 1 };
 }
 
 function lowest(trace, kind, component) {
   if (kind === 'particles' && trace.particles) {
     const most = trace.header.settings?.particles ?? trace.particles.reduce((a, b) => Math.max(a, b), 0);
-    const series = [{ name: 'fused', index: 0, values: trace.particles }];
+    const series = [{ name: 'fused', values: trace.particles }];
     return { title: 'Particles', unit: `of ${most}`, series, limits: [0, 1.04 * most], digits: 0 };
   }
   const angle = trace.angles.includes(component);
   const what = angle ? component : 'position';
-  const series = trace.sources.map((name, index) => ({ name, index, values: trace.error(name, what) }));
+  const series = trace.sources.map((name) => ({ name, values: trace.error(name, what) }));
   return {
     title: angle ? `${capital(spoken(trace.components[component].name))} error` : 'Position error',
     unit: angle ? '°' : 'cm',
