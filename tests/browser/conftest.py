@@ -35,9 +35,9 @@ TOLERATED = "Evaluating a string as JavaScript violates"
 class Served:
     """``beliefscope serve`` as a user starts it."""
 
-    def __init__(self, workspace: Path, port: int = 0) -> None:
+    def __init__(self, workspace: Path, port: int = 0, *more: str) -> None:
         command = Path(sysconfig.get_path("scripts")) / "beliefscope"
-        options = ["serve", "--port", str(port), "--no-open", "--workspace", str(workspace)]
+        options = ["serve", "--port", str(port), "--no-open", "--workspace", str(workspace), *more]
         self.process = subprocess.Popen([str(command), *options], stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
@@ -67,8 +67,8 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
     """Starts servers of the test's own, on one workspace."""
     started: list[Served] = []
 
-    def start(port: int = 0) -> Served:
-        started.append(Served(tmp_path / "workspace", port))
+    def start(port: int = 0, *more: str) -> Served:
+        started.append(Served(tmp_path / "workspace", port, *more))
         return started[-1]
 
     yield start

@@ -1,0 +1,91 @@
+"""The page of one's own filters, data and tasks: what there is not is said, and nothing stays behind of what was."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.batch import Steps
+from beliefscope.filters.catalog import architecture, build
+from beliefscope.filters.checkpoint import save_checkpoint
+
+pytestmark = pytest.mark.browser
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
+
+
+def untrained(task: str, name: str, data: Path, path: Path) -> None:
+    with open_dataset(data) as episodes:
+        filter_ = build(architecture(task, name))
+        filter_.statistics.fit(Steps.of(find_task(task), [episodes[0]]))
+    save_checkpoint(filter_, name, {}, path)
+
+
+def choose(page: Any, picker: str, value: str) -> None:
+    page.page.locator(f"#{picker}").select_option(value)
+
+
+def test_what_a_filter_has_not_is_said(open_page: Any, serve: Any, tmp_path: Path) -> None:
+    names = ("feature-ekf", "lstm")
+    for name in names:
+        untrained("door", name, sample_path("door"), tmp_path / f"my-{name}.safetensors")
+    options = [part for name in names for part in ("--filter", str(tmp_path / f"my-{name}.safetensors"))]
+    page = open_page(url=serve(0, *options, "--data", str(sample_path("door"))).url)
+    text = page.page.locator
+
+    assert page.state["filter"] == "my-feature-ekf"
+    assert text("#heatmaps h3").all_text_contents() == ["image + haptics"]
+    assert text("#numbers tbody th").all_text_contents() == ["estimate"]
+    assert "go into one measurement model" in text("#timeline .why").text_content()
+    assert text("#data").locator("option").all_text_contents() == ["door", "sample"]
+    page.picture("one-model")
+
+    choose(page, "filter", "my-lstm")
+    page.until("() => document.querySelector('#heatmaps').dataset.state === 'empty'")
+    assert "an LSTM estimates the state" in text("#heatmaps .note").text_content()
+    assert text("#reading").text_content().endswith("how sure it is, this filter does not say.")
+    assert "\N{GREEK SMALL LETTER SIGMA}" not in text("#numbers thead").text_content()
+    assert not text("#slice-label").is_visible()
+    page.page.keyboard.press("ArrowRight")
+    page.settle(1)
+    page.picture("lstm")
+
+    choose(page, "filter", "crossmodal-pf")
+    page.until("() => document.querySelectorAll('#heatmaps h3').length === 3")
+    assert text("#numbers tbody th").all_text_contents() == ["image", "haptics", "fused"]
+    assert text("#slice-label").is_visible()
+    choose(page, "data", "sample")
+    page.until("() => location.search.includes('data=sample')")
+    assert page.state["step"] == 0
+
+
+def test_a_task_of_ones_own(open_page: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, own = tmp_path / "ball.h5", tmp_path / "own.safetensors"
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), str(data)])
+    before = dict(TASKS)
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    name = find_task(f"{EXAMPLE}:TASK").name
+    try:
+        untrained(name, "crossmodal-pf", data, own)
+    finally:
+        for other in TASKS.keys() - before.keys():
+            monkeypatch.delitem(TASKS, other)
+    page = open_page(url=serve(0, "--task", f"{EXAMPLE}:TASK", "--data", str(data), "--filter", str(own)).url)
+    text = page.page.locator
+    assert page.state["task"] == name
+    assert text("#maps-what").text_content() == "position"
+    assert text("#heatmaps h3").all_text_contents() == ["image", "sound", "fused"]
+    assert not text("#slice-label").is_visible()
+    assert text("#camera figcaption").text_content() == "camera, 16 \N{MULTIPLICATION SIGN} 16"
+    page.settle(0)
+    page.picture("own-task")
+    choose(page, "task", "door")
+    page.until("() => document.querySelector('#maps-what').textContent === 'hinge'")
+    assert page.state["component"] == "hinge_x"
+    assert text("#slice-label").is_visible()
