@@ -16,8 +16,8 @@ from viser import ViserServer
 from beliefscope.app.library import Traced
 from beliefscope.datasets.replay import Replay, replay
 from beliefscope.datasets.task import Task
+from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
-from beliefscope.recordings.schema import colour
 
 Array = NDArray[Any]
 RGB = tuple[int, int, int]

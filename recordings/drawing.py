@@ -10,8 +10,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
-from beliefscope.recordings.schema import colour
 
 Array = NDArray[Any]
 Columns = Iterable[tuple[str, Any]]

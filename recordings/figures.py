@@ -20,7 +20,8 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import write_atomically
 from beliefscope.filters.study import TRIVIAL, Row
-from beliefscope.recordings.schema import COLOURS, SPARE_COLOURS
+from beliefscope.inspect.palette import COLOURS, SPARE_COLOURS
+from beliefscope.inspect.plotting import STYLE, WIDTH
 
 FAMILIES = {
     "crossmodal": COLOURS["fused"],
@@ -35,21 +36,6 @@ OTHERS = ("#000000", COLOURS["contact"], COLOURS["truth"])
 
 HATCHES = {"pf": "/////", "ukf": "....."}
 """Kinds of filters are told apart by hatching, and are lighter, so that print and any eye can."""
-
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 7,
-    "axes.titlesize": 8.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.6,
-    "hatch.linewidth": 0.4,
-    "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "beliefscope",  # the same results give the same file
-}
-
-WIDTH = 7.16
-"""Inches: two columns of a paper."""
 
 TALLEST = 2.0
 """Times the trivial predictor's error: taller bars are cut off there, and say their value."""

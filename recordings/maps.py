@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.drawing import rgba, series, sources
-from beliefscope.recordings.schema import colour
 
 Array = NDArray[Any]
 

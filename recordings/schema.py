@@ -1,4 +1,4 @@
-"""What is in a recording: its entities, its properties, its colours. ``docs/recordings.md`` is tested against this.
+"""What is in a recording: its entities and its properties. ``docs/recordings.md`` is tested against this.
 
 Paths under ``trace/`` and ``observations/`` hold the trace's own numbers (SI units, stored types) and are what an
 import reads. All other paths are drawn from them, for the eye: the page's units (cm, degrees), colours, markers.
@@ -18,18 +18,6 @@ HEADER = "__properties/beliefscope"
 
 STEP, TIME = "step", "time"
 """The two timelines: the trace's index t, and t * dt as a duration."""
-
-COLOURS: dict[str, str] = {
-    "truth": "#009E73",
-    "image": "#56B4E9",
-    "haptics": "#E69F00",
-    "fused": "#D55E00",
-    "contact": "#CC79A7",
-}
-"""Okabe and Ito's colours, which people with any colour vision tell apart. One meaning each, all over the product."""
-
-SPARE_COLOURS: tuple[str, ...] = ("#0072B2", "#F0E442", "#999999")
-"""For modalities that ``COLOURS`` does not name, in the order of the trace's modalities."""
 
 Needs = Literal["always", "modalities", "covariance", "weights", "acting", "ekf", "pf", "maps", "replay", "ghost"]
 
@@ -143,11 +131,3 @@ PROPERTIES: dict[str, str] = {
     "shapes": "JSON: stored path -> shape and type of one step",
 }
 """Properties of the recording (``property:beliefscope:...`` in Rerun's own queries)."""
-
-
-def colour(source: str, modalities: tuple[str, ...]) -> str:
-    """``#RRGGBB`` of ``truth``, ``fused``, ``contact`` or a modality."""
-    if source in COLOURS:
-        return COLOURS[source]
-    unnamed = [modality for modality in modalities if modality not in COLOURS]
-    return SPARE_COLOURS[unnamed.index(source) % len(SPARE_COLOURS)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from beliefscope.filters.checkpoint import shipped
-from beliefscope.recordings.schema import COLOURS
+from beliefscope.inspect.palette import COLOURS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -35,7 +35,8 @@ HEAVY = {
     "tensorboardX": ("app",),
     "scipy": ("filters", "inspect"),
     "ray": ("filters",),
-    "matplotlib": ("recordings",),
+    "matplotlib": ("inspect", "recordings"),
+    "captum": ("inspect",),
 }
 """Distribution's top-level module -> folders that may import it."""
 

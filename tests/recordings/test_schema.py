@@ -7,8 +7,9 @@ from pathlib import Path
 
 import beliefscope
 from beliefscope.datasets.episode import Episode
+from beliefscope.inspect.palette import COLOURS, SPARE_COLOURS, colour
 from beliefscope.inspect.trace import ARRAYS
-from beliefscope.recordings.schema import COLOURS, FORMAT_VERSION, PROPERTIES, SCHEMA, SPARE_COLOURS, colour
+from beliefscope.recordings.schema import FORMAT_VERSION, PROPERTIES, SCHEMA
 
 DOCS = (Path(beliefscope.__file__).resolve().parents[2] / "docs" / "recordings.md").read_text()
 

@@ -1,0 +1,95 @@
+"""What diagnostics measure a trace by: errors, NEES, and the kinds of steps it has. Shared by all of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.task import Task
+from beliefscope.filters.evaluate import LEFT_OUT, UNITS
+from beliefscope.inspect.trace import Trace
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FLOOR = 1e-8
+"""m^2 or rad^2 on the diagonal of a covariance before it is inverted: a particle set may have collapsed."""
+
+
+def task_of(trace: Trace) -> Task:
+    """The task of a trace's episode."""
+    return find_task(trace.episode.task)
+
+
+def layers(trace: Trace) -> tuple[str, ...]:
+    """Whose estimates there are: the K modalities, then ``fused``. L of them."""
+    return (*trace.modalities, "fused")
+
+
+def wrapped(task: Task, difference: NDArray[Any]) -> Array:
+    """Differences of states (..., n), angles brought to -pi..pi."""
+    difference = np.array(difference, dtype=np.float64)
+    for i, component in enumerate(task.components):
+        if component.unit == "rad":
+            difference[..., i] = (difference[..., i] + np.pi) % (2.0 * np.pi) - np.pi
+    return difference
+
+
+def means(trace: Trace) -> Array:
+    """(T, L, n) m, rad: each layer's estimate."""
+    return np.concatenate([trace.modality_mean, trace.estimate_mean[:, None]], axis=1).astype(np.float64)
+
+
+def covariances(trace: Trace) -> Array:
+    """(T, L, n, n): each layer's covariance with ``FLOOR`` on its diagonal; NaN where a filter has none."""
+    both = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
+    return both.astype(np.float64) + FLOOR * np.eye(both.shape[-1])
+
+
+def errors(trace: Trace) -> Array:
+    """(T, L, n) m, rad: estimate minus truth, angles wrapped."""
+    return wrapped(task_of(trace), means(trace) - trace.episode.states[:, None])
+
+
+def position_error(trace: Trace) -> Array:
+    """(T, L) m: distance from the truth on the map."""
+    where = list(task_of(trace).map_indices)
+    return np.linalg.norm(errors(trace)[..., where], axis=-1)
+
+
+def nees(trace: Trace) -> Array:
+    """(T, L): ``e^T S^-1 e / n``: mean 1 where consistent, more where over-confident. NaN without a covariance."""
+    error = errors(trace)
+    if not trace.has_covariance:
+        return np.full(error.shape[:2], np.nan)
+    white = np.linalg.solve(covariances(trace), error[..., None])[..., 0]
+    return np.einsum("tln,tln->tl", error, white) / error.shape[-1]
+
+
+def blackout(trace: Trace) -> Mask:
+    """(T,): whether a picture is black, every pixel zero."""
+    black = np.zeros(len(trace), dtype=bool)
+    for array in trace.episode.observations.values():
+        if array.ndim == 3 and array.dtype == np.uint8:
+            black |= ~array.any(axis=(1, 2))
+    return black
+
+
+def counted(trace: Trace) -> Mask:
+    """(T,): the steps that metrics count: not the first ``LEFT_OUT``, where the start at the truth still helps."""
+    return np.arange(len(trace)) >= min(LEFT_OUT, len(trace) - 1)
+
+
+def splits(trace: Trace) -> dict[str, Mask]:
+    """Kind of step -> its mask (T,), first steps left out: ``all``, ``contact``, ``no contact``, ``blackout``."""
+    contact, keep = trace.episode.contact.astype(bool), counted(trace)
+    return {"all": keep, "contact": keep & contact, "no contact": keep & ~contact, "blackout": keep & blackout(trace)}
+
+
+def shown_units(task: Task) -> tuple[tuple[str, ...], Array]:
+    """Units as shown (``cm``, ``deg``) of the n components, and the factors (n,) to them."""
+    pairs = [UNITS[component.unit] for component in task.components]
+    return tuple(unit for unit, _ in pairs), np.array([factor for _, factor in pairs])
