@@ -178,6 +178,7 @@ BAD = [
     f"trace {EKF} --recipe blackout=0.4: -o new.trace",
     f"record {EKF} --recipe frozen -o new.rrd",
     "train door --filter crossmodal-pf --recipe blackout=much -o new.safetensors",
+    "train door --filter crossmodal-pf --blackouts 0,1.5 -o new.safetensors",
     "recipes --json file",
     f"""evaluate {EKF} --recipe '{{"blackout": "much"}}'""",
     f"""evaluate {EKF} --recipe '{{"blackout": 1.5}}'""",
@@ -376,7 +377,10 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert trained["record"]["command"].startswith("beliefscope train door --filter crossmodal-pf --data ten.h5")
     assert trained["record"]["recipe"] == []
     episodes = trained["record"]["episodes"]
-    hardened = json.loads(run(line.replace("--json", "--recipe force_bias:x=5,blackout=0.4 --json"))[1])["record"]
+    more = "--recipe force_bias:x=5,blackout=0.4 --blackouts 0,0.8 --json"
+    hardened = json.loads(run(line.replace("--json", more))[1])["record"]
+    assert (trained["record"]["blackouts"], hardened["blackouts"]) == ([0.0, 0.4, 0.8], [0.0, 0.8])
+    assert hardened["command"].partition("--blackouts ")[2].startswith("0,0.8")
     assert [fault["fault"] for fault in hardened["recipe"]] == ["force_bias", "blackout"]
     assert hardened["episodes"] == episodes | {"train": 2 * episodes["train"]}
     assert "--recipe force_bias=5,blackout=0.4" in hardened["command"]

@@ -28,7 +28,14 @@ from beliefscope.datasets.errors import BadInput, one_of
 
 def train(
     task: TaskName,
-    filter_: Annotated[str, typer.Option("--filter", metavar="NAME", help="crossmodal-ekf or crossmodal-pf.")],
+    filter_: Annotated[
+        str,
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            help="{crossmodal,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf or lstm (docs/filters.md).",
+        ),
+    ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="CHECKPOINT", help="The .safetensors file to write.")
     ],
@@ -40,6 +47,14 @@ def train(
             "--preset", metavar="NAME", help="cpu: about 10 minutes on 2 cores. full: for a GPU. smoke: a trial."
         ),
     ] = "cpu",
+    blackouts: Annotated[
+        str,
+        typer.Option(
+            "--blackouts",
+            metavar="P,P,...",
+            help="Chances of a black picture, one of which is drawn for each training window.",
+        ),
+    ] = "0,0.4,0.8",
     recipe_: RecipeText = "",
     seed: Seed = 0,
     log: Annotated[
@@ -67,11 +82,13 @@ def train(
     from beliefscope.filters.checkpoint import save_checkpoint
     from beliefscope.filters.train import PLANS
     from beliefscope.filters.train import train as train_filter
+    from beliefscope.filters.trainer import BLACKOUTS
 
     check(output, json)
     if log is not None and (log.exists() and not log.is_dir()):
         raise BadInput(f"--log {str(log)!r} is a file; give the name of a folder")
     chosen = architecture(find_task(task).name, filter_)
+    black = chances(blackouts)
     if preset not in PLANS:
         raise one_of("preset", preset, PLANS)
     # Where on this machine the data lie is no part of the record; their hash is.
@@ -79,6 +96,7 @@ def train(
     broken = recipe(recipe_, find_task(task))
     partial = output.with_name(f"{output.name}.partial")
     given += f" --recipe {broken}" if broken else ""
+    given += "" if black == BLACKOUTS else f" --blackouts {blackouts}"
     with dataset(find_task(task), data, skip_bad) as episodes, console.bars() as move, losses(log) as write:
 
         def report(stage: str, done: int, count: int, loss: float) -> None:
@@ -92,6 +110,7 @@ def train(
             data_hash=episodes.hash,
             plan=PLANS[preset],
             seed=seed,
+            blackouts=black,
             command=f"beliefscope train {task} --filter {filter_}{given} --preset {preset} --seed {seed}",
             report=report,
             validated=lambda stage, done, count, loss: write("validation", stage, done, loss),
@@ -112,6 +131,19 @@ def train(
     for name, metrics in record["metrics"].get("0", {}).items():
         lines.append(f"{name}: " + ", ".join(f"{key} {value:.2f}" for key, value in metrics["rmse"].items()))
     console.result(document, "\n".join(lines), json)
+
+
+def chances(text: str) -> tuple[float, ...]:
+    """Reads ``0,0.4,0.8``. Raises BadInput where a part is not a chance."""
+    found = []
+    for part in text.split(","):
+        try:
+            found.append(float(part))
+        except ValueError:
+            found.append(-1.0)
+        if not 0.0 <= found[-1] <= 1.0:
+            raise BadInput(f"--blackouts {text!r}: {part!r} is not a chance from 0 to 1")
+    return tuple(found)
 
 
 @contextmanager
