@@ -6,7 +6,7 @@ Steps are pure: ``step(belief, evidence, generator) -> (belief, StepTrace)``. No
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -65,12 +65,14 @@ class Evidence:
             likelihood. LSTM: (T, N, 1, u) observations and controls, encoded and joined.
         noise: EKF, UKF: (T, N, K, n) standard deviations of z, the square root of R's diagonal. Others: None.
         log_weights: (T, N, K, W) log beta, W = n for weights per component, 1 for scalars; None without a weight model.
+        present: (T, N, K) bool, which models' evidence is used; None where all is. See ``of``.
     """
 
     control: Tensor
     observation: Tensor
     noise: Tensor | None
     log_weights: Tensor | None
+    present: Tensor | None = None
 
     def __getitem__(self, index: int | slice) -> Evidence:
         return self._map(lambda tensor: tensor[index])
@@ -84,6 +86,7 @@ class Evidence:
             observation=function(self.observation),
             noise=None if self.noise is None else function(self.noise),
             log_weights=None if self.log_weights is None else function(self.log_weights),
+            present=None if self.present is None else function(self.present),
         )
 
     def only(self, k: int) -> Evidence:
@@ -92,7 +95,24 @@ class Evidence:
             return self
         log_weights = torch.full_like(self.log_weights, -torch.inf)
         log_weights[..., k, :] = 0.0
-        return Evidence(self.control, self.observation, self.noise, log_weights)
+        return replace(self, log_weights=log_weights)
+
+    def of(self, present: Tensor) -> Evidence:
+        """The same evidence without some of the models: as if what they see were not there.
+
+        EKF, UKF: a model that is not present updates nothing, and is left out of the fusion. PF: its likelihood is left
+        out of the mixture. Beta of the others keeps its proportions. Where no model is present, only the dynamics move
+        the belief.
+
+        Args:
+            present: (T, N, K) bool. With N = 1 of the evidence, N may be any number: one trajectory a subset.
+        """
+        n = present.shape[1]
+        subset = replace(self._map(lambda tensor: tensor.expand(-1, n, *tensor.shape[2:])), present=present)
+        if subset.log_weights is None:
+            return subset
+        absent = present.any(-1, keepdim=True) & ~present
+        return replace(subset, log_weights=subset.log_weights.masked_fill(absent.unsqueeze(-1), -torch.inf))
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,11 @@ class ExtendedKalmanFilter(Filter):
         assert evidence.noise is not None
         predicted = self.predict(belief, evidence.control.unsqueeze(1))
         bank = update(predicted, evidence.observation, evidence.noise)
-        fused = self.fuse(bank, evidence.log_weights)
+        if evidence.present is not None:
+            seen = evidence.present.unsqueeze(-1)
+            mean = torch.where(seen, bank.mean, predicted.mean)
+            bank = Gaussian(mean, torch.where(seen.unsqueeze(-1), bank.covariance, predicted.covariance))
+        fused = self.fuse(bank, evidence.log_weights, evidence.present)
         trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)
         if self.architecture.feedback:
             bank = Gaussian(
@@ -109,10 +113,10 @@ class ExtendedKalmanFilter(Filter):
         mean, jacobian = self.dynamics.with_jacobian(belief.mean, control_part)
         return predict(belief, mean, jacobian, self.dynamics.noise)
 
-    def fuse(self, bank: Gaussian, log_weights: Tensor | None) -> Gaussian:
-        """The fused belief (N, n) of a bank (N, K, n)."""
+    def fuse(self, bank: Gaussian, log_weights: Tensor | None, present: Tensor | None = None) -> Gaussian:
+        """The fused belief (N, n) of a bank (N, K, n). present: (N, K) bool, as in ``Evidence``."""
         if log_weights is not None:
             return weighted_average(bank, log_weights, self.architecture.covariance)
         if len(self.names) == 1:
             return Gaussian(bank.mean[:, 0], bank.covariance[:, 0])
-        return product_of_experts(bank)
+        return product_of_experts(bank, present)

@@ -12,9 +12,16 @@ from beliefscope.filters.belief import Gaussian
 CovarianceRule = Literal["paper", "moments"]
 
 
-def product_of_experts(bank: Gaussian) -> Gaussian:
-    """Product of K Gaussians (N, K, n): ``S = (sum S_k^-1)^-1``, ``m = S sum S_k^-1 m_k`` (Lee et al., eq. 10, 11)."""
+def product_of_experts(bank: Gaussian, present: Tensor | None = None) -> Gaussian:
+    """Product of K Gaussians (N, K, n): ``S = (sum S_k^-1)^-1``, ``m = S sum S_k^-1 m_k`` (Lee et al., eq. 10, 11).
+
+    present: (N, K) bool, which of them there are. Where none is left, the K predictions, each to the power 1 / K, so
+    that they do not count as K pieces of evidence.
+    """
     precision = torch.linalg.inv(bank.covariance)
+    if present is not None:
+        power = torch.where(present.any(-1, keepdim=True), present.to(precision.dtype), 1.0 / present.shape[-1])
+        precision = precision * power[..., None, None]
     covariance = symmetric(torch.linalg.inv(precision.sum(-3)))
     information = (precision @ bank.mean.unsqueeze(-1)).sum(-3)
     return Gaussian((covariance @ information).squeeze(-1), covariance)
@@ -50,6 +57,13 @@ def mixture(log_likelihood: Tensor, log_weights: Tensor | None) -> Tensor:
     if log_weights is None:
         return torch.logsumexp(log_likelihood, dim=-2)
     return torch.logsumexp(log_likelihood + log_weights, dim=-2)
+
+
+def only_present(log_likelihood: Tensor, present: Tensor) -> Tensor:
+    """Log-likelihoods (N, K, M) without those of models that are not ``present`` (N, K); where none is, flat ones."""
+    none = ~present.any(-1, keepdim=True)
+    kept = log_likelihood.masked_fill(~present.unsqueeze(-1), -torch.inf)
+    return kept.masked_fill(none.unsqueeze(-1), 0.0)
 
 
 def symmetric(matrix: Tensor) -> Tensor:

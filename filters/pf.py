@@ -10,11 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from beliefscope.datasets.task import Task
+from beliefscope.filters import draws
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, Particles, StepTrace
 from beliefscope.filters.dynamics import Dynamics
 from beliefscope.filters.filter import Architecture, Filter, WeightModel, encoders
-from beliefscope.filters.fusion import mixture
+from beliefscope.filters.fusion import mixture, only_present
 from beliefscope.filters.networks import Residual, Stack, in_groups, vector_stack
 from beliefscope.filters.resample import resample
 
@@ -101,7 +102,7 @@ class ParticleFilter(Filter):
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Particles:
         factor = torch.linalg.cholesky(belief.covariance)
         shape = (len(belief.mean), particles, self.n)
-        unit = torch.randn(shape, generator=generator, device=belief.mean.device)
+        unit = draws.normal(shape, generator)
         states = belief.mean.unsqueeze(1) + unit @ factor.transpose(-1, -2)
         return Particles(states, torch.full(shape[:2], -math.log(particles), device=states.device))
 
@@ -109,10 +110,12 @@ class ParticleFilter(Filter):
         assert isinstance(belief, Particles)
         control = evidence.control.unsqueeze(1)
         moved = in_groups(lambda states: self.dynamics(states, control), belief.states)
-        unit = torch.randn(moved.shape, generator=generator, device=moved.device)
+        unit = draws.normal(moved.shape, generator)
         predicted = Particles(moved + unit * self.dynamics.noise, belief.log_weights)
         log_likelihood = self.log_likelihood(evidence, predicted.states)
         weighed = log_likelihood - self.scale(predicted.log_weights, log_likelihood)
+        if evidence.present is not None:
+            weighed = only_present(weighed, evidence.present)
         log_weights = predicted.log_weights + mixture(weighed, evidence.log_weights)
         posterior = Particles(predicted.states, torch.log_softmax(log_weights, dim=-1))
         rule, share = self.architecture.resampling, self.architecture.soft_share

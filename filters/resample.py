@@ -8,6 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from beliefscope.filters import draws
+
 Resampling = Literal["systematic", "hard", "soft"]
 
 
@@ -40,14 +42,14 @@ def systematic(log_weights: Tensor, generator: torch.Generator) -> Tensor:
         log_weights: (N, M), normalised. generator: of the same device.
     """
     count = log_weights.shape[-1]
-    offset = torch.rand(log_weights.shape[0], 1, generator=generator, device=log_weights.device)
+    offset = draws.uniform((len(log_weights), 1), generator)
     pointers = (torch.arange(count, device=log_weights.device) + offset) / count
     return pointed_at(log_weights, pointers)
 
 
 def multinomial(log_weights: Tensor, generator: torch.Generator) -> Tensor:
     """Ancestors (N, M) int64, each drawn on its own: particle i with the chance w_i. Arguments as ``systematic``."""
-    return pointed_at(log_weights, torch.rand(log_weights.shape, generator=generator, device=log_weights.device))
+    return pointed_at(log_weights, draws.uniform(log_weights.shape, generator))
 
 
 def soft(log_weights: Tensor, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
