@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.fusion import mixture
-from beliefscope.filters.pf import ParticleFilter
+from beliefscope.filters.pf import MeasurementModel, ParticleFilter
+from beliefscope.inspect.measures import wrapped
 from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float32]
 
+COARSE, FINE = 41, 135
+"""Cells along a side of a map that is drawn while a hand moves, or made of every step; and of one to look at."""
+
 LARGEST = 1024
 """Cells along a side that a map may have."""
+
+CELLS_AT_ONCE = 1700
+"""Cells that go through the networks in one go: a whole coarse map, and their activations stay in the caches."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,13 @@ def no_maps(checkpoint: Checkpoint) -> str | None:
 
 
 class MapEngine:
-    """Maps of one trace. What depends on the observations is computed once, for all steps."""
+    """Maps of one trace, with each thing computed once that several cells or steps share.
+
+    What depends on the observations: for all steps together. What depends on the cells: their first layer is linear,
+    ``W s + b = (W_x dx) + (W_y dy + W s_0 + b)`` for the cell at offsets dx, dy from the state s_0 in the middle, so it
+    is S columns and S rows instead of S x S cells. Their whole part of the networks is kept for the next map, which has
+    the same cells where only the observations have changed: the truth stands still, or the slice is held.
+    """
 
     def __init__(self, checkpoint: Checkpoint, trace: Trace) -> None:
         """Raises BadInput where there are none (``no_maps``), and when the trace was made by another checkpoint."""
@@ -90,7 +103,7 @@ class MapEngine:
         self.evidence = self._encode()
         rest = [i for i in range(len(self.task.components)) if i not in self.task.map_indices]
         self.fixed = rest[0] if rest else None
-        self._grid = lru_cache(maxsize=4)(self._compute_grid)
+        self._kept_parts = lru_cache(maxsize=2)(lambda size, middle: list(self._state_parts(size, middle)))
 
     @torch.no_grad()
     def _encode(self) -> Evidence | None:
@@ -99,18 +112,8 @@ class MapEngine:
             return None
         return filter_.encode(Steps.of(self.task, [self.trace.episode]).episode(0))
 
-    def _compute_grid(self, size: int, x: float, y: float) -> tuple[Array, Tensor]:
-        """Offsets (S,) and states (S * S, n) in SI units, row by row, the fixed component zero."""
-        half = self.task.map_half_width
-        offsets = ((np.arange(size) + 0.5) / size * 2.0 - 1.0) * half
-        states = np.zeros((size, size, len(self.task.components)), np.float32)
-        ix, iy = self.task.map_indices
-        states[..., ix] = x + offsets
-        states[..., iy] = y + offsets[:, None]
-        return offsets.astype(np.float32), torch.from_numpy(states.reshape(size * size, -1))
-
     @torch.no_grad()
-    def map(self, step: int, angle: float | None = None, size: int = 135) -> LikelihoodMap:
+    def map(self, step: int, angle: float | None = None, size: int = FINE) -> LikelihoodMap:
         """The maps at one step.
 
         Args:
@@ -126,54 +129,101 @@ class MapEngine:
             raise BadInput(f"a map has 2 to {LARGEST} cells along a side, not {size}")
         if angle is not None and not math.isfinite(angle):
             raise BadInput(f"angle must be a finite number of rad, not {angle}")
-        truth = trace.episode.states[step]
-        centre = truth[list(self.task.map_indices)]
-        offsets, states = self._grid(size, float(centre[0]), float(centre[1]))
-        if self.fixed is None:
-            angle = math.nan
-        else:
-            angle = float(truth[self.fixed]) if angle is None else angle
-            states = states.clone()
-            states[:, self.fixed] = angle
-        values = self._particle_filter(step, states) if self.evidence is not None else self._gaussians(step, states)
+        middle = trace.episode.states[step].astype(np.float64)
+        centre = trace.episode.states[step][list(self.task.map_indices)]
+        if self.fixed is not None and angle is not None:
+            middle[self.fixed] = angle
+        values = self._particle_filter if self.evidence is not None else self._gaussians
         return LikelihoodMap(
             step=step,
-            angle=angle,
+            angle=math.nan if self.fixed is None else float(middle[self.fixed]),
             layers=(*trace.modalities, "fused"),
-            offsets_x=offsets,
-            offsets_y=offsets,
+            offsets_x=self._offsets(size),
+            offsets_y=self._offsets(size),
             centre=centre,
-            log_likelihood=values.reshape(-1, size, size).numpy(),
+            log_likelihood=values(step, size, middle),
         )
 
-    def maps(self, steps: Iterable[int], size: int = 135) -> Iterator[LikelihoodMap]:
-        """The maps at several steps, at the true angle."""
-        return (self.map(step, size=size) for step in steps)
+    def maps(
+        self, steps: Sequence[int], size: int = FINE, progress: Callable[[float], None] | None = None
+    ) -> Iterator[LikelihoodMap]:
+        """The maps at several steps, at the true angle. ``progress`` is called with the share done, 0..1."""
+        for count, step in enumerate(steps, start=1):
+            yield self.map(step, size=size)
+            if progress is not None:
+                progress(count / len(steps))
 
-    def _particle_filter(self, step: int, states: Tensor) -> Tensor:
-        """(K + 1, S * S) log-likelihoods of the measurement models and of their mixture."""
-        filter_ = self.checkpoint.filter
+    def _offsets(self, size: int) -> Array:
+        """(S,) m, cell centres."""
+        offsets = ((np.arange(size) + 0.5) / size * 2.0 - 1.0) * self.task.map_half_width
+        return offsets.astype(np.float32)
+
+    def _particle_filter(self, step: int, size: int, middle: NDArray[np.float64]) -> Array:
+        """(K + 1, S, S) log-likelihoods of the measurement models and of their mixture."""
+        filter_, trace = self.checkpoint.filter, self.trace
         assert isinstance(filter_, ParticleFilter)
         assert self.evidence is not None
         evidence = self.evidence[step]
-        standard = filter_.statistics.standardise("state", states).unsqueeze(0)
-        each = filter_.log_likelihood(evidence, standard)[0]
-        trace = self.trace
+        state = tuple(middle.tolist())
+        parts = self._kept_parts(size, state) if size <= FINE else self._state_parts(size, state)
+        of_observation = list(zip(self._models(), evidence.observation[0], strict=True))
+        chunks = [
+            torch.stack(
+                [model.log_likelihood(seen, part) for (model, seen), part in zip(of_observation, each, strict=True)]
+            )
+            for each in parts
+        ]
+        each = torch.cat(chunks, dim=1)
         assert trace.prior_log_weights is not None
         assert trace.log_likelihood is not None
         prior, of_particles = trace.prior_log_weights[step], trace.log_likelihood[step]
         scale = filter_.scale(torch.from_numpy(prior)[None], torch.from_numpy(of_particles)[None])[0]
         log_weights = None if evidence.log_weights is None else evidence.log_weights[0]
-        return torch.cat([each, mixture(each - scale, log_weights).unsqueeze(0)])
+        values = torch.cat([each, mixture(each - scale, log_weights).unsqueeze(0)])
+        return values.unflatten(1, (size, size)).numpy()
 
-    def _gaussians(self, step: int, states: Tensor) -> Tensor:
-        """(K + 1, S * S) log densities of each unimodal posterior and of the fused one."""
-        trace = self.trace
-        mean = np.concatenate([trace.modality_mean[step], trace.estimate_mean[step][None]])
+    def _models(self) -> list[MeasurementModel]:
+        filter_ = self.checkpoint.filter
+        assert isinstance(filter_, ParticleFilter)
+        return [filter_.measurement_model(name) for name in filter_.names]
+
+    def _state_parts(self, size: int, middle: tuple[float, ...]) -> Iterator[list[Tensor]]:
+        """Each model's part of a chunk of cells (cells, units), chunk by chunk, row by row."""
+        statistics = self.checkpoint.filter.statistics
+        _, std = statistics.mean_std("state")
+        state = statistics.standardise("state", torch.tensor(middle, dtype=torch.float64))
+        offsets = torch.from_numpy(self._offsets(size))[:, None]
+        summands = []
+        for model in self._models():
+            first = model.state_encoder[0]
+            assert isinstance(first, nn.Linear)
+            by_x, by_y = ((first.weight / std)[:, i] for i in self.task.map_indices)
+            summands.append((model, offsets * by_x, offsets * by_y + first(state)))
+        at_once = max(1, CELLS_AT_ONCE // size)
+        for row in range(0, size, at_once):
+            yield [
+                model.join_state(model.state_encoder[1:](columns + rows[row : row + at_once, None])).flatten(0, 1)
+                for model, columns, rows in summands
+            ]
+
+    def _gaussians(self, step: int, size: int, middle: NDArray[np.float64]) -> Array:
+        """(K + 1, S, S) log densities of each unimodal posterior and of the fused one.
+
+        The squared Mahalanobis distance is a sum over columns, over rows, and over their product.
+        """
+        trace, (ix, iy) = self.trace, self.task.map_indices
+        mean = np.concatenate([trace.modality_mean[step], trace.estimate_mean[step][None]]).astype(np.float64)
         covariance = np.concatenate([trace.modality_covariance[step], trace.estimate_covariance[step][None]])
-        factor = torch.linalg.cholesky(torch.from_numpy(covariance).double())
-        difference = states.double() - torch.from_numpy(mean).double()[:, None]
-        white = torch.linalg.solve_triangular(factor, difference.transpose(-1, -2), upper=False)
-        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
-        constant = 0.5 * states.shape[-1] * math.log(2.0 * math.pi)
-        return (-0.5 * white.square().sum(-2) - log_det - constant).float()
+        factor = np.linalg.cholesky(covariance.astype(np.float64))
+        whiten = np.linalg.inv(factor)
+        precision = whiten.swapaxes(-1, -2) @ whiten
+        from_mean = wrapped(self.task, middle - mean)
+        offsets = self._offsets(size).astype(np.float64)
+        slope = (precision @ from_mean[..., None])[..., 0]
+        along_x, along_y = (precision[:, i, i, None] * offsets**2 + 2.0 * slope[:, i, None] * offsets for i in (ix, iy))
+        both = 2.0 * precision[:, ix, iy, None, None] * offsets[:, None] * offsets
+        middle_squared = np.einsum("ln,ln->l", from_mean, slope)[:, None, None]
+        squared = middle_squared + along_x[:, None, :] + along_y[:, :, None] + both
+        log_det = np.log(np.einsum("lnn->ln", factor)).sum(-1)[:, None, None]
+        constant = 0.5 * mean.shape[-1] * math.log(2.0 * math.pi)
+        return (-0.5 * squared - log_det - constant).astype(np.float32)
