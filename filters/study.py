@@ -13,7 +13,7 @@ import os
 import statistics
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -240,6 +240,8 @@ class Row:
             ``coverage95``, ``seconds`` of training. Spread is the standard deviation (n - 1). None where a seed has no
             such number, and a spread of one seed.
         bounds: of ``nees``: see ``nees_bounds``. None with no covariance.
+        alone: modality -> mean RMSE over the seeds of the same filter where that modality alone decides; of crossmodal
+            filters.
     """
 
     task: str
@@ -251,6 +253,7 @@ class Row:
     mean: Mapping[str, float | None]
     spread: Mapping[str, float | None]
     bounds: tuple[float, float] | None = None
+    alone: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
 
 
 def nees_bounds(n: int, trajectories: int) -> tuple[float, float]:
@@ -279,7 +282,8 @@ def rows_of(documents: Mapping[Cell, Document | None]) -> list[Row]:
                 if mean.get("nees") is not None:
                     trajectories = found[0]["episodes"]["test"] or found[0]["episodes"]["val"]
                     bounds = nees_bounds(len(find_task(task).components), trajectories)
-                rows.append(Row(task, name, blackout, len(found), len(asked), failed, mean, spread, bounds))
+                alone = _alone([d["metrics"][f"{blackout:g}"] for d in found])
+                rows.append(Row(task, name, blackout, len(found), len(asked), failed, mean, spread, bounds, alone))
         if finished:
             rows.append(Row(task, TRIVIAL, None, 0, 0, 0, finished[0]["trivial"], {}))
     return rows
@@ -290,6 +294,11 @@ def _numbers(document: Document, blackout: float) -> dict[str, float | None]:
     rest = {key: fused[key] for key in ("nll", "nees", "coverage95")}
     rmse = {key: fused["rmse"][key] for key in document["trivial"]}
     return rmse | rest | {"seconds": document["seconds"]}
+
+
+def _alone(measured: Sequence[Document]) -> dict[str, dict[str, float | None]]:
+    names = [name for name in (measured[0] if measured else ()) if name != "fused"]
+    return {name: _over_seeds([one[name]["rmse"] for one in measured])[0] for name in names}
 
 
 def _over_seeds(numbers: Sequence[Mapping[str, float | None]]) -> tuple[dict[str, Any], dict[str, Any]]:
