@@ -16,6 +16,7 @@ from beliefscope.app import console
 from beliefscope.app.commands.collect import collect
 from beliefscope.app.commands.convert import convert
 from beliefscope.app.commands.evaluate import evaluate
+from beliefscope.app.commands.failures import failures
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
 from beliefscope.app.commands.serve import serve
@@ -24,7 +25,7 @@ from beliefscope.app.commands.trace import trace
 from beliefscope.app.commands.train import train
 from beliefscope.datasets.errors import BadInput
 
-COMMANDS = (serve, collect, convert, train, evaluate, study, trace, record, recipes)
+COMMANDS = (serve, collect, convert, train, evaluate, study, trace, record, failures, recipes)
 
 cli = typer.Typer(
     name="beliefscope",

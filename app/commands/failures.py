@@ -1,0 +1,139 @@
+"""``beliefscope failures``"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from beliefscope.app import console
+from beliefscope.app.commands.given import (
+    DataPath,
+    FilterName,
+    Json,
+    Particles,
+    RecipeText,
+    Seed,
+    SkipBad,
+    TaskName,
+    check,
+    checkpoint,
+    dataset,
+    recipe,
+    whole,
+)
+
+if TYPE_CHECKING:
+    from beliefscope.inspect.diagnostic import Table
+
+
+def failures(
+    task: TaskName,
+    filter_: FilterName,
+    data: DataPath = None,
+    skip_bad: SkipBad = False,
+    recipe_: RecipeText = "",
+    by: Annotated[
+        str,
+        typer.Option(
+            "--by",
+            metavar="SCORE",
+            help="error (on the map), the name of an angle, nees, ess, disagreement (of the modalities), "
+            "regret (of the weights).",
+        ),
+    ] = "error",
+    top: Annotated[int, typer.Option("--top", parser=whole(1), metavar="N", help="So many of the worst.")] = 20,
+    group: Annotated[
+        str | None, typer.Option("--group", metavar="NAME", help="Only moments of this group: 'contact made'.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Every episode, not only those held out.")] = False,
+    url: Annotated[
+        str | None, typer.Option("--url", metavar="URL", help="Of a running page: print a whole link to each moment.")
+    ] = None,
+    particles: Particles = 300,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Find the moments at which a filter fails.
+
+    Over all held-out episodes: stretches of steps whose score is among the worst tenth, one moment each, ranked by
+    their peak; and what was happening there, with how much more often than chance. Groups: contact made, contact
+    lost, blackout, fast motion, start, steady contact, free. A link opens a moment on the page (beliefscope serve).
+
+    \b
+    Examples:
+      beliefscope failures door --filter crossmodal-ekf
+      beliefscope failures push --filter crossmodal-pf --by disagreement --group "contact made"
+      beliefscope failures push --filter crossmodal-pf --recipe blackout=0.4 --url http://127.0.0.1:8000
+      beliefscope failures door --filter mine.safetensors --data door.h5 --by angle --top 5 --json -
+    """
+    from beliefscope.app.link import moment_link
+    from beliefscope.app.shelf import SAMPLE, short_names
+    from beliefscope.datasets.catalog import TASKS
+    from beliefscope.datasets.errors import one_of
+    from beliefscope.filters.catalog import filters_of
+    from beliefscope.inspect.diagnostic import as_json
+    from beliefscope.inspect.failures import find_failures
+    from beliefscope.inspect.survey import GROUPS
+
+    check(None, json)
+    if group is not None and group not in GROUPS:
+        raise one_of("group", group, GROUPS)
+    tested = checkpoint(task, filter_)
+    broken = recipe(recipe_, tested.task)
+    with dataset(tested.task, data, skip_bad) as episodes, console.progress("Filtering") as advance:
+        indices = range(len(episodes)) if every else episodes.held_out()
+        found = find_failures(
+            tested, episodes, indices, by=by, recipe=broken, seed=seed, particles=particles, progress=advance
+        )
+    is_path = filter_.endswith(".safetensors") or os.sep in filter_
+    # The names that `serve` gives to the same files.
+    ships = {name for known in TASKS.values() for name in filters_of(known)}
+    filter_name = next(iter(short_names([Path(filter_)], ships))) if is_path else filter_
+    data_name = SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
+    moments = found.worst(top, group)
+    base = "" if url is None else url.rstrip("/") + "/"
+    links = [
+        base + moment_link(tested.task, filter_name, data_name, m.episode, m.step, str(broken), by) for m in moments
+    ]
+    document = found.to_dict() | {
+        "moments": [as_json(m) | {"link": link} for m, link in zip(moments, links, strict=True)],
+        "serve": serving(filter_ if is_path else None, data, seed),
+    }
+    lines = [found.verdict, *map(text, (found.table_of_groups(), found.table_of(moments)))]
+    if url is not None:
+        lines += [f"Links, for {document['serve']}", *links]
+    if particles != 300 and found.particles:
+        console.say("note: the page filters with 300 particles, so its numbers at these moments are others")
+    console.result(document, "\n\n".join(lines[:3]) + "".join(f"\n{line}" for line in lines[3:]), json)
+
+
+def serving(filter_: str | None, data: Path | None, seed: int) -> str:
+    """The command whose page shows what was looked at."""
+    given = [*(["--data", str(data)] if data else []), *(["--filter", filter_] if filter_ else [])]
+    return shlex.join(["beliefscope", "serve", *given, *(["--seed", str(seed)] if seed else [])])
+
+
+def text(table: Table) -> str:
+    """A table, as wide as it needs."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table as Grid
+
+    grid = Grid(title=table.title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for i, name in enumerate(table.columns):
+        words = any(isinstance(row[i], str) for row in table.rows)
+        grid.add_column(name, justify="left" if words else "right", no_wrap=True)
+    for row in table.rows:
+        grid.add_row(*(_shown(value) for value in row))
+    view = Console(width=1000, color_system=None)
+    with view.capture() as capture:
+        view.print(grid)
+    return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
+
+
+def _shown(value: str | int | float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,97 @@
+"""The command ``failures`` and the links it gives."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from urllib.parse import parse_qs
+
+import pytest
+
+from beliefscope.app.cli import main
+from beliefscope.app.link import moment_link
+from beliefscope.app.server import Settings
+from beliefscope.datasets.door import DOOR
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["beliefscope", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return int(end.value.code or 0), *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def line(given: Settings) -> list[object]:
+    """The command over the small data set."""
+    checkpoint, data = given.checkpoints["crossmodal-pf"], given.data["mine"]
+    return ["failures", "door", "--filter", checkpoint, "--data", data, "--particles", 30]
+
+
+def test_a_document_with_links(run: Run, line: list[object], given: Settings) -> None:
+    folder = given.checkpoints["crossmodal-pf"].parent.name
+    code, out, _ = run(*line, "--all", "--by", "angle", "--recipe", "blackout=0.4", "--top", 2, "--json", "-")
+    assert code == 0
+    document = json.loads(out)
+    assert document["episodes"] == 2
+    assert 1 <= len(document["moments"]) <= 2
+    moment = document["moments"][0]
+    asked = {key: value for key, (value,) in parse_qs(moment["link"].removeprefix("?")).items()}
+    assert asked == {
+        "task": "door",
+        "filter": f"{folder}-crossmodal-pf",  # the bare name is that of the filter that ships
+        "data": "door",
+        "episode": str(moment["episode"]),
+        "step": str(moment["step"]),
+        "component": "angle",
+        "weights": "raw",
+        "track": "error",
+        "tab": "scene",
+        "recipe": "blackout=0.4",
+    }
+    assert "--data" in document["serve"]
+
+
+def test_tables_and_whole_links(run: Run, line: list[object]) -> None:
+    code, out, err = run(*line, "--url", "http://127.0.0.1:9000/", "--by", "ess")
+    assert code == 0
+    assert "What was happening: particles to effective ones (x)" in out
+    assert "http://127.0.0.1:9000/?task=door&" in out
+    assert "track=particles" in out
+    assert "the page filters with 300 particles" in err
+
+
+def test_only_one_group(run: Run, line: list[object]) -> None:
+    every = json.loads(run(*line, "--all", "--by", "ess", "--json", "-")[1])["moments"]
+    name = every[-1]["group"]
+    kept = json.loads(run(*line, "--all", "--by", "ess", "--group", name, "--json", "-")[1])["moments"]
+    assert kept == [moment for moment in every if moment["group"] == name]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--by", "eror"], "score of task 'door' 'eror' does not exist. Available: error, angle, nees, ess"),
+        (["--group", "contact"], "group 'contact' does not exist. Available: contact made"),
+        (["--top", "0"], "'0' is not a whole number of at least 1"),
+    ],
+)
+def test_what_is_wrong_is_said(run: Run, line: list[object], options: list[str], message: str) -> None:
+    code, out, err = run(*line, *options)
+    assert (code, out) == (2, "")
+    assert message in " ".join(err.split())
+
+
+def test_a_link_keeps_any_name() -> None:
+    link = moment_link(DOOR, "my filter*~", "a&b=ü", 3, 4, "blackout=1:from=2,delay=image:steps=3", "regret")
+    asked = {key: value for key, (value,) in parse_qs(link.removeprefix("?")).items()}
+    assert (asked["filter"], asked["data"]) == ("my filter*~", "a&b=ü")
+    assert asked["recipe"] == "blackout=1:from=2,delay=image:steps=3"
+    assert asked["weights"] == "acting"
