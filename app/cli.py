@@ -15,6 +15,7 @@ from beliefscope import __version__
 from beliefscope.app import console
 from beliefscope.app.commands.collect import collect
 from beliefscope.app.commands.convert import convert
+from beliefscope.app.commands.counterfactual import counterfactual
 from beliefscope.app.commands.evaluate import evaluate
 from beliefscope.app.commands.failures import failures
 from beliefscope.app.commands.recipes import recipes
@@ -25,7 +26,7 @@ from beliefscope.app.commands.trace import trace
 from beliefscope.app.commands.train import train
 from beliefscope.datasets.errors import BadInput
 
-COMMANDS = (serve, collect, convert, train, evaluate, study, trace, record, failures, recipes)
+COMMANDS = (serve, collect, convert, train, evaluate, study, trace, record, counterfactual, failures, recipes)
 
 cli = typer.Typer(
     name="beliefscope",

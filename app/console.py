@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
@@ -41,6 +41,24 @@ def table(rows: Mapping[str, str]) -> str:
     """Two columns, the second aligned to the right."""
     left, right = max(map(len, rows)), max(map(len, rows.values()))
     return "\n".join(f"{name:<{left}}  {value:>{right}}" for name, value in rows.items())
+
+
+def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int | float | None]]) -> str:
+    """A table under its title; numbers to the right with three digits, unknown ones as ``-``."""
+
+    def shown(value: str | int | float | None) -> str:
+        return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+    cells = [list(columns), *([shown(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    numeric = [bool(rows) and not any(isinstance(row[i], str) for row in rows) for i in range(len(columns))]
+    lines = [
+        "  ".join(
+            f"{cell:{'>' if right else '<'}{width}}" for cell, width, right in zip(row, widths, numeric, strict=True)
+        )
+        for row in cells
+    ]
+    return "\n".join([title, *(f"  {line.rstrip()}" for line in lines)])
 
 
 @contextmanager

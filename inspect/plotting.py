@@ -45,6 +45,7 @@ FORMATS: dict[str, dict[str, Any]] = {
 BANDS = {
     "contact": {"facecolor": COLOURS["contact"], "alpha": 0.2},
     "blackout": {"facecolor": "#000000", "alpha": 0.12},
+    "edit": {"facecolor": "#0072B2", "alpha": 0.12},
 }
 
 PANEL_HEIGHT = 1.5
@@ -53,13 +54,19 @@ PANEL_HEIGHT = 1.5
 
 def write_figure(figure: Figure, path: Path) -> None:
     """Writes a figure as SVG, PDF or PNG (300 dpi), by the path's ending. Raises BadInput for another ending."""
-    suffix = path.suffix.removeprefix(".").lower()
-    if suffix not in FORMATS:
-        raise one_of("format of a figure", suffix, FORMATS)
+    suffix = figure_format(path)
     data = io.BytesIO()
     with rc_context(STYLE):
         figure.savefig(data, format=suffix, **FORMATS[suffix])
     write_atomically(path, data.getvalue())
+
+
+def figure_format(path: Path) -> str:
+    """``svg``, ``pdf`` or ``png``, by the path's ending. Raises BadInput for another ending."""
+    suffix = path.suffix.removeprefix(".").lower()
+    if suffix not in FORMATS:
+        raise one_of("format of a figure", suffix, FORMATS)
+    return suffix
 
 
 def figure_of(diagnostic: Diagnostic) -> Figure:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, moments
 from beliefscope.filters.checkpoint import Checkpoint, write_atomically
 from beliefscope.filters.filter import Filter, Kind
+from beliefscope.filters.foreign import Foreign
 from beliefscope.filters.pf import ParticleFilter
 from beliefscope.filters.resample import effective_sample_size
 from beliefscope.filters.rollout import rollout, start_at_truth
@@ -41,7 +42,8 @@ class Trace:
         episode: what was filtered: truth, contact, observations as the filter saw them, replay.
         modalities: names of the K measurement models, in the order of every K axis: each a modality, or several joined
             by ``+`` that share one. None in an LSTM, which has no models: K is 0.
-        kind: ``ekf``, ``ukf``, ``pf`` or ``lstm``. What is said of EKFs here holds for UKFs as well.
+        kind: ``ekf``, ``ukf``, ``pf``, ``lstm`` or ``foreign``, which has what could be captured. What is said of EKFs
+            here holds for UKFs as well.
         filter: its name.
         estimate_mean, estimate_covariance: (T, n), (T, n, n) fused posterior. LSTM: the covariance is NaN.
         modality_mean, modality_covariance: (T, K, n), (T, K, n, n): what each modality alone believes after the step.
@@ -97,7 +99,12 @@ class Trace:
     @property
     def has_covariance(self) -> bool:
         """Whether the estimates come with a covariance: an LSTM's do not."""
-        return self.kind != "lstm"
+        return not np.isnan(self.estimate_covariance).all() or not len(self)
+
+    @property
+    def alone(self) -> tuple[str, ...]:
+        """The modalities, where it is known what each alone believes; else none."""
+        return () if np.isnan(self.modality_mean).all() else self.modalities
 
     @property
     def effective_sample_size(self) -> Array | None:
@@ -131,6 +138,10 @@ def trace(
     Raises:
         BadInput: the episode does not fit the checkpoint's task, the recipe does not, or a setting is out of range.
     """
+    if isinstance(checkpoint, Foreign):
+        from beliefscope.inspect.foreign import trace_foreign  # which builds upon this module
+
+        return trace_foreign(checkpoint, episode, episode_index, seed, recipe, progress)
     if particles < 1:
         raise BadInput(f"particles must be at least 1, not {particles}")
     if episode.task != checkpoint.task.name:
@@ -146,11 +157,35 @@ def trace(
     result = rollout(
         filter_, evidence, start, torch.Generator().manual_seed(seed), particles, keep=True, progress=progress
     )
+    return assemble(
+        checkpoint,
+        episode,
+        start,
+        evidence,
+        result.steps,
+        data_hash=data_hash,
+        episode_index=episode_index,
+        seed=seed,
+        recipe=recipe,
+        settings={"particles": particles, "torch": torch.__version__},
+    )
+
+
+def assemble(
+    checkpoint: Checkpoint,
+    episode: Episode,
+    start: Gaussian,
+    evidence: Evidence,
+    steps: Sequence[StepTrace],
+    **given: Any,
+) -> Trace:
+    """The trace of T steps with N = 1. given: fields of the trace that say where it comes from."""
+    filter_ = checkpoint.filter
     si = filter_.statistics
-    arrays = ARRAYS_OF[checkpoint.kind](filter_, result.steps, evidence)
+    arrays = ARRAYS_OF[checkpoint.kind](filter_, steps, evidence)
     arrays |= {
-        "estimate_mean": si.state_to_si(result.estimate.mean[:, 0]),
-        "estimate_covariance": si.covariance_to_si(result.estimate.covariance[:, 0]),
+        "estimate_mean": si.state_to_si(torch.cat([s.estimate.mean for s in steps])),
+        "estimate_covariance": si.covariance_to_si(torch.cat([s.estimate.covariance for s in steps])),
         "start_mean": si.state_to_si(start.mean[0]),
         "start_covariance": si.covariance_to_si(start.covariance[0]),
     }
@@ -162,12 +197,7 @@ def trace(
         kind=checkpoint.kind,
         filter=checkpoint.name,
         checkpoint_hash=checkpoint.hash,
-        data_hash=data_hash,
-        episode_index=episode_index,
-        seed=seed,
-        recipe=recipe,
-        settings={"particles": particles, "torch": torch.__version__},
-        **{name: np.ascontiguousarray(value.numpy()) for name, value in arrays.items()},
+        **(given | {name: np.ascontiguousarray(value.numpy()) for name, value in arrays.items()}),
     )
 
 
@@ -178,7 +208,7 @@ def _stack(filter_: Filter, beliefs: list[Gaussian]) -> tuple[Tensor, Tensor]:
     return si.state_to_si(mean), si.covariance_to_si(torch.cat([belief.covariance for belief in beliefs]))
 
 
-def _ekf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+def _ekf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
     assert evidence.noise is not None
     predicted = [s.predicted for s in steps if isinstance(s.predicted, Gaussian)]
     modality = [s.modality for s in steps if s.modality is not None]
@@ -196,7 +226,7 @@ def _ekf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> 
     return arrays
 
 
-def _pf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+def _pf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
     predicted = [s.predicted for s in steps if isinstance(s.predicted, Particles)]
     states = torch.cat([p.states for p in predicted])
     prior = torch.cat([p.log_weights for p in predicted])
@@ -225,12 +255,12 @@ def _pf_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> d
     return arrays
 
 
-def _lstm_arrays(filter_: Filter, steps: list[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+def _lstm_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
     none = torch.zeros(len(steps), 0, filter_.n)
     return {"modality_mean": none, "modality_covariance": none.unsqueeze(-1).expand(-1, -1, -1, filter_.n)}
 
 
-ARRAYS_OF: dict[Kind, Callable[[Filter, list[StepTrace], Evidence], dict[str, Tensor]]] = {
+ARRAYS_OF: dict[Kind, Callable[[Filter, Sequence[StepTrace], Evidence], dict[str, Tensor]]] = {
     "ekf": _ekf_arrays,
     "ukf": _ekf_arrays,
     "pf": _pf_arrays,

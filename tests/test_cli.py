@@ -39,6 +39,7 @@ OPTIONS = {
     "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
     "trace": "--filter --data --skip-bad --episode --recipe --seed -o --json",
     "record": "--filter --data --skip-bad --episode --maps --recipe --seed -o --json",
+    "counterfactual": "--filter --data --episode --recipe --weights --from --to --particles --seed --trace -o --json",
     "failures": "--filter --data --skip-bad --recipe --by --top --group --all --url --particles --seed --json",
     "recipes": "--json",
 }
