@@ -54,12 +54,12 @@ def counterfactual(
     ] = None,
     json: Json = None,
 ) -> None:
-    """Edit a sensor or beta for a while; run again.
+    """Edit a sensor for a while and run again.
 
     From the belief before the edit's first step on, with the same random numbers at every step as the run without the
     edit, so that all that differs comes from the edit. Says how far the estimate moved, in cm and in the original's
-    own standard deviations, when it was back, and which modality decided meanwhile. The faults are those of
-    beliefscope recipes, here without a span of their own.
+    own standard deviations, when it was back, and which modality decided meanwhile. --weights edits beta instead.
+    Faults are written as elsewhere, but without a span of their own.
 
     \b
     Examples:
