@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from beliefscope.inspect import maps
 from beliefscope.inspect.diagnostic import Entry
 
-ENTRIES: tuple[Entry, ...] = ()
+ENTRIES: tuple[Entry, ...] = (maps.ENTRY,)
 
 DIAGNOSTICS: dict[str, Entry] = {entry.name: entry for entry in ENTRIES}
 """By name, in the order in which they are shown."""
