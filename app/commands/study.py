@@ -46,7 +46,7 @@ def study(
     ] = "local",
     json: Json = None,
 ) -> None:
-    """Train and compare filters over tasks, black pictures and seeds.
+    """Train and compare filters over many conditions.
 
     Each filter trains once with each seed, and is measured with 0, 40 and 80 % black pictures on the episodes kept for
     tests. Checkpoints and metrics lie in DIR/cells; DIR/table.md, table.csv, results.svg and results.png are written
