@@ -69,6 +69,16 @@ def nees(trace: Trace) -> Array:
     return np.einsum("tln,tln->tl", error, white) / error.shape[-1]
 
 
+def particle_log_weights(trace: Trace) -> Array:
+    """(T, L, M): the predicted particles as each layer weighs them, normalised: prior x its likelihood, the posterior."""
+    assert trace.prior_log_weights is not None
+    assert trace.log_likelihood is not None
+    assert trace.log_weights is not None
+    alone = trace.prior_log_weights[:, None].astype(np.float64) + trace.log_likelihood
+    alone -= np.logaddexp.reduce(alone, axis=-1, keepdims=True)
+    return np.concatenate([alone, trace.log_weights[:, None]], axis=1)
+
+
 def blackout(trace: Trace) -> Mask:
     """(T,): whether a picture is black, every pixel zero."""
     black = np.zeros(len(trace), dtype=bool)
