@@ -82,7 +82,7 @@ def routes(library: Library, views: Views) -> APIRouter:
         except NotYet:
             return JSONResponse({"progress": traced.progress}, status_code=202)
         components = [{"name": c.name, "unit": c.unit} for c in traced.checkpoint.task.components]
-        described = header(trace, traced.columns[0], components, no_maps(traced.checkpoint))
+        described = header(trace, traced.columns[0], components, no_maps(traced.checkpoint, trace))
         return JSONResponse(described | {"filter": asked.filter})
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
@@ -111,7 +111,7 @@ def routes(library: Library, views: Views) -> APIRouter:
         # The name says all that the file depends on, so one that is there is this one.
         parts = hashlib.sha256(f"{traced.key} maps {wanted.maps} version {__version__}".encode()).hexdigest()[:8]
         path = recordings / f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}.rrd"
-        steps = range(0, len(trace), wanted.maps) if wanted.maps and not no_maps(traced.checkpoint) else ()
+        steps = range(0, len(trace), wanted.maps) if wanted.maps and not no_maps(traced.checkpoint, trace) else ()
         with writing:
             there = path.is_file()
             if not there:

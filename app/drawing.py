@@ -272,8 +272,8 @@ def _believed(trace: Trace) -> Iterator[tuple[str, Array, Array]]:
     """(name, states (T, n), covariances (T, n, n)): the truth, the fused estimate, each modality's if it is another."""
     yield "truth", trace.episode.states, np.zeros_like(trace.estimate_covariance)
     yield "fused", trace.estimate_mean, trace.estimate_covariance
-    if len(trace.modalities) > 1:
-        for k, name in enumerate(trace.modalities):
+    if len(trace.alone) > 1:
+        for k, name in enumerate(trace.alone):
             yield name, trace.modality_mean[:, k], trace.modality_covariance[:, k]
 
 

@@ -33,14 +33,14 @@ class Settings:
     Attributes:
         workspace: folder for recordings, traces and caches; made when needed.
         data: name as shown -> file or folder of episodes, before the sample sets that ship.
-        checkpoints: filter's name as shown -> file, before (or in place of) those that ship.
+        checkpoints: filter's name as shown -> file, or a filter from outside; before (or in place of) those that ship.
         hosts: names the server answers to beside the loopback's.
         particles: of particle filters. seed: of the filters' randomness.
     """
 
     workspace: Path
     data: Mapping[str, Path] = field(default_factory=dict)
-    checkpoints: Mapping[str, Path] = field(default_factory=dict)
+    checkpoints: Mapping[str, Path | Checkpoint] = field(default_factory=dict)
     hosts: tuple[str, ...] = ()
     particles: int = 300
     seed: int = 0

@@ -107,7 +107,7 @@ class View:
         trace = traced.trace
         if wanted.step >= len(trace):
             raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(trace) - 1}.")
-        if no_maps(traced.checkpoint):
+        if no_maps(traced.checkpoint, trace):
             await websocket.send_json({"type": "no_maps", "serial": wanted.serial, "step": wanted.step})
         else:
             maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)

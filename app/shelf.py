@@ -104,17 +104,20 @@ class Shelf:
             data.close()
 
 
-def shelves(checkpoints: Mapping[str, Path], data: Mapping[str, Path]) -> tuple[dict[str, Shelf], list[str]]:
+def shelves(
+    checkpoints: Mapping[str, Path | Checkpoint], data: Mapping[str, Path]
+) -> tuple[dict[str, Shelf], list[str]]:
     """A shelf for each task, those that something was given for first; and a line for each thing that cannot be shown.
 
     Args:
-        checkpoints, data: name as shown -> file, or folder of episodes.
+        checkpoints: name as shown -> file, or a filter that is there already, as one from outside is.
+        data: name as shown -> file, or folder of episodes.
     """
     made: dict[str, Shelf] = {}
     problems: list[str] = []
-    for name, path in checkpoints.items():
+    for name, given in checkpoints.items():
         with _told(problems):
-            checkpoint = load_checkpoint(path)
+            checkpoint = given if isinstance(given, Checkpoint) else load_checkpoint(given)
             made.setdefault(checkpoint.task.name, Shelf(checkpoint.task)).given_filters[name] = checkpoint
     filtered = [shelf.task for shelf in made.values()]
     for name, path in data.items():

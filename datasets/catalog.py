@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-from importlib import import_module
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 
+from beliefscope.datasets import own
 from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.push import PUSH
@@ -40,10 +37,9 @@ _FOREIGN: dict[tuple[str, str], Task] = {}
 
 def _foreign(name: str) -> Task:
     place, _, attribute = name.rpartition(":")
-    is_file = place.endswith(".py")
-    key = (str(Path(place).resolve()) if is_file else place, attribute)
+    key = (str(Path(place).resolve()) if place.endswith(".py") else place, attribute)
     if key not in _FOREIGN:
-        module = _run_file(Path(place)) if is_file else _run_module(place)
+        module = own.run(place)
         task = getattr(module, attribute, None)
         if not isinstance(task, Task):
             found = ", ".join(n for n, value in vars(module).items() if isinstance(value, Task)) or "none"
@@ -51,29 +47,6 @@ def _foreign(name: str) -> Task:
         _check(task, name)
         _FOREIGN[key] = TASKS[task.name] = task
     return _FOREIGN[key]
-
-
-def _run_file(path: Path) -> ModuleType:
-    if not path.is_file():
-        raise BadInput(f"{path} does not exist.")
-    spec = spec_from_file_location(f"beliefscope_task_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[module.__name__] = module  # dataclasses look their module up
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        del sys.modules[module.__name__]
-        raise BadInput(f"{path} cannot be run: {type(error).__name__}: {error}") from error
-    return module
-
-
-def _run_module(name: str) -> ModuleType:
-    try:
-        return import_module(name)
-    except Exception as error:
-        raise BadInput(f"module {name!r} cannot be imported: {type(error).__name__}: {error}") from error
 
 
 def _check(task: Task, name: str) -> None:

@@ -7,14 +7,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.filter import Filter
+from beliefscope.filters.foreign import Foreign
 from beliefscope.filters.rollout import rollout, start_at_truth
 
 LEFT_OUT = 30
@@ -51,7 +54,7 @@ class Metrics:
 
 
 def evaluate(
-    filter_: Filter,
+    filter_: Filter | Foreign,
     episodes: Sequence[Episode],
     *,
     recipe: Recipe = WHOLE,
@@ -64,20 +67,26 @@ def evaluate(
 
     Args:
         recipe: how the sensors are broken. only: one modality's name: beta one-hot on it.
+        particles: of this project's filters; one from outside has its own number.
         seed: of the filter's randomness and of the recipe's.
 
     Raises:
         BadInput: no episode, one that does not fit the filter's task, or a recipe or modality that does not.
     """
-    device = next(filter_.parameters()).device
-    steps = Steps.of(filter_.task, [recipe.apply(episode, seed) for episode in episodes], device)
+    if isinstance(filter_, Foreign) and only is not None:
+        raise BadInput(f"only {only!r}: {filter_.source} is from outside, and cannot be told whom to follow")
+    device = torch.device("cpu") if isinstance(filter_, Foreign) else next(filter_.parameters()).device
+    broken = [recipe.apply(episode, seed) for episode in episodes]
+    steps = Steps.of(filter_.task, broken, device)
     groups: dict[int, list[int]] = {}
     for number, length in enumerate(steps.length.tolist()):
         groups.setdefault(length, []).append(number)
     errors, covariances = [], []
     for done, (length, members) in enumerate(sorted(groups.items())):
-        batch = steps.windows(steps.first[members], length)
-        error, covariance = run(filter_, batch, only, particles, seed)
+        if isinstance(filter_, Foreign):
+            error, covariance = _run_foreign(filter_, [broken[number] for number in members], seed)
+        else:
+            error, covariance = run(filter_, steps.windows(steps.first[members], length), only, particles, seed)
         first = min(LEFT_OUT, length - 1)
         errors.append(error[first:].flatten(0, 1))
         covariances.append(covariance[first:].flatten(0, 1))
@@ -97,6 +106,15 @@ def run(filter_: Filter, batch: Batch, only: str | None, particles: int, seed: i
     estimate = rollout(filter_, evidence, start_at_truth(filter_, batch), generator, particles).estimate
     mean = filter_.statistics.state_to_si(estimate.mean)
     return (mean - batch.states).cpu(), filter_.statistics.covariance_to_si(estimate.covariance).cpu()
+
+
+def _run_foreign(foreign: Foreign, episodes: Sequence[Episode], seed: int) -> tuple[Tensor, Tensor]:
+    """As ``run``; covariances are NaN where the filter gives none."""
+    values, _ = foreign.run(episodes, seed)
+    mean = values["estimate_mean"]
+    truth = torch.from_numpy(np.stack([episode.states for episode in episodes], axis=1))
+    unknown = torch.full((*mean.shape, mean.shape[-1]), torch.nan)
+    return mean - truth, values.get("estimate_covariance", unknown)
 
 
 def metrics(task: Task, error: Tensor, covariance: Tensor) -> Metrics:

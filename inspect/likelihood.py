@@ -16,6 +16,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.foreign import Foreign
 from beliefscope.filters.fusion import mixture
 from beliefscope.filters.pf import MeasurementModel, ParticleFilter
 from beliefscope.inspect.measures import wrapped
@@ -68,16 +69,38 @@ class LikelihoodMap:
         return np.stack([self.offsets_x[ix], self.offsets_y[iy]], axis=1)
 
 
-def no_maps(checkpoint: Checkpoint) -> str | None:
-    """Why a filter has no likelihood maps, in one line; None where it has them."""
+def no_maps(checkpoint: Checkpoint, trace: Trace | None = None) -> str | None:
+    """Why a filter has no likelihood maps, in one line; None where it has them.
+
+    Args:
+        trace: of the filter. One from outside has those that follow from its trace: its Gaussians.
+    """
     task, what = checkpoint.task, "has no likelihood maps"
-    if not checkpoint.filter.has_covariance:
+    if isinstance(checkpoint, Foreign):
+        if why := _nothing_to_map(trace):
+            return f"filter {checkpoint.name!r} {what}: {why}"
+    elif not checkpoint.filter.has_covariance:
         kind = checkpoint.kind.upper()
         return f"filter {checkpoint.name!r} {what}: an {kind} estimates the state, but not how likely others are"
     off = [c.name for i, c in enumerate(task.components) if i not in task.map_indices]
     if len(off) > 1:
         return f"task {task.name!r} {what}: {', '.join(off)} are off the map; one at most can be held fixed"
     return None
+
+
+def _nothing_to_map(trace: Trace | None) -> str | None:
+    """Why there are no Gaussians to draw of a filter from outside."""
+    if trace is None or not trace.has_covariance:
+        return "it estimates the state, but does not say how likely others are"
+    if trace.log_likelihood is not None or trace.particles is not None:
+        return (
+            "its particles are known, but its measurement model cannot be asked about states that none of them visited"
+        )
+    if trace.modalities and not trace.alone:
+        return "it does not say what each modality alone believes"
+    both = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
+    flat = np.linalg.eigvalsh(both.astype(np.float64)).min(axis=(1, 2)) <= 0.0
+    return f"a covariance of step {int(flat.argmax())} is not positive definite" if flat.any() else None
 
 
 class MapEngine:
@@ -91,7 +114,7 @@ class MapEngine:
 
     def __init__(self, checkpoint: Checkpoint, trace: Trace) -> None:
         """Raises BadInput where there are none (``no_maps``), and when the trace was made by another checkpoint."""
-        if why := no_maps(checkpoint):
+        if why := no_maps(checkpoint, trace):
             raise BadInput(why)
         if trace.checkpoint_hash != checkpoint.hash:
             raise BadInput(
@@ -107,9 +130,9 @@ class MapEngine:
 
     @torch.no_grad()
     def _encode(self) -> Evidence | None:
-        filter_ = self.checkpoint.filter
-        if not isinstance(filter_, ParticleFilter):
+        if self.trace.log_likelihood is None:
             return None
+        filter_ = self.checkpoint.filter
         return filter_.encode(Steps.of(self.task, [self.trace.episode]).episode(0))
 
     @torch.no_grad()

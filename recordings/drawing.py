@@ -28,6 +28,7 @@ KINDS = {
     "ukf": "An unscented Kalman filter for each measurement model",
     "pf": "A particle filter",
     "lstm": "An LSTM, which knows no covariance and no likelihood,",
+    "foreign": "A filter from outside, of which is shown what it says,",
 }
 MEANINGS = {
     "truth": "what the filter should find",
@@ -37,8 +38,8 @@ MEANINGS = {
 
 
 def sources(trace: Trace) -> tuple[str, ...]:
-    """Whose estimates there are: ``fused``, then each modality's."""
-    return ("fused", *trace.modalities)
+    """Whose estimates there are: ``fused``, then each modality's where it is known."""
+    return ("fused", *trace.alone)
 
 
 def angles(task: Task) -> tuple[Component, ...]:
@@ -192,7 +193,7 @@ def _errors(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
 def _estimates(trace: Trace, steps: slice) -> Iterator[tuple[str, Array, Array]]:
     """(source, mean (T, n), covariance (T, n, n)) of the fused estimate and of each modality's."""
     yield "fused", trace.estimate_mean[steps], trace.estimate_covariance[steps]
-    for k, modality in enumerate(trace.modalities):
+    for k, modality in enumerate(trace.alone):
         yield modality, trace.modality_mean[steps, k], trace.modality_covariance[steps, k]
 
 

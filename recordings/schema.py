@@ -117,7 +117,7 @@ PROPERTIES: dict[str, str] = {
     "versions": "JSON: versions of beliefscope, rerun-sdk and numpy that wrote the file",
     "task": "name of the task",
     "filter": "name of the filter",
-    "kind": "`ekf`, `ukf`, `pf` or `lstm`",
+    "kind": "`ekf`, `ukf`, `pf`, `lstm`, or `foreign` for a filter from outside",
     "modalities": "JSON list: the K modalities in order",
     "episode_index": "index in its data set",
     "steps": "T, rows of every path under `trace/` and `observations/` that is not static",

@@ -55,6 +55,7 @@ def evaluate(
       beliefscope evaluate door --filter crossmodal-pf --recipe delay=haptics:steps=5 --only haptics
     """
     from beliefscope.filters.evaluate import evaluate as measure
+    from beliefscope.filters.foreign import Foreign
 
     check(None, json)
     text, alone = without_only(recipe_text(recipe_))
@@ -63,7 +64,7 @@ def evaluate(
     with dataset(tested.task, data, skip_bad) as episodes, console.progress("Evaluating") as advance:
         held_out = episodes.held_out()
         metrics = measure(
-            tested.filter,
+            tested if isinstance(tested, Foreign) else tested.filter,
             [episodes[i] for i in held_out],
             recipe=broken,
             only=only,

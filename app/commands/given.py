@@ -49,8 +49,9 @@ FilterName = Annotated[
     str,
     typer.Option(
         "--filter",
-        metavar="NAME|CHECKPOINT",
-        help="A filter that ships trained, such as crossmodal-pf, or the path of a .safetensors file.",
+        metavar="NAME|CHECKPOINT|MODULE:BUILD",
+        help="A filter that ships trained, such as crossmodal-pf; the path of a .safetensors file; or one of your own, "
+        "which package.module:build or path/to/file.py:build makes (docs/own_filter.md).",
     ),
 ]
 DataPath = Annotated[
@@ -120,16 +121,27 @@ def dataset(task: Task, path: Path | None, skip_bad: bool = False) -> Dataset:
 
 
 def checkpoint(task: str, name_or_path: str) -> Checkpoint:
-    """A path ends in .safetensors or holds a separator; anything else names a checkpoint that ships."""
+    """A path ends in .safetensors or holds a separator; with a colon it is a filter from outside, to be made by the
+    function behind it; anything else names a checkpoint that ships.
+    """
     from beliefscope.datasets.catalog import find_task
     from beliefscope.filters.checkpoint import load_checkpoint, shipped
 
     known = find_task(task)
+    if is_code(name_or_path):
+        from beliefscope.filters.foreign import load_foreign
+
+        return load_foreign(name_or_path, known.name)
     is_path = name_or_path.endswith(".safetensors") or os.sep in name_or_path
     loaded = load_checkpoint(Path(name_or_path) if is_path else shipped(known.name, name_or_path))
     if loaded.task.name != known.name:
         raise BadInput(f"filter {name_or_path!r} is for task {loaded.task.name!r}, not for {known.name!r}")
     return loaded
+
+
+def is_code(name_or_path: str) -> bool:
+    """Whether a filter is named as uvicorn names an app: ``package.module:build``, ``path/to/file.py:build``."""
+    return ":" in name_or_path and not name_or_path.endswith(".safetensors")
 
 
 def recipe_text(text: str) -> str:

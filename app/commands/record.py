@@ -41,7 +41,7 @@ def record(
     from beliefscope.inspect.likelihood import MapEngine, no_maps
     from beliefscope.recordings.write import write_recording
 
-    if maps and (why := no_maps(checkpoint)):
+    if maps and (why := no_maps(checkpoint, made)):
         console.say(f"without maps: {why}")
         maps = 0
     layers = MapEngine(checkpoint, made).maps(range(0, len(made), maps)) if maps else None

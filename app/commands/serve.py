@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import Seed, whole
+from beliefscope.app.commands.given import Seed, is_code, whole
 from beliefscope.datasets.errors import BadInput
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -31,12 +31,13 @@ def serve(
         typer.Option("--data", metavar="FILE|DIR", help="Episodes to show beside those that ship; may be given again."),
     ] = None,
     filter_: Annotated[
-        list[Path] | None,
+        list[str] | None,
         typer.Option(
             "--filter",
             "--checkpoint",
-            metavar="CHECKPOINT",
-            help="A filter to show beside those that ship; may be given again.",
+            metavar="CHECKPOINT|MODULE:BUILD",
+            help="A filter to show beside those that ship; may be given again. One of your own (docs/own_filter.md) is "
+            "for the task that it names, or the one that --task does.",
         ),
     ] = None,
     open_page: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = False,
@@ -53,6 +54,7 @@ def serve(
       beliefscope serve --open
       beliefscope serve --port 0 --workspace ~/beliefscope
       beliefscope serve --data mit_push --filter mine.safetensors
+      beliefscope serve --task door --filter examples/04_own_filter.py:build
       beliefscope serve --task examples/own_task.py:TASK --data own.h5 --filter own.safetensors
     """
     from beliefscope.app.library import Settings
@@ -60,6 +62,7 @@ def serve(
     from beliefscope.app.shelf import SAMPLE, short_names
     from beliefscope.datasets.catalog import TASKS, find_task
     from beliefscope.filters.catalog import filters_of
+    from beliefscope.filters.foreign import load_foreign
 
     if workspace.exists() and not workspace.is_dir():
         raise BadInput(f"workspace {str(workspace)!r} is a file, not a folder")
@@ -76,13 +79,15 @@ def serve(
 
             webbrowser.open(url)
 
-    for name in task or ():
-        find_task(name)
+    named = [find_task(name).name for name in task or ()]
+    code = [name for name in filter_ or () if is_code(name)]
+    paths = [Path(name) for name in filter_ or () if not is_code(name)]
+    foreign = [load_foreign(name, unsaid=named[0] if len(named) == 1 else "") for name in code]
     shipped = {name for known in TASKS.values() for name in filters_of(known)}
     settings = Settings(
         workspace=workspace,
         data=short_names(data or (), {SAMPLE}),
-        checkpoints=short_names(filter_ or (), shipped),
+        checkpoints={**short_names(paths, shipped), **{one.name: one for one in foreign}},
         hosts=(host,),
         seed=seed,
     )

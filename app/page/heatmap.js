@@ -29,7 +29,7 @@ export class Heatmaps {
     const first = this.#maps === null || this.#maps.layers.join() !== maps.layers.join();
     [this.#maps, this.#trace] = [maps, trace];
     // Of one measurement model alone the fused map is the same again.
-    if (first) this.#figures = this.#build(trace.fuses ? maps.layers : trace.modalities);
+    if (first) this.#figures = this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
     this.redraw();
   }
 
@@ -47,7 +47,7 @@ export class Heatmaps {
       figure.innerHTML = '<h3></h3><canvas role="img"></canvas><figcaption></figcaption>';
       figure.style.setProperty('--line', `var(${variable(fuses ? name : 'fused')})`);
       const [title, canvas, caption] = figure.children;
-      title.textContent = name.replaceAll('+', ' + ');
+      title.textContent = (fuses || name !== 'fused' ? name : 'estimate').replaceAll('+', ' + ');
       canvas.addEventListener('pointermove', (event) => this.#point(event, layer));
       canvas.addEventListener('pointerleave', () => this.#point(null, layer));
       this.#host.append(figure);

@@ -18,7 +18,7 @@ export function reading(trace, step, component) {
 
   const [best, leader] = [closest(trace, step), leading(trace, step, component)];
   const blind = (leader?.name === 'image' && trace.black[step] && 'the picture is black') || (leader?.name === 'haptics' && !trace.contact[step] && 'there is no contact to feel');
-  const better = leader && best.name !== leader.name && best.error + NEAR < error && `${best.name} alone is ${fixed(best.error, 1)} cm off`;
+  const better = leader && best && best.name !== leader.name && best.error + NEAR < error && `${best.name} alone is ${fixed(best.error, 1)} cm off`;
   const though = [blind, better].filter(Boolean).join(' and ');
   if (leader && (leader.share >= LEADS || better)) {
     said.push(`It follows ${leader.name} (${percent(leader.share)})${though && `, though ${though}`}.`);
@@ -40,7 +40,7 @@ function judge(trace, step) {
 }
 
 function closest(trace, step) {
-  const each = trace.modalities.map((name) => ({ name, error: trace.error(name, 'position')[step] }));
+  const each = (trace.has('modality_mean') ? trace.modalities : []).map((name) => ({ name, error: trace.error(name, 'position')[step] }));
   return each.sort((a, b) => a.error - b.error)[0];
 }
 

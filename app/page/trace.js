@@ -19,8 +19,8 @@ export class Trace {
     this.dt = header.dt;
     this.components = header.components;
     this.modalities = header.modalities;
-    /** Whose estimates there are: each modality alone, and all of them; one alone is the same as all. */
-    this.sources = this.fuses ? [...header.modalities, FUSED] : [FUSED];
+    /** Whose estimates there are: each modality alone where it is known, and all of them; one alone is the same as all. */
+    this.sources = this.fuses && header.columns.some((c) => c.name === 'modality_mean') ? [...header.modalities, FUSED] : [FUSED];
     this.pictures = pictures && new Uint8Array(pictures);
     for (const { name, shape, offset } of header.columns) {
       const size = shape.reduce((a, b) => a * b, 1);

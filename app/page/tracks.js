@@ -24,7 +24,8 @@ function weights(trace, chosen, component) {
   return { title, unit: '', series, limits: [-0.04 * most, 1.06 * most], digits: 2 };
 }
 
-function unweighed({ modalities: [model] }) {
+function unweighed({ modalities: [model], fuses }) {
+  if (fuses) return 'None: this filter does not say how it weighs its modalities.';
   if (model) return `None: ${model.replaceAll('+', ' and ')} ${model.includes('+') ? 'go into one measurement model, which' : 'alone'} decides.`;
   return 'None: the network takes all senses in at once and does not say which it follows.';
 }

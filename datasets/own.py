@@ -1,0 +1,54 @@
+"""Python of the user's own, named as uvicorn names an app: ``path/to/file.py:NAME`` or ``package.module:NAME``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+from beliefscope.datasets.errors import BadInput
+
+
+def run(place: str) -> ModuleType:
+    """Runs a file, or imports a module. Raises BadInput where it does not exist or fails."""
+    return _run_file(Path(place)) if place.endswith(".py") else _run_module(place)
+
+
+@contextmanager
+def importable(place: str) -> Iterator[None]:
+    """Meanwhile, what lies beside the file, or in the working directory, can be imported, after all else."""
+    folder = str(Path(place).resolve().parent if place.endswith(".py") else Path.cwd())
+    sys.path.append(folder)
+    try:
+        yield
+    finally:
+        sys.path.reverse()
+        sys.path.remove(folder)  # the last one, which is ours
+        sys.path.reverse()
+
+
+def _run_file(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist.")
+    spec = spec_from_file_location(f"beliefscope_own_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[module.__name__] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[module.__name__]
+        raise BadInput(f"{path} cannot be run: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _run_module(name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except Exception as error:
+        raise BadInput(f"module {name!r} cannot be imported: {type(error).__name__}: {error}") from error

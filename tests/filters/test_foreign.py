@@ -1,0 +1,109 @@
+"""Filters from outside, named by file or module: what cannot be one is said in a line, and nothing stays of it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from torch import nn
+
+from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.adapter import Adapter
+from beliefscope.filters.foreign import Foreign, load_foreign
+
+
+@pytest.fixture(scope="module")
+def episode() -> Episode:
+    with open_dataset(sample_path("door")) as data:
+        return data[0]
+
+
+FILE = """
+import torch
+from torch import nn
+class Filter(nn.Module):
+    said = {said}
+    def initialize_beliefs(self, mean, covariance): self.at = 0
+    def forward(self, observations, controls):
+        self.at += 1
+        return self.said if self.at == 4 else torch.zeros(len(controls), 3)
+build = Filter
+NUMBER = 3
+def number(): return 3
+def fails(): raise KeyError("weights.pt")
+def other():
+    filter = Filter()
+    filter.task = "push"
+    return filter
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "message"),
+    [
+        ("missing.py:build", "", r"^missing\.py does not exist\.$"),
+        ("no.such.module:build", "", r"^module 'no\.such\.module' cannot be imported: ModuleNotFoundError"),
+        ("own.py:biuld", "", r"^own\.py holds no 'biuld'\. To be called in it: Filter, build, number, fails, other\.$"),
+        ("own.py:NUMBER", "", r"^own\.py holds 'NUMBER', which cannot be called\. To be called"),
+        ("own.py:number", "", r"^own\.py:number gives a int, expected a torch\.nn\.Module, or an Adapter of one$"),
+        ("own.py:fails", "", r"^own\.py:fails fails when it is called: KeyError: 'weights\.pt'$"),
+        ("own.py:other", "", r"^filter 'own\.py:other' is for task 'push', not for 'door'$"),
+        ("own.py:build", "1 / 0", r"^own\.py cannot be run: ZeroDivisionError"),
+        (
+            "own.py:build",
+            "None",
+            r"^own\.py:build returns a NoneType, expected a mean, a pair of mean and covariance, or",
+        ),
+        (
+            "own.py:build",
+            "torch.zeros(1, 2)",
+            r"build at step 3 gives estimate_mean of shape \(1, 2\), expected \(1, 3\)$",
+        ),
+        (
+            "own.py:build",
+            "torch.full((1, 3), float('nan'))",
+            r"build at step 3 gives estimate_mean with a number that is",
+        ),
+    ],
+)
+def test_files_that_are_no_filters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episode: Episode, name: str, said: str, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(FILE.format(said=said or "None"))
+    path = list(sys.path)
+    with pytest.raises(BadInput, match=message):
+        load_foreign(name, "door").run([episode])
+    assert sys.path == path
+
+
+def test_the_hash_is_of_weights_and_code(tmp_path: Path) -> None:
+    (tmp_path / "beside.py").write_text("from torch import nn\nclass One(nn.Linear):\n    task = 'door'\n")
+    code = "import torch\nfrom beside import One\ndef build():\n    torch.manual_seed({})\n    return One(2, 2)\n"
+    hashes = []
+    for seed in (0, 0, 1):
+        (tmp_path / "own.py").write_text(code.format(seed))
+        hashes.append(load_foreign(f"{tmp_path}/own.py:build").hash)
+    sys.modules.pop("beside")
+    assert hashes[0] == hashes[1] != hashes[2]
+    one, other = Adapter(nn.Linear(2, 2), std=(1, 1, 1)), Adapter(nn.Linear(2, 2), std=(1, 1, 2))
+    assert Foreign(one, DOOR, "a").hash != Foreign(other, DOOR, "a").hash
+
+
+@pytest.mark.parametrize(
+    ("adapter", "message"),
+    [
+        ({"components": ("angle", "hinge_x", "hinge_z")}, "component of task 'door' 'hinge_z' does not exist"),
+        ({"components": ("angle",)}, "Adapter's components are angle; task 'door' has hinge_x, hinge_y, angle"),
+        ({"mean": (0.0, 1.0)}, "Adapter's mean has 2 numbers, expected 3"),
+        ({"std": (1.0, 0.0, 1.0)}, r"Adapter's std is \(1.0, 0.0, 1.0\), expected numbers above 0"),
+    ],
+)
+def test_adapters_that_do_not_fit(adapter: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        Foreign(Adapter(nn.Linear(2, 2), **adapter), DOOR, "mine")
