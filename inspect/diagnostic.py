@@ -160,7 +160,10 @@ class Entry:
                 return f"{self.name} needs the filter's checkpoint, not only its trace"
             if checkpoint.hash != trace.checkpoint_hash:
                 return f"the trace was made by checkpoint {trace.checkpoint_hash[:12]}, not by {checkpoint.hash[:12]}"
-        return self.why_not(trace, checkpoint)
+        try:
+            return self.why_not(trace, checkpoint)
+        except BadInput as error:  # asked of a filter from outside for what only ours have
+            return str(error)
 
     def __call__(self, traces: Sequence[Trace], checkpoint: Checkpoint | None = None, **options: Any) -> Diagnostic:
         """The result. Raises BadInput with the reason where it cannot be made."""
