@@ -109,7 +109,8 @@ def draw_chart(axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Diagn
     axes.set_ylabel(curves[0].unit)
     axes.set_xlabel("step")
     axes.margins(x=0)
-    axes.legend(frameon=False, ncols=3, loc="best")
+    # Beside the title, where no curve is.
+    axes.legend(frameon=False, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
 
 
 def draw_plot(axes: Axes, plot: Plot) -> None:

@@ -24,6 +24,7 @@ from beliefscope.app.cli import COMMANDS, cli, main
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import save_checkpoint
+from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import load_trace
 from beliefscope.recordings.read import read_recording
 
@@ -39,6 +40,7 @@ OPTIONS = {
     "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
     "trace": "--filter --data --skip-bad --episode --recipe --seed -o --json",
     "record": "--filter --data --skip-bad --episode --maps --recipe --seed -o --json",
+    "inspect": "--filter --only --all --figures --format --json",
     "counterfactual": "--filter --data --episode --recipe --weights --from --to --particles --seed --trace -o --json",
     "failures": "--filter --data --skip-bad --recipe --by --top --group --all --url --particles --seed --json",
     "recipes": "--json",
@@ -181,6 +183,12 @@ BAD = [
     f"record {EKF} --recipe frozen -o new.rrd",
     "train door --filter crossmodal-pf --recipe blackout=much -o new.safetensors",
     "train door --filter crossmodal-pf --blackouts 0,1.5 -o new.safetensors",
+    "inspect",
+    "inspect missing.trace",
+    "inspect ekf.safetensors",
+    "inspect missing.trace --only health",
+    "inspect missing.trace --format gif",
+    "inspect missing.trace --figures notes.txt",
     "recipes --json file",
     f"""evaluate {EKF} --recipe '{{"blackout": "much"}}'""",
     f"""evaluate {EKF} --recipe '{{"blackout": 1.5}}'""",
@@ -391,3 +399,30 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert code == 0
     assert json.loads(out)["checkpoint_hash"] == trained["checkpoint_hash"]
     assert json.loads(out)["episodes"] == 1
+
+
+def test_inspect_says_what_applies_and_why_the_rest_does_not(run: Run, folder: Path) -> None:
+    for episode in (9, 19):
+        assert run(f"trace {EKF} --episode {episode} -o {episode}.trace")[0] == 0
+    code, out, _ = run("inspect 9.trace 19.trace --filter ekf.safetensors --figures figures --format png --json -")
+    document = json.loads(out)
+    assert code == 0
+    assert set(document["diagnostics"]) | set(document["not_made"]) == set(DIAGNOSTICS)
+    assert "no particles" in document["not_made"]["particles"]
+    assert "--only maps" in document["not_made"]["maps"]
+    assert {path.stem for path in (folder / "figures").iterdir()} == set(document["diagnostics"])
+    assert [trace["episode"] for trace in document["traces"]] == [9, 19]
+    for name, found in document["diagnostics"].items():
+        alone = json.loads(run(f"inspect 9.trace 19.trace --only {name} --json -")[1])["diagnostics"]
+        assert alone == {name: found}
+    # Its filter does not ship: what needs the checkpoint says so.
+    code, out, _ = run("inspect 9.trace")
+    assert code == 0
+    assert "Particle health: not made" in out
+    assert "Likelihood maps: not made. maps needs the filter's checkpoint" in out
+    code, _, err = run("inspect 9.trace --only particles")
+    assert (code, err.splitlines()[-1]) == (2, "error: crossmodal-ekf has no particles")
+    assert run("trace door --filter crossmodal-pf --particles 10 -o pf.trace")[0] == 0
+    code, _, err = run("inspect 9.trace pf.trace")
+    assert code == 2
+    assert "another checkpoint" in err
