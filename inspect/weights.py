@@ -232,6 +232,8 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
         return f"what each modality of {trace.filter} alone believes is not known" if missing else None
     if not trace.modalities:
         return f"{trace.filter} does not weigh its modalities: one network sees them all"
+    if len(trace.modalities) > 1:
+        return f"how much each modality of {trace.filter} decided is not known"
     return f"{trace.filter} has one measurement model, {trace.modalities[0]}, and nothing to weigh it against"
 
 
