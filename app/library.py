@@ -8,17 +8,19 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from beliefscope.app.shelf import Shelf, shelves
 from beliefscope.app.wire import MAP_SIZES, columns
+from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.foreign import Foreign, load_foreign
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 
@@ -36,6 +38,7 @@ class Settings:
         checkpoints: filter's name as shown -> file, or a filter from outside; before (or in place of) those that ship.
         hosts: names the server answers to beside the loopback's.
         particles: of particle filters. seed: of the filters' randomness.
+        tasks: the user's own, as ``find_task`` knows them.
     """
 
     workspace: Path
@@ -44,6 +47,34 @@ class Settings:
     hosts: tuple[str, ...] = ()
     particles: int = 300
     seed: int = 0
+    tasks: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON, for another process. A filter from outside is named by what makes it."""
+        checkpoints = {
+            name: {"source": given.source, "task": given.task.name} if isinstance(given, Foreign) else str(given)
+            for name, given in self.checkpoints.items()
+        }
+        data = {name: str(path) for name, path in self.data.items()}
+        shown = {"workspace": str(self.workspace), "data": data, "checkpoints": checkpoints, "tasks": list(self.tasks)}
+        return shown | {"particles": self.particles, "seed": self.seed}
+
+    @classmethod
+    def of_json(cls, shown: Mapping[str, Any]) -> Settings:
+        """What ``to_json`` gave. The user's own tasks are in ``TASKS`` then; filters from outside are made again."""
+        for name in shown["tasks"]:
+            find_task(name)
+        return cls(
+            Path(shown["workspace"]),
+            {name: Path(path) for name, path in shown["data"].items()},
+            {
+                name: Path(given) if isinstance(given, str) else load_foreign(given["source"], given["task"])
+                for name, given in shown["checkpoints"].items()
+            },
+            particles=shown["particles"],
+            seed=shown["seed"],
+            tasks=tuple(shown["tasks"]),
+        )
 
 
 @dataclass(frozen=True)
@@ -142,25 +173,37 @@ class Library:
         with self._lock:
             known = self._traced.get(self._keys.get(selection, ""))
             if known is None or (known.done.done() and known.done.exception() is not None):
-                shelf = self._shelf(selection.task)
-                checkpoint = shelf.filter(selection.filter)
-                episode = shelf.episode(selection.data, selection.episode)
-                selection.recipe.check(checkpoint.task)
-                parts = (
-                    checkpoint.hash,
-                    episode.digest(),
-                    self.settings.seed,
-                    self.settings.particles,
-                    str(selection.recipe),
-                )
-                key = hashlib.sha256(repr(parts).encode()).hexdigest()
-                self._keys[selection] = key
+                checkpoint, episode = self._found(selection)
+                key = self.key(selection)
                 known = self._traced[key] = Traced(key, checkpoint)
                 self._tracing.submit(self._compute, known, selection, episode)
             self._traced.move_to_end(known.key)
             while len(self._traced) > TRACES_IN_MEMORY:
                 self._traced.popitem(last=False)
             return known
+
+    def key(self, selection: Selection) -> str:
+        """Hash of everything its trace depends on; the trace need not be there. Raises BadInput as ``traced``."""
+        with self._lock:
+            if selection not in self._keys:
+                checkpoint, episode = self._found(selection)
+                seed, particles = self.settings.seed, self.settings.particles
+                parts = (checkpoint.hash, episode.digest(), seed, particles, str(selection.recipe))
+                self._keys[selection] = hashlib.sha256(repr(parts).encode()).hexdigest()
+            return self._keys[selection]
+
+    def held_out(self, selection: Selection) -> list[Selection]:
+        """The same of each episode that its data set holds out. Raises BadInput for an unknown task or data set."""
+        with self._lock:
+            episodes = self._shelf(selection.task).dataset(selection.data).held_out()
+            return [replace(selection, episode=episode) for episode in episodes]
+
+    def _found(self, selection: Selection) -> tuple[Checkpoint, Episode]:
+        shelf = self._shelf(selection.task)
+        checkpoint = shelf.filter(selection.filter)
+        episode = shelf.episode(selection.data, selection.episode)
+        selection.recipe.check(checkpoint.task)
+        return checkpoint, episode
 
     def _shelf(self, task: str) -> Shelf:
         found, _ = self._stock

@@ -19,6 +19,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
+from beliefscope.app import diagnostics, jobs
 from beliefscope.app.api import routes
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.security import Guard
@@ -42,6 +43,7 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
     """
     library = Library(settings)
     views = Views(library)
+    work = jobs.Jobs(settings.workspace / "jobs")
     rerun = RerunViewer(settings.workspace / "cache")
 
     @contextlib.asynccontextmanager
@@ -55,17 +57,20 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
         stopping.set()
         tidying.cancel()
         await views.close()
+        await asyncio.to_thread(work.close)
         await asyncio.to_thread(library.close)
         # A thread that is inside C++ when Python ends takes the whole process down with an abort.
         if warm:
             await asyncio.to_thread(warming.join)
 
     app = FastAPI(title="Beliefscope", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
-    app.state.library, app.state.views = library, views
-    app.include_router(routes(library, views))
+    app.state.library, app.state.views, app.state.jobs = library, views, work
+    for router in (routes(library, views), jobs.routes(work), diagnostics.routes(library, work)):
+        app.include_router(router)
     _add_files(app, rerun)
     app.add_middleware(Guard, hosts=settings.hosts)
     app.add_exception_handler(BadInput, _say(400))
+    app.add_exception_handler(jobs.QueueFull, _say(429))
     app.add_exception_handler(RequestValidationError, _say(422))
     app.add_exception_handler(HTTPException, _say(None))
     app.add_exception_handler(Exception, _say(500))

@@ -90,5 +90,6 @@ def serve(
         checkpoints={**short_names(paths, shipped), **{one.name: one for one in foreign}},
         hosts=(host,),
         seed=seed,
+        tasks=tuple(task or ()),
     )
     serve_until_signal(settings, host=host, port=port, listening=listening)

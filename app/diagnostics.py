@@ -1,0 +1,222 @@
+"""Diagnostics over HTTP (docs/api.md): of one episode, or of all that are held out; slow ones as jobs."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping
+from concurrent.futures import TimeoutError as NotYet
+from dataclasses import asdict
+from typing import Annotated, Any, Literal, get_type_hints
+
+from fastapi import APIRouter, Depends, HTTPException, Request
+from fastapi.responses import FileResponse, JSONResponse, Response
+from pydantic import TypeAdapter, ValidationError
+
+from beliefscope.app.api import PATIENCE, Asked
+from beliefscope.app.jobs import Job, Jobs
+from beliefscope.app.library import Library, Selection, Settings, Traced
+from beliefscope.app.work import Report
+from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnostic import Entry
+from beliefscope.inspect.trace import Trace
+
+RESULTS_IN_MEMORY = 64
+HELD_OUT = "held-out"
+NAMES_OF_A_TRACE = ("recipe", "data", "episodes")
+"""What a query names beside the diagnostic's own options."""
+
+
+def _entry(name: str) -> Entry:
+    if name not in DIAGNOSTICS:
+        raise HTTPException(404, str(one_of("diagnostic", name, DIAGNOSTICS)))
+    return DIAGNOSTICS[name]
+
+
+def _options(name: str, request: Request) -> dict[str, Any]:
+    return parse(_entry(name), {k: v for k, v in request.query_params.items() if k not in NAMES_OF_A_TRACE})
+
+
+Named = Annotated[Entry, Depends(_entry)]
+Options = Annotated[dict[str, Any], Depends(_options)]
+Episodes = Literal["held-out"] | None
+
+
+def routes(library: Library, jobs: Jobs) -> APIRouter:
+    """Every route under ``/api/diagnostics``."""
+    router = APIRouter()
+    made = _Made()
+
+    @router.get("/api/diagnostics")
+    def list_entries() -> list[dict[str, Any]]:
+        return [described(entry) for entry in DIAGNOSTICS.values()]
+
+    @router.get("/api/diagnostics/{task}/{filter}/{episode}")
+    def list_of_trace(asked: Asked) -> Response:
+        traced = library.traced(asked)
+        trace = _there(traced)
+        if trace is None:
+            return _not_yet(traced)
+        refused = {name: entry.refusal(trace, traced.checkpoint) for name, entry in DIAGNOSTICS.items()}
+        return JSONResponse([described(entry) | {"why_not": refused[name]} for name, entry in DIAGNOSTICS.items()])
+
+    @router.get("/api/diagnostics/{name}/{task}/{filter}/{episode}")
+    def views(entry: Named, asked: Asked, options: Options, episodes: Episodes = None) -> Response:
+        traced = library.traced(asked)
+        trace = _there(traced)
+        if trace is None:
+            return _not_yet(traced)
+        _allow(entry, trace, traced)
+        if not (entry.slow or episodes):
+            return Response(made.views(entry, traced, trace, options), media_type="application/json")
+        job = jobs.find("diagnostic", _key(library, entry, _selections(library, asked, episodes), options))
+        if job is not None and job.state == "done":
+            return FileResponse(jobs.result(job.id), media_type="application/json")
+        return _under_way(job)
+
+    @router.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
+    def compute(entry: Named, asked: Asked, options: Options, episodes: Episodes = None) -> Response:
+        traced = library.traced(asked)
+        _allow(entry, traced.trace, traced)
+        selections = _selections(library, asked, episodes)
+        arguments = {
+            "settings": library.settings.to_json(),
+            "diagnostic": entry.name,
+            "options": options,
+            "task": asked.task,
+            "filter": asked.filter,
+            "data": asked.data,
+            "recipe": str(asked.recipe),
+            "episodes": [selection.episode for selection in selections],
+        }
+        where = f"all {len(selections)} held-out episodes" if episodes else f"episode {asked.episode}"
+        title = ", ".join(
+            [f"{entry.title} of {asked.filter}", f"{asked.task} {where}", *filter(None, [str(asked.recipe)])]
+        )
+        return _under_way(jobs.submit("diagnostic", title, arguments, _key(library, entry, selections, options)))
+
+    return router
+
+
+def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """The job of a diagnostic: its views. What was traced before is read, not traced again."""
+    entry = DIAGNOSTICS[arguments["diagnostic"]]
+    recipe, episodes = Recipe.parse(arguments["recipe"]), arguments["episodes"]
+    library = Library(Settings.of_json(arguments["settings"]))
+    traces: list[Trace] = []
+    try:
+        for i, episode in enumerate(episodes):
+            of = Selection(arguments["task"], arguments["filter"], episode, recipe, arguments["data"])
+            traced = library.traced(of)
+            while (trace := _there(traced)) is None:
+                report(0.5 * (i + traced.progress) / len(episodes), f"running the filter over episode {episode}")
+            traces.append(trace)
+            report(0.5 * (i + 1) / len(episodes), f"{i + 1} of {len(episodes)} episodes are filtered")
+        measuring = f"measuring {len(traces)} episodes" if len(traces) > 1 else f"measuring episode {episodes[0]}"
+        report(0.5, measuring)
+        more = {"progress": lambda share: report(0.5 + 0.5 * share, measuring)} if _says_how_far(entry) else {}
+        found = entry(traces, traced.checkpoint, **arguments["options"], **more)
+        return {"trajectories": len(traces), **found.views()}
+    finally:
+        library.close()
+
+
+def described(entry: Entry) -> dict[str, Any]:
+    """An entry as JSON; an option's default is text, empty where there is none to be shown."""
+    parameters = inspect.signature(entry.run).parameters
+    options = [
+        {"name": name, "meaning": meaning, "default": _shown(parameters[name].default)}
+        for name, meaning in entry.options.items()
+    ]
+    return {
+        "name": entry.name,
+        "title": entry.title,
+        "question": entry.question,
+        "slow": entry.slow,
+        "options": options,
+    }
+
+
+def parse(entry: Entry, texts: Mapping[str, str]) -> dict[str, Any]:
+    """The entry's options from texts, as the types that its function takes; an empty one is its default.
+
+    Raises BadInput for an option that the entry does not have, and for a text that its type does not take.
+    """
+    hints = get_type_hints(entry.run)
+    options: dict[str, Any] = {}
+    for name, text in texts.items():
+        if name not in entry.options:
+            raise one_of(f"option of {entry.name}", name, entry.options)
+        if not text:
+            continue
+        try:
+            options[name] = TypeAdapter(hints.get(name, str)).validate_strings(text)
+        except ValidationError as error:
+            said = error.errors()[0]["msg"]
+            raise BadInput(f"{entry.name}'s {name!r} is {text!r}: {said}. It is {entry.options[name]}.") from None
+    return options
+
+
+class _Made:
+    """The newest results of fast diagnostics, as JSON."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._results: OrderedDict[str, bytes] = OrderedDict()
+
+    def views(self, entry: Entry, traced: Traced, trace: Trace, options: Mapping[str, Any]) -> bytes:
+        """Computes them where they are not there, one at a time."""
+        key = repr((entry.name, traced.key, sorted(options.items())))
+        with self._lock:
+            if key not in self._results:
+                found = entry([trace], traced.checkpoint, **options)
+                self._results[key] = json.dumps({"trajectories": 1, **found.views()}, allow_nan=False).encode()
+            self._results.move_to_end(key)
+            while len(self._results) > RESULTS_IN_MEMORY:
+                self._results.popitem(last=False)
+            return self._results[key]
+
+
+def _there(traced: Traced) -> Trace | None:
+    """The trace; None where it takes longer than a moment. Raises what computing it raised."""
+    try:
+        return traced.done.result(timeout=PATIENCE)
+    except NotYet:
+        return None
+
+
+def _not_yet(traced: Traced) -> JSONResponse:
+    return JSONResponse({"progress": traced.progress}, status_code=202)
+
+
+def _under_way(job: Job | None) -> JSONResponse:
+    return JSONResponse({"job": None if job is None else asdict(job)}, status_code=202)
+
+
+def _allow(entry: Entry, trace: Trace, traced: Traced) -> None:
+    why = entry.refusal(trace, traced.checkpoint)
+    if why:
+        raise HTTPException(409, why)
+
+
+def _selections(library: Library, asked: Selection, episodes: Episodes) -> list[Selection]:
+    return library.held_out(asked) if episodes == HELD_OUT else [asked]
+
+
+def _key(library: Library, entry: Entry, selections: list[Selection], options: Mapping[str, Any]) -> str:
+    """Of all that a result depends on. A trace of an index differs from the same episode's under another one."""
+    traces = [(selection.episode, library.key(selection)) for selection in selections]
+    return hashlib.sha256(repr((entry.name, traces, sorted(options.items()))).encode()).hexdigest()
+
+
+def _says_how_far(entry: Entry) -> bool:
+    return "progress" in inspect.signature(entry.run).parameters
+
+
+def _shown(default: Any) -> str:
+    return "" if default in (None, inspect.Parameter.empty) else str(default)

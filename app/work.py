@@ -1,0 +1,73 @@
+"""What a job's process runs: one function of ours, given JSON, whose result becomes a file (``app/jobs.py``).
+
+    python -m beliefscope.app.work MODULE:FUNCTION FOLDER
+
+Standard output carries the reports, one JSON object a line; what the function prints goes to standard error, the log.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from beliefscope.datasets.errors import BadInput
+
+Report = Callable[[float, str], None]
+"""(share done 0..1, what it is doing) -> None; may be called at every step."""
+
+PAUSE = 0.1  # s between reports
+NICENESS = 5  # the page goes first
+
+
+def main(function: str, folder: Path) -> int:
+    """Exit code: 0 where the result is written, else 1."""
+    os.nice(NICENESS)
+    reports = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    threading.Thread(target=_end_with_the_server, daemon=True).start()
+    said = [0.0]
+
+    def tell(**fields: Any) -> None:
+        reports.write(json.dumps(fields) + "\n")
+
+    def report(progress: float, message: str) -> None:
+        now = time.monotonic()
+        if now - said[0] >= PAUSE:
+            said[0] = now
+            tell(progress=min(max(float(progress), 0.0), 1.0), message=message)
+
+    try:
+        tell(message="starting")
+        module, _, name = function.partition(":")
+        run = getattr(importlib.import_module(module), name)
+        result = run(json.loads((folder / "arguments.json").read_bytes()), report)
+        from beliefscope.filters.checkpoint import write_atomically  # brings PyTorch, which takes seconds
+
+        write_atomically(folder / "result.json", json.dumps(result, allow_nan=False).encode())
+    except BadInput as error:
+        tell(error=str(error))
+        return 1
+    except Exception as error:
+        traceback.print_exc()
+        tell(error=f"{type(error).__name__}: {error}")
+        return 1
+    return 0
+
+
+def _end_with_the_server() -> None:
+    # Not sys.stdin: a thread that waits in it when Python ends takes the process down with an abort.
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], Path(sys.argv[2])))
