@@ -70,7 +70,7 @@ def nees(trace: Trace) -> Array:
 
 
 def particle_log_weights(trace: Trace) -> Array:
-    """(T, L, M): the predicted particles as each layer weighs them, normalised: prior x its likelihood, the posterior."""
+    """(T, L, M): predicted particles as each layer weighs them, normalised: prior x its likelihood, the posterior."""
     assert trace.prior_log_weights is not None
     assert trace.log_likelihood is not None
     assert trace.log_weights is not None
