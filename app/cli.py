@@ -18,6 +18,7 @@ from beliefscope.app.commands.convert import convert
 from beliefscope.app.commands.counterfactual import counterfactual
 from beliefscope.app.commands.evaluate import evaluate
 from beliefscope.app.commands.failures import failures
+from beliefscope.app.commands.figure import figure
 from beliefscope.app.commands.inspect import inspect
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
@@ -27,7 +28,21 @@ from beliefscope.app.commands.trace import trace
 from beliefscope.app.commands.train import train
 from beliefscope.datasets.errors import BadInput
 
-COMMANDS = (serve, collect, convert, train, evaluate, study, trace, record, inspect, counterfactual, failures, recipes)
+COMMANDS = (
+    serve,
+    collect,
+    convert,
+    train,
+    evaluate,
+    study,
+    trace,
+    record,
+    inspect,
+    counterfactual,
+    figure,
+    failures,
+    recipes,
+)
 
 cli = typer.Typer(
     name="beliefscope",

@@ -42,6 +42,7 @@ OPTIONS = {
     "record": "--filter --data --skip-bad --episode --maps --recipe --seed -o --json",
     "inspect": "--filter --only --all --figures --format --json",
     "counterfactual": "--filter --data --episode --recipe --weights --from --to --particles --seed --trace -o --json",
+    "figure": "--filter --data --skip-bad --episode --step --recipe --particles --seed -o --json",
     "failures": "--filter --data --skip-bad --recipe --by --top --group --all --url --particles --seed --json",
     "recipes": "--json",
 }
@@ -210,6 +211,10 @@ BAD = [
     f"record {EKF} --maps -1 -o new.rrd",
     f"record {EKF} --data cut.h5 -o new.rrd",
     f"record {EKF} -o taken",
+    f"figure bars {EKF} -o new.svg",
+    f"figure maps {EKF} -o new.gif",
+    f"figure maps {EKF} -o taken",
+    f"figure weights {EKF} --step 40 -o new.svg",
     "serve --port 70000",
     "serve --workspace notes.txt",
     "serve --workspace missing/deep",
