@@ -1,0 +1,120 @@
+"""Filters from outside in the commands and on the server; and that only the command line can name one."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from beliefscope.app.cli import main
+from beliefscope.app.server import Settings
+from beliefscope.filters.foreign import load_foreign
+from beliefscope.inspect.trace import load_trace
+from beliefscope.recordings.read import read_recording
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "04_own_filter.py"
+SPEC = f"{EXAMPLE}:build"
+FAILS = """
+from torch import nn
+class Fails(nn.Module):
+    def initialize_beliefs(self, mean, covariance): pass
+    def forward(self, observations, controls): return observations["touch"]
+"""
+
+
+def run(*arguments: object) -> tuple[int, str, str]:
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["beliefscope", *map(str, arguments)])
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.raises(SystemExit) as end:
+            main()
+    return int(end.value.code or 0), out.getvalue(), err.getvalue()
+
+
+def result(*arguments: object) -> Any:
+    code, out, err = run(*arguments, "--json", "-")
+    assert code == 0, err
+    return json.loads(out)
+
+
+def test_example_is_short_and_knows_how_sure_it_is() -> None:
+    assert len(EXAMPLE.read_text().splitlines()) < 60
+    measured = result("evaluate", "door", "--filter", SPEC)
+    assert measured["filter"] == "04_own_filter-build"
+    assert 0.5 < measured["nees"] < 2.0
+    assert measured["coverage95"] > 0.85
+    assert measured["particles"] is None
+
+
+def test_trace_and_recording_are_of_one_run(tmp_path: Path) -> None:
+    made = result("trace", "door", "--filter", SPEC, "-o", tmp_path / "own.trace")
+    result("record", "door", "--filter", SPEC, "--maps", 50, "-o", tmp_path / "own.rrd")
+    traced, recorded = load_trace(tmp_path / "own.trace"), read_recording(tmp_path / "own.rrd")
+    assert traced.checkpoint_hash == recorded.checkpoint_hash == made["checkpoint_hash"]
+    assert (traced.kind, traced.modalities) == (recorded.kind, recorded.modalities) == ("foreign", ())
+    for name in ("estimate_mean", "estimate_covariance", "modality_mean"):
+        np.testing.assert_array_equal(getattr(recorded, name), getattr(traced, name))
+
+
+@pytest.mark.parametrize("command", ["trace", "record", "evaluate"])
+def test_a_failure_is_one_line_and_leaves_no_file(command: str, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(FAILS)
+    output = () if command == "evaluate" else ("-o", tmp_path / "new")
+    code, out, err = run(command, "door", "--filter", f"{tmp_path}/own.py:Fails", *output)
+    assert (code, out) == (2, "")
+    assert err.splitlines()[-1] == f"error: {tmp_path}/own.py:Fails fails at step 0: KeyError: 'touch'"
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["own.py"]
+
+
+def test_a_module_is_found_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_own_filters.py").write_text(EXAMPLE.read_text())
+    monkeypatch.chdir(tmp_path)
+    assert result("evaluate", "door", "--filter", "my_own_filters:build")["filter"] == "my_own_filters-build"
+    sys.modules.pop("my_own_filters")
+
+
+def test_a_server_must_know_the_task(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(FAILS)
+    code, _, err = run("serve", "--filter", f"{tmp_path}/own.py:Fails", "--workspace", tmp_path / "w")
+    assert code == 2
+    assert err.endswith("does not say which task it is for: give it an attribute task, or name one with --task\n")
+
+
+@pytest.fixture
+def client(given: Settings, tmp_path: Path, open_client: Callable[..., TestClient]) -> TestClient:
+    own = load_foreign(SPEC)
+    return open_client(Settings(tmp_path / "workspace", given.data, {own.name: own}))
+
+
+def test_the_page_has_what_it_says(client: TestClient) -> None:
+    with client:
+        listed = client.get("/api/catalog").json()["tasks"][0]["filters"][0]
+        assert (listed["name"], listed["kind"]) == ("04_own_filter-build", "foreign")
+        while (answer := client.get("/api/trace/door/04_own_filter-build/0")).status_code == 202:
+            pass
+        found = answer.json()
+        columns = {column["name"] for column in found["columns"]}
+        assert {"estimate_mean", "estimate_sigma"} <= columns
+        assert not {"modality_mean", "modality_sigma", "weights", "acting", "effective_sample_size"} & columns
+        assert found["no_maps"] is None
+
+
+def test_the_page_cannot_name_code(client: TestClient, tmp_path: Path) -> None:
+    trap = tmp_path / "trap.py"
+    trap.write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\n" + EXAMPLE.read_text())
+    with client:
+        for name in (f"{trap}:build", "trap:build", "json:loads"):
+            answer = client.get("/api/trace/door/" + name.replace("/", "%2F") + "/0")
+            assert answer.status_code in (400, 404)
+            answer = client.post("/api/recordings", json={"task": "door", "filter": name, "episode": 0})
+            assert answer.status_code == 400
+            assert f"filter '{name}' does not exist. Available: " in answer.json()["error"]
+    assert not (tmp_path / "sprung").exists()
