@@ -1,0 +1,208 @@
+"""Consistency and calibration: exact filters of a simulated system, closed forms, and other people's packages."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest, norm
+from statsmodels.stats.diagnostic import acorr_ljungbox
+from uncertainty_toolbox.metrics_scoring_rule import crps_gaussian
+
+from beliefscope.inspect.calibration import (
+    gaussian_crps,
+    gaussian_level,
+    ljung_box,
+    particle_crps,
+    particle_level,
+)
+from beliefscope.inspect.consistency import Consistency, consistency, innovations
+
+sys.path.insert(0, str(Path(__file__).parent))
+import planted as plant
+
+
+@pytest.fixture(scope="module")
+def true() -> Consistency:
+    return consistency(plant.simulated())
+
+
+def test_an_exact_filter_is_consistent(true: Consistency) -> None:
+    assert true.layers == ("image", "haptics", "fused")
+    for one in true.by_layer:
+        # 2000 steps, some 500 of them independent: the mean of chi2_3 / 3 is right to sqrt(2 / 3 / 500) = 0.04.
+        assert one.nees == pytest.approx(1.0, abs=0.12), (one.layer, one.split)
+        assert one.bounds[0] < one.nees < one.bounds[1]
+        assert one.judgement == "consistent"
+        assert one.coverage95 == pytest.approx(0.95, abs=0.02)
+        assert one.miscalibration < 0.03
+        np.testing.assert_allclose(one.rmse, one.sharpness, rtol=0.1)
+        # The mean CRPS of a true N(m, s^2) is s / sqrt(pi).
+        np.testing.assert_allclose(one.crps, one.sharpness / math.sqrt(math.pi), rtol=0.1)
+        if one.layer != "fused":
+            assert one.nis == pytest.approx(1.0, abs=0.1)
+    assert true.verdict.startswith("Consistent (NEES/n ")
+    assert "So it is in each kind of step: contact, no contact." in true.verdict
+    assert "Each modality alone is consistent." in true.verdict
+    assert "Innovations are white." in true.verdict
+
+
+def test_density_of_the_truth_is_the_entropy_of_a_true_filter(true: Consistency) -> None:
+    covariance = plant.simulated(1)[0].estimate_covariance[-1].astype(float)
+    entropy = 0.5 * np.linalg.slogdet(2.0 * math.pi * math.e * covariance)[1]
+    assert true.of("fused").nll == pytest.approx(entropy, abs=0.15)  # 1.5 x what NEES / n may be off
+
+
+@pytest.mark.parametrize(("stated", "said"), [(0.25, "Over"), (4.0, "Under")])
+def test_covariances_a_quarter_or_four_times_the_true_ones(true: Consistency, stated: float, said: str) -> None:
+    found = consistency(plant.simulated(stated=stated))
+    assert re.match(rf"{said}-confident by (1\.9|2|2\.1) x ", found.verdict)
+    for layer in found.layers:
+        # The same errors over other covariances; a floor of 1e-8 beside 2e-5 at the least.
+        assert found.of(layer).nees == pytest.approx(true.of(layer).nees / stated, rel=2e-3)
+        assert np.all(found.of(layer).rmse == true.of(layer).rmse)
+    assert found.of("fused").nll > true.of("fused").nll + 0.3
+    coverage = found.of("fused").coverage95
+    assert coverage == pytest.approx(chi2.cdf(stated * chi2.ppf(0.95, 3), 3), abs=0.04)
+    assert found.of("fused").crps.mean() > true.of("fused").crps.mean()
+
+
+def test_noise_with_memory_is_not_white() -> None:
+    found = consistency(plant.simulated(memory=0.9))
+    assert "Innovations are not white" in found.verdict
+    assert "one error returns at every step" in found.verdict
+    assert max(one.p for one in found.whiteness) < 1e-6
+    assert found.verdict.startswith("Over-confident")  # evidence counted again and again
+
+
+def test_angles_wrap(true: Consistency) -> None:
+    turned = []
+    for trace in plant.simulated():
+        move = {}
+        for name, turns in (("estimate_mean", 1), ("modality_mean", -1), ("observation_mean", 2)):
+            move[name] = getattr(trace, name).copy()
+            move[name][..., 2] += turns * 2.0 * np.pi
+        turned.append(replace(trace, **move))
+    again = consistency(turned)
+    for one, other in zip(true.by_layer, again.by_layer, strict=True):
+        assert one.nees == pytest.approx(other.nees, rel=1e-3)  # float32 at 4 pi: 1e-6 rad of 0.03
+        np.testing.assert_allclose(one.crps, other.crps, rtol=1e-3)
+    found = innovations(turned[0])
+    assert found is not None
+    assert np.abs(found[0][..., 2]).max() < 1.0
+
+
+def test_modalities_in_another_order_give_the_same() -> None:
+    traces = plant.simulated(5)
+    one, other = consistency(traces), consistency([plant.swapped(trace) for trace in traces])
+    assert other.layers == ("haptics", "image", "fused")
+    for found in one.by_layer:
+        assert found.nees == other.of(found.layer, found.split).nees
+    assert {(w.modality, w.component, w.p) for w in one.whiteness} == {
+        (w.modality, w.component, w.p) for w in other.whiteness
+    }
+
+
+def test_few_trajectories_tell_little() -> None:
+    found = consistency(plant.simulated(1))
+    assert "as far as 1 trajectory tells" in found.verdict
+    assert found.of("fused").bounds[1] > 3.0
+    assert found.nees.shape == (130, 3)
+    assert found.nis.shape == (130, 2)
+    assert len(consistency(plant.simulated(2)).curves()) == 0
+
+
+def test_a_particle_set_that_is_true_is_calibrated() -> None:
+    """Truth and particles from one distribution, about pi: levels are uniform, and the mean CRPS is s / sqrt(pi)."""
+    rng = np.random.default_rng(3)
+    steps, count = 630, 400
+    centre = np.array([0.5, -0.2, np.pi])
+    truth = centre + rng.normal(size=(steps, 3)) * plant.SCALE
+    particles = centre + rng.normal(size=(steps, count, 3)) * plant.SCALE
+    truth[:, 2] -= 2.0 * np.pi  # the same angle
+    mean, away = particles.mean(1), particles - particles.mean(1, keepdims=True)
+    covariance = np.einsum("tmi,tmj->tij", away, away) / count
+    flat = np.full((steps, count), -np.log(count))
+    found = consistency(
+        [
+            plant.planted(
+                plant.real("crossmodal-pf"),
+                truth,
+                estimate_mean=mean,
+                estimate_covariance=covariance,
+                modality_mean=np.stack([mean, mean], 1),
+                modality_covariance=np.stack([covariance, covariance], 1),
+                particles=particles,
+                prior_log_weights=flat,
+                log_weights=flat,
+                log_likelihood=np.zeros((steps, 2, count)),
+                ancestors=np.tile(np.arange(count, dtype=np.int32), (steps, 1)),
+            )
+        ]
+    )
+    assert found.whiteness == ()
+    for layer in found.layers:
+        one = found.of(layer)
+        assert one.nees == pytest.approx(1.0, abs=0.1)  # sqrt(2 / 3 / 600) = 0.033
+        assert one.miscalibration < 0.03
+        assert one.coverage95 == pytest.approx(0.95, abs=0.03)
+        np.testing.assert_allclose(one.crps, plant.SCALE / math.sqrt(math.pi), rtol=0.1)
+
+
+def test_crps_of_a_gaussian() -> None:
+    rng = np.random.default_rng(0)
+    error, deviation = rng.normal(size=200), rng.uniform(0.2, 3.0, 200)
+    theirs = crps_gaussian(np.zeros(200), deviation, -error)
+    assert gaussian_crps(error, deviation).mean() == pytest.approx(theirs, rel=1e-12)
+    assert gaussian_crps(np.zeros(1), np.full(1, 2.0))[0] == pytest.approx(
+        2.0 * (math.sqrt(2) - 1) / math.sqrt(math.pi)
+    )
+    # By its definition, the integral of (F(x) - [x > y])^2, y = 0, on cells of 1e-3.
+    x = np.arange(-20.0, 20.0, 1e-3) + 5e-4
+    integral = np.square(norm.cdf(x, 0.7, 1.3) - (x > 0)).sum() * 1e-3
+    assert gaussian_crps(np.array([0.7]), np.array([1.3]))[0] == pytest.approx(integral, rel=1e-5)
+
+
+def test_crps_of_particles() -> None:
+    rng = np.random.default_rng(1)
+    x, w = rng.normal(size=(4, 40)), rng.dirichlet(np.full(40, 0.3), 4)
+    pairs = (w[:, :, None] * w[:, None] * np.abs(x[:, :, None] - x[:, None])).sum((1, 2))
+    np.testing.assert_allclose(particle_crps(x, w), (w * np.abs(x)).sum(1) - 0.5 * pairs, rtol=1e-12)
+    assert particle_crps(np.full(5, -0.3), np.full(5, 0.2)) == pytest.approx(0.3)  # of a point, the distance
+    # Quantiles of N(0.5, 2^2) as particles: it converges to the Gaussian's.
+    exact = gaussian_crps(np.array(0.5), np.array(2.0))
+    off = []
+    for count in (10, 100, 1000):
+        quantiles = 0.5 + 2.0 * norm.ppf((np.arange(count) + 0.5) / count)
+        off.append(abs(particle_crps(quantiles, np.full(count, 1.0 / count)) - exact))
+    assert off[0] > 4.0 * off[1] > 16.0 * off[2]
+    # The same Gaussian from draws of another, by importance weights: noise of 1 / sqrt(200000), some times over.
+    draws = rng.normal(0.0, 3.0, 200_000)
+    weights = norm.pdf(draws, 0.5, 2.0) / norm.pdf(draws, 0.0, 3.0)
+    assert particle_crps(draws, weights / weights.sum()) == pytest.approx(exact, rel=0.02)
+
+
+def test_levels_are_uniform_where_the_distribution_is_true() -> None:
+    rng = np.random.default_rng(2)
+    covariance = np.diag(np.square(plant.SCALE))
+    error = rng.multivariate_normal(np.zeros(3), covariance, 300)
+    squared = np.square(error / plant.SCALE).sum(1)
+    exact = gaussian_level(squared, 3)
+    assert kstest(exact, "uniform").pvalue > 0.01
+    particles = rng.multivariate_normal(np.zeros(3), covariance, (300, 1000))
+    level = particle_level(particles, np.full((300, 1000), 1e-3), error, covariance)
+    np.testing.assert_allclose(level, exact, atol=0.07)  # four of sqrt(0.25 / 1000)
+
+
+def test_ljung_box_is_that_of_statsmodels() -> None:
+    rng = np.random.default_rng(4)
+    series = np.stack([rng.normal(size=80), np.cumsum(rng.normal(size=80))], axis=1)
+    statistic, correlation = ljung_box(series)
+    theirs = [float(acorr_ljungbox(column, lags=[10]).lb_stat.iloc[0]) for column in series.T]
+    np.testing.assert_allclose(statistic, theirs, rtol=1e-9)
+    assert abs(correlation[0]) < 0.3 < 0.8 < correlation[1]
