@@ -1,0 +1,129 @@
+"""What every diagnostic of a trace gives, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnostic import Diagnostic, Entry, as_json
+from beliefscope.inspect.plotting import write_figure
+from beliefscope.inspect.trace import Trace
+
+sys.path.insert(0, str(Path(__file__).parent))
+import planted as plant
+
+OF_TRACES = [entry for entry in DIAGNOSTICS.values() if entry.needs == "trace"]
+
+
+def blind(steps: int = 60) -> Trace:
+    """As an LSTM's trace is: estimates, and nothing else."""
+    base = plant.real("crossmodal-ekf", steps)
+    others = ("weights", "acting", "predicted_mean", "predicted_covariance")
+    none: dict[str, Any] = dict.fromkeys((*others, "observation_mean", "observation_covariance"))
+    return replace(
+        base,
+        kind="lstm",
+        filter="lstm",
+        modalities=(),
+        estimate_covariance=np.full_like(base.estimate_covariance, np.nan),
+        modality_mean=base.modality_mean[:, :0],
+        modality_covariance=base.modality_covariance[:, :0],
+        **none,
+    )
+
+
+PAIRS = [
+    (entry, name)
+    for entry in OF_TRACES
+    for name in ("crossmodal-pf", "crossmodal-ekf")
+    if (entry.name, name) != ("particles", "crossmodal-ekf")
+]
+
+
+@pytest.fixture(params=PAIRS, ids=lambda pair: f"{pair[0].name}-{pair[1]}")
+def made(request: pytest.FixtureRequest) -> tuple[Diagnostic, Diagnostic, Trace]:
+    """Of one trace and of six."""
+    entry, name = request.param
+    trace = plant.real(name)
+    return entry([trace]), entry([trace] * 6), trace
+
+
+def test_json_has_all_and_no_nan(made: tuple[Diagnostic, Diagnostic, Trace]) -> None:
+    for found in made[:2]:
+        numbers = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+        assert numbers["verdict"] == found.verdict
+        assert numbers["filter"] == made[2].filter
+        shown = json.loads(json.dumps(found.views(), allow_nan=False))
+        assert [table["title"] for table in shown["tables"]] == [table.title for table in found.tables()]
+
+
+def test_not_a_number_becomes_none() -> None:
+    numbers = DIAGNOSTICS["consistency"]([plant.real("crossmodal-pf")]).to_dict()
+    assert numbers["by_layer"][0]["nis"] is None  # of no Kalman filter
+    values = {"a": np.array([1.0, np.nan]), "b": (np.float32("inf"), np.int64(3)), "c": np.array([True])}
+    assert as_json(values) == {"a": [1.0, None], "b": [None, 3], "c": [True]}
+
+
+def test_views_fit_the_trace(made: tuple[Diagnostic, Diagnostic, Trace]) -> None:
+    one, several, trace = made
+    assert one.verdict[0].isupper()
+    assert one.verdict.endswith(".")
+    assert {curve.values.shape for curve in one.curves()} == {(len(trace),)}
+    np.testing.assert_array_equal(one.bands()["contact"], trace.episode.contact)
+    assert not several.curves()
+    assert not several.bands()
+    for found in (one, several):
+        assert found.tables()
+        for table in found.tables():
+            assert {len(row) for row in table.rows} == {len(table.columns)}, table.title
+
+
+def test_figures_are_written(made: tuple[Diagnostic, Diagnostic, Trace], tmp_path: Path) -> None:
+    figure = made[0].plot()
+    curves = made[0].curves()
+    assert sum(len(axes.lines) for axes in figure.axes) >= len(curves)
+    write_figure(figure, tmp_path / "one.svg")
+    write_figure(made[1].plot(), tmp_path / "several.png")
+    text = (tmp_path / "one.svg").read_text(encoding="utf-8")
+    assert "</svg>" in text
+    assert curves[0].name in text
+    assert (tmp_path / "several.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(BadInput, match=r"format of a figure 'bmp' does not exist\. Available: svg, pdf, png"):
+        write_figure(figure, tmp_path / "one.bmp")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.svg", "several.png"]
+
+
+@pytest.mark.parametrize("entry", OF_TRACES, ids=lambda entry: entry.name)
+def test_no_traces_and_traces_of_two_filters_are_refused(entry: Entry) -> None:
+    with pytest.raises(BadInput, match=f"{entry.name} needs at least one trace"):
+        entry([])
+    one = plant.real("crossmodal-pf")
+    with pytest.raises(BadInput, match=f"traces of two checkpoints, {one.checkpoint_hash[:12]} and ffff"):
+        entry([one, replace(one, checkpoint_hash="f" * 64)])
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("weights", "lstm does not weigh its modalities: one network sees them all"),
+        ("consistency", "lstm states no covariance, so there is nothing that its errors could be held against"),
+        ("particles", "lstm has no particles"),
+    ],
+)
+def test_an_lstm_has_none_of_them(name: str, why: str) -> None:
+    assert DIAGNOSTICS[name].refusal(blind(), None) == why
+    with pytest.raises(BadInput, match=why):
+        DIAGNOSTICS[name]([blind()])
+
+
+def test_a_checkpoint_is_asked_for_where_it_is_needed() -> None:
+    why = DIAGNOSTICS["maps"].refusal(plant.real("crossmodal-pf"), None)
+    assert why == "maps needs the filter's checkpoint, not only its trace"
