@@ -104,7 +104,7 @@ def maps_figure(checkpoint: Checkpoint, trace: Trace, steps: dict[bool, int], si
     rows = -(-len(shown) // columns)
     with rc_context(STYLE):
         width = WIDTH * (columns + 0.25) / (A_ROW + 0.25)
-        figure = Figure(figsize=(width, 2.6 * rows), layout="constrained")
+        figure = Figure(figsize=(width, 2.65 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for i, (axes, panel) in enumerate(zip(grid.flat, shown, strict=False)):
@@ -125,7 +125,7 @@ def maps_figure(checkpoint: Checkpoint, trace: Trace, steps: dict[bool, int], si
             _truth(axes, half)
             axes.set(xlim=(-half, half), ylim=(-half, half))
             letter = f"({chr(ord('a') + i)}) " if len(shown) > 1 else ""
-            axes.set_title(f"{letter}{panel.modality}, {STATES[panel.contact]}, step {panel.step}", fontsize=7.5)
+            axes.set_title(f"{letter}{panel.modality}\n{STATES[panel.contact]}, step {panel.step}", fontsize=7.5)
             if i + columns >= len(shown):
                 axes.set_xlabel(f"{_spoken(checkpoint.task.map_components[0])} offset (cm)")
                 axes.tick_params(labelbottom=True)

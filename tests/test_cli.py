@@ -326,6 +326,24 @@ def test_collect_to_recording(run: Run, folder: Path) -> None:
     assert (folder / "one.rrd").stat().st_size > 10_000
 
 
+def test_figures_of_the_paper(run: Run, folder: Path) -> None:
+    """What is shown is said, the same command gives the same bytes, and --step moves only its own state's map."""
+    line = f"figure maps {EKF} --json - -o"
+    first, again = (json.loads(run(f"{line} {name}.svg")[1]) for name in ("first", "again"))
+    assert first["shown"] == again["shown"] == {"no contact": 66, "contact": 31}
+    assert (folder / "first.svg").read_bytes() == (folder / "again.svg").read_bytes()
+    moved = json.loads(run(f"{line} moved.pdf --step 20")[1])
+    assert moved["shown"] == {"no contact": 66, "contact": 20}
+    assert (folder / "moved.pdf").read_bytes().startswith(b"%PDF")
+    code, out, _ = run(f"figure weights {EKF} -o weights.png")
+    assert (code, out) == (0, "weights.png (0.2 MB): crossmodal-ekf over 100 steps of door episode 9\n")
+    for wrong in (f"maps {EKF} --step 100000", "weights door --filter image-ekf"):
+        code, out, err = run(f"figure {wrong} -o wrong.svg")
+        assert (code, out) == (2, "")
+        assert err.splitlines()[-1].startswith("error: ")
+        assert not (folder / "wrong.svg").exists()
+
+
 def test_one_option_breaks_any_sensor(run: Run, folder: Path) -> None:
     run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
     faults = json.loads(run("recipes --json -")[1])

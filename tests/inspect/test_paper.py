@@ -109,7 +109,7 @@ def test_drawn_maps_are_the_engines(pf: tuple[Checkpoint, Trace]) -> None:
         np.testing.assert_allclose(drawn.get_array(), likelihood / likelihood.max(), atol=1e-5)
         assert drawn.origin == "lower"
         np.testing.assert_allclose(drawn.get_extent(), [-13.5, 13.5, -13.5, 13.5])
-        assert axes.get_title().endswith(f"{modality}, {paper.STATES[state]}, step {steps[state]}")
+        assert axes.get_title().endswith(f"{modality}\n{paper.STATES[state]}, step {steps[state]}")
     dots = [[line.get_xydata()[0] for line in axes.lines if line.get_marker() == "o"] for axes in figure.axes[:3]]
     assert [len(each) for each in dots] == [0, 0, 1], "the line belongs to touch in contact"
     step = steps[True]
