@@ -166,7 +166,7 @@ class Page {
     const [trace, { state }] = [this.#trace, this.#store];
     const set = (key) => (value) => this.#store.set({ [key]: value });
     choice($('#components'), trace.components.map((c) => [c.name, spoken(c.name)]), state.component, set('component'));
-    choice($('#weights'), trace.has('weights') ? [['raw', 'β raw'], ['acting', 'as it acted']] : [], state.weights, set('weights'));
+    choice($('#weights'), trace.has('weights') && trace.has('acting') ? [['raw', 'β raw'], ['acting', 'as it acted']] : [], state.weights, set('weights'));
     choice($('#track'), trace.particles ? [['error', 'error'], ['particles', 'particles']] : [], state.track, set('track'));
     this.timeline.redraw();
     this.numbers.show(trace, state.component);

@@ -61,11 +61,12 @@ function columns(trace, component) {
       sure && { title: 'σ', unit: '°', help: `Claimed standard deviation of the ${name}`, value: (s, t) => fixed(trace.sigma(s, angle)[t], 1) },
     );
   }
-  if (trace.has('weights')) {
+  const shared = trace.sources.length > 1; // else there is no row for a modality's
+  if (shared && trace.has('weights')) {
     const of = trace.weightWidth > 1 ? spoken(trace.components[component].name) : 'raw';
     list.push({ title: 'β', unit: of, help: `Fusion weight as the network gave it${trace.weightWidth > 1 ? `, for ${of}` : ''}`, value: (s, t) => fixed(trace.weight('raw', s, component)?.[t], 2) });
   }
-  if (trace.has('acting')) {
+  if (shared && trace.has('acting')) {
     list.push({ title: 'share', unit: 'acting', component, help: 'Share of the modality in the fused belief, as it acted', value: (s, t) => percent(trace.weight('acting', s, component)?.[t]) });
   }
   return list.filter(Boolean);

@@ -13,7 +13,8 @@ export function tracks(trace, state) {
 
 /** @returns {import('./chart.js').Track} or, where nothing is weighed, a line that says so. */
 function weights(trace, chosen, component) {
-  const kind = trace.has('weights') ? chosen : 'acting';
+  const both = trace.has('weights') && trace.has('acting');
+  const kind = both ? chosen : trace.has('weights') ? 'raw' : 'acting';
   const series = trace.modalities
     .map((name) => ({ name, values: trace.weight(kind, name, component) }))
     .filter((s) => s.values);
@@ -24,9 +25,10 @@ function weights(trace, chosen, component) {
   return { title, unit: '', series, limits: [-0.04 * most, 1.06 * most], digits: 2 };
 }
 
-function unweighed({ modalities: [model], fuses }) {
+function unweighed({ modalities: [model], fuses, header }) {
   if (fuses) return 'None: this filter does not say how it weighs its modalities.';
   if (model) return `None: ${model.replaceAll('+', ' and ')} ${model.includes('+') ? 'go into one measurement model, which' : 'alone'} decides.`;
+  if (header.kind === 'foreign') return 'None: this filter does not say which of its senses it follows.';
   return 'None: the network takes all senses in at once and does not say which it follows.';
 }
 
