@@ -88,9 +88,8 @@ def inspect(
                 if figures is not None:
                     write_figure(result.plot(), figures / f"{name}.{format_}")
             advance((done + 1) / len(chosen))
-    if only and refused:
-        name, why = next(iter(refused.items()))
-        raise BadInput(why)
+    if not found:
+        raise BadInput("; ".join(refused.values()))
     text += [f"{DIAGNOSTICS[name].title}: not made. {why}" for name, why in refused.items()]
     document = {
         "task": traces[0].episode.task,
