@@ -56,4 +56,6 @@ def test_filters_from_outside(open_page: Any, serve: Any, tmp_path: Path) -> Non
     assert text("#timeline .why").count() == 0
     assert not text("#weights").is_visible()
     assert "\N{GREEK SMALL LETTER BETA}" not in text("#numbers thead").text_content()
+    page.page.keyboard.press("ArrowRight")
+    page.settle(2)
     page.picture("foreign-weights")
