@@ -1,0 +1,192 @@
+"""What the commands do, one after the other as their users run them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.store import open_dataset
+from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.trace import load_trace
+from beliefscope.recordings.read import read_recording
+
+Run = Callable[[str], tuple[int, str, str]]
+EKF = "door --filter ekf.safetensors"
+
+
+@pytest.mark.parametrize("task", ["door", "push"])
+def test_collect_shows_the_authors_statistics_beside_its_own(run: Run, folder: Path, task: str) -> None:
+    from beliefscope.datasets.statistics import AUTHORS
+
+    code, out, _ = run(f"collect {task} --episodes 1 --steps 4 --workers 1 -o one.h5")
+    assert code == 0
+    head, empty, title, *rows = out.splitlines()
+    assert (empty, title.split()) == ("", ["this", "set", "authors", "ratio"])
+    assert head.startswith("one.h5")
+    row = next(row for row in rows if row.startswith("contact fraction"))
+    assert row.split()[3] == str(AUTHORS[task].statistics["contact_fraction"])
+    force = next(row for row in rows if row.startswith("force std, N"))
+    assert len(force.split()) == 3 + 3 * 3, "three axes each"
+
+
+def test_collect_to_recording(run: Run, folder: Path) -> None:
+    """The whole line: what one command writes, the next one reads, and the JSON agrees with the files."""
+    code, out, _ = run("collect door --episodes 2 --steps 12 --seed 3 --workers 1 -o few.h5 --json -")
+    collected = json.loads(out)
+    assert code == 0
+    with open_dataset(folder / "few.h5") as data:
+        assert collected["data_hash"] == data.hash
+        assert (collected["episodes"], [len(episode) for episode in data]) == (2, [12, 12])
+        assert collected["contact_fraction"] == np.mean([episode.contact for episode in data])
+        digest = data[1].digest()
+    assert collected["statistics"].keys() > collected["authors"].keys() > {"force_std_N", "angle_std_deg"}
+
+    code, out, err = run("evaluate door --filter ekf.safetensors --data few.h5 --json -")
+    evaluated = json.loads(out)
+    assert code == 0
+    assert "Evaluating" in err
+    assert evaluated["data_hash"] == collected["data_hash"]
+    assert set(evaluated["rmse"]) == {"hinge_x_cm", "hinge_y_cm", "angle_deg", "position_cm"}
+    assert {"task", "filter", "checkpoint_hash", "episodes", "recipe", "nll", "nees", "coverage95"} <= set(evaluated)
+
+    code, out, _ = run(f"trace {EKF} --data few.h5 --episode 1 -o one.trace --json -")
+    assert code == 0
+    traced = load_trace(folder / "one.trace")
+    assert json.loads(out)["data_hash"] == traced.data_hash == digest
+    assert json.loads(out)["checkpoint_hash"] == traced.checkpoint_hash == evaluated["checkpoint_hash"]
+
+    code, out, _ = run(f"record {EKF} --data few.h5 --episode 1 --maps 6 -o one.rrd")
+    assert code == 0
+    assert out.startswith("one.rrd (")
+    assert len(out.splitlines()) == 1
+    assert (folder / "one.rrd").stat().st_size > 10_000
+
+
+def test_figures_of_the_paper(run: Run, folder: Path) -> None:
+    """What is shown is said, the same command gives the same bytes, and --step moves only its own state's map."""
+    line = f"figure maps {EKF} --json - -o"
+    first, again = (json.loads(run(f"{line} {name}.svg")[1]) for name in ("first", "again"))
+    assert first["shown"] == again["shown"] == {"no contact": 66, "contact": 31}
+    assert (folder / "first.svg").read_bytes() == (folder / "again.svg").read_bytes()
+    moved = json.loads(run(f"{line} moved.pdf --step 20")[1])
+    assert moved["shown"] == {"no contact": 66, "contact": 20}
+    assert (folder / "moved.pdf").read_bytes().startswith(b"%PDF")
+    code, out, _ = run(f"figure weights {EKF} -o weights.png")
+    assert (code, out) == (0, "weights.png (0.2 MB): crossmodal-ekf over 100 steps of door episode 9\n")
+    for wrong in (f"maps {EKF} --step 100000", "weights door --filter image-ekf"):
+        code, out, err = run(f"figure {wrong} -o wrong.svg")
+        assert (code, out) == (2, "")
+        assert err.splitlines()[-1].startswith("error: ")
+        assert not (folder / "wrong.svg").exists()
+
+
+def test_one_option_breaks_any_sensor(run: Run, folder: Path) -> None:
+    run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
+    faults = json.loads(run("recipes --json -")[1])
+    names = [fault["fault"] for fault in faults["faults"]]
+    assert {"blackout", "force_stuck", "effector_offset", "contact_late", "delay", "drop"} <= set(names)
+    text = run("recipes")[1]
+    assert all(f"\n{name} " in f"\n{text}" for name in names)
+    everything = ",".join(names)
+    line = f"{EKF} --data one.h5 --episode 0 --recipe {everything} --json - -o"
+    traced = json.loads(run(f"trace {line} all.trace")[1])
+    assert [fault["fault"] for fault in traced["recipe"]] == names
+    assert load_trace(folder / "all.trace").recipe.to_json() == traced["recipe"]
+    recorded = json.loads(run(f"record {line} all.rrd --maps 0")[1])
+    assert recorded["recipe"] == traced["recipe"] == read_recording(folder / "all.rrd").recipe.to_json()
+    assert (
+        f"with {load_trace(folder / 'all.trace').recipe}" in run(f"trace {line.replace('--json -', '')} all.trace")[1]
+    )
+
+
+def test_every_way_to_write_a_recipe_is_the_same(run: Run, folder: Path) -> None:
+    run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
+    (folder / "recipe.json").write_text('[{"fault": "blackout", "probability": 0.4}]')
+
+    def evaluated(rest: str) -> dict[str, Any]:
+        code, out, _ = run(f"evaluate {EKF} --data one.h5 --json - {rest}")
+        assert code == 0
+        return dict(json.loads(out))
+
+    whole = evaluated("")
+    assert (whole["recipe"], whole["only"]) == ([], None)
+    asked = evaluated("--recipe blackout=0.4")
+    assert asked["recipe"] == [{"fault": "blackout", "probability": 0.4}]
+    assert asked["rmse"] != whole["rmse"]
+    for other in (
+        """'{"blackout": 0.4}'""",
+        "recipe.json",
+        "./recipe.json",
+        """'[{"fault": "blackout", "probability": 0.4}]'""",
+    ):
+        assert evaluated(f"--recipe {other}") == asked
+    alone = evaluated("--recipe blackout=0.4 --only image")
+    assert alone["only"] == "image"
+    assert alone["rmse"] != asked["rmse"]
+    assert evaluated("""--recipe '{"blackout": 0.4, "only": "image"}'""") == alone
+
+
+def test_what_is_bad_can_be_left_out(run: Run, folder: Path) -> None:
+    line = f"trace {EKF} --data shape.h5 -o some.trace"
+    assert run(line)[0] == 2
+    code, out, err = run(f"{line} --skip-bad --json -")
+    assert code == 0
+    left_out = "left out: shape.h5: 'states' of trajectory9 has shape (100, 2), expected (100, 3)."
+    assert err.splitlines()[0] == left_out
+    assert json.loads(out)["episode"] == 18, "the first of the held-out ones, now that the tenth is gone"
+
+
+def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> None:
+    run("collect door --episodes 10 --steps 20 --workers 1 -o ten.h5")
+    line = "train door --filter crossmodal-pf --data ten.h5 --preset smoke -o pf.safetensors --json -"
+    code, out, err = run(line)
+    trained = json.loads(out)
+    assert code == 0
+    assert "dynamics" in err
+    assert trained["record"]["command"].startswith("beliefscope train door --filter crossmodal-pf --data ten.h5")
+    assert trained["record"]["recipe"] == []
+    episodes = trained["record"]["episodes"]
+    more = "--recipe force_bias:x=5,blackout=0.4 --blackouts 0,0.8 --json"
+    hardened = json.loads(run(line.replace("--json", more))[1])["record"]
+    assert (trained["record"]["blackouts"], hardened["blackouts"]) == ([0.0, 0.4, 0.8], [0.0, 0.8])
+    assert hardened["command"].partition("--blackouts ")[2].startswith("0,0.8")
+    assert [fault["fault"] for fault in hardened["recipe"]] == ["force_bias", "blackout"]
+    assert hardened["episodes"] == episodes | {"train": 2 * episodes["train"]}
+    assert "--recipe force_bias=5,blackout=0.4" in hardened["command"]
+    trained = json.loads(run(line)[1])
+    code, out, _ = run("evaluate door --filter pf.safetensors --data ten.h5 --particles 50 --json -")
+    assert code == 0
+    assert json.loads(out)["checkpoint_hash"] == trained["checkpoint_hash"]
+    assert json.loads(out)["episodes"] == 1
+
+
+def test_inspect_says_what_applies_and_why_the_rest_does_not(run: Run, folder: Path) -> None:
+    for episode in (9, 19):
+        assert run(f"trace {EKF} --episode {episode} -o {episode}.trace")[0] == 0
+    code, out, _ = run("inspect 9.trace 19.trace --filter ekf.safetensors --figures figures --format png --json -")
+    document = json.loads(out)
+    assert code == 0
+    assert set(document["diagnostics"]) | set(document["not_made"]) == set(DIAGNOSTICS)
+    assert "no particles" in document["not_made"]["particles"]
+    assert "--only maps" in document["not_made"]["maps"]
+    assert {path.stem for path in (folder / "figures").iterdir()} == set(document["diagnostics"])
+    assert [trace["episode"] for trace in document["traces"]] == [9, 19]
+    for name, found in document["diagnostics"].items():
+        alone = json.loads(run(f"inspect 9.trace 19.trace --only {name} --json -")[1])["diagnostics"]
+        assert alone == {name: found}
+    # Its filter does not ship: what needs the checkpoint says so.
+    code, out, _ = run("inspect 9.trace")
+    assert code == 0
+    assert "Particle health: not made" in out
+    assert "Likelihood maps: not made. maps needs the filter's checkpoint" in out
+    code, _, err = run("inspect 9.trace --only particles")
+    assert (code, err.splitlines()[-1]) == (2, "error: crossmodal-ekf has no particles")
+    assert run("trace door --filter crossmodal-pf --particles 10 -o pf.trace")[0] == 0
+    code, _, err = run("inspect 9.trace pf.trace")
+    assert code == 2
+    assert "another checkpoint" in err
