@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import asdict
 from typing import Annotated, Any, Literal, get_type_hints
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, HTTPException, Request
 from fastapi.responses import FileResponse, JSONResponse, Response
@@ -98,7 +99,8 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         title = ", ".join(
             [f"{entry.title} of {asked.filter}", f"{asked.task} {where}", *filter(None, [str(asked.recipe)])]
         )
-        return _under_way(jobs.submit("diagnostic", title, arguments, _key(library, entry, selections, options)))
+        key = _key(library, entry, selections, options)
+        return _under_way(jobs.submit("diagnostic", title, arguments, key, _link(entry, asked, options, episodes)))
 
     return router
 
@@ -212,6 +214,13 @@ def _key(library: Library, entry: Entry, selections: list[Selection], options: M
     """Of all that a result depends on. A trace of an index differs from the same episode's under another one."""
     traces = [(selection.episode, library.key(selection)) for selection in selections]
     return hashlib.sha256(repr((entry.name, traces, sorted(options.items()))).encode()).hexdigest()
+
+
+def _link(entry: Entry, asked: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:
+    """The page's address with this open."""
+    kept = {"task": asked.task, "filter": asked.filter, "data": asked.data, "episode": asked.episode}
+    opened = {"recipe": str(asked.recipe), "diagnostic": entry.name, "options": urlencode(options), "over": episodes}
+    return "?" + urlencode(kept | {"tab": "diagnostics"} | {name: text for name, text in opened.items() if text})
 
 
 def _says_how_far(entry: Entry) -> bool:

@@ -52,7 +52,7 @@ class Job:
         id: hash of its kind and of all that its result depends on. title: for people.
         progress: 0..1. message: what it is doing, in a line. error: why it ended without a result, in a line.
         asked, started, ended: s since 1970; None where it has not come to that.
-        server: process id of the server that has it.
+        server: process id of the server that has it. link: what follows the page's ``?`` to see its result.
     """
 
     id: str
@@ -66,6 +66,7 @@ class Job:
     started: float | None = None
     ended: float | None = None
     server: int = 0
+    link: str = ""
 
 
 class Jobs:
@@ -117,11 +118,12 @@ class Jobs:
         """Where its result is, once it is done: JSON."""
         return self._folder / id / "result.json"
 
-    def submit(self, kind: str, title: str, arguments: Mapping[str, Any], key: str) -> Job:
+    def submit(self, kind: str, title: str, arguments: Mapping[str, Any], key: str, link: str = "") -> Job:
         """Has it done; one that is under way or done already is not done again.
 
         Args:
             arguments: JSON, handed to the kind's function. key: hash of all that the result depends on.
+            link: to see the result on the page, from its ``?`` on.
 
         Raises BadInput for an unknown kind, and QueueFull.
         """
@@ -142,7 +144,7 @@ class Jobs:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
             write_atomically(folder / "arguments.json", json.dumps(arguments).encode())
-            self._put(Job(id, kind, title, asked=time.time(), server=os.getpid()))
+            self._put(Job(id, kind, title, asked=time.time(), server=os.getpid(), link=link))
             self._queue.append(id)
             self._start()
             self._tidy()

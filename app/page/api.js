@@ -72,6 +72,45 @@ export async function loadTrace(task, selection, progress, signal) {
   return new Trace(task, selection, header, columns, pictures);
 }
 
+/**
+ * @typedef {{name: string, title: string, question: string, slow: boolean, why_not: string | null,
+ *   options: {name: string, meaning: string, default: string}[]}} Entry of the catalog of diagnostics, for one trace
+ * @typedef {{id: string, kind: string, title: string, state: string, progress: number, message: string, error: string, link: string,
+ *   asked: number, started: number | null, ended: number | null}} Job
+ * @typedef {{verdict: string, trajectories: number, tables: object[], curves: object[], bands: object, plots: object[], pictures: object[]}} Found
+ */
+
+const diagnosticUrl = ({ task, filter, data, episode, recipe }, name, query = {}) =>
+  `/api/diagnostics/${name ? `${encodeURIComponent(name)}/` : ''}${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, recipe, ...query })}`;
+
+/** All diagnostics, and why those that do not apply do not. @returns {Promise<Entry[]>} */
+export const diagnostics = (selection, signal) => whole(diagnosticUrl(selection), signal);
+
+/** One diagnostic: what it found; or the job that finds it, null where nobody asked for it.
+ *  @param {Record<string, string>} query its options, and `episodes` @returns {Promise<Found | {job: Job | null}>} */
+export const diagnostic = (selection, name, query, signal) => whole(diagnosticUrl(selection, name, query), signal);
+
+/** Has a diagnostic computed as a job. @returns {Promise<{job: Job}>} */
+export const compute = async (selection, name, query) => (await ask(diagnosticUrl(selection, name, query), { method: 'POST' })).json();
+
+/** Asks again while the trace that it is of is computed. */
+async function whole(url, signal) {
+  for (;;) {
+    const body = await (await ask(url, { signal })).json();
+    if (!('progress' in body)) return body;
+    await new Promise((resolve) => setTimeout(resolve, AGAIN));
+  }
+}
+
+/** @returns {Promise<Job[]>} the newest first. */
+export const jobs = async () => (await ask('/api/jobs')).json();
+
+/** A job with its log. @returns {Promise<Job & {log: string}>} */
+export const job = async (id) => (await ask(`/api/jobs/${id}`)).json();
+
+/** Cancels a job that is under way, forgets one that has ended. @returns {Promise<Job>} */
+export const cancel = async (id) => (await ask(`/api/jobs/${id}`, { method: 'DELETE' })).json();
+
 /** Writes a recording of a trace, with maps at even steps. @param {Trace} trace @returns {Promise<Recording>} */
 export async function record(trace) {
   const maps = Math.ceil(trace.steps / RECORDED_MAPS);

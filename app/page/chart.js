@@ -18,7 +18,7 @@ import { colour, line, translucent } from './palette.js';
 /** px beside and below a track's plot. */
 export const GUTTER = { left: 46, right: 12, axis: 33 };
 const BLACK_STRIP = 8; // px
-const FONT = '10px system-ui, sans-serif';
+export const FONT = '10px system-ui, sans-serif';
 
 /**
  * @param {HTMLElement} parent @param {Track} track @param {Shading} shading
@@ -99,8 +99,8 @@ function fitted(track, [from, to]) {
   return [track.fromZero ? 0 : low - margin, high + margin];
 }
 
-/** Contact behind everything, as the paper draws it; black pictures hatched along the top edge. */
-function shade(plot, { contact, black }) {
+/** Contact behind everything, as the paper draws it; black pictures hatched along the top edge. @param {uPlot} plot @param {Shading} shading */
+export function shade(plot, { contact, black }) {
   const { ctx, bbox } = plot;
   const across = ([first, last]) => {
     const left = Math.max(bbox.left, plot.valToPos(first - 0.5, 'x', true));

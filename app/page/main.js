@@ -3,7 +3,9 @@
 import * as api from './api.js';
 import { Camera } from './camera.js';
 import { Clock } from './clock.js';
+import { Diagnostics } from './diagnostics.js';
 import { Heatmaps, paintColourBar } from './heatmap.js';
+import { Jobs } from './jobs.js';
 import { keys } from './keys.js';
 import { Numbers } from './numbers.js';
 import { Theme, swatch, tellApart } from './palette.js';
@@ -68,6 +70,8 @@ class Page {
     this.slice = new Slice($('#slice-label'), $('#slice-true'), store);
     this.scene = new Scene($('#scene'));
     this.rerun = new Rerun($('#rerun'), (step) => store.set({ step, playing: false }, { origin: 'rerun' }));
+    this.jobs = new Jobs($('#jobs'), $('#jobs-button'));
+    this.diagnostics = new Diagnostics($('#diagnostics'), store, this.jobs);
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
     this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
@@ -108,6 +112,7 @@ class Page {
     const any = (...names) => names.some((name) => changed.has(name));
     if (any('task', 'filter', 'data', 'episode', 'recipe')) this.#load();
     if (any('tab')) this.#showTab(state.tab);
+    if (any('diagnostic', 'options', 'over')) this.diagnostics.choose();
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
     if (any('component', 'weights', 'track')) this.#choose();
@@ -147,7 +152,7 @@ class Page {
     }
     tellApart(trace.modalities);
     bodies.slice(1).forEach((body) => say(body, 'ready'));
-    for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun]) panel.show(trace);
+    for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun, this.diagnostics]) panel.show(trace);
     $('#maps-what').textContent = spoken(trace.task.map.x).replace(/(^| )x$/, '') || 'position';
     $('#maps').classList.toggle('one', !trace.fuses);
     $('#maps').classList.toggle('handless', !trace.has('effector_position'));
@@ -177,7 +182,7 @@ class Page {
   #move() {
     const [trace, { state, origin, inputTime }] = [this.#trace, this.#store];
     const { step, angle } = state;
-    for (const panel of [this.timeline, this.camera, this.numbers, this.slice]) panel.move(step);
+    for (const panel of [this.timeline, this.camera, this.numbers, this.slice, this.diagnostics]) panel.move(step);
     this.rerun.move(step, origin === 'rerun');
     this.socket.move({ ...trace.selection, step, angle }, inputTime);
     this.#read(state);
@@ -204,6 +209,7 @@ class Page {
   #showTab(tab) {
     this.showTab(tab);
     this.rerun.open = tab === 'rerun';
+    this.diagnostics.open = tab === 'diagnostics';
     if (this.#trace) this.rerun.move(this.#store.state.step, false);
   }
 
@@ -216,6 +222,7 @@ class Page {
     this.socket.theme(dark);
     this.timeline.redraw();
     this.heatmaps.redraw();
+    this.diagnostics.redraw();
   }
 
   #goWorst() {
@@ -240,6 +247,8 @@ class Page {
       ']': () => this.clock.changeSpeed(1),
       1: () => this.#store.set({ tab: 'scene' }),
       2: () => this.#store.set({ tab: 'rerun' }),
+      3: () => this.#store.set({ tab: 'diagnostics' }),
+      j: () => this.jobs.toggle(),
       c: () => this.#nextComponent(),
       e: () => this.#goWorst(),
       s: () => this.save(),

@@ -11,15 +11,20 @@ const DASHES = { truth: [], fused: [], image: [7, 3], haptics: [2, 2.5] };
 const WIDTHS = { truth: 1.25, fused: 2.25 };
 const SPARE_DASHES = [[9, 3, 2, 3], [4, 2], [1, 3]];
 
+/** Blue through white to red at 11 even places, ColorBrewer's: for values on either side of zero. */
+const DIVERGING = [
+  0x053061, 0x2166ac, 0x4393c3, 0x92c5de, 0xd1e5f0, 0xf7f7f7, 0xfddbc7, 0xf4a582, 0xd6604d, 0xb2182b, 0x67001f,
+];
+
 /** @returns {Uint32Array} 256 colours as the bytes R, G, B, A in memory: what ImageData holds. */
-function colourTable() {
+function colourTable(stops) {
   const bytes = new Uint8ClampedArray(256 * 4);
   for (let i = 0; i < 256; i++) {
-    const place = (i / 255) * (VIRIDIS.length - 1);
-    const low = Math.min(Math.floor(place), VIRIDIS.length - 2);
+    const place = (i / 255) * (stops.length - 1);
+    const low = Math.min(Math.floor(place), stops.length - 2);
     for (let channel = 0; channel < 3; channel++) {
       const shift = 16 - 8 * channel;
-      const [a, b] = [(VIRIDIS[low] >> shift) & 255, (VIRIDIS[low + 1] >> shift) & 255];
+      const [a, b] = [(stops[low] >> shift) & 255, (stops[low + 1] >> shift) & 255];
       bytes[4 * i + channel] = a + (b - a) * (place - low);
     }
     bytes[4 * i + 3] = 255;
@@ -27,7 +32,8 @@ function colourTable() {
   return new Uint32Array(bytes.buffer);
 }
 
-export const COLOUR_TABLE = colourTable();
+export const COLOUR_TABLE = colourTable(VIRIDIS);
+export const SIGNED_TABLE = colourTable(DIVERGING);
 
 /** @param {string} name of a colour in page.css. @returns {string} as it is now, light or dark. */
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
@@ -59,6 +65,11 @@ export function line(name) {
 /** A short piece of the line, for legends. @returns {SVGElement} */
 export function swatch(name) {
   const { dash, width } = line(name);
+  return sample(variable(name), dash, width);
+}
+
+/** The same of any line. @param {string} property of the colour in CSS */
+export function sample(property, dash, width) {
   const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');
   svg.setAttribute('class', 'swatch');
   svg.setAttribute('viewBox', '0 0 20 8');
@@ -67,7 +78,7 @@ export function swatch(name) {
   path.setAttribute('d', 'M0 4h20');
   path.setAttribute('stroke-dasharray', dash.join(' '));
   path.setAttribute('stroke-width', String(width));
-  path.style.stroke = `var(${variable(name)})`;
+  path.style.stroke = `var(${property})`;
   svg.append(path);
   return svg;
 }

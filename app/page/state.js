@@ -8,14 +8,17 @@ import { spoken } from './units.js';
  * @property {number} episode index in it
  * @property {string} recipe how the sensors are broken, as text (docs/data.md); empty where they are not
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
- * @property {'scene' | 'rerun'} tab
+ * @property {'scene' | 'rerun' | 'diagnostics'} tab
  * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
  * @property {'error' | 'particles'} track the lowest chart
+ * @property {string} diagnostic that is open, empty for the list of all
+ * @property {string} options of the open one, as in an address: size=21
+ * @property {'episode' | 'held-out'} over what diagnostics are made: this episode, or all that are held out
  * @property {boolean} playing @property {number} speed
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
-const CHOICES = { tab: ['scene', 'rerun'], weights: ['raw', 'acting'], track: ['error', 'particles'] };
+const CHOICES = { tab: ['scene', 'rerun', 'diagnostics'], weights: ['raw', 'acting'], track: ['error', 'particles'], over: ['episode', 'held-out'] };
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
 /** Holds the state; tells listeners once a frame what has changed. */
@@ -67,9 +70,12 @@ export class Store {
 
 /** @param {State} state @returns {string} what follows the `?` says all of it that a link should keep. */
 export function address(state) {
-  const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track } = state;
+  const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track, diagnostic, options, over } = state;
   const kept = { task, filter, data, episode, step, component, weights, track, tab };
   if (recipe) kept.recipe = recipe;
+  if (diagnostic) kept.diagnostic = diagnostic;
+  if (options) kept.options = options;
+  if (over !== CHOICES.over[0]) kept.over = over;
   if (angle !== null) kept.angle = Number(angle.toFixed(4));
   return `?${new URLSearchParams(kept)}`;
 }
@@ -100,6 +106,8 @@ export function resolve(search, catalog) {
     step: number(asked, 'step', 0, null, problems),
     angle: asked.has('angle') && Number.isFinite(Number(asked.get('angle'))) ? Number(asked.get('angle')) : null,
     component: pick('component', task.components.map((c) => c.name), task.map.x),
+    diagnostic: asked.get('diagnostic') ?? '',
+    options: asked.get('options') ?? '',
     playing: false,
     speed: 1,
   };

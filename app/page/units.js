@@ -18,6 +18,15 @@ export function fixed(value, digits = 1) {
 /** As `fixed`, with the sign always written. */
 export const signed = (value, digits = 1) => (value > 0 && Number(value.toFixed(digits)) > 0 ? '+' : '') + fixed(value, digits);
 
+/** A number with three significant digits, an integer whole; a dash where there is none. */
+export function significant(value) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return '–';
+  const size = Math.abs(value);
+  if (Number.isInteger(value) && size < 1e6) return fixed(value, 0);
+  if (size >= 1e6 || size < 1e-4) return value.toExponential(2).replaceAll('-', '−').replace('e+', 'e');
+  return fixed(value, Math.max(0, 2 - Math.floor(Math.log10(size))));
+}
+
 export const percent = (share) => (Number.isFinite(share) ? `${Math.round(100 * share)} %` : '–');
 
 /** The difference of two angles in degrees, in -180..180. */

@@ -1,8 +1,8 @@
-/** The left of the page: tabs for the 3D scene and for Rerun's viewer. */
+/** The left of the page: tabs for the 3D scene, for Rerun's viewer and for the diagnostics. */
 
 import { say } from './panel.js';
 
-const TABS = ['scene', 'rerun'];
+const TABS = ['scene', 'rerun', 'diagnostics'];
 
 /** The scene's frame: another page of the server's, which follows the cursor by itself. */
 export class Scene {
@@ -49,9 +49,9 @@ export function tabs(store) {
     button.addEventListener('keydown', (event) => {
       if (event.key !== 'ArrowLeft' && event.key !== 'ArrowRight') return;
       event.stopPropagation();
-      const other = TABS[(i + 1) % TABS.length];
-      store.set({ tab: other });
-      buttons[(i + 1) % TABS.length].focus();
+      const other = (i + (event.key === 'ArrowRight' ? 1 : TABS.length - 1)) % TABS.length;
+      store.set({ tab: TABS[other] });
+      buttons[other].focus();
     });
   });
   return (shown) => {

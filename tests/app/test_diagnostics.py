@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl
 
 import pytest
 from starlette.testclient import TestClient
@@ -152,6 +153,14 @@ def test_a_slow_one_is_a_job_that_is_asked_for(shown: TestClient) -> None:
     job = asked.json()["job"]
     assert (asked.status_code, job["state"]) == (202, "running")
     assert job["title"] == f"Likelihood maps of crossmodal-ekf, door episode {EPISODE}"
+    opens = {
+        "task": "door",
+        "filter": "crossmodal-ekf",
+        "tab": "diagnostics",
+        "diagnostic": "maps",
+        "options": "size=5",
+    }
+    assert opens.items() <= dict(parse_qsl(job["link"].removeprefix("?"))).items()
     assert shown.post(url("maps"), params=quick).json()["job"]["id"] == job["id"]
     answer = answered(shown, url("maps"), **quick)
     assert answer.status_code == 200, answer.text
