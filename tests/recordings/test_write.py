@@ -228,7 +228,7 @@ def test_a_full_disk_is_noticed(new_trace: Callable[..., Trace], tmp_path: Path)
     path = tmp_path / "run.rrd"
     size = write_recording(new_trace("pf", steps=300), path).stat().st_size
     path.unlink()
-    limits = [int(share * size) for share in (0.3, 0.999)]
+    limits = [int(share * size) for share in (0.3, 0.98)]  # where chunks end differs by up to 0.3 % of the size
     script = FULL.format(folder=str(Path(__file__).parent), path=str(path), limits=limits)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
