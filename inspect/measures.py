@@ -99,6 +99,12 @@ def splits(trace: Trace) -> dict[str, Mask]:
     return {"all": keep, "contact": keep & contact, "no contact": keep & ~contact, "blackout": keep & blackout(trace)}
 
 
+def stretches(mask: Mask) -> NDArray[np.int64]:
+    """(R, 2): first step of each stretch of True in a mask (T,), and the first step after it."""
+    edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
+    return np.flatnonzero(edges).reshape(-1, 2)
+
+
 def shown_units(task: Task) -> tuple[tuple[str, ...], Array]:
     """Units as shown (``cm``, ``deg``) of the n components, and the factors (n,) to them."""
     pairs = [UNITS[component.unit] for component in task.components]

@@ -19,7 +19,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect import measures, weights
 from beliefscope.inspect.likelihood import FINE, MapEngine
 from beliefscope.inspect.palette import COLOURS, colour
-from beliefscope.inspect.plotting import BANDS, STYLE, WIDTH
+from beliefscope.inspect.plotting import STYLE, WIDTH, draw_bands
 from beliefscope.inspect.trace import Trace
 
 STATES = {False: "no contact", True: "contact"}
@@ -38,15 +38,9 @@ class Panel:
     contact: bool
 
 
-def stretches(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(R, 2): first step of each stretch of True, and the first step after it."""
-    edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
-    return np.flatnonzero(edges).reshape(-1, 2)
-
-
 def middle_of_longest(mask: NDArray[np.bool_]) -> int | None:
     """Middle of the longest stretch of True, the first of several, the earlier of two middles; None without any."""
-    found = stretches(mask)
+    found = measures.stretches(mask)
     if not len(found):
         return None
     first, end = found[(found[:, 1] - found[:, 0]).argmax()]
@@ -231,9 +225,5 @@ def _weights(axes: Axes, trace: Trace, column: int) -> None:
 
 def _bands(axes: Axes, trace: Trace) -> None:
     """Contact behind everything, and black pictures where there are any."""
-    for kind, mask in {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}.items():
-        if mask.any():
-            spans = [(first - 0.5, end - first) for first, end in stretches(mask)]
-            shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, "zorder": 0, **BANDS[kind]}
-            axes.broken_barh(spans, (0, 1), label=kind, **shade)
+    draw_bands(axes, {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}, named=True)
     axes.set_xlim(-0.5, len(trace) - 0.5)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,12 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import one_of
 from beliefscope.filters.checkpoint import write_atomically
 from beliefscope.inspect.diagnostic import Curve, Diagnostic, Picture, Plot
+from beliefscope.inspect.measures import stretches
 from beliefscope.inspect.palette import COLOURS, colour
 
 STYLE: dict[Any, Any] = {
@@ -71,7 +73,7 @@ def figure_format(path: Path) -> str:
 
 def figure_of(diagnostic: Diagnostic) -> Figure:
     """Curves by chart, one below the other; then plots and pictures, two a row; the verdict on top."""
-    charts = [(name, list(curves)) for name, curves in groupby(diagnostic.curves(), key=lambda curve: curve.chart)]
+    charts = charts_of(diagnostic)
     panels: list[Plot | Picture] = [*diagnostic.plots(), *diagnostic.pictures()]
     rows = len(charts) + -(-len(panels) // 2)
     with rc_context(STYLE):
@@ -89,16 +91,30 @@ def figure_of(diagnostic: Diagnostic) -> Figure:
             draw_chart(axes, name, curves, diagnostic)
         for i, panel in enumerate(panels):
             axes = figure.add_subplot(grid[len(charts) + i // 2, i % 2])
-            draw_plot(axes, panel) if isinstance(panel, Plot) else draw_picture(axes, panel)
+            draw_panel(axes, panel)
     return figure
+
+
+def png_of(panel: Plot | Picture) -> bytes:
+    """One plot or picture by itself as PNG, half as wide as a figure."""
+    data = io.BytesIO()
+    with rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH / 2, 1.6 * PANEL_HEIGHT), layout="constrained")
+        FigureCanvasAgg(figure)
+        draw_panel(figure.add_subplot(), panel)
+        figure.savefig(data, format="png", dpi=200)
+    return data.getvalue()
+
+
+def charts_of(diagnostic: Diagnostic) -> list[tuple[str, list[Curve]]]:
+    """The curves of each chart, under its name. Those of one chart are neighbours."""
+    return [(name, list(curves)) for name, curves in groupby(diagnostic.curves(), key=lambda curve: curve.chart)]
 
 
 def draw_chart(axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Diagnostic) -> None:
     """Curves over steps, with the bands behind them and their bounds dashed."""
     steps = np.arange(len(curves[0].values))
-    for kind, mask in diagnostic.bands().items():
-        shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, **BANDS[kind]}
-        axes.fill_between(steps, 0, 1, where=mask.tolist(), step="mid", **shade)
+    draw_bands(axes, diagnostic.bands())
     layers = [curve.layer for curve in curves]
     for i, curve in enumerate(curves):
         style = ("-", "--", ":", "-.")[layers[:i].count(curve.layer) % 4]
@@ -108,9 +124,23 @@ def draw_chart(axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Diagn
     axes.set_title(name, loc="left")
     axes.set_ylabel(curves[0].unit)
     axes.set_xlabel("step")
-    axes.margins(x=0)
+    axes.set_xlim(-0.5, len(steps) - 0.5)
     # Beside the title, where no curve is.
     axes.legend(frameon=False, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
+
+
+def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], named: bool = False) -> None:
+    """Shades the steps of each kind, half a step to both sides, behind all else. ``named``: for the legend."""
+    for kind, mask in bands.items():
+        if mask.any():
+            spans = [(first - 0.5, end - first) for first, end in stretches(mask)]
+            shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, "zorder": 0, **BANDS[kind]}
+            axes.broken_barh(spans, (0, 1), label=kind if named else None, **shade)
+
+
+def draw_panel(axes: Axes, panel: Plot | Picture) -> None:
+    """What is not over time."""
+    draw_plot(axes, panel) if isinstance(panel, Plot) else draw_picture(axes, panel)
 
 
 def draw_plot(axes: Axes, plot: Plot) -> None:
