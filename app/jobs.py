@@ -29,7 +29,10 @@ from beliefscope import __version__
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import write_atomically
 
-KINDS: dict[str, str] = {"diagnostic": "beliefscope.app.diagnostics:work"}
+KINDS: dict[str, str] = {
+    "diagnostic": "beliefscope.app.diagnostics:work",
+    "failures": "beliefscope.app.failures:work",
+}
 """Kind of job -> ``module:function`` of (arguments, report) -> result; ``report(share done, what it is doing)``."""
 
 AT_ONCE, WAITING, KEPT = 2, 16, 100  # running, queued, and finished jobs that are remembered

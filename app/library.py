@@ -17,6 +17,7 @@ from beliefscope.app.shelf import Shelf, shelves
 from beliefscope.app.wire import MAP_SIZES, columns
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.corrupt import WHOLE, Recipe
+from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import Checkpoint
@@ -138,6 +139,8 @@ class Library:
         self.settings = settings
         self._lock = threading.RLock()
         self._keys: dict[Selection, str] = {}
+        self._hashing = threading.Lock()
+        self._hashes: dict[tuple[str, str], str] = {}
         self._traced: OrderedDict[str, Traced] = OrderedDict()
         self._tracing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="tracing")
         self._closing = False
@@ -197,6 +200,25 @@ class Library:
         with self._lock:
             episodes = self._shelf(selection.task).dataset(selection.data).held_out()
             return [replace(selection, episode=episode) for episode in episodes]
+
+    def checkpoint(self, task: str, filter_: str) -> Checkpoint:
+        """Raises BadInput for a name that is not here."""
+        with self._lock:
+            return self._shelf(task).filter(filter_)
+
+    def dataset(self, task: str, name: str) -> tuple[str, Dataset]:
+        """Name and data set; the task's first for an empty name. Raises BadInput for a name that is not here."""
+        with self._lock:
+            shelf = self._shelf(task)
+            found = shelf.dataset(name)
+            return name or next(iter(shelf.data)), found
+
+    def data_hash(self, task: str, name: str) -> str:
+        """Of a data set; worked out once, since some kinds have to read every episode for it."""
+        with self._hashing:  # of its own: reading takes long, and others want the library meanwhile
+            if (task, name) not in self._hashes:
+                self._hashes[task, name] = self.dataset(task, name)[1].hash
+            return self._hashes[task, name]
 
     def _found(self, selection: Selection) -> tuple[Checkpoint, Episode]:
         shelf = self._shelf(selection.task)

@@ -19,7 +19,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
-from beliefscope.app import diagnostics, jobs
+from beliefscope.app import diagnostics, failures, jobs
 from beliefscope.app.api import routes
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.security import Guard
@@ -65,7 +65,12 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
 
     app = FastAPI(title="Beliefscope", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     app.state.library, app.state.views, app.state.jobs = library, views, work
-    for router in (routes(library, views), jobs.routes(work), diagnostics.routes(library, work)):
+    for router in (
+        routes(library, views),
+        jobs.routes(work),
+        diagnostics.routes(library, work),
+        failures.routes(library, work),
+    ):
         app.include_router(router)
     _add_files(app, rerun)
     app.add_middleware(Guard, hosts=settings.hosts)

@@ -229,13 +229,28 @@ def find_failures(
         episodes = data.held_out()
     elif episodes is None:
         episodes = data if isinstance(data, Mapping) else range(len(data))
+    found = survey_of(checkpoint, data, episodes, recipe=recipe, seed=seed, particles=particles, progress=progress)
+    return failures_of(found, by)
+
+
+def survey_of(
+    checkpoint: Checkpoint,
+    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    episodes: Iterable[int],
+    *,
+    recipe: Recipe = WHOLE,
+    seed: int = 0,
+    particles: int = 300,
+    progress: Callable[[float], None] | None = None,
+) -> Survey:
+    """Runs a filter over episodes of a data set, one by one, as the page does. Raises BadInput as ``trace``."""
     chosen = list(episodes)
 
     def traces() -> Iterator[Trace]:
         for done, index in enumerate(chosen):
             yield trace(checkpoint, data[index], index, seed, particles, recipe, _part(progress, done, len(chosen)))
 
-    return failures_of(Survey.of(traces()), by)
+    return Survey.of(traces())
 
 
 def failures_of(survey: Survey, by: str = "error") -> Failures:
