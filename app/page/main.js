@@ -80,7 +80,7 @@ class Page {
     this.#takeButtons();
     this.#showTab(store.state.tab);
     this.#load();
-    window.beliefscope = { state: () => ({ ...store.state }), stats, rerun: { getState: () => this.rerun.getState() } };
+    window.beliefscope = { state: () => ({ ...store.state }), stats, timeline: this.timeline, rerun: { getState: () => this.rerun.getState() } };
   }
 
   /** The view's socket tells. */

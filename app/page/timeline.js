@@ -1,6 +1,7 @@
 /** The time line: charts one above the other with one step axis, one cursor, and the hand that scrubs and zooms. */
 
 import { GUTTER, chart } from './chart.js';
+import { Marks } from './marks.js';
 import { swatch } from './palette.js';
 import { stretches } from './trace.js';
 import { shownError, tracks } from './tracks.js';
@@ -8,6 +9,7 @@ import { fixed } from './units.js';
 
 const CLOSEST = 8; // steps that the strongest zoom still shows
 const NOTE = 26; // px of a line in place of a plot
+const LINE = 14; // px of a legend's
 
 export class TimeLine {
   #element;
@@ -17,15 +19,19 @@ export class TimeLine {
   #tracks = [];
   #charts = [];
   #window = [0, 1];
+  #plot = { left: 0, width: 1 }; // px from the host's left edge
+  #edge = 0; // px from the window's
   #hover = null;
   #cursor = mark('cursor');
   #pointer = mark('hover');
+  #marks;
 
   /** @param {HTMLElement} element that takes the hand @param {import('./state.js').Store} store */
   constructor(element, store) {
     [this.#element, this.#store] = [element, store];
     this.#host = element.querySelector('#tracks');
     this.#host.append(this.#cursor, this.#pointer);
+    this.#marks = new Marks(element.querySelector('#marks'), store);
     new ResizeObserver(() => this.#build()).observe(element);
     this.#takeHand();
   }
@@ -35,6 +41,7 @@ export class TimeLine {
     const same = this.#trace?.steps === trace.steps;
     this.#trace = trace;
     if (!same) this.#window = this.#all;
+    this.#marks.set([]);
     this.redraw();
   }
 
@@ -51,9 +58,20 @@ export class TimeLine {
     const [from, to] = this.#window;
     if (step < from || step > to) this.#look(step - (to - from) / 4, step + (3 * (to - from)) / 4);
     place(this.#cursor, this.#x(step));
-    this.#element.setAttribute('aria-valuenow', String(step));
-    this.#element.setAttribute('aria-valuetext', `step ${step}, ${fixed(step * this.#trace.dt)} s`);
+    this.#marks.move(step);
+    this.#host.setAttribute('aria-valuenow', String(step));
+    this.#host.setAttribute('aria-valuetext', `step ${step}, ${fixed(step * this.#trace.dt)} s`);
     if (this.#hover === null) this.#tell(step);
+  }
+
+  /**
+   * Marks moments of the trace that is shown, until the next call or the next trace.
+   * @param {import('./marks.js').Moment[]} moments none: away with those that are there
+   */
+  mark(moments) {
+    this.#marks.set(moments);
+    this.#placeMarks();
+    if (this.#trace) this.#marks.move(this.#store.state.step);
   }
 
   /** Shows the whole episode. */
@@ -74,19 +92,14 @@ export class TimeLine {
     return [0, Math.max(1, this.#trace.steps - 1)];
   }
 
-  get #width() {
-    return this.#host.clientWidth - legendWidth() - GUTTER.left - GUTTER.right;
-  }
-
   #x(step) {
     const [from, to] = this.#window;
-    return legendWidth() + GUTTER.left + ((step - from) / (to - from)) * this.#width;
+    return this.#plot.left + ((step - from) / (to - from)) * this.#plot.width;
   }
 
   #step(event) {
-    const x = event.clientX - this.#host.getBoundingClientRect().left - legendWidth() - GUTTER.left;
     const [from, to] = this.#window;
-    return from + (x / this.#width) * (to - from);
+    return from + ((event.clientX - this.#edge - this.#plot.left) / this.#plot.width) * (to - from);
   }
 
   #look(from, to) {
@@ -95,6 +108,7 @@ export class TimeLine {
     const start = Math.min(Math.max(from, first), last - span);
     this.#window = [start, start + span];
     for (const plot of this.#charts) plot.setScale('x', { min: start, max: start + span });
+    this.#placeMarks();
     this.move(this.#store.state.step);
     document.querySelector('#whole').disabled = span >= last - first;
   }
@@ -103,12 +117,15 @@ export class TimeLine {
     for (const plot of this.#charts) plot.destroy();
     this.#charts = [];
     this.#host.querySelectorAll('.track').forEach((row) => row.remove());
-    const height = this.#element.clientHeight;
+    const [height, wide] = [this.#host.clientHeight, this.#host.clientWidth];
     if (!this.#trace || height < 60) return;
+    const legendWidth = parseFloat(getComputedStyle(this.#element).getPropertyValue('--legend-width'));
+    const left = legendWidth + GUTTER.left;
+    this.#plot = { left, width: wide - left - GUTTER.right };
+    this.#edge = this.#host.getBoundingClientRect().left;
     const trace = this.#trace;
     const shading = { contact: stretches(trace.contact), black: stretches(trace.black) };
-    const noted = this.#tracks.filter((track) => track.note).length;
-    const each = Math.floor((height - GUTTER.axis - noted * NOTE) / (this.#tracks.length - noted));
+    const heights = shares(this.#tracks, height - GUTTER.axis);
     this.#tracks.forEach((track, i) => {
       const withAxis = i === this.#tracks.length - 1;
       const row = document.createElement('div');
@@ -118,8 +135,8 @@ export class TimeLine {
       if (track.note) return row.append(note(track.note));
       this.#charts.push(
         chart(row, track, shading, {
-          width: this.#host.clientWidth - legendWidth(),
-          height: each + (withAxis ? GUTTER.axis - 4 : 0),
+          width: wide - legendWidth,
+          height: heights[i] + (withAxis ? GUTTER.axis - 4 : 0),
           window: () => this.#window,
           steps: trace.steps,
           withAxis,
@@ -127,12 +144,22 @@ export class TimeLine {
         }),
       );
     });
-    this.#element.setAttribute('aria-valuemax', String(trace.steps - 1));
+    this.#host.setAttribute('aria-valuemax', String(trace.steps - 1));
+    this.#placeMarks();
     this.move(this.#store.state.step);
+  }
+
+  #placeMarks() {
+    const [from, to] = this.#window;
+    const { left, width } = this.#plot;
+    const before = left - GUTTER.left; // the marks are beside the legends
+    this.#marks.place((step) => (step < from || step > to ? null : this.#x(step) - before), width + GUTTER.left);
   }
 
   /** Writes the values at a step into the legends. */
   #tell(step) {
+    const { dt } = this.#trace;
+    this.#element.querySelector('#told').textContent = `${this.#hover === null ? 'cursor' : 'pointer'} ${step} · ${fixed(step * dt)} s`;
     const rows = this.#host.querySelectorAll('.track');
     this.#tracks.forEach((track, i) => {
       const cells = rows[i]?.querySelectorAll('dd') ?? [];
@@ -180,24 +207,23 @@ export class TimeLine {
     const step = event && Math.round(this.#step(event));
     this.#hover = step !== null && step >= this.#window[0] && step <= this.#window[1] ? step : null;
     this.#pointer.hidden = this.#hover === null;
-    if (this.#hover !== null) {
-      place(this.#pointer, this.#x(this.#hover));
-      this.#pointer.classList.toggle('leftward', this.#x(this.#hover) > this.#host.clientWidth - 90);
-      this.#pointer.firstChild.textContent = `${this.#hover} · ${fixed(this.#hover * this.#trace.dt)} s`;
-    }
-    this.#host.classList.toggle('hovering', this.#hover !== null);
-    this.#tell(this.#hover ?? this.#store.state.step);
+    if (this.#hover !== null) place(this.#pointer, this.#x(this.#hover));
+    if (this.#trace) this.#tell(this.#hover ?? this.#store.state.step);
   }
 }
-
-const legendWidth = () => parseFloat(getComputedStyle(document.documentElement).getPropertyValue('--legend-width'));
 
 function mark(kind) {
   const element = document.createElement('div');
   element.className = `mark ${kind}`;
   element.hidden = kind === 'hover';
-  if (kind === 'hover') element.append(document.createElement('span'));
   return element;
+}
+
+/** px for each track: what its legend needs, and an even share of what is left. */
+function shares(tracks, height) {
+  const needed = tracks.map(({ note, series }) => (note ? NOTE : 3 + LINE * (1 + series.length)));
+  const spare = (height - needed.reduce((a, b) => a + b, 0)) / tracks.filter((track) => !track.note).length;
+  return tracks.map(({ note }, i) => Math.floor(needed[i] + (note ? 0 : spare)));
 }
 
 const place = (element, x) => (element.style.transform = `translateX(${x.toFixed(2)}px)`);

@@ -93,7 +93,7 @@ def test_its_charts_follow_and_move_the_cursor(open_page: Any, window: tuple[int
     page.settle(page.state["step"])  # maps and scene follow
     assert shown() == pytest.approx(page.state["step"], abs=0.5)
     assert told.text_content() != before
-    page.page.locator("#timeline .body").focus()
+    page.page.locator("#tracks").focus()
     page.page.keyboard.press("Home")
     page.settle(0)
     assert shown() == pytest.approx(0, abs=0.5)
