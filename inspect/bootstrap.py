@@ -1,4 +1,4 @@
-"""Correlations over the steps of several trajectories, with bootstrap intervals over whole trajectories."""
+"""Bootstrap over whole trajectories: sums of resampled ones, and correlations of their steps with intervals."""
 
 from __future__ import annotations
 
@@ -33,11 +33,17 @@ def correlate(sums: Array, seed: int = SEED) -> tuple[Array, Array, Array]:
     value, trajectories = _correlation(sums.sum(0)), len(sums)
     if trajectories < FEWEST:
         return value, np.full_like(value, np.nan), np.full_like(value, np.nan)
-    drawn = np.random.default_rng(seed).multinomial(trajectories, np.full(trajectories, 1.0 / trajectories), RESAMPLES)
-    resampled = _correlation(np.tensordot(drawn.astype(np.float64), sums, axes=1))
+    drawn = _correlation(resampled(sums, seed))
     # A percentile of nothing but NaN would warn.
-    low, high = np.nanpercentile(np.where(np.isnan(value), 0.0, resampled), [2.5, 97.5], axis=0)
+    low, high = np.nanpercentile(np.where(np.isnan(value), 0.0, drawn), [2.5, 97.5], axis=0)
     return value, np.where(np.isnan(value), np.nan, low), np.where(np.isnan(value), np.nan, high)
+
+
+def resampled(sums: Array, seed: int = SEED) -> Array:
+    """(RESAMPLES, ...): sums (R, ...) of R trajectories, added up over R that are drawn with replacement."""
+    trajectories = len(sums)
+    drawn = np.random.default_rng(seed).multinomial(trajectories, np.full(trajectories, 1.0 / trajectories), RESAMPLES)
+    return np.tensordot(drawn.astype(np.float64), sums, axes=1)
 
 
 def _correlation(sums: Array) -> Array:
