@@ -101,8 +101,8 @@ class Evidence:
         """The same evidence without some of the models: as if what they see were not there.
 
         EKF, UKF: a model that is not present updates nothing, and is left out of the fusion. PF: its likelihood is left
-        out of the mixture. Beta of the others keeps its proportions. Where no model is present, only the dynamics move
-        the belief.
+        out of the mixture. Beta of the others keeps its proportions; one of beta zero counts as not present, alone too.
+        Where no model is present, only the dynamics move the belief.
 
         Args:
             present: (T, N, K) bool. With N = 1 of the evidence, N may be any number: one trajectory a subset.
@@ -111,8 +111,10 @@ class Evidence:
         subset = replace(self._map(lambda tensor: tensor.expand(-1, n, *tensor.shape[2:])), present=present)
         if subset.log_weights is None:
             return subset
-        absent = present.any(-1, keepdim=True) & ~present
-        return replace(subset, log_weights=subset.log_weights.masked_fill(absent.unsqueeze(-1), -torch.inf))
+        heard = present & (subset.log_weights > -torch.inf).any(-1)
+        absent = heard.any(-1, keepdim=True) & ~heard
+        log_weights = subset.log_weights.masked_fill(absent.unsqueeze(-1), -torch.inf)
+        return replace(subset, present=heard, log_weights=log_weights)
 
 
 @dataclass(frozen=True)
