@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.pf import MeasurementModel
-from beliefscope.filters.rollout import START_VARIANCE
+from beliefscope.filters.rollout import START_VARIANCE, rollout, start_at_truth
 
 
 def state(filter_: Filter, batch: Batch) -> Tensor:
@@ -80,8 +82,43 @@ def contrast(model: MeasurementModel, part: Tensor, states: Tensor) -> Tensor:
     return (evidence - value.diagonal()).mean() + 0.01 * evidence.square().mean()
 
 
+def through_filter(
+    filter_: Filter,
+    evidence: Evidence,
+    batch: Batch,
+    noise: torch.Generator,
+    particles: int,
+    likelihood_weight: float,
+    weight: Tensor | None = None,
+) -> Tensor:
+    """Of the filter's estimates over T steps: squared error and, where it has a covariance, negative log-likelihood.
+
+    Args:
+        noise: of the first belief and of the filter's own draws.
+        weight: (T, N) of each step of each trajectory, sum 1; without it all count alike.
+    """
+    start = perturbed(start_at_truth(filter_, batch), noise)
+    estimate = rollout(filter_, evidence, start, noise, particles).estimate
+    error = estimate.mean - state(filter_, batch)
+    total = averaged(error.square().sum(-1), weight)
+    if not filter_.has_covariance:
+        return total
+    return total + likelihood_weight * averaged(negative_log_likelihood(error, estimate.covariance), weight)
+
+
+def averaged(values: Tensor, weight: Tensor | None) -> Tensor:
+    """The mean of (T, N), or their sum with these weights."""
+    return values.mean() if weight is None else (weight * values).sum()
+
+
+def perturbed(start: Gaussian, noise: torch.Generator) -> Gaussian:
+    """A first belief whose mean is off by as much as its covariance says: the filter must learn to come back."""
+    unit = torch.randn(start.mean.shape, generator=noise, device=start.mean.device)
+    return replace(start, mean=start.mean + START_VARIANCE**0.5 * unit)
+
+
 def negative_log_likelihood(error: Tensor, covariance: Tensor) -> Tensor:
-    """Mean of ``0.5 (e^T S^-1 e + log det S)``, without the constant.
+    """``0.5 (e^T S^-1 e + log det S)``, without the constant: (..., n), (..., n, n) to (...).
 
     A floor of 1e-4 on the diagonal keeps a collapsed particle set from a gradient without bound.
     """
@@ -89,4 +126,4 @@ def negative_log_likelihood(error: Tensor, covariance: Tensor) -> Tensor:
     factor = torch.linalg.cholesky(covariance)
     white = torch.linalg.solve_triangular(factor, error.unsqueeze(-1), upper=False).squeeze(-1)
     log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return (0.5 * white.square().sum(-1) + log_det).mean()
+    return 0.5 * white.square().sum(-1) + log_det

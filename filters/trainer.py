@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +14,11 @@ from torch import Tensor, nn
 
 from beliefscope.filters import losses
 from beliefscope.filters.batch import Batch, Steps, black_out, shift
-from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.ekf import VirtualSensor
 from beliefscope.filters.filter import Filter, modality_shape
 from beliefscope.filters.kept import Parts, key_of
 from beliefscope.filters.networks import PICTURES_AT_ONCE, ImageEncoder, fresh
 from beliefscope.filters.pf import MeasurementModel
-from beliefscope.filters.rollout import START_VARIANCE, rollout, start_at_truth
 
 if TYPE_CHECKING:
     from beliefscope.filters.train import Plan
@@ -303,13 +301,7 @@ class Trainer:
             evidence = filter_.encode(batch)
             if k is not None:
                 evidence = evidence.only(k)
-            start = self.perturbed(start_at_truth(filter_, batch))
-            estimate = rollout(filter_, evidence, start, self.noise, plan.particles).estimate
-            error = estimate.mean - losses.state(filter_, batch)
-            total = error.square().sum(-1).mean()
-            if not filter_.has_covariance:
-                return total
-            return total + plan.likelihood_weight * losses.negative_log_likelihood(error, estimate.covariance)
+            return losses.through_filter(filter_, evidence, batch, self.noise, plan.particles, plan.likelihood_weight)
 
         chosen = list(parameters)
         if not remembered:
@@ -323,11 +315,6 @@ class Trainer:
     def sees(self, name: str) -> bool:
         """Whether a measurement model looks at pictures."""
         return any(len(modality_shape(self.filter.task, modality)) == 2 for modality in name.split("+"))
-
-    def perturbed(self, start: Gaussian) -> Gaussian:
-        """A first belief whose mean is off by as much as its covariance says: the filter must learn to come back."""
-        unit = torch.randn(start.mean.shape, generator=self.noise, device=self.device)
-        return replace(start, mean=start.mean + START_VARIANCE**0.5 * unit)
 
     def optimise(
         self,
