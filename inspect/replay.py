@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
+from urllib.parse import parse_qsl
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ class Edit:
     first: int
     to: int
     recipe: Recipe = WHOLE
-    weights: Mapping[str, float] = field(default_factory=dict)
+    weights: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if not 0 <= self.first < self.to:
@@ -48,6 +49,27 @@ class Edit:
         if not all(0.0 <= beta <= 1.0 for beta in self.weights.values()) or total > 1.0 + 1e-6:
             given = ", ".join(f"{name}={beta:g}" for name, beta in self.weights.items())
             raise BadInput(f"weights {given}: each is from 0 to 1, and so is their sum")
+
+    @classmethod
+    def parse(cls, text: str) -> Edit:
+        """From its text, ``from=20&to=40&recipe=blackout&weights=image=0.9``, as in an address.
+
+        Raises BadInput for anything else, and where neither a recipe nor weights are given.
+        """
+        given = dict(parse_qsl(text, keep_blank_values=True))
+        known = ("from", "to", "recipe", "weights")
+        for key in given:
+            if key not in known:
+                raise one_of("part of an edit", key, known)
+        edit = cls(
+            _step(text, given, "from"),
+            _step(text, given, "to"),
+            Recipe.parse(given.get("recipe", "")),
+            betas(given.get("weights", "")),
+        )
+        if not edit.recipe and not edit.weights:
+            raise BadInput(f"nothing is edited by {text!r}: give a recipe, weights or both")
+        return edit
 
     @classmethod
     def of(cls, value: Mapping[str, Any]) -> Edit:
@@ -77,6 +99,28 @@ class Edit:
             "recipe": self.recipe.to_json(),
             "weights": dict(self.weights),
         }
+
+
+def betas(text: str) -> dict[str, float]:
+    """``image=0.9,haptics=0.1`` as numbers by modality. Raises BadInput for anything else."""
+    given: dict[str, float] = {}
+    for part in text.split(",") if text.strip() else ():
+        name, equals, value = part.strip().partition("=")
+        try:
+            beta = float(value)
+        except ValueError:
+            equals = ""
+        if not equals or not name or name in given:
+            raise BadInput(f"weights {text!r}: {part.strip()!r} is not a new MODALITY=BETA such as image=0.9")
+        given[name] = beta
+    return given
+
+
+def _step(text: str, given: Mapping[str, str], key: str) -> int:
+    value = given.get(key, "")
+    if not (value.isascii() and value.isdigit()):
+        raise BadInput(f"{key!r} of the edit {text!r} is a step, an integer from 0; got {value!r}")
+    return int(value)
 
 
 class Replay:

@@ -69,7 +69,7 @@ def counterfactual(
     """
     from beliefscope.inspect.counterfactual import compare
     from beliefscope.inspect.plotting import figure_format, write_figure
-    from beliefscope.inspect.replay import Edit, Replay
+    from beliefscope.inspect.replay import Edit, Replay, betas
     from beliefscope.inspect.trace import save_trace, trace
 
     check(output, json)
@@ -102,18 +102,3 @@ def counterfactual(
     }
     tables = [console.grid(one.title, one.columns, one.rows) for one in result.tables()]
     console.result(document, "\n\n".join([result.verdict, *tables]), json)
-
-
-def betas(text: str) -> dict[str, float]:
-    """``image=0.9,haptics=0.1`` as numbers by modality. Raises BadInput for anything else."""
-    given: dict[str, float] = {}
-    for part in text.split(",") if text.strip() else ():
-        name, equals, value = part.strip().partition("=")
-        try:
-            beta = float(value)
-        except ValueError:
-            equals = ""
-        if not equals or not name or name in given:
-            raise BadInput(f"weights {text!r}: {part.strip()!r} is not a new MODALITY=BETA such as image=0.9")
-        given[name] = beta
-    return given
