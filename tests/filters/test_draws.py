@@ -1,0 +1,125 @@
+"""Common random numbers, and evidence without some of its models: what subsets of the modalities are run with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Evidence, Gaussian
+from beliefscope.filters.catalog import architecture, build
+from beliefscope.filters.draws import Common, normal, uniform
+from beliefscope.filters.filter import Filter
+from beliefscope.filters.rollout import rollout, start_at_truth
+
+STEPS, PARTICLES = 6, 50
+SUBSETS = torch.tensor([[False, False], [True, False], [False, True], [True, True]])
+
+KINDS = ("crossmodal-ekf", "crossmodal-ukf", "unimodal-ekf", "crossmodal-pf", "unimodal-pf", "feature-pf")
+
+
+@pytest.mark.parametrize("draw", [normal, uniform])
+def test_common_numbers_are_those_of_one_trajectory(draw: Callable[..., Tensor]) -> None:
+    common, plain = Common().manual_seed(3), torch.Generator().manual_seed(3)
+    for _ in range(2):  # and it goes on as that of one would
+        drawn, alone = draw((4, 5, 2), common), draw((1, 5, 2), plain)
+        assert torch.equal(drawn, alone.expand(4, -1, -1))
+    assert torch.equal(common.get_state(), plain.get_state())
+    apart = draw((4, 5, 2), plain)
+    assert not torch.equal(apart[0], apart[1])
+
+
+def made(name: str, window: Callable[..., Batch]) -> tuple[Filter, Evidence, Gaussian]:
+    """An untrained filter, one trajectory's evidence, and its start."""
+    filter_ = build(architecture("door", name)).eval().requires_grad_(False)
+    batch = window(STEPS, 1)
+    return filter_, filter_.encode(batch), start_at_truth(filter_, batch)
+
+
+def run(filter_: Filter, evidence: Evidence, start: Gaussian) -> Tensor:
+    """Estimates (T, N, n)."""
+    count = evidence.control.shape[1]
+    belief = Gaussian(start.mean.expand(count, -1), start.covariance.expand(count, -1, -1))
+    return rollout(filter_, evidence, belief, Common().manual_seed(0), PARTICLES).estimate.mean
+
+
+def subsets(evidence: Evidence) -> Tensor:
+    """(T, S, K): all subsets of the evidence's models."""
+    count = evidence.observation.shape[2]
+    return SUBSETS[: 2**count, :count].expand(len(evidence), -1, -1)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_subsets_side_by_side(name: str, window: Callable[..., Batch]) -> None:
+    filter_, evidence, start = made(name, window)
+    present = subsets(evidence)
+    both = run(filter_, evidence.of(present), start)
+    # All that there is changes nothing; rounding alone differs between batches of one and of four.
+    torch.testing.assert_close(both[:, -1:], run(filter_, evidence, start), rtol=0, atol=1e-5)
+    for i in range(present.shape[1]):
+        alone = run(filter_, evidence.of(present[:, i : i + 1]), start)
+        torch.testing.assert_close(both[:, i : i + 1], alone, rtol=0, atol=1e-5)
+    if evidence.log_weights is not None:
+        for k in range(2):
+            only = run(filter_, evidence.only(k), start)
+            torch.testing.assert_close(both[:, 1 + k : 2 + k], only, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_without_any_model_observations_do_not_matter(name: str, window: Callable[..., Batch]) -> None:
+    filter_, evidence, start = made(name, window)
+    other = replace(evidence, observation=evidence.observation + 1.0)
+    present = subsets(evidence)
+    runs = [run(filter_, one.of(present), start) for one in (evidence, other)]
+    assert torch.equal(runs[0][:, 0], runs[1][:, 0])
+    assert not torch.equal(runs[0][:, -1], runs[1][:, -1])
+
+
+def test_without_any_model_a_kalman_filter_only_predicts(window: Callable[..., Batch]) -> None:
+    filter_, evidence, start = made("crossmodal-ekf", window)
+    mean = start.mean
+    for t, estimate in enumerate(run(filter_, evidence.of(subsets(evidence)), start)[:, 0]):
+        mean = filter_.dynamics(mean, evidence.control[t])
+        torch.testing.assert_close(estimate, mean[0], rtol=0, atol=1e-5)
+
+
+def test_without_any_model_particles_keep_their_weights(window: Callable[..., Batch]) -> None:
+    filter_, evidence, start = made("crossmodal-pf", window)
+    belief = filter_.start(start, PARTICLES, torch.Generator().manual_seed(0))
+    none = evidence.of(subsets(evidence)[:, :1])
+    _, step = filter_.step(belief, none[0], torch.Generator().manual_seed(0))
+    log_weights = step.posterior.log_weights  # type: ignore[union-attr]
+    torch.testing.assert_close(log_weights, belief.log_weights)  # type: ignore[union-attr]
+
+
+def three(log_weights: Tensor) -> Evidence:
+    """One step of three models with log beta (3, W), and nothing else of interest."""
+    nothing = torch.zeros(1, 1, 3, 1)
+    return Evidence(torch.zeros(1, 1, 1), nothing, nothing, log_weights[None, None])
+
+
+def test_beta_of_those_left_keeps_its_proportions() -> None:
+    beta = torch.tensor([[0.5, 0.2], [0.3, 0.2], [0.2, 0.6]])
+    left = three(beta.log()).of(torch.tensor([[[True, False, True], [False, False, False]]]))
+    assert left.log_weights is not None
+    assert left.present is not None
+    shares = torch.softmax(left.log_weights[0], dim=-2)
+    torch.testing.assert_close(shares[0], torch.tensor([[5 / 7, 0.25], [0.0, 0.0], [2 / 7, 0.75]]))
+    torch.testing.assert_close(shares[1], beta)  # of nothing there is: as it was
+    assert left[0].present is not None
+    assert torch.equal(left[0].present, left.present[0])
+    assert left[:1].control.shape == (1, 2, 1)
+
+
+def test_beta_zero_is_not_present() -> None:
+    beta = torch.tensor([[0.6], [0.4], [0.0]])
+    asked = torch.tensor([[[True, True, True], [False, False, True]]])
+    left = three(beta.log()).of(asked)
+    assert left.present is not None
+    assert left.present[0].tolist() == [[True, True, False], [False, False, False]]
+    assert left.log_weights is not None
+    torch.testing.assert_close(torch.softmax(left.log_weights[0], dim=-2), beta.expand(2, 3, 1))

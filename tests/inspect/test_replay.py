@@ -1,0 +1,23 @@
+"""A run taken again has the bits of the first one, whatever the kind of filter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.catalog import architecture, build
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.replay import Edit, Replay
+from beliefscope.inspect.trace import ARRAYS, trace
+
+
+@pytest.mark.parametrize("name", ["crossmodal-ukf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"])
+def test_nothing_edited_changes_no_bit(name: str) -> None:
+    checkpoint = Checkpoint(build(architecture("door", name)).eval().requires_grad_(False), name, "0" * 64, {})
+    with open_dataset(sample_path("door")) as data:
+        replay = Replay(checkpoint, trace(checkpoint, data[9], 9, seed=3, particles=50))
+    assert replay.exact
+    again = replay.edited(Edit(40, 100))
+    for array in ARRAYS:
+        np.testing.assert_array_equal(getattr(again, array), getattr(replay.original, array), err_msg=array)
