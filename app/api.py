@@ -24,6 +24,7 @@ from beliefscope.app.session import Views
 from beliefscope.app.wire import header, pictures
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.corrupt import Recipe, described
+from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.likelihood import no_maps
 from beliefscope.recordings.write import write_recording
 
@@ -58,6 +59,14 @@ Asked = Annotated[Selection, Depends(_selection)]
 """What a path and its query name."""
 
 
+def _of_two(asked: Asked, against: str = "") -> Selection:
+    return asked.against(against) if against else asked
+
+
+OfTwo = Annotated[Selection, Depends(_of_two)]
+"""The same, or the other run that it is compared with, where ``against`` says what differs."""
+
+
 def routes(library: Library, views: Views) -> APIRouter:
     """Every route under ``/api``, ``/scene`` and ``/healthz``. What blocks runs in worker threads (plain ``def``)."""
     router = APIRouter()
@@ -75,7 +84,7 @@ def routes(library: Library, views: Views) -> APIRouter:
         return {"version": __version__, "faults": described(), **library.catalog()}
 
     @router.get("/api/trace/{task}/{filter}/{episode}")
-    def trace_header(asked: Asked) -> Response:
+    def trace_header(asked: OfTwo) -> Response:
         traced = library.traced(asked)
         try:
             trace = traced.done.result(timeout=PATIENCE)
@@ -86,12 +95,12 @@ def routes(library: Library, views: Views) -> APIRouter:
         return JSONResponse(described | {"filter": asked.filter})
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
-    def trace_columns(asked: Asked, request: Request) -> Response:
+    def trace_columns(asked: OfTwo, request: Request) -> Response:
         traced = library.traced(asked)
         return _immutable(request, traced, "columns", lambda: traced.columns[1])
 
     @router.get("/api/trace/{task}/{filter}/{episode}/images")
-    def trace_images(asked: Asked, request: Request) -> Response:
+    def trace_images(asked: OfTwo, request: Request) -> Response:
         traced = library.traced(asked)
         shown = pictures(traced.trace)
         if shown is None:
@@ -109,14 +118,16 @@ def routes(library: Library, views: Views) -> APIRouter:
         traced = library.traced(_selection(wanted.task, wanted.filter, wanted.episode, wanted.recipe, wanted.data))
         trace = traced.trace
         # The name says all that the file depends on, so one that is there is this one.
-        parts = hashlib.sha256(f"{traced.key} maps {wanted.maps} version {__version__}".encode()).hexdigest()[:8]
+        depends = f"{traced.key} maps {wanted.maps} diagnostics version {__version__}"
+        parts = hashlib.sha256(depends.encode()).hexdigest()[:8]
         path = recordings / f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}.rrd"
         steps = range(0, len(trace), wanted.maps) if wanted.maps and not no_maps(traced.checkpoint, trace) else ()
         with writing:
             there = path.is_file()
             if not there:
                 recordings.mkdir(parents=True, exist_ok=True)
-                write_recording(trace, path, maps=traced.maps(steps) if steps else None)
+                maps = traced.maps(steps) if steps else None
+                write_recording(trace, path, maps, diagnostics=quick(trace, traced.checkpoint))
         if there:
             response.status_code = 200
         return {

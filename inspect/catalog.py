@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from beliefscope.inspect import consistency, maps, particles, weights
-from beliefscope.inspect.diagnostic import Entry
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect import consistency, maps, particles, shapley, weights
+from beliefscope.inspect.diagnostic import Diagnostic, Entry
+from beliefscope.inspect.trace import Trace
 
-ENTRIES: tuple[Entry, ...] = (maps.ENTRY, weights.ENTRY, consistency.ENTRY, particles.ENTRY)
+ENTRIES: tuple[Entry, ...] = (maps.ENTRY, weights.ENTRY, consistency.ENTRY, particles.ENTRY, shapley.ENTRY)
 
 DIAGNOSTICS: dict[str, Entry] = {entry.name: entry for entry in ENTRIES}
 """By name, in the order in which they are shown."""
+
+
+def quick(trace: Trace, checkpoint: Checkpoint | None = None) -> dict[str, Diagnostic]:
+    """By name, what is made of one trace at once: every diagnostic that is not slow and can be made of it."""
+    return {
+        name: entry([trace], checkpoint)
+        for name, entry in DIAGNOSTICS.items()
+        if not entry.slow and entry.refusal(trace, checkpoint) is None
+    }

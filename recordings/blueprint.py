@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.diagnostic import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.diagnostics import diagnostic_tab
 from beliefscope.recordings.drawing import SHOWN_SCALE, SHOWN_UNIT, SIGMAS, angles, plane_height
 from beliefscope.recordings.schema import STEP
 
@@ -21,8 +26,17 @@ BACKGROUND = rrb.Background(kind="SolidColor", color=[16, 17, 24])
 LINKED = rrb.TimeAxis(link="LinkToGlobal")
 
 
-def blueprint(trace: Trace, task: Task, first: LikelihoodMap | None = None) -> rrb.Blueprint:
-    """The layout for a trace. ``first`` is the first of its maps; where there is none, they have no views."""
+def blueprint(
+    trace: Trace,
+    task: Task,
+    first: LikelihoodMap | None = None,
+    diagnostics: Mapping[str, Diagnostic] = MappingProxyType({}),
+) -> rrb.Blueprint:
+    """The layout for a trace.
+
+    Args:
+        first: of its maps; where there is none, they have no views. diagnostics: by name, a tab each beside the story.
+    """
     sensed = [_picture(key) for key, shape in task.observations.items() if len(shape) == 2]
     if first is not None:
         sensed += [_map(layer, len(first.offsets_x)) for layer in first.layers]
@@ -32,6 +46,8 @@ def blueprint(trace: Trace, task: Task, first: LikelihoodMap | None = None) -> r
         row_shares=[3, 2] if len(sensed) < 4 else [5, 2],
     )
     story = _story(trace, task)
+    if diagnostics:
+        story = rrb.Tabs(story, *(diagnostic_tab(one, name) for name, one in diagnostics.items()), active_tab=0)
     return rrb.Blueprint(
         rrb.Horizontal(scene, story, column_shares=[1, 1]),
         rrb.TimePanel(state="collapsed", timeline=STEP, play_state="paused"),
@@ -106,7 +122,7 @@ def _story(trace: Trace, task: Task) -> rrb.Container:
     if trace.log_weights is not None:
         rows.append(_plot("diagnostics/effective_sample_size", "Effective sample size"))
         shares.append(2.0)
-    return rrb.Vertical(*rows, row_shares=shares)
+    return rrb.Vertical(*rows, row_shares=shares, name="Run")
 
 
 def _estimate(trace: Trace, task: Task, component: Component) -> rrb.TimeSeriesView:

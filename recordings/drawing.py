@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.task import Component, Task
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.schema import STEP, TIME
 
 Array = NDArray[Any]
 Columns = Iterable[tuple[str, Any]]
@@ -75,6 +76,12 @@ def series(values: Array) -> Any:
     return rr.Scalars.columns(scalars=rows.ravel()).partition([rows.shape[1]] * len(rows))
 
 
+def time_columns(steps: NDArray[np.int64], dt: float) -> list[rr.TimeColumn]:
+    """Both timelines at some steps of ``dt`` s."""
+    nanoseconds = np.rint(steps * (dt * 1e9)).astype("timedelta64[ns]")
+    return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
+
+
 def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     """What does not change: names, colours and widths of every series and marker."""
     yield "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
@@ -101,17 +108,17 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
                     colors=rgba(hue), line_radii=rr.Radius.ui_points(width), fill_mode="MajorWireframe"
                 ),
             )
-        yield f"errors/position/{source}", _line(hue, width, f"{source} (cm)")
+        yield f"errors/position/{source}", line(hue, width, f"{source} (cm)")
         for component in angles(task):
-            yield f"errors/{component.name}/{source}", _line(hue, width, f"{source} (deg)")
+            yield f"errors/{component.name}/{source}", line(hue, width, f"{source} (deg)")
         for component in task.components:
-            yield f"states/{component.name}/{source}", _line(hue, width, source)
+            yield f"states/{component.name}/{source}", line(hue, width, source)
     for component in task.components:
-        truth = _line(_hex("truth", trace), 2.0, "truth")
+        truth = line(_hex("truth", trace), 2.0, "truth")
         yield f"states/{component.name}/truth", truth
         if trace.has_covariance:
             band = ["fused - 2 sigma", "fused + 2 sigma"]
-            yield f"states/{component.name}/two_sigma", _line(_hex("fused", trace), 1.0, *band, opacity=0.5)
+            yield f"states/{component.name}/two_sigma", line(_hex("fused", trace), 1.0, *band, opacity=0.5)
     for name in ("weights", "acting"):
         values = getattr(trace, name)
         if values is None:
@@ -122,9 +129,9 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
                 names = [f"{modality}, {component.name}" for component in task.components]
             # One hue a modality: its components tell apart by their strength.
             opacity = np.linspace(1.0, 0.35, len(names))
-            yield f"{name}/{modality}", _line(_hex(modality, trace), 2.0, *names, opacity=opacity)
+            yield f"{name}/{modality}", line(_hex(modality, trace), 2.0, *names, opacity=opacity)
     if trace.log_weights is not None:
-        yield "diagnostics/effective_sample_size", _line(_hex("fused", trace), 1.5, "effective particles")
+        yield "diagnostics/effective_sample_size", line(_hex("fused", trace), 1.5, "effective particles")
 
 
 def contact_changes(trace: Trace) -> tuple[NDArray[np.int64], Any]:
@@ -229,7 +236,8 @@ def rgba(hue: str, opacity: float = 1.0) -> int:
     return int(hue[1:], 16) << 8 | round(255 * opacity)
 
 
-def _line(hue: str, width: float, *names: str, opacity: Array | float = 1.0) -> rr.SeriesLines:
+def line(hue: str, width: float, *names: str, opacity: Array | float = 1.0) -> rr.SeriesLines:
+    """The look of the series of one entity: one colour, each its name and its opacity."""
     count = len(names)
     colours = np.array([rgba(hue, one) for one in np.broadcast_to(opacity, count)], np.uint32)
     return rr.SeriesLines(colors=colours, widths=[width] * count, names=list(names))

@@ -19,7 +19,9 @@ HEADER = "__properties/beliefscope"
 STEP, TIME = "step", "time"
 """The two timelines: the trace's index t, and t * dt as a duration."""
 
-Needs = Literal["always", "modalities", "covariance", "weights", "acting", "ekf", "pf", "maps", "replay", "ghost"]
+Needs = Literal[
+    "always", "modalities", "covariance", "weights", "acting", "ekf", "pf", "maps", "diagnostics", "replay", "ghost"
+]
 
 
 @dataclass(frozen=True)
@@ -28,10 +30,10 @@ class Entity:
 
     Attributes:
         path: with ``{component}`` of the state, ``{modality}``, ``{source}`` (``fused`` or a modality), ``{key}`` of an
-            observation, ``{layer}`` of a likelihood map.
+            observation, ``{layer}`` of a likelihood map, ``{diagnostic}`` and the names of what it shows.
         archetype: Rerun's, or ``Trace`` for numbers that no view of Rerun's draws.
         shape: of one step; T steps, K modalities, n components, M particles, c controls, S cells a side of a map,
-            W weights a modality.
+            W weights a modality, B bounds.
         unit: of the numbers as stored.
         needs: what the trace must have for the path to be there; ``ekf`` is a UKF as well.
         meaning: one line for the documentation.
@@ -104,6 +106,55 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("acting/{modality}", "Scalars", "(W,)", "1", "acting", "acting share, one series a column"),
     Entity("contact", "StateChange", "()", "text", "always", "`contact` or `free`, where it changes"),
     Entity("diagnostics/effective_sample_size", "Scalars", "()", "particles", "pf", "1 / sum of squared weights"),
+    # The diagnostics: what the page and a figure show of each.
+    Entity(
+        "diagnostics/{diagnostic}/about",
+        "TextDocument",
+        "static",
+        "text",
+        "diagnostics",
+        "what it says: its question, verdict and tables",
+    ),
+    Entity(
+        "diagnostics/{diagnostic}/curves/{chart}/{curve}",
+        "Scalars",
+        "()",
+        "in its name",
+        "diagnostics",
+        "a curve of one of its charts",
+    ),
+    Entity(
+        "diagnostics/{diagnostic}/bounds/{chart}",
+        "Scalars",
+        "(B,)",
+        "in its name",
+        "diagnostics",
+        "bounds between which a chart's curves should lie, at the first and last step",
+    ),
+    Entity(
+        "diagnostics/{diagnostic}/bands/{kind}",
+        "StateChange",
+        "()",
+        "text",
+        "diagnostics",
+        "whether the step is of that kind, where it changes",
+    ),
+    Entity(
+        "diagnostics/{diagnostic}/plots/{plot}",
+        "EncodedImage",
+        "static",
+        "PNG",
+        "diagnostics",
+        "what is not over time, drawn",
+    ),
+    Entity(
+        "diagnostics/{diagnostic}/pictures/{picture}",
+        "EncodedImage",
+        "static",
+        "PNG",
+        "diagnostics",
+        "what is per pixel, drawn with its scale",
+    ),
     # The maps: at the steps they were made for.
     Entity("maps/{layer}", "DepthImage", "(S, S)", "u8", "maps", "255 x likelihood / its maximum; top row: largest y"),
     Entity("maps/{layer}/log_peak", "Scalars", "()", "log", "maps", "log-likelihood of the maximum"),

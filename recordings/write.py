@@ -6,11 +6,12 @@ import importlib.metadata
 import json
 import os
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,12 +26,14 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
+from beliefscope.inspect.diagnostic import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings import drawing
 from beliefscope.recordings.blueprint import blueprint
+from beliefscope.recordings.diagnostics import log_diagnostic
 from beliefscope.recordings.maps import map_columns, map_style
-from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, SCHEMA, STEP, TIME, TRACE_COMPONENT
+from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, SCHEMA, TRACE_COMPONENT
 
 STEPS_PER_CHUNK = 100
 MAPS_PER_CHUNK = 16
@@ -41,6 +44,7 @@ def write_recording(
     path: str | Path,
     maps: Iterable[LikelihoodMap] | None = None,
     progress: Callable[[float], None] | None = None,
+    diagnostics: Mapping[str, Diagnostic] = MappingProxyType({}),
 ) -> Path:
     """Write a recording that Rerun's own viewer opens with its layout, and ``read_recording`` reads back.
 
@@ -51,12 +55,14 @@ def write_recording(
             block, so they may be made while being written. Kept as 8-bit shares of their layer's maximum: the error
             is at most 1/510 of it.
         progress: called with the share that is done, 0 to 1.
+        diagnostics: of this trace, by name: each has a tab of its own. ``catalog.quick`` makes those that apply.
 
     Returns:
         The path.
 
     Raises:
-        BadInput: the folder does not exist or cannot be written; maps of different sizes or unknown steps.
+        BadInput: the folder does not exist or cannot be written; maps of different sizes or unknown steps; a diagnostic
+            with curves of another number of steps.
     """
     rr.set_strict_mode(True)  # or Rerun turns its errors into warnings and leaves gaps
     task = find_task(trace.episode.task)
@@ -66,7 +72,8 @@ def write_recording(
     layers = first[0].layers if first else ()
     with _complete_or_absent(Path(path)) as unfinished:
         stream = rr.RecordingStream(APPLICATION)
-        stream.save(unfinished, default_blueprint=blueprint(trace, task, first[0] if first else None))
+        layout = blueprint(trace, task, first[0] if first else None, diagnostics)
+        stream.save(unfinished, default_blueprint=layout)
         _send_header(stream, trace)
         _send_static(stream, trace, task)
         stream.flush()  # so that even a file cut off later says what it is
@@ -74,6 +81,8 @@ def write_recording(
             steps = slice(start, min(start + STEPS_PER_CHUNK, len(trace)))
             _send_steps(stream, trace, task, steps)
             report(0.5 * steps.stop / len(trace))
+        for name, diagnostic in diagnostics.items():
+            log_diagnostic(stream, diagnostic, name, trace)
         if first:
             for entity, what in map_style(first[0], trace):
                 stream.log(entity, what, static=True)
@@ -153,11 +162,11 @@ def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task) -> None:
         stream.log(path, what, static=True)
     stream.log("about", drawing.about(trace, task), static=True)
     steps, states = drawing.contact_changes(trace)
-    stream.send_columns("contact", _times(steps, trace), states)
+    stream.send_columns("contact", drawing.time_columns(steps, trace.episode.dt), states)
 
 
 def _send_steps(stream: rr.RecordingStream, trace: Trace, task: Task, steps: slice) -> None:
-    times = _times(np.arange(steps.start, steps.stop), trace)
+    times = drawing.time_columns(np.arange(steps.start, steps.stop), trace.episode.dt)
     for path, static, array in stored_arrays(trace):
         if not static:
             rows = array[steps]
@@ -181,14 +190,9 @@ def _send_maps(
             raise BadInput(f"map of step {one.step}: the trace has steps 0 to {len(trace) - 1}.")
         if one.layers != layers or one.log_likelihood.shape != maps[0].log_likelihood.shape:
             raise BadInput(f"map of step {one.step}: all maps of a recording have one size and one set of layers.")
-    times = _times(np.array([one.step for one in maps]), trace)
+    times = drawing.time_columns(np.array([one.step for one in maps]), trace.episode.dt)
     for path, columns in map_columns(maps, trace, task):
         stream.send_columns(path, times, columns)
-
-
-def _times(steps: NDArray[np.int64], trace: Trace) -> list[rr.TimeColumn]:
-    nanoseconds = np.rint(steps * (trace.episode.dt * 1e9)).astype("timedelta64[ns]")
-    return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
 
 
 def _batch(array: NDArray[Any]) -> AnyBatchValue:

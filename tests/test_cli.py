@@ -26,7 +26,7 @@ OPTIONS = {
     "evaluate": "--filter --data --skip-bad --recipe --only --particles --seed --json",
     "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
     "trace": "--filter --data --skip-bad --episode --recipe --seed -o --json",
-    "record": "--filter --data --skip-bad --episode --maps --recipe --seed -o --json",
+    "record": "--filter --data --skip-bad --episode --maps --diagnostics --no-diagnostics --recipe --seed -o --json",
     "inspect": "--filter --only --all --figures --format --json",
     "counterfactual": "--filter --data --episode --recipe --weights --from --to --particles --seed --trace -o --json",
     "figure": "--filter --data --skip-bad --episode --step --recipe --particles --seed -o --json",

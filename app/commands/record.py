@@ -26,18 +26,25 @@ def record(
             "--maps", parser=whole(0), metavar="STRIDE", help="Likelihood maps of each STRIDE-th step; 0: none."
         ),
     ] = 10,
+    diagnostics: Annotated[
+        bool,
+        typer.Option(
+            "--diagnostics/--no-diagnostics", help="With every diagnostic that applies and is not slow, a tab for each."
+        ),
+    ] = True,
     json: Json = None,
 ) -> None:
     """Write one episode as a Rerun recording.
 
-    Pictures, particles or ellipses, estimates beside the truth, fusion weights, contact, errors and likelihood
-    maps, with their layout. Open it with: rerun run.rrd.
+    Pictures, particles or ellipses, estimates beside the truth, fusion weights, contact, errors, likelihood maps and
+    diagnostics, with their layout. Open it with: rerun run.rrd.
 
     \b
     Examples:
       beliefscope record door --filter crossmodal-ekf --episode 9 --maps 5 -o run.rrd
       beliefscope record door --filter crossmodal-pf --recipe image_frozen=20 -o frozen.rrd
     """
+    from beliefscope.inspect.catalog import quick
     from beliefscope.inspect.likelihood import MapEngine, no_maps
     from beliefscope.recordings.write import write_recording
 
@@ -45,6 +52,7 @@ def record(
         console.say(f"without maps: {why}")
         maps = 0
     layers = MapEngine(checkpoint, made).maps(range(0, len(made), maps)) if maps else None
+    found = quick(made, checkpoint) if diagnostics else {}
     with console.progress("Recording") as advance:
-        write_recording(made, output, maps=layers, progress=advance)
-    console.result(described(made, output) | {"maps": maps}, title(made, output), json)
+        write_recording(made, output, maps=layers, progress=advance, diagnostics=found)
+    console.result(described(made, output) | {"maps": maps, "diagnostics": list(found)}, title(made, output), json)

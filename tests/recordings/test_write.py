@@ -38,6 +38,7 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
         "ekf": trace.kind in ("ekf", "ukf"),
         "pf": trace.kind == "pf",
         "maps": maps,
+        "diagnostics": False,  # tests/recordings/test_diagnostics.py
         "replay": trace.episode.qpos.size > 0,
         "ghost": task.ghost is not None,
     }
