@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl
 
 from beliefscope.app.shelf import Shelf, shelves
 from beliefscope.app.wire import MAP_SIZES, columns
@@ -23,6 +24,7 @@ from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.foreign import Foreign, load_foreign
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
+from beliefscope.inspect.replay import Edit, Replay
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 
 TRACES_IN_MEMORY = 8
@@ -82,7 +84,7 @@ class Settings:
 class Selection:
     """What is being looked at: names of a task and a filter, an episode's index, how its sensors are broken.
 
-    Data: name of the data set; empty for the task's first.
+    Data: name of the data set; empty for the task's first. Edit: what is changed over some steps of the run.
     """
 
     task: str
@@ -90,6 +92,25 @@ class Selection:
     episode: int
     recipe: Recipe = WHOLE
     data: str = ""
+    edit: Edit | None = None
+
+    def against(self, text: str) -> Selection:
+        """The other run that this one is compared with, from what is different about it.
+
+        ``filter=NAME``, ``recipe=FAULTS`` (none where empty) or both; or an edit over some steps, ``from=20&to=40``
+        with ``recipe=FAULTS``, ``weights=MODALITY=BETA`` or both. Raises BadInput for anything else, and the same run.
+        """
+        given = dict(parse_qsl(text, keep_blank_values=True))
+        if given.keys() & {"from", "to", "weights"}:
+            return replace(self, edit=Edit.parse(text))
+        for key in given:
+            if key not in ("filter", "recipe"):
+                raise one_of("part of the other run", key, ("filter", "recipe", "from", "to", "weights"))
+        recipe = Recipe.parse(given["recipe"]) if "recipe" in given else self.recipe
+        other = replace(self, filter=given.get("filter", self.filter), recipe=recipe)
+        if other == self:
+            raise BadInput(f"{text!r} is the run that is shown, not another")
+        return other
 
 
 class Traced:
@@ -143,6 +164,7 @@ class Library:
         self._hashes: dict[tuple[str, str], str] = {}
         self._traced: OrderedDict[str, Traced] = OrderedDict()
         self._tracing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="tracing")
+        self._replay: tuple[str, Replay] | None = None  # of the run that was edited last; for the tracing thread alone
         self._closing = False
 
     @cached_property
@@ -191,8 +213,10 @@ class Library:
             if selection not in self._keys:
                 checkpoint, episode = self._found(selection)
                 seed, particles = self.settings.seed, self.settings.particles
-                parts = (checkpoint.hash, episode.digest(), seed, particles, str(selection.recipe))
-                self._keys[selection] = hashlib.sha256(repr(parts).encode()).hexdigest()
+                parts = [checkpoint.hash, episode.digest(), seed, particles, str(selection.recipe)]
+                if selection.edit is not None:
+                    parts.append(selection.edit.to_json())
+                self._keys[selection] = hashlib.sha256(repr(tuple(parts)).encode()).hexdigest()
             return self._keys[selection]
 
     def held_out(self, selection: Selection) -> list[Selection]:
@@ -225,6 +249,8 @@ class Library:
         checkpoint = shelf.filter(selection.filter)
         episode = shelf.episode(selection.data, selection.episode)
         selection.recipe.check(checkpoint.task)
+        if selection.edit is not None:
+            selection.edit.recipe.check(checkpoint.task)
         return checkpoint, episode
 
     def _shelf(self, task: str) -> Shelf:
@@ -239,27 +265,51 @@ class Library:
                 raise CancelledError
             traced.progress = fraction
 
-        name = f"{selection.task}-{selection.filter}-episode{selection.episode}-{traced.key[:16]}.trace"
-        path = self.settings.workspace / "traces" / name
         try:
-            # A trace file that cannot be read is only a cache: it is computed and written again.
-            with suppress(BadInput):
-                traced.done.set_result(load_trace(path))
-                return
-            result = trace(
-                traced.checkpoint,
-                episode,
-                episode_index=selection.episode,
-                seed=self.settings.seed,
-                particles=self.settings.particles,
-                recipe=selection.recipe,
-                progress=progress,
-            )
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save_trace(result, path)
+            if selection.edit is None:
+                result = self._run(traced.checkpoint, selection, episode, progress)
+            else:
+                result = self._edited(traced.checkpoint, selection, selection.edit, episode, progress)
             traced.done.set_result(result)
         except BaseException as error:
             traced.done.set_exception(error)
+
+    def _run(
+        self, checkpoint: Checkpoint, selection: Selection, episode: Episode, progress: Callable[[float], None]
+    ) -> Trace:
+        """The trace from its file, or computed and written there."""
+        name = f"{selection.task}-{selection.filter}-episode{selection.episode}-{self.key(selection)[:16]}.trace"
+        path = self.settings.workspace / "traces" / name
+        # A trace file that cannot be read is only a cache: it is computed and written again.
+        with suppress(BadInput):
+            return load_trace(path)
+        result = trace(
+            checkpoint,
+            episode,
+            episode_index=selection.episode,
+            seed=self.settings.seed,
+            particles=self.settings.particles,
+            recipe=selection.recipe,
+            progress=progress,
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_trace(result, path)
+        return result
+
+    def _edited(
+        self,
+        checkpoint: Checkpoint,
+        selection: Selection,
+        edit: Edit,
+        episode: Episode,
+        progress: Callable[[float], None],
+    ) -> Trace:
+        """The run with an edit. It has no file: edits are tried by the dozen, and each is soon made again."""
+        whole = replace(selection, edit=None)
+        if self._replay is None or self._replay[0] != self.key(whole):
+            original = self._run(checkpoint, whole, episode, progress)
+            self._replay = self.key(whole), Replay(checkpoint, original, progress)
+        return self._replay[1].edited(edit)
 
     def close(self) -> None:
         """Give up what is being computed and close the data sets."""

@@ -19,7 +19,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
-from beliefscope.app import diagnostics, failures, jobs
+from beliefscope.app import compare, diagnostics, failures, jobs
 from beliefscope.app.api import routes
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.security import Guard
@@ -69,6 +69,7 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
         routes(library, views),
         jobs.routes(work),
         diagnostics.routes(library, work),
+        compare.routes(library),
         failures.routes(library, work),
     ):
         app.include_router(router)
