@@ -144,7 +144,7 @@ class Replay:
         self.batch = Steps.of(filter_.task, [trace.episode]).episode(0)
         self.evidence = filter_.encode(self.batch)
         for edit in trace.settings.get("edits", []):
-            self.evidence = self._weighed(self.evidence, Edit.of(edit))
+            self.evidence = self.weighed(self.evidence, Edit.of(edit))
         self.start = start_at_truth(filter_, self.batch)
         generator = torch.Generator().manual_seed(trace.seed)
         belief = filter_.start(self.start, int(trace.settings["particles"]), generator)
@@ -195,7 +195,7 @@ class Replay:
             evidence = filter_.encode(Steps.of(filter_.task, [episode]).episode(0))
         edits = [*original.settings.get("edits", []), edit.to_json()]
         for one in edits:
-            evidence = self._weighed(evidence, Edit.of(one))
+            evidence = self.weighed(evidence, Edit.of(one))
         belief, generator = self.beliefs[edit.first], self.generator(edit.first)
         steps = self.steps[: edit.first]
         for t in range(edit.first, len(self.beliefs)):
@@ -207,7 +207,7 @@ class Replay:
         }
         return assemble(self.checkpoint, episode, self.start, evidence, steps, **changed)
 
-    def _weighed(self, evidence: Evidence, edit: Edit) -> Evidence:
+    def weighed(self, evidence: Evidence, edit: Edit) -> Evidence:
         """The evidence with beta as the edit has it."""
         if not edit.weights:
             return evidence
