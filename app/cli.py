@@ -20,6 +20,7 @@ from beliefscope.app.commands.evaluate import evaluate
 from beliefscope.app.commands.failures import failures
 from beliefscope.app.commands.figure import figure
 from beliefscope.app.commands.inspect import inspect
+from beliefscope.app.commands.modules import modules
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
 from beliefscope.app.commands.serve import serve
@@ -33,6 +34,7 @@ COMMANDS = (
     collect,
     convert,
     train,
+    modules,
     evaluate,
     study,
     trace,
