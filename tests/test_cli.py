@@ -23,6 +23,7 @@ OPTIONS = {
     "collect": "--episodes --steps --seed --workers -o --json",
     "convert": "--data --skip-bad -o --json",
     "train": "--filter --data --skip-bad --preset --recipe --seed --log -o --json",
+    "modules": "--filter --train --freeze --depth --json",
     "evaluate": "--filter --data --skip-bad --recipe --only --particles --seed --json",
     "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
     "trace": "--filter --data --skip-bad --episode --recipe --seed -o --json",
