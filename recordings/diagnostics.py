@@ -18,8 +18,11 @@ from beliefscope.inspect.plotting import charts_of, png_of
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.drawing import line, rgba, series, time_columns
 
-COLOUR_OF_NOTHING = "#C8C8C8"
+COLOUR_OF_NOTHING = "#9A9A9A"
 """Of curves that belong to no layer, and of bounds."""
+
+HEIGHT, WORDS, AXIS, LANE, LEAST = 800.0, 230.0, 56.0, 41.0, 110.0
+"""Points: of a tab in a window of common size, of its words, of the kinds of steps' axis and of each, of a chart."""
 
 COLOURS_OF_BANDS = {"contact": "#CC79A7", "blackout": "#808080", "edit": "#0072B2"}
 
@@ -60,7 +63,7 @@ def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, na
             ends = np.unique([0, len(trace) - 1])
             rr.log(
                 path,
-                line(COLOUR_OF_NOTHING, 0.8, *(f"bound {one:.3g}" for one in bounds)),
+                line(COLOUR_OF_NOTHING, 0.8, *["bounds"] * len(bounds)),
                 static=True,
                 recording=stream,
             )
@@ -70,7 +73,7 @@ def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, na
                 series(np.tile(np.array(bounds), (len(ends), 1))),
                 recording=stream,
             )
-    for kind, mask in diagnostic.bands().items():
+    for kind, mask in _bands(diagnostic).items():
         _log_band(stream, f"{root}/bands/{slug(kind)}", kind, mask, trace)
     for where, panels in (("plots", diagnostic.plots()), ("pictures", diagnostic.pictures())):
         for panel in panels:
@@ -90,24 +93,25 @@ def diagnostic_tab(diagnostic: Diagnostic, name: str) -> rrb.Container:
         *(rrb.Spatial2DView(origin=f"{root}/{where}/{slug(p.title)}", name=p.title) for where, p in panels),
     ]
     rows: list[rrb.View | rrb.Container] = [rrb.Tabs(*said, active_tab=0)]
-    shares = [4.0]
+    heights = [WORDS]
     linked = rrb.TimeAxis(link="LinkToGlobal")
-    charts = charts_of(diagnostic)
-    if charts and diagnostic.bands():
+    charts, bands = charts_of(diagnostic), _bands(diagnostic)
+    if charts and bands:
         rows.append(rrb.StateTimelineView(origin=f"{root}/bands", name="Steps", time_view=linked))
-        shares.append(1.6)
-    for chart, _ in charts:
+        heights.append(AXIS + LANE * len(bands))
+    for chart, curves in charts:
+        unit = curves[0].unit
         rows.append(
             rrb.TimeSeriesView(
                 origin=f"{root}/curves/{slug(chart)}",
                 contents=["$origin/**", f"/{root}/bounds/{slug(chart)}"],
-                name=chart,
+                name=chart if not unit or unit in chart else f"{chart} ({unit})",
                 axis_x=linked,
                 plot_legend=rrb.PlotLegend(corner="LeftTop"),
             )
         )
-        shares.append(2.5)
-    return rrb.Vertical(*rows, row_shares=shares, name=title_of(name))
+    heights += [max(LEAST, (HEIGHT - sum(heights)) / len(charts))] * len(charts) if charts else []
+    return rrb.Vertical(*rows, row_shares=heights, name=title_of(name))
 
 
 def title_of(name: str) -> str:
@@ -121,9 +125,13 @@ def slug(name: str) -> str:
 
 
 def told(diagnostic: Diagnostic, name: str) -> str:
-    """Title, question, verdict and tables as Markdown."""
+    """Title, question, verdict and tables as Markdown, with a last one of what its curves are."""
     question = [f"*{DIAGNOSTICS[name].question}*"] if name in DIAGNOSTICS else []
-    return "\n\n".join([f"# {title_of(name)}", *question, diagnostic.verdict, *map(_table, diagnostic.tables())]) + "\n"
+    tables = diagnostic.tables()
+    if curves := diagnostic.curves():
+        rows = [(one.chart, one.name, one.unit, *(one.bounds or (None, None))) for one in curves]
+        tables = [*tables, Table("Curves", ("chart", "curve", "unit", "should be from", "to"), tuple(rows))]
+    return "\n\n".join([f"# {title_of(name)}", *question, diagnostic.verdict, *map(_table, tables)]) + "\n"
 
 
 def _table(table: Table) -> str:
@@ -141,8 +149,12 @@ def _line(curve: Curve, layers: Sequence[str], before: int) -> rr.SeriesLines:
     count = layers.count(curve.layer)
     named = list(dict.fromkeys(one for one in layers if one))
     hue = colour(curve.layer, named) if curve.layer else COLOUR_OF_NOTHING
-    name = f"{curve.name} ({curve.unit})" if curve.unit else curve.name
-    return line(hue, 1.5, name, opacity=np.linspace(1.0, 0.4, count)[before : before + 1])
+    return line(hue, 1.5, curve.name, opacity=np.linspace(1.0, 0.4, count)[before : before + 1])
+
+
+def _bands(diagnostic: Diagnostic) -> dict[str, NDArray[np.bool_]]:
+    """Those that some step is of."""
+    return {kind: mask for kind, mask in diagnostic.bands().items() if mask.any()}
 
 
 def _log_band(stream: rr.RecordingStream | None, path: str, kind: str, mask: NDArray[np.bool_], trace: Trace) -> None:

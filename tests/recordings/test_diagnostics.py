@@ -76,7 +76,7 @@ def test_curves_are_those_of_the_diagnostic(recorded: Any) -> None:
         assert rows[name][STEP] == list(range(len(run)))
         np.testing.assert_array_equal(scalars(rows[name])[:, 0], curve.values)  # stored as float64
         (said,) = (one for one in rows[name]["SeriesLines:names"] if one)
-        assert said == [f"{curve.name} ({curve.unit})" if curve.unit else curve.name]
+        assert said == [curve.name]
 
 
 def test_bounds_and_bands_are_those_of_the_diagnostic(recorded: Any) -> None:
@@ -90,6 +90,9 @@ def test_bounds_and_bands_are_those_of_the_diagnostic(recorded: Any) -> None:
                 assert bounds[STEP] == [0, len(run) - 1]
                 assert set(curve.bounds) <= set(scalars(bounds)[0]) == set(scalars(bounds)[1])
         for kind, mask in one.bands().items():
+            if not mask.any():
+                assert f"{name}/bands/{kind}" not in rows
+                continue
             changes = rows[f"{name}/bands/{kind}"]
             states = [state[0] == kind for state in changes["StateChange:state"] if state]
             since = np.searchsorted(changes[STEP], np.arange(len(run)), side="right") - 1
@@ -103,6 +106,8 @@ def test_words_say_the_verdict_and_every_table(recorded: Any) -> None:
     for name, one in found.items():
         ((text,),) = rows[f"{name}/about"]["TextDocument:text"]
         assert text.startswith(f"# {DIAGNOSTICS[name].title}\n\n*{DIAGNOSTICS[name].question}*\n\n{one.verdict}\n")
+        for curve in one.curves():
+            assert f"| {curve.chart} | {curve.name} | {curve.unit} |" in text
         for table in one.tables():
             body = text.split(f"## {table.title}\n\n")[1].split("\n\n")[0].strip().splitlines()
             assert len(body) == 2 + len(table.rows)
