@@ -102,6 +102,24 @@ async function whole(url, signal) {
   }
 }
 
+/**
+ * @typedef {{episode: number, step: number, first: number, last: number, value: number, group: string, also: string[],
+ *   error: (number | null)[], nees: number | null, ess: number | null, acting: number[] | null, link: string}} Moment
+ * @typedef {object} Failures where a filter fails over a data set (docs/api.md) @property {string[]} layers
+ * @property {{name: string, title: string, unit: string, why_not: string | null, verdict?: string, total?: number,
+ *   counts?: Record<string, number>, groups?: object[], moments?: Moment[]}[]} scores
+ * @property {{index: number, steps: number, rmse: number, worst: number, worst_step: number, error: number[], contact: boolean[]}[]} episodes
+ */
+
+const failuresUrl = ({ task, filter, data, recipe, among }) =>
+  `/api/failures/${encodeURIComponent(task)}/${encodeURIComponent(filter)}?${new URLSearchParams({ data, recipe, among })}`;
+
+/** Where a filter fails; or the job that looks for it, null where nobody asked for it. @returns {Promise<Failures | {job: Job | null}>} */
+export const failures = async (asked, signal) => (await ask(failuresUrl(asked), { signal })).json();
+
+/** Has it looked for as a job. @returns {Promise<{job: Job}>} */
+export const lookForFailures = async (asked) => (await ask(failuresUrl(asked), { method: 'POST' })).json();
+
 /** @returns {Promise<Job[]>} the newest first. */
 export const jobs = async () => (await ask('/api/jobs')).json();
 

@@ -2,7 +2,7 @@
 
 import * as api from './api.js';
 import { Figures } from './figures.js';
-import { told, underWay } from './jobs.js';
+import { result, told, underWay } from './jobs.js';
 import { say } from './panel.js';
 import { choice } from './pickers.js';
 import { sentence } from './units.js';
@@ -281,14 +281,6 @@ export class Diagnostics {
     });
     return button;
   }
-}
-
-/** @returns {Result} of what the server answered */
-function result(body) {
-  if (!('job' in body)) return { state: 'ready', found: body };
-  const { job } = body;
-  if (!job) return { state: 'unasked' };
-  return { state: underWay(job) ? 'working' : 'ended', job };
 }
 
 function said(entry, { state, found, job, error }) {

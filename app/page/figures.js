@@ -1,6 +1,7 @@
 /** What a diagnostic found, drawn: curves over the steps with the page's cursor, plots, pictures and tables. */
 
 import { FONT, GUTTER, shade } from './chart.js';
+import { copied } from './clipboard.js';
 import { COLOUR_TABLE, SIGNED_TABLE, colour, line, sample, swatch, variable } from './palette.js';
 import { stretches } from './trace.js';
 import { significant, spoken } from './units.js';
@@ -381,20 +382,4 @@ function drawn({ title, values, unit, signed }) {
 function field(value) {
   if (value === null) return '';
   return /[",\n]/.test(value) ? `"${String(value).replaceAll('"', '""')}"` : String(value);
-}
-
-/** Into the clipboard; browsers allow it on this machine's own pages and over https. @returns {Promise<boolean>} */
-async function copied(text) {
-  try {
-    await navigator.clipboard.writeText(text);
-    return true;
-  } catch {
-    const area = document.createElement('textarea');
-    area.value = text;
-    document.body.append(area);
-    area.select();
-    const done = document.execCommand('copy');
-    area.remove();
-    return done;
-  }
 }

@@ -121,3 +121,11 @@ export function told(job) {
   if (job.state === 'done') return `Done in ${Math.max(1, Math.round(job.ended - job.started))} s.`;
   return sentence(STATES[job.state]);
 }
+
+/** What the server answered where a job finds something: what it found, or how the job is. */
+export function result(body) {
+  if (!('job' in body)) return { state: 'ready', found: body };
+  const { job } = body;
+  if (!job) return { state: 'unasked' };
+  return { state: underWay(job) ? 'working' : 'ended', job };
+}

@@ -4,6 +4,7 @@ import * as api from './api.js';
 import { Camera } from './camera.js';
 import { Clock } from './clock.js';
 import { Diagnostics } from './diagnostics.js';
+import { Failures } from './failures.js';
 import { Heatmaps, paintColourBar } from './heatmap.js';
 import { Jobs } from './jobs.js';
 import { keys } from './keys.js';
@@ -72,6 +73,7 @@ class Page {
     this.rerun = new Rerun($('#rerun'), (step) => store.set({ step, playing: false }, { origin: 'rerun' }));
     this.jobs = new Jobs($('#jobs'), $('#jobs-button'));
     this.diagnostics = new Diagnostics($('#diagnostics'), store, this.jobs);
+    this.failures = new Failures($('#failures'), store, this.jobs, this.timeline, catalog);
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
     this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
@@ -113,6 +115,8 @@ class Page {
     if (any('task', 'filter', 'data', 'episode', 'recipe')) this.#load();
     if (any('tab')) this.#showTab(state.tab);
     if (any('diagnostic', 'options', 'over')) this.diagnostics.choose();
+    if (any('task', 'filter', 'data', 'recipe', 'among')) this.failures.load();
+    else if (any('by', 'group', 'list')) this.failures.draw();
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
     if (any('component', 'weights', 'track')) this.#choose();
@@ -152,7 +156,7 @@ class Page {
     }
     tellApart(trace.modalities);
     bodies.slice(1).forEach((body) => say(body, 'ready'));
-    for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun, this.diagnostics]) panel.show(trace);
+    for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun, this.diagnostics, this.failures]) panel.show(trace);
     $('#maps-what').textContent = spoken(trace.task.map.x).replace(/(^| )x$/, '') || 'position';
     $('#maps').classList.toggle('one', !trace.fuses);
     $('#maps').classList.toggle('handless', !trace.has('effector_position'));
@@ -182,7 +186,7 @@ class Page {
   #move() {
     const [trace, { state, origin, inputTime }] = [this.#trace, this.#store];
     const { step, angle } = state;
-    for (const panel of [this.timeline, this.camera, this.numbers, this.slice, this.diagnostics]) panel.move(step);
+    for (const panel of [this.timeline, this.camera, this.numbers, this.slice, this.diagnostics, this.failures]) panel.move(step);
     this.rerun.move(step, origin === 'rerun');
     this.socket.move({ ...trace.selection, step, angle }, inputTime);
     this.#read(state);
@@ -248,6 +252,9 @@ class Page {
       1: () => this.#store.set({ tab: 'scene' }),
       2: () => this.#store.set({ tab: 'rerun' }),
       3: () => this.#store.set({ tab: 'diagnostics' }),
+      f: () => this.#store.set({ tab: 'failures' }),
+      n: (event) => this.failures.go(1, event.timeStamp),
+      b: (event) => this.failures.go(-1, event.timeStamp),
       j: () => this.jobs.toggle(),
       c: () => this.#nextComponent(),
       e: () => this.#goWorst(),

@@ -52,20 +52,27 @@ function fill(select, options) {
 }
 
 /**
- * One choice of a few, as radio buttons in a row.
+ * One choice of a few, as radio buttons in a row. They are made anew only where the options are others: the focus stays.
  * @param {HTMLElement} host @param {[string, string][]} options values and what they are called
  * @param {string} chosen @param {(value: string) => void} choose
  */
 export function choice(host, options, chosen, choose) {
   host.hidden = options.length < 2;
-  host.replaceChildren(
-    ...options.map(([value, text]) => {
-      const label = document.createElement('label');
-      const input = document.createElement('input');
-      Object.assign(input, { type: 'radio', name: host.id, value, checked: value === chosen });
-      input.addEventListener('change', () => choose(value));
-      label.append(input, text);
-      return label;
-    }),
-  );
+  choosing.set(host, choose);
+  const shown = JSON.stringify(options);
+  if (host.dataset.options !== shown) {
+    host.dataset.options = shown;
+    host.replaceChildren(...options.map(([value, text]) => option(host, value, text)));
+  }
+  for (const input of host.querySelectorAll('input')) input.checked = input.value === chosen;
+}
+
+const choosing = new WeakMap(); // host -> what is to be done with a choice
+
+function option(host, value, text) {
+  const label = document.createElement('label');
+  const input = Object.assign(document.createElement('input'), { type: 'radio', name: host.id, value });
+  input.addEventListener('change', () => choosing.get(host)(value));
+  label.append(input, text);
+  return label;
 }

@@ -8,17 +8,20 @@ import { spoken } from './units.js';
  * @property {number} episode index in it
  * @property {string} recipe how the sensors are broken, as text (docs/data.md); empty where they are not
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
- * @property {'scene' | 'rerun' | 'diagnostics'} tab
+ * @property {'scene' | 'rerun' | 'diagnostics' | 'failures'} tab
  * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
  * @property {'error' | 'particles'} track the lowest chart
  * @property {string} diagnostic that is open, empty for the list of all
  * @property {string} options of the open one, as in an address: size=21
  * @property {'episode' | 'held-out'} over what diagnostics are made: this episode, or all that are held out
+ * @property {'held-out' | 'all'} among which episodes failures are looked for @property {'moments' | 'episodes'} list what is listed of them
+ * @property {string} by measure that ranks failures @property {string} group the only one that is listed, empty for all
  * @property {boolean} playing @property {number} speed
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
-const CHOICES = { tab: ['scene', 'rerun', 'diagnostics'], weights: ['raw', 'acting'], track: ['error', 'particles'], over: ['episode', 'held-out'] };
+const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures'], weights: ['raw', 'acting'], track: ['error', 'particles'], over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'] };
+const WORST = 'error'; // the measure that ranks failures where none is chosen
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
 /** Holds the state; tells listeners once a frame what has changed. */
@@ -70,12 +73,15 @@ export class Store {
 
 /** @param {State} state @returns {string} what follows the `?` says all of it that a link should keep. */
 export function address(state) {
-  const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track, diagnostic, options, over } = state;
+  const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track, diagnostic, options, over, by, group } = state;
   const kept = { task, filter, data, episode, step, component, weights, track, tab };
   if (recipe) kept.recipe = recipe;
   if (diagnostic) kept.diagnostic = diagnostic;
   if (options) kept.options = options;
   if (over !== CHOICES.over[0]) kept.over = over;
+  if (by !== WORST) kept.by = by;
+  if (group) kept.group = group;
+  for (const key of ['list', 'among']) if (state[key] !== CHOICES[key][0]) kept[key] = state[key];
   if (angle !== null) kept.angle = Number(angle.toFixed(4));
   return `?${new URLSearchParams(kept)}`;
 }
@@ -108,6 +114,8 @@ export function resolve(search, catalog) {
     component: pick('component', task.components.map((c) => c.name), task.map.x),
     diagnostic: asked.get('diagnostic') ?? '',
     options: asked.get('options') ?? '',
+    by: asked.get('by') ?? WORST,
+    group: asked.get('group') ?? '',
     playing: false,
     speed: 1,
   };

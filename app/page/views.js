@@ -1,8 +1,8 @@
-/** The left of the page: tabs for the 3D scene, for Rerun's viewer and for the diagnostics. */
+/** The left of the page: tabs for the 3D scene, for Rerun's viewer, for the diagnostics and for failures. */
 
 import { say } from './panel.js';
 
-const TABS = ['scene', 'rerun', 'diagnostics'];
+const TABS = ['scene', 'rerun', 'diagnostics', 'failures'];
 
 /** The scene's frame: another page of the server's, which follows the cursor by itself. */
 export class Scene {
