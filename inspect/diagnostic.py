@@ -67,7 +67,11 @@ class Line:
 
 @dataclass(frozen=True)
 class Plot:
-    """Something over something else than time. ``diagonal``: draw y = x, the ideal, beneath."""
+    """Something over something else than time.
+
+    Attributes:
+        diagonal: draw y = x, the ideal, beneath. names: of x = 0, 1, ..., where x counts things.
+    """
 
     title: str
     x_label: str
@@ -75,6 +79,7 @@ class Plot:
     lines: tuple[Line, ...]
     kind: Literal["line", "points", "bars"] = "line"
     diagonal: bool = False
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,8 @@ def draw_plot(axes: Axes, plot: Plot) -> None:
             axes.plot(line.x, line.y, lw=1.0, **look)
     if plot.diagonal:
         axes.plot([0, 1], [0, 1], color="black", lw=0.6, ls="--")
+    if plot.names:
+        axes.set_xticks(range(len(plot.names)), [name.replace(" ", "\n", 1) for name in plot.names])
     axes.set_title(plot.title, loc="left")
     axes.set_xlabel(plot.x_label)
     axes.set_ylabel(plot.y_label)
