@@ -14,7 +14,8 @@ import { Trace } from './trace.js';
  * @typedef {{name: string, default: number | string | null, unit: string, meaning: string}} Parameter
  * @typedef {{fault: string, meaning: string, parameters: Parameter[]}} Fault
  * @typedef {{version: string, tasks: Task[], faults: Fault[], problems?: string[]}} Catalog
- * @typedef {{task: string, filter: string, data: string, episode: number, recipe: string}} Selection names of what is looked at
+ * @typedef {{task: string, filter: string, data: string, episode: number, recipe: string, against?: string}} Selection names of what is looked at;
+ *   `against` makes it the other run that it is compared with, by what differs
  * @typedef {{name: string, url: string, bytes: number, seconds: number | null}} Recording seconds: null if it was there
  */
 
@@ -50,8 +51,12 @@ export const openView = async (dark) => (await post('/api/views', { dark })).jso
 /** Raises ServerError where there is no such trace: an unknown name, or a recipe that cannot be. @param {Selection} selection */
 export const check = (selection) => ask(traceUrl(selection));
 
-const traceUrl = ({ task, filter, data, episode, recipe }, part = '') =>
-  `/api/trace/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}${part}?${new URLSearchParams({ data, recipe })}`;
+const traceUrl = ({ task, filter, data, episode, recipe, against }, part = '') =>
+  `/api/trace/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}${part}?${new URLSearchParams({ data, recipe, ...(against && { against }) })}`;
+
+/** A run and the other one side by side. @param {Selection} selection with `against` @returns {Promise<Found & {names: [string, string]}>} */
+export const comparison = ({ task, filter, data, episode, recipe, against }, signal) =>
+  whole(`/api/compare/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, recipe, against })}`, signal);
 
 /**
  * A trace with all its numbers and pictures; the server computes it first if need be.

@@ -1,13 +1,14 @@
 /** What the keys do, anywhere on the page but in a field. */
 
-const OWN = { 'select': /./, 'input[type=radio]': /^( |Arrow.*)$/, 'input[type=range]': /^(Arrow.*|Home|End|Page.*)$/, 'button, a': /^ $/ };
+const OWN = { 'select': /^(?!ctrl\+)/, 'input[type=radio]': /^( |Arrow.*)$/, 'input[type=range]': /^(Arrow.*|Home|End|Page.*)$/, 'button, a': /^ $/ };
 
-/** @param {Record<string, (event: KeyboardEvent) => void>} actions by key, as KeyboardEvent.key names it. */
+/** @param {Record<string, (event: KeyboardEvent) => void>} actions by key, as KeyboardEvent.key names it, those with Ctrl or ⌘ as `ctrl+shift+z`. */
 export function keys(actions) {
   document.addEventListener('keydown', (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
-    if (document.querySelector('dialog[open]') || belongsTo(event.target, event.key)) return;
-    const action = actions[event.key];
+    if (event.altKey || event.defaultPrevented) return;
+    const key = event.ctrlKey || event.metaKey ? `ctrl+${event.shiftKey ? 'shift+' : ''}${event.key.toLowerCase()}` : event.key;
+    if (document.querySelector('dialog[open]') || belongsTo(event.target, key)) return;
+    const action = actions[key];
     if (!action) return;
     event.preventDefault();
     action(event);

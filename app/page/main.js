@@ -3,6 +3,7 @@
 import * as api from './api.js';
 import { Camera } from './camera.js';
 import { Clock } from './clock.js';
+import { Compare } from './compare.js';
 import { Diagnostics } from './diagnostics.js';
 import { Failures } from './failures.js';
 import { Heatmaps, paintColourBar } from './heatmap.js';
@@ -13,12 +14,14 @@ import { Theme, swatch, tellApart } from './palette.js';
 import { Messages, say } from './panel.js';
 import { choice, pickers } from './pickers.js';
 import { reading } from './reading.js';
+import { FaultSheet } from './recipes.js';
 import { saving } from './recordings.js';
 import { Rerun } from './rerun.js';
 import { Slice } from './slice.js';
 import { ViewSocket } from './socket.js';
 import { Store, resolve } from './state.js';
 import { TimeLine } from './timeline.js';
+import { Undo } from './undo.js';
 import { fixed, sentence, spoken } from './units.js';
 import { Scene, tabs } from './views.js';
 
@@ -44,7 +47,7 @@ async function start() {
     throw new api.ServerError('There is nothing to show: no task has both episodes and a trained filter.');
   }
   const { state, problems } = resolve(location.search, catalog);
-  if (state.recipe) await api.check(state).catch((error) => {
+  if (state.recipe) await api.check({ ...state, against: '' }).catch((error) => {
     problems.push(`The link asks for sensors broken by “${state.recipe}”: ${error.message}`);
     state.recipe = '';
   });
@@ -61,7 +64,9 @@ class Page {
 
   constructor(catalog, store) {
     [this.#catalog, this.#store] = [catalog, store];
-    pickers(catalog, store);
+    const sheet = new FaultSheet($('#faults'), catalog.faults);
+    pickers(catalog, store, sheet);
+    this.undo = new Undo(store);
     this.theme = new Theme((dark) => this.#recolour(dark));
     this.clock = new Clock(store);
     this.timeline = new TimeLine($('#timeline .body'), store);
@@ -74,6 +79,7 @@ class Page {
     this.jobs = new Jobs($('#jobs'), $('#jobs-button'));
     this.diagnostics = new Diagnostics($('#diagnostics'), store, this.jobs);
     this.failures = new Failures($('#failures'), store, this.jobs, this.timeline, catalog);
+    this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.timeline.against?.(other, name));
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
     this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
@@ -115,6 +121,7 @@ class Page {
     if (any('task', 'filter', 'data', 'episode', 'recipe')) this.#load();
     if (any('tab')) this.#showTab(state.tab);
     if (any('diagnostic', 'options', 'over')) this.diagnostics.choose();
+    if (any('against') && this.#trace) this.compare.choose();
     if (any('task', 'filter', 'data', 'recipe', 'among')) this.failures.load();
     else if (any('by', 'group', 'list')) this.failures.draw();
     if (any('playing')) this.#showPlaying(state.playing);
@@ -166,6 +173,7 @@ class Page {
     $('#worst').disabled = false;
     $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s) => [swatch(s), ` ${trace.called(s)}  `]));
     $('#sigma-key').hidden = !trace.has('estimate_sigma');
+    this.compare.show(trace);
     this.#choose();
     this.#move();
   }
@@ -187,6 +195,7 @@ class Page {
     const [trace, { state, origin, inputTime }] = [this.#trace, this.#store];
     const { step, angle } = state;
     for (const panel of [this.timeline, this.camera, this.numbers, this.slice, this.diagnostics, this.failures]) panel.move(step);
+    this.compare.move(step);
     this.rerun.move(step, origin === 'rerun');
     this.socket.move({ ...trace.selection, step, angle }, inputTime);
     this.#read(state);
@@ -214,6 +223,7 @@ class Page {
     this.showTab(tab);
     this.rerun.open = tab === 'rerun';
     this.diagnostics.open = tab === 'diagnostics';
+    this.compare.open = tab === 'compare';
     if (this.#trace) this.rerun.move(this.#store.state.step, false);
   }
 
@@ -227,10 +237,17 @@ class Page {
     this.timeline.redraw();
     this.heatmaps.redraw();
     this.diagnostics.redraw();
+    this.compare.redraw();
   }
 
   #goWorst() {
     if (this.#trace) this.#store.set({ step: this.timeline.worst(), playing: false }, { inputTime: performance.now() });
+  }
+
+  /** The edit of the other run begins, or ends, at the cursor. */
+  #markEdit(end) {
+    this.#store.set({ tab: 'compare' });
+    this.compare.mark(end, this.#store.state.step);
   }
 
   #nextComponent() {
@@ -247,8 +264,14 @@ class Page {
       ArrowRight: by(1),
       Home: (event) => this.#step(-Infinity, event.timeStamp),
       End: (event) => this.#step(Infinity, event.timeStamp),
-      '[': () => this.clock.changeSpeed(-1),
-      ']': () => this.clock.changeSpeed(1),
+      '<': () => this.clock.changeSpeed(-1),
+      '>': () => this.clock.changeSpeed(1),
+      '[': () => this.#markEdit('from'),
+      ']': () => this.#markEdit('last'),
+      o: () => this.#store.set({ tab: 'compare' }),
+      'ctrl+z': () => this.undo.undo(),
+      'ctrl+shift+z': () => this.undo.redo(),
+      'ctrl+y': () => this.undo.redo(),
       1: () => this.#store.set({ tab: 'scene' }),
       2: () => this.#store.set({ tab: 'rerun' }),
       3: () => this.#store.set({ tab: 'diagnostics' }),

@@ -1,18 +1,24 @@
 /** What is shown: task, filter, episode, speed; and the small choices above the time line. */
 
-import { recipes } from './recipes.js';
+import { check } from './api.js';
+import { recipePicker } from './recipes.js';
 import { SPEEDS } from './state.js';
 import { percent } from './units.js';
 
-/** @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store */
-export function pickers(catalog, store) {
+/** @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store @param {import('./recipes.js').FaultSheet} sheet */
+export function pickers(catalog, store, sheet) {
   const ids = ['task', 'filter', 'data', 'episode', 'speed'];
   const [task, filter, data, episode, speed] = ids.map((id) => document.getElementById(id));
   const named = (list, name) => list.find((one) => one.name === name);
   const current = () => named(catalog.tasks, store.state.task);
   const names = (list) => list.map(({ name }) => [name, name]);
   fill(task, names(catalog.tasks));
-  const showRecipe = recipes(document.getElementById('recipe'), document.getElementById('faults'), catalog, store);
+  const showRecipe = recipePicker(document.getElementById('recipe'), sheet, {
+    none: 'as recorded',
+    chosen: () => store.state.recipe,
+    choose: (recipe) => store.set({ recipe }),
+    check: (recipe) => check({ ...store.state, recipe, against: '' }),
+  });
   fill(speed, SPEEDS.map((s) => [s, `${s}×`]));
   const refill = () => {
     fill(filter, names(current().filters));
@@ -25,7 +31,7 @@ export function pickers(catalog, store) {
     const { name, filters, data: [{ name: data, first }], recipes, map } = named(catalog.tasks, task.value);
     const filter = (named(filters, store.state.filter) ?? filters[0]).name;
     const recipe = recipes.some((r) => r.recipe === store.state.recipe) ? store.state.recipe : '';
-    store.set({ task: name, filter, data, episode: first, recipe, step: 0, angle: null, component: map.x, playing: false });
+    store.set({ task: name, filter, data, episode: first, recipe, against: '', step: 0, angle: null, component: map.x, playing: false });
   });
   data.addEventListener('change', () => {
     store.set({ data: data.value, episode: named(current().data, data.value).first, step: 0, playing: false });
@@ -35,7 +41,7 @@ export function pickers(catalog, store) {
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
   const show = (state, changed = new Set(['task'])) => {
     if (changed.has('task') || changed.has('data')) refill();
-    if (changed.has('task') || changed.has('recipe')) showRecipe();
+    if (changed.has('task') || changed.has('recipe')) showRecipe(current().recipes);
     for (const select of [task, filter, data, episode, speed]) select.value = state[select.id];
   };
   show(store.state);

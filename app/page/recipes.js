@@ -1,47 +1,76 @@
 /** How the sensors are broken: recipes that are ready to be picked, and any other in words (docs/data.md). */
 
-import { check } from './api.js';
-
 const OTHER = 'other';
 
-/**
- * The picker, and the sheet behind its last entry. A recipe that the server refuses changes nothing but the sheet.
- * @param {HTMLSelectElement} select @param {HTMLDialogElement} sheet
- * @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store
- * @returns {() => void} shows the state's recipe
- */
-export function recipes(select, sheet, catalog, store) {
-  const [text, wrong, list] = ['input', '.wrong', 'tbody'].map((part) => sheet.querySelector(part));
-  const tell = (line) => (wrong.textContent = line);
-  select.addEventListener('change', () => {
-    if (select.value !== OTHER) return store.set({ recipe: select.value });
-    select.value = text.value = store.state.recipe;
-    tell('');
-    sheet.showModal();
-    text.focus();
-  });
-  text.addEventListener('input', () => tell(''));
-  list.replaceChildren(...catalog.faults.map((fault) => row(fault, text)));
-  sheet.querySelector('form').addEventListener('submit', async (event) => {
+/** The sheet in which any recipe can be written. A recipe that the server refuses changes nothing but the sheet. */
+export class FaultSheet {
+  #sheet;
+  #text;
+  #wrong;
+  #asker = null;
+
+  /** @param {HTMLDialogElement} sheet @param {import('./api.js').Fault[]} faults */
+  constructor(sheet, faults) {
+    this.#sheet = sheet;
+    [this.#text, this.#wrong] = ['input', '.wrong'].map((part) => sheet.querySelector(part));
+    this.#text.addEventListener('input', () => this.#tell(''));
+    sheet.querySelector('tbody').replaceChildren(...faults.map((fault) => row(fault, this.#text)));
+    sheet.querySelector('form').addEventListener('submit', (event) => this.#take(event));
+  }
+
+  /**
+   * @param {string} recipe to begin with @param {(recipe: string) => Promise<unknown>} check raises what is wrong with one
+   * @param {(recipe: string) => void} choose is given the one that is applied
+   */
+  ask(recipe, check, choose) {
+    this.#asker = { check, choose };
+    this.#text.value = recipe;
+    this.#tell('');
+    this.#sheet.showModal();
+    this.#text.focus();
+  }
+
+  async #take(event) {
     if (event.submitter?.value === 'cancel') return;
     event.preventDefault();
-    const recipe = text.value.trim();
+    const recipe = this.#text.value.trim();
     try {
-      await check({ ...store.state, recipe });
+      await this.#asker.check(recipe);
     } catch (error) {
-      return tell(error.message);
+      return this.#tell(error.message);
     }
-    store.set({ recipe });
-    sheet.close();
-  });
-  return () => {
-    const { task, recipe } = store.state;
-    const ready = catalog.tasks.find((t) => t.name === task).recipes;
+    this.#asker.choose(recipe);
+    this.#sheet.close();
+  }
+
+  #tell(line) {
+    this.#wrong.textContent = line;
+  }
+}
+
+/**
+ * A picker of recipes, with the sheet behind its last entry.
+ * @param {HTMLSelectElement} select @param {FaultSheet} sheet
+ * @param {object} of @param {string} of.none what no recipe is called @param {() => string} of.chosen
+ * @param {(recipe: string) => void} of.choose @param {(recipe: string) => Promise<unknown>} of.check
+ * @returns {(ready: {name: string, recipe: string}[]) => void} shows those that are ready, and the chosen one
+ */
+export function recipePicker(select, sheet, { none, chosen, choose, check }) {
+  let ready = [];
+  const show = () => {
+    const recipe = chosen();
     const own = recipe && !ready.some((r) => r.recipe === recipe) ? [{ name: recipe, recipe }] : [];
-    const all = [{ name: 'as recorded', recipe: '' }, ...ready, ...own, { name: 'other …', recipe: OTHER }];
+    const all = [{ name: none, recipe: '' }, ...ready, ...own, { name: 'other …', recipe: OTHER }];
     select.replaceChildren(...all.map((r) => new Option(r.name, r.recipe)));
     [select.value, select.disabled, select.title] = [recipe, false, `How the sensors are broken${recipe && `: ${recipe}`}`];
   };
+  const take = (recipe) => (choose(recipe), show());
+  select.addEventListener('change', () => {
+    if (select.value !== OTHER) return take(select.value);
+    select.value = chosen();
+    sheet.ask(chosen(), check, take);
+  });
+  return (list) => ((ready = list), show());
 }
 
 /** A fault in the sheet's list; its button adds it to the text. */

@@ -7,8 +7,9 @@ import { spoken } from './units.js';
  * @property {string} task @property {string} filter @property {string} data set of episodes
  * @property {number} episode index in it
  * @property {string} recipe how the sensors are broken, as text (docs/data.md); empty where they are not
+ * @property {string} against what differs in the other run that this one is compared with (docs/api.md); empty without one
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
- * @property {'scene' | 'rerun' | 'diagnostics' | 'failures'} tab
+ * @property {'scene' | 'rerun' | 'diagnostics' | 'failures' | 'compare'} tab
  * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
  * @property {'error' | 'particles'} track the lowest chart
  * @property {string} diagnostic that is open, empty for the list of all
@@ -20,7 +21,7 @@ import { spoken } from './units.js';
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
-const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures'], weights: ['raw', 'acting'], track: ['error', 'particles'], over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'] };
+const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare'], weights: ['raw', 'acting'], track: ['error', 'particles'], over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'] };
 const WORST = 'error'; // the measure that ranks failures where none is chosen
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
@@ -76,6 +77,7 @@ export function address(state) {
   const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track, diagnostic, options, over, by, group } = state;
   const kept = { task, filter, data, episode, step, component, weights, track, tab };
   if (recipe) kept.recipe = recipe;
+  if (state.against) kept.against = state.against;
   if (diagnostic) kept.diagnostic = diagnostic;
   if (options) kept.options = options;
   if (over !== CHOICES.over[0]) kept.over = over;
@@ -109,6 +111,7 @@ export function resolve(search, catalog) {
     data: data.name,
     episode: number(asked, 'episode', data.first, data.episodes.map((e) => e.index), problems),
     recipe: asked.get('recipe')?.trim() ?? '',
+    against: asked.get('against') ?? '',
     step: number(asked, 'step', 0, null, problems),
     angle: asked.has('angle') && Number.isFinite(Number(asked.get('angle'))) ? Number(asked.get('angle')) : null,
     component: pick('component', task.components.map((c) => c.name), task.map.x),

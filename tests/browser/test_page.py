@@ -111,7 +111,7 @@ def test_wheel_over_a_map_steps_and_hover_tells_the_value(open_page: Any) -> Non
 
 def test_playing_follows_the_episodes_clock(open_page: Any) -> None:
     page = open_page("?step=0")
-    page.page.keyboard.press("]")  # 2x
+    page.page.keyboard.press(">")  # 2x
     page.page.keyboard.press("Space")
     page.until("() => beliefscope.state().step >= 10")
     assert page.state["playing"]

@@ -1,0 +1,96 @@
+/** The run that is shown beside another one: what differs, drawn over the time line and told in this panel. */
+
+import * as api from './api.js';
+import { Edit } from './edit.js';
+import { Figures } from './figures.js';
+import { say } from './panel.js';
+
+const NOTHING = 'Nothing to compare with yet. Choose another filter, other sensors or an edit over some steps, and run it beside this one.';
+
+export class Compare {
+  #catalog;
+  #store;
+  #result;
+  #figures;
+  #form;
+  #overlay;
+  #trace = null;
+  #loading = new AbortController();
+  #open = false;
+
+  /**
+   * @param {HTMLElement} host @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store
+   * @param {import('./recipes.js').FaultSheet} sheet
+   * @param {(other: import('./trace.js').Trace | null, name: string) => void} overlay is told of the other run as it comes and goes
+   */
+  constructor(host, catalog, store, sheet, overlay) {
+    [this.#catalog, this.#store, this.#overlay] = [catalog, store, overlay];
+    this.#result = host.querySelector('.result');
+    this.#figures = new Figures(host.querySelector('.figures'), store);
+    this.#form = new Edit(host.querySelector('form'), catalog, store, sheet, (against) => api.check({ ...store.state, against }));
+    say(this.#result, 'loading', 'Loading …');
+  }
+
+  /** Whether the panel can be seen. */
+  set open(open) {
+    this.#open = open;
+    if (open && this.#trace) this.move(this.#store.state.step);
+  }
+
+  /** @param {import('./trace.js').Trace} trace that the page shows */
+  show(trace) {
+    this.#trace = trace;
+    this.choose();
+  }
+
+  /** Another other run was chosen. */
+  choose() {
+    if (!this.#trace) return;
+    this.#form.show(this.#trace);
+    this.#load();
+  }
+
+  move(step) {
+    if (this.#open) this.#figures.move(step);
+  }
+
+  redraw() {
+    this.#figures.redraw();
+  }
+
+  /** An edit begins or ends at a step. @param {'from' | 'last'} end */
+  mark(end, step) {
+    this.#form.mark(end, step);
+  }
+
+  /** Loads the other run, and what is said of both. */
+  async #load() {
+    const { against, task: name } = this.#store.state;
+    this.#loading.abort();
+    const { signal } = (this.#loading = new AbortController());
+    this.#overlay(null, '');
+    this.#show(null);
+    if (!against) return say(this.#result, 'empty', NOTHING);
+    const wait = (share) => say(this.#result, 'loading', 'Running the other one …', share);
+    wait(null);
+    try {
+      const task = this.#catalog.tasks.find((t) => t.name === name);
+      const selection = { ...this.#trace.selection, against };
+      const other = await api.loadTrace(task, selection, wait, signal);
+      const found = await api.comparison(selection, signal);
+      this.#overlay(other, found.names[1]);
+      this.#show(found);
+      say(this.#result, 'ready');
+    } catch (error) {
+      if (error.name === 'AbortError') return;
+      if (!(error instanceof api.ServerError)) console.error(error);
+      say(this.#result, 'error', error.message);
+    }
+  }
+
+  #show(found) {
+    this.#result.querySelector('.verdict').textContent = found?.verdict ?? '';
+    this.#figures.show(found, this.#trace);
+    if (this.#open) this.#figures.move(this.#store.state.step);
+  }
+}
