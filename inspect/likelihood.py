@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
@@ -18,7 +16,8 @@ from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.foreign import Foreign
 from beliefscope.filters.fusion import mixture
-from beliefscope.filters.pf import MeasurementModel, ParticleFilter
+from beliefscope.filters.pf import ParticleFilter
+from beliefscope.inspect.cells import Cells, one_thread
 from beliefscope.inspect.measures import wrapped
 from beliefscope.inspect.trace import Trace
 
@@ -29,9 +28,6 @@ COARSE, FINE = 41, 135
 
 LARGEST = 1024
 """Cells along a side that a map may have."""
-
-CELLS_AT_ONCE = 1700
-"""Cells that go through the networks in one go: a whole coarse map, and their activations stay in the caches."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +102,7 @@ def _nothing_to_map(trace: Trace | None) -> str | None:
 class MapEngine:
     """Maps of one trace, with each thing computed once that several cells or steps share.
 
-    What depends on the observations: for all steps together. What depends on the cells: their first layer is linear,
-    ``W s + b = (W_x dx) + (W_y dy + W s_0 + b)`` for the cell at offsets dx, dy from the state s_0 in the middle, so it
-    is S columns and S rows instead of S x S cells. Their whole part of the networks is kept for the next map, which has
-    the same cells where only the observations have changed: the truth stands still, or the slice is held.
+    What depends on the observations: for all steps together. What depends on the cells: in ``Cells``.
     """
 
     def __init__(self, checkpoint: Checkpoint, trace: Trace) -> None:
@@ -126,7 +119,7 @@ class MapEngine:
         self.evidence = self._encode()
         rest = [i for i in range(len(self.task.components)) if i not in self.task.map_indices]
         self.fixed = rest[0] if rest else None
-        self._kept_parts = lru_cache(maxsize=2)(lambda size, middle: list(self._state_parts(size, middle)))
+        self._cells = self._networks()
 
     @torch.no_grad()
     def _encode(self) -> Evidence | None:
@@ -134,6 +127,14 @@ class MapEngine:
             return None
         filter_ = self.checkpoint.filter
         return filter_.encode(Steps.of(self.task, [self.trace.episode]).episode(0))
+
+    def _networks(self) -> Cells | None:
+        if self.evidence is None:
+            return None
+        filter_ = self.checkpoint.filter
+        assert isinstance(filter_, ParticleFilter)
+        models = [filter_.measurement_model(name) for name in filter_.names]
+        return Cells(models, self.task.map_indices, filter_.statistics.mean_std("state")[1])
 
     @torch.no_grad()
     def map(self, step: int, angle: float | None = None, size: int = FINE) -> LikelihoodMap:
@@ -156,7 +157,8 @@ class MapEngine:
         centre = trace.episode.states[step][list(self.task.map_indices)]
         if self.fixed is not None and angle is not None:
             middle[self.fixed] = angle
-        values = self._particle_filter if self.evidence is not None else self._gaussians
+        with one_thread():
+            values = (self._particle_filter if self.evidence is not None else self._gaussians)(step, size, middle)
         return LikelihoodMap(
             step=step,
             angle=math.nan if self.fixed is None else float(middle[self.fixed]),
@@ -164,7 +166,7 @@ class MapEngine:
             offsets_x=self._offsets(size),
             offsets_y=self._offsets(size),
             centre=centre,
-            log_likelihood=values(step, size, middle),
+            log_likelihood=values,
         )
 
     def maps(
@@ -187,16 +189,13 @@ class MapEngine:
         assert isinstance(filter_, ParticleFilter)
         assert self.evidence is not None
         evidence = self.evidence[step]
-        state = tuple(middle.tolist())
-        parts = self._kept_parts(size, state) if size <= FINE else self._state_parts(size, state)
-        of_observation = list(zip(self._models(), evidence.observation[0], strict=True))
-        chunks = [
-            torch.stack(
-                [model.log_likelihood(seen, part) for (model, seen), part in zip(of_observation, each, strict=True)]
-            )
-            for each in parts
-        ]
-        each = torch.cat(chunks, dim=1)
+        assert self._cells is not None
+        each = self._cells.log_likelihood(
+            torch.from_numpy(self._offsets(size)),
+            filter_.statistics.standardise("state", torch.from_numpy(middle)),
+            tuple(middle.tolist()),
+            evidence.observation[0],
+        )
         assert trace.prior_log_weights is not None
         assert trace.log_likelihood is not None
         prior, of_particles = trace.prior_log_weights[step], trace.log_likelihood[step]
@@ -204,30 +203,6 @@ class MapEngine:
         log_weights = None if evidence.log_weights is None else evidence.log_weights[0]
         values = torch.cat([each, mixture(each - scale, log_weights).unsqueeze(0)])
         return values.unflatten(1, (size, size)).numpy()
-
-    def _models(self) -> list[MeasurementModel]:
-        filter_ = self.checkpoint.filter
-        assert isinstance(filter_, ParticleFilter)
-        return [filter_.measurement_model(name) for name in filter_.names]
-
-    def _state_parts(self, size: int, middle: tuple[float, ...]) -> Iterator[list[Tensor]]:
-        """Each model's part of a chunk of cells (cells, units), chunk by chunk, row by row."""
-        statistics = self.checkpoint.filter.statistics
-        _, std = statistics.mean_std("state")
-        state = statistics.standardise("state", torch.tensor(middle, dtype=torch.float64))
-        offsets = torch.from_numpy(self._offsets(size))[:, None]
-        summands = []
-        for model in self._models():
-            first = model.state_encoder[0]
-            assert isinstance(first, nn.Linear)
-            by_x, by_y = ((first.weight / std)[:, i] for i in self.task.map_indices)
-            summands.append((model, offsets * by_x, offsets * by_y + first(state)))
-        at_once = max(1, CELLS_AT_ONCE // size)
-        for row in range(0, size, at_once):
-            yield [
-                model.join_state(model.state_encoder[1:](columns + rows[row : row + at_once, None])).flatten(0, 1)
-                for model, columns, rows in summands
-            ]
 
     def _gaussians(self, step: int, size: int, middle: NDArray[np.float64]) -> Array:
         """(K + 1, S, S) log densities of each unimodal posterior and of the fused one.

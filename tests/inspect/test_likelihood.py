@@ -102,6 +102,33 @@ def test_another_angle_is_another_slice(pf: MapEngine) -> None:
     assert np.abs(other.log_likelihood - same.log_likelihood).max() > 0.1
 
 
+def test_what_is_kept_of_a_grid_changes_nothing(pf: MapEngine) -> None:
+    """A slice that is held is computed, kept and remembered, with other grids of the same and other sizes between."""
+    fresh = {step: engine("crossmodal-pf").map(step, 0.4, 41).log_likelihood for step in (5, 30)}
+    for step in (5, 30, 5, 30, 5):
+        pf.map(step, 0.9, size=135)
+        # Sums in another order, once the part is kept: float32 rounding of values of order 10.
+        np.testing.assert_allclose(pf.map(step, 0.4, 41).log_likelihood, fresh[step], rtol=0, atol=1e-5)
+        if step == 30:
+            pf.map(step, 0.9, size=41), pf.map(step, size=21), pf.map(step, size=23)
+
+
+def test_large_grids_go_through_in_parts(pf: MapEngine) -> None:
+    """Every fifth cell of a grid five times as fine is a cell of the coarse one."""
+    coarse, fine = pf.map(30, size=31), pf.map(30, size=155)
+    np.testing.assert_allclose(fine.log_likelihood[:, 2::5, 2::5], coarse.log_likelihood, atol=2e-4)
+
+
+def test_the_number_of_threads_is_left_as_it_was(pf: MapEngine) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        pf.map(3, size=5)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_normalised_peaks_at_255_where_peaks_says(pf: MapEngine) -> None:
     map_ = pf.map(60, size=41)
     shown = map_.normalised()
