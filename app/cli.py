@@ -13,13 +13,16 @@ import typer
 
 from beliefscope import __version__
 from beliefscope.app import console
+from beliefscope.app.commands.change import change
 from beliefscope.app.commands.collect import collect
 from beliefscope.app.commands.convert import convert
 from beliefscope.app.commands.counterfactual import counterfactual
 from beliefscope.app.commands.evaluate import evaluate
 from beliefscope.app.commands.failures import failures
 from beliefscope.app.commands.figure import figure
+from beliefscope.app.commands.finetune import finetune
 from beliefscope.app.commands.inspect import inspect
+from beliefscope.app.commands.lineage import lineage
 from beliefscope.app.commands.modules import modules
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
@@ -34,7 +37,10 @@ COMMANDS = (
     collect,
     convert,
     train,
+    finetune,
     modules,
+    change,
+    lineage,
     evaluate,
     study,
     trace,

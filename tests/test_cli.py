@@ -24,6 +24,8 @@ OPTIONS = {
     "convert": "--data --skip-bad -o --json",
     "train": "--filter --data --skip-bad --preset --recipe --seed --log -o --json",
     "modules": "--filter --train --freeze --depth --json",
+    "change": "--data --skip-bad --slice --particles --seed -o --json",
+    "lineage": "--export -o --json",
     "evaluate": "--filter --data --skip-bad --recipe --only --particles --seed --json",
     "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
     "trace": "--filter --data --skip-bad --episode --recipe --seed -o --json",

@@ -1,0 +1,129 @@
+"""``beliefscope change``"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from beliefscope.app import console
+from beliefscope.app.commands.given import DataPath, Json, Particles, Seed, SkipBad, check, checkpoint, dataset
+from beliefscope.datasets.errors import BadInput
+
+if TYPE_CHECKING:
+    from beliefscope.filters.checkpoint import Checkpoint
+
+Either = "A .safetensors file, or the name of a filter that ships for the other one's task, such as crossmodal-ekf."
+
+SliceTexts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--slice",
+        metavar="SLICE",
+        help="Look at this one too: NAME:recipe=FAULTS:contact=yes:only=MODALITY, all but the name as needed. "
+        "May be given several times.",
+    ),
+]
+
+
+def change(
+    before: Annotated[str, typer.Argument(metavar="BEFORE", help=Either)],
+    after: Annotated[str, typer.Argument(metavar="AFTER", help=Either)],
+    data: DataPath = None,
+    skip_bad: SkipBad = False,
+    slices: SliceTexts = None,
+    particles: Particles = 300,
+    seed: Seed = 0,
+    output: Annotated[
+        Path | None, typer.Option("-o", metavar="DIR", help="New folder for change.json, change.svg and change.md.")
+    ] = None,
+    json: Json = None,
+) -> None:
+    """Tell what a change of a filter mended and broke.
+
+    Both checkpoints run over the held-out episodes with the same broken sensors and the same random numbers. Every
+    error and every number of the belief before and after, by slice: nominal, contact, no contact, 80 % black pictures,
+    each modality alone; with 95 % bootstrap intervals over episodes. Mended or damaged is what changed by 2 % or more
+    with an interval that excludes no change. Then the moments that got worse, and what became of each module.
+
+    \b
+    Examples:
+      beliefscope change crossmodal-ekf child.safetensors
+      beliefscope change parent.safetensors child.safetensors --data door.h5 -o report
+      beliefscope change crossmodal-pf child.safetensors --slice black-in-contact:recipe=blackout=1:contact=yes
+    """
+    from beliefscope.app.link import moment_link
+    from beliefscope.app.shelf import SAMPLE, short_names
+    from beliefscope.datasets.catalog import TASKS
+    from beliefscope.filters.catalog import filters_of
+    from beliefscope.filters.slices import Slice, slices_of
+    from beliefscope.inspect.change import change_of
+    from beliefscope.inspect.diagnostic import as_json
+
+    check(None, json)
+    if output is not None and (output.exists() or not output.parent.is_dir()):
+        raise BadInput(f"output {str(output)!r} is there already, or its folder is not; give the name of a new folder")
+    pair = both(before, after)
+    task = pair[0].task
+    chosen = [Slice.parse(text, slices_of(task)) for text in slices or []]
+    with dataset(task, data, skip_bad) as episodes, console.progress("Comparing") as advance:
+        found = change_of(*pair, episodes, slices=chosen, particles=particles, seed=seed, progress=advance)
+        data_hash = episodes.hash
+    # The names that `serve` gives to the same files.
+    ships = {name for known in TASKS.values() for name in filters_of(known)}
+    paths = [Path(text) for text in (before, after) if is_path(text)]
+    named = {str(path): name for name, path in short_names(paths, ships).items()}
+    name = named.get(str(Path(after)), after)
+    data_name = SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
+    links = [moment_link(task, name, data_name, m.episode, m.step, m.recipe) for m in found.moments]
+    document = found.to_dict() | {
+        "data_hash": data_hash,
+        "frozen": list(found.frozen),
+        "mended": as_json(found.mended()),
+        "damaged": as_json(found.damaged()),
+        "moments": [as_json(m) | {"link": link} for m, link in zip(found.moments, links, strict=True)],
+        "serve": serving(paths, data, seed),
+    }
+    tables = [console.grid(one.title, one.columns, one.rows) for one in found.tables()]
+    text = "\n\n".join([found.verdict, *tables])
+    if output is not None:
+        write(output, document, text, found.plot())
+    console.result(document, text, json)
+
+
+def both(before: str, after: str) -> tuple[Checkpoint, Checkpoint]:
+    """Two checkpoints, of which one may be a name that ships. Raises BadInput for what is not there."""
+    from beliefscope.filters.checkpoint import load_checkpoint
+
+    loaded = {text: load_checkpoint(Path(text)) for text in (before, after) if is_path(text)}
+    if not loaded:
+        raise BadInput(f"{before!r} and {after!r} are both names; give at least one as a .safetensors file")
+    task = next(iter(loaded.values())).task.name
+    first, second = (loaded.get(text) or checkpoint(task, text) for text in (before, after))
+    return first, second
+
+
+def is_path(text: str) -> bool:
+    return text.endswith(".safetensors") or os.sep in text
+
+
+def serving(filters: list[Path], data: Path | None, seed: int) -> str:
+    """The command whose page shows the moments."""
+    given = [*(["--data", str(data)] if data else []), *(part for one in filters for part in ("--filter", str(one)))]
+    return shlex.join(["beliefscope", "serve", *given, *(["--seed", str(seed)] if seed else [])])
+
+
+def write(folder: Path, document: dict[str, Any], text: str, figure: Any) -> None:
+    """The report as numbers, as a figure and as text."""
+    import json as json_format
+
+    from beliefscope.filters.checkpoint import write_atomically
+    from beliefscope.inspect.plotting import write_figure
+
+    folder.mkdir()
+    write_figure(figure, folder / "change.svg")
+    write_atomically(folder / "change.md", f"```\n{text}\n```\n".encode())
+    write_atomically(folder / "change.json", (json_format.dumps(document, indent=2) + "\n").encode())
