@@ -105,7 +105,7 @@ def diagnostic_tab(diagnostic: Diagnostic, name: str) -> rrb.Container:
             rrb.TimeSeriesView(
                 origin=f"{root}/curves/{slug(chart)}",
                 contents=["$origin/**", f"/{root}/bounds/{slug(chart)}"],
-                name=chart if not unit or unit in chart else f"{chart} ({unit})",
+                name=chart if unit.lower() in chart.lower() else f"{chart} ({unit})",
                 axis_x=linked,
                 plot_legend=rrb.PlotLegend(corner="LeftTop"),
             )

@@ -1,10 +1,11 @@
-"""A task from plain arrays, as the example of docs/data.md adds one, goes the whole way with no other change."""
+"""The examples run and say what they promise. A task from plain arrays goes the whole way with no other change."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import json
+import re
 import runpy
 import sys
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from beliefscope.datasets import catalog
 from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
+from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import load_trace
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_task.py"
@@ -63,6 +65,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for command, name in (("trace", "own.trace"), ("record", "own.rrd")):
         result(command, SPEC, "--filter", trained, "--data", data, "-o", folder / name)
     return folder
+
+
+def example(name: str, argument: object, capsys: pytest.CaptureFixture[str]) -> str:
+    """What one of the numbered examples prints."""
+    path = EXAMPLE.parent / name
+    assert len(path.read_text().splitlines()) < 40
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(path), str(argument)])
+        runpy.run_path(str(path), run_name="__main__")
+    return capsys.readouterr().out
+
+
+def test_diagnose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = example("01_diagnose.py", tmp_path, capsys)
+    assert all(f"{entry.title}. {entry.question}\n  " in said for entry in DIAGNOSTICS.values())
+    assert "an oracle would" in said
+    assert "95 % -" in said, "five trajectories give intervals"
+    assert {path.stem for path in tmp_path.glob("*.pdf")} == {"weights", "consistency", "particles"}
+
+
+def test_counterfactual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = example("02_counterfactual.py", tmp_path / "what.svg", capsys)
+    black, trusted, _ = re.findall(r"the error went from ([\d.]+) to ([\d.]+) cm", said)
+    assert black[0] == trusted[0], "each is compared with the same run"
+    assert float(black[1]) < float(trusted[1]), "trusting a black picture is worse than not"
+    assert (tmp_path / "what.svg").read_text().startswith("<?xml")
 
 
 def test_example_is_short() -> None:

@@ -1,0 +1,29 @@
+
+import sys
+from pathlib import Path
+
+from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.counterfactual import compare
+from beliefscope.inspect.plotting import write_figure
+from beliefscope.inspect.replay import Edit, Replay
+from beliefscope.inspect.trace import trace
+
+checkpoint = load_checkpoint(shipped("push", "crossmodal-pf"))
+with open_dataset(sample_path("push")) as data:
+    index = data.held_out()[0]
+    replay = Replay(checkpoint, trace(checkpoint, data[index], index))
+
+black = Recipe.parse("blackout")
+edits = {
+    "the picture is black": Edit(40, 60, black),
+    "the picture is black, and beta still trusts it": Edit(40, 60, black, {"image": 1.0}),
+    "the picture is good, and beta trusts touch alone": Edit(40, 60, weights={"haptics": 1.0}),
+}
+for what, edit in edits.items():
+    found = compare(replay.original, replay.edited(edit), edit)
+    print(f"\nWhat if {what}?\n  {found.verdict}")
+
+if len(sys.argv) > 1:
+    write_figure(found.plot(), Path(sys.argv[1]))
