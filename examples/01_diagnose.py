@@ -1,3 +1,7 @@
+"""Ask a filter what it trusts, whether rightly, and whether its covariance is true.
+
+python examples/01_diagnose.py [DIR]; with a folder, a figure of each answer is written there.
+"""
 
 import sys
 from pathlib import Path

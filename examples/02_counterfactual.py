@@ -1,3 +1,7 @@
+"""What if? Break a sensor for two seconds, or set beta by hand, and run again.
+
+python examples/02_counterfactual.py [FIGURE.pdf]; all edits are compared with one run, by common random numbers.
+"""
 
 import sys
 from pathlib import Path
