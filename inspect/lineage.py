@@ -50,7 +50,7 @@ class Ancestor:
         hash: SHA-256 of its file. path: of that file. task, name: of its filter.
         parent: hash of the checkpoint that it was made from; None where it was trained from nothing.
         command: that made it. settings: of the fine-tuning; empty where there was none.
-        metrics: those of its record, as they are: ``RMSE`` and the rest by slice or by chance of black pictures.
+        metrics: those of its record, as they are: by chance of black pictures, fused and by modality.
         record: all that it says of its training.
     """
 
@@ -82,9 +82,8 @@ class Ancestor:
 
     @property
     def rmse(self) -> Mapping[str, float]:
-        """Of the fused estimate on whole sensors, in cm and degrees, position first; empty where its record has none."""
-        nominal = self.metrics.get("nominal") or self.metrics.get("0") or {}
-        found = (nominal.get("fused") or nominal).get("rmse")
+        """Of the fused estimate on whole sensors, in cm and deg, position first; empty where its record has none."""
+        found = (self.metrics.get("0") or {}).get("fused", {}).get("rmse")
         if not isinstance(found, Mapping):
             return {}
         return {name: found[name] for name in sorted(found, key=lambda name: name != "position_cm")}
