@@ -21,7 +21,7 @@ def key_of(**what: Any) -> str:
 
 
 class Partial:
-    """The weights after the last finished stage of one training, in one file beside its checkpoint.
+    """How far one training has come, tensors and JSON, in one file beside its checkpoint.
 
     Args:
         path: of the file. key: of the training; a file with another key is of no use to this one.
@@ -30,13 +30,12 @@ class Partial:
     def __init__(self, path: Path, key: str) -> None:
         self.path, self.key = path, key
 
-    def load(self) -> tuple[dict[str, Tensor], list[str], float] | None:
-        """Tensors, names of the finished stages, and seconds they took; None where there is nothing to go on from."""
-        found = _read(self.path, self.key)
-        return found and (found[0], list(found[1]["done"]), float(found[1]["seconds"]))
+    def load(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+        """Tensors and progress as they were saved; None where there is nothing to go on from."""
+        return _read(self.path, self.key)
 
-    def save(self, tensors: Mapping[str, Tensor], done: list[str], seconds: float) -> None:
-        _write(self.path, tensors, {"key": self.key, "done": done, "seconds": seconds})
+    def save(self, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
+        _write(self.path, tensors, {**progress, "key": self.key})
 
     def drop(self) -> None:
         self.path.unlink(missing_ok=True)

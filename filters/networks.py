@@ -114,9 +114,12 @@ class ImageEncoder(nn.Module):
     Attributes:
         table: (pictures + 1, units) what it says to each training picture and, last, to a black one; only while a
             trainer leaves it as it is.
+        pictures: numbers of pictures (...) to pictures (..., H, W), standardised; only while a trainer numbers them and
+            yet trains it.
     """
 
     table: Tensor | None = None
+    pictures: Callable[[Tensor], Tensor] | None = None
 
     def __init__(self, shape: tuple[int, int], units: int, stride: int = 2, pooling: Pooling = "flatten") -> None:
         super().__init__()
@@ -163,6 +166,8 @@ class Encoders(nn.Module):
         features = []
         for modality, encoder in self.by_modality.items():
             observed = observations[modality]
+            if isinstance(encoder, ImageEncoder) and encoder.pictures is not None:
+                observed = encoder.pictures(observed)
             if isinstance(encoder, ImageEncoder) and observed.dtype == torch.int64:
                 assert encoder.table is not None
                 features.append(encoder.table[observed])

@@ -158,7 +158,8 @@ def train(
     done: list[str] = []
     spent = 0.0
     if kept is not None and (found := kept.load()) is not None:
-        tensors, done, spent = found
+        tensors, progress = found
+        done, spent = list(progress["done"]), float(progress["seconds"])
         filter_.load_state_dict(tensors)
         if resumed is not None:
             resumed(done[-1])
@@ -166,7 +167,7 @@ def train(
     def finished(stage: str) -> None:
         done.append(stage)
         if kept is not None:
-            kept.save(filter_.state_dict(), done, spent + time.monotonic() - began)
+            kept.save(filter_.state_dict(), {"done": done, "seconds": spent + time.monotonic() - began})
 
     trainer.run(tuple(done), finished)
     filter_.eval().requires_grad_(False)

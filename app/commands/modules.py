@@ -40,10 +40,11 @@ def modules(
     depth: Annotated[int, typer.Option("--depth", parser=whole(0), metavar="N", help="So many levels.")] = 3,
     json: Json = None,
 ) -> None:
-    """Show what a filter is made of, and what fine-tuning would train.
+    """Show what a filter is made of.
 
-    Every module by its dotted name, with its number of parameters, whether it would be trained, and what it does. Of a
-    fine-tuned filter also what its training did: the gradient's size, and how far the weights went.
+    Every module by its dotted name, with its number of parameters, whether beliefscope finetune would train it with
+    the same options, and what it does. Of a fine-tuned filter also what its training did: the gradient's size, and how
+    far the weights went.
 
     \\b
     Examples:
