@@ -23,6 +23,8 @@ OPTIONS = {
     "collect": "--episodes --steps --seed --workers -o --json",
     "convert": "--data --skip-bad -o --json",
     "train": "--filter --data --skip-bad --preset --recipe --seed --log -o --json",
+    "finetune": "--filter --train --freeze --slice --recipe --nominal --moment --data --skip-bad --steps --length --rate --pull --seed "
+    "--log -o --json",
     "modules": "--filter --train --freeze --depth --json",
     "change": "--data --skip-bad --slice --particles --seed -o --json",
     "lineage": "--export -o --json",
