@@ -86,7 +86,7 @@ class Drawing:
         self._arrow = server.scene.add_arrows(
             "/belief/force",
             np.zeros((1, 2, 3), np.float32),
-            _rgb("contact", trace),
+            rgb("contact", trace),
             shaft_radius=0.008,
             head_radius=0.02,
             head_length=0.05,
@@ -116,7 +116,7 @@ class Drawing:
         trace, scene = self._trace, self._server.scene
         height = float(self._anchors[0, index, 2]) + self._above + POLE_STEP * (len(self._believed) - index)
         pole = scene.add_cylinder(
-            f"/belief/{name}/pole", POLE_RADIUS, height, color=_rgb(name, trace), cast_shadow=False
+            f"/belief/{name}/pole", POLE_RADIUS, height, color=rgb(name, trace), cast_shadow=False
         )
         called = "estimate" if name == "fused" and len(trace.modalities) < 2 else name
         label = scene.add_label(
@@ -135,7 +135,7 @@ class Drawing:
             batched_wxyzs=wxyzs,
             batched_positions=positions,
             batched_scales=scales,
-            batched_colors=np.array([_rgb(name, self._trace) for name in names], np.uint8),
+            batched_colors=np.array([rgb(name, self._trace) for name in names], np.uint8),
             batched_opacities=np.array([0.45 if name == "fused" else 0.3 for name in names], np.float32),
             side="double",
             lod="off",
@@ -150,7 +150,7 @@ class Drawing:
         size = np.asarray(self._ghost.size, np.float32)
         outlines = {}
         for i, (name, _, _) in enumerate(self._believed[:2]):
-            hue = _rgb(name, self._trace)
+            hue = rgb(name, self._trace)
             outlines[i] = self._server.scene.add_frame(f"/belief/{name}/ghost", show_axes=False)
             self._server.scene.add_line_segments(
                 f"/belief/{name}/ghost/edges",
@@ -183,7 +183,7 @@ class Drawing:
         points[:, :2] = trace.particles[step][:, self._plane]
         weights = trace.log_weights[step]
         share = np.sqrt(np.exp(weights - weights.max()))[:, None]
-        hue = np.array(_rgb("fused", trace), np.float32)
+        hue = np.array(rgb("fused", trace), np.float32)
         return points, np.rint(PALE + share * (hue - PALE)).astype(np.uint8)
 
     def _contours(self, step: int) -> tuple[Array, Array, Array]:
@@ -277,6 +277,6 @@ def _believed(trace: Trace) -> Iterator[tuple[str, Array, Array]]:
             yield name, trace.modality_mean[:, k], trace.modality_covariance[:, k]
 
 
-def _rgb(source: str, trace: Trace) -> RGB:
+def rgb(source: str, trace: Trace) -> RGB:
     hue = colour(source, trace.modalities)
     return int(hue[1:3], 16), int(hue[3:5], 16), int(hue[5:7], 16)

@@ -11,6 +11,8 @@ from viser import GuiEvent, GuiSliderHandle
 from beliefscope.app.drawing import Drawing
 from beliefscope.app.library import Traced
 from beliefscope.app.proxy import EmbeddedViser
+from beliefscope.app.shadow import Shadow
+from beliefscope.inspect.trace import Trace
 
 PANEL_WIDTH = 180  # pixels
 USER_HOLDS = 0.5  # s after the step was moved in the scene in which an echo does not move the slider under the hand
@@ -30,6 +32,8 @@ class Scene:
         self._moved = moved
         self._lock = threading.Lock()
         self._drawing: Drawing | None = None
+        self._other: Trace | None = None
+        self._shadow: Shadow | None = None
         self._closed = False
         self._key = ""
         self._slider: GuiSliderHandle[int] | None = None
@@ -44,8 +48,8 @@ class Scene:
         )
         self._server.flush()
 
-    def show(self, traced: Traced, step: int) -> None:
-        """Draw a step of a trace and send it to the browser."""
+    def show(self, traced: Traced, step: int, other: Trace | None = None) -> None:
+        """Draw a step of a trace and send it to the browser. Other: the run of its episode that it is compared with."""
         with self._lock:
             if self._closed:
                 return
@@ -54,6 +58,10 @@ class Scene:
             assert self._drawing is not None
             with self._server.atomic():
                 self._drawing.move(step)
+                if other is not self._other:
+                    self._shade(traced, other)
+                if self._shadow is not None:
+                    self._shadow.move(step)
                 if self._slider is not None and time.monotonic() - self._user_moved > USER_HOLDS:
                     self._slider.value = step  # type: ignore[misc]
             self._server.flush()
@@ -69,11 +77,17 @@ class Scene:
         with server.atomic():
             server.scene.reset()
             server.gui.reset()
-            self._drawing = Drawing(server, traced)
+            self._drawing, self._shadow, self._other = Drawing(server, traced), None, None
             self._slider = server.gui.add_slider("step", 0, max(1, len(traced.trace) - 1), 1, 0)
             self._slider.on_update(self._on_slider)
             self._fold_panel()
         self._key = traced.key
+
+    def _shade(self, traced: Traced, other: Trace | None) -> None:
+        if self._shadow is not None:
+            self._shadow.remove()
+        self._shadow = None if other is None else Shadow(self._server, traced.checkpoint.task, other)
+        self._other = other
 
     def _fold_panel(self) -> None:
         panel = self._server.gui.main_panel

@@ -17,6 +17,7 @@ from beliefscope.app.scene import Scene
 from beliefscope.app.wire import Cursor, cursor, maps_message
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import no_maps
+from beliefscope.inspect.trace import Trace
 
 log = logging.getLogger("beliefscope.app")
 
@@ -114,8 +115,16 @@ class View:
             await websocket.send_bytes(maps_message(wanted.serial, trace, maps))
         if not wanted.scene:
             return
-        await asyncio.to_thread(self.scene.show, traced, wanted.step)
+        other = self._other(selection, wanted.against, len(trace))
+        await asyncio.to_thread(self.scene.show, traced, wanted.step, other)
         await websocket.send_json({"type": "drawn", "serial": wanted.serial, "step": wanted.step})
+
+    def _other(self, selection: Selection, against: str, steps: int) -> Trace | None:
+        """The other run, once it is there: the page has it computed over HTTP, and is told there what is wrong."""
+        with contextlib.suppress(BadInput):
+            other = self._library.there(selection.against(against)) if against else None
+            return other if other is not None and len(other) == steps else None
+        return None
 
     async def _ready_before_newer(self, traced: Traced) -> bool:
         """Wait for the trace, but no longer than until a newer cursor comes. Raises what computing it raised."""

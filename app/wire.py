@@ -24,7 +24,8 @@ class Cursor:
     """The page's whole selection, as one message of it says.
 
     Serial: the page's own count of its cursors. Recipe: how the sensors are broken. Scene: whether the 3D scene
-    follows, or only the maps. Data: name of the data set; empty for the task's first.
+    follows, or only the maps. Data: name of the data set; empty for the task's first. Against: what differs in the
+    other run, whose estimate the scene shows too (``Selection.against``); empty without one.
     """
 
     serial: int
@@ -37,6 +38,7 @@ class Cursor:
     recipe: Recipe = WHOLE
     scene: bool = True
     data: str = ""
+    against: str = ""
 
 
 def cursor(message: dict[str, Any]) -> Cursor:
@@ -48,8 +50,8 @@ def cursor(message: dict[str, Any]) -> Cursor:
     angle = message.get("angle")
     if angle is not None and not _is_number(angle):
         raise BadInput(f"cursor's 'angle' is a number of radians or null; got {angle!r}.")
-    recipe, data = message.get("recipe", ""), message.get("data", "")
-    for key, text in (("recipe", recipe), ("data", data)):
+    recipe, data, against = (message.get(key, "") for key in ("recipe", "data", "against"))
+    for key, text in (("recipe", recipe), ("data", data), ("against", against)):
         if not isinstance(text, str):
             raise BadInput(f"cursor's {key!r} is text; got {text!r}.")
     size = message.get("size", MAP_SIZES[0])
@@ -66,6 +68,7 @@ def cursor(message: dict[str, Any]) -> Cursor:
         recipe=Recipe.parse(recipe),
         scene=scene,
         data=data,
+        against=against,
         **integers,
     )
 

@@ -15,6 +15,7 @@ export class Compare {
   #form;
   #overlay;
   #trace = null;
+  #other = null;
   #loading = new AbortController();
   #open = false;
 
@@ -68,7 +69,7 @@ export class Compare {
     const { against, task: name } = this.#store.state;
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
-    this.#overlay(null, '');
+    this.#draw(null, '');
     this.#show(null);
     if (!against) return say(this.#result, 'empty', NOTHING);
     const wait = (share) => say(this.#result, 'loading', 'Running the other one …', share);
@@ -78,7 +79,7 @@ export class Compare {
       const selection = { ...this.#trace.selection, against };
       const other = await api.loadTrace(task, selection, wait, signal);
       const found = await api.comparison(selection, signal);
-      this.#overlay(other, found.names[1]);
+      this.#draw(other, found.names[1]);
       this.#show(found);
       say(this.#result, 'ready');
     } catch (error) {
@@ -86,6 +87,11 @@ export class Compare {
       if (!(error instanceof api.ServerError)) console.error(error);
       say(this.#result, 'error', error.message);
     }
+  }
+
+  #draw(other, name) {
+    if (other !== this.#other) this.#overlay(other, name);
+    this.#other = other;
   }
 
   #show(found) {

@@ -4,7 +4,7 @@ import { choice } from './pickers.js';
 import { recipePicker } from './recipes.js';
 import { fixed, sentence } from './units.js';
 
-const KINDS = [['filter', 'another filter'], ['recipe', 'other sensors'], ['edit', 'an edit over some steps']];
+const KINDS = [['filter', 'another filter'], ['recipe', 'other sensors'], ['edit', 'an edit of some steps']];
 const FIRST_SPAN = 20; // steps of an edit, until somebody chooses others
 
 /** `a=1&b=2`, as an address has it, with as few signs escaped as can be. */

@@ -79,7 +79,7 @@ class Page {
     this.jobs = new Jobs($('#jobs'), $('#jobs-button'));
     this.diagnostics = new Diagnostics($('#diagnostics'), store, this.jobs);
     this.failures = new Failures($('#failures'), store, this.jobs, this.timeline, catalog);
-    this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.timeline.against?.(other, name));
+    this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.#overlay(other, name));
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
     this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
@@ -178,6 +178,12 @@ class Page {
     this.#move();
   }
 
+  /** The other run has come or gone: it is drawn over the time line, and in the scene. */
+  #overlay(other, name) {
+    this.timeline.against?.(other, name);
+    this.#move();
+  }
+
   /** Another component, kind of weights or lowest chart. */
   #choose() {
     const [trace, { state }] = [this.#trace, this.#store];
@@ -197,7 +203,7 @@ class Page {
     for (const panel of [this.timeline, this.camera, this.numbers, this.slice, this.diagnostics, this.failures]) panel.move(step);
     this.compare.move(step);
     this.rerun.move(step, origin === 'rerun');
-    this.socket.move({ ...trace.selection, step, angle }, inputTime);
+    this.socket.move({ ...trace.selection, step, angle, against: state.against }, inputTime);
     this.#read(state);
     const [count, time] = $('#readout').children;
     count.textContent = `${step} / ${trace.steps - 1}`;

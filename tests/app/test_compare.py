@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from beliefscope.app.drawing import OUTLINES
 from beliefscope.app.library import Selection, Settings
+from beliefscope.app.scene import Scene
 from beliefscope.app.server import create_app
+from beliefscope.app.shadow import dashed
 from beliefscope.datasets.corrupt import Recipe
 from beliefscope.inspect.replay import Edit
 
@@ -137,3 +140,38 @@ def test_a_selection_knows_its_other_run() -> None:
     edited = selection.against("from=40&to=60&recipe=blackout&weights=image=0.5")
     assert edited == replace(selection, edit=Edit(40, 60, Recipe.parse("blackout"), {"image": 0.5}))
     assert len({selection, edited, selection.against("from=40&to=60&recipe=blackout&weights=image=0.6")}) == 3
+
+
+@pytest.mark.parametrize("shape", OUTLINES)
+def test_dashes_lie_on_their_edges_and_cover_about_half(shape: str) -> None:
+    edges = np.asarray(OUTLINES[shape])  # of size 1 m: a box has long edges alone
+    dashes = dashed(edges)
+    lengths = [np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1) for lines in (edges, dashes)]
+    assert 0.4 < lengths[1].sum() / lengths[0].sum() < 0.7
+    ends = dashes.reshape(-1, 1, 3)
+    along = (edges[:, 1] - edges[:, 0]) / lengths[0][:, None]
+    away = ends - edges[None, :, 0]
+    on = np.clip((away * along).sum(-1, keepdims=True), 0.0, lengths[0][:, None])
+    assert np.linalg.norm(away - on * along, axis=-1).min(axis=1).max() < 1e-6
+
+
+def test_the_scene_shows_the_other_run_where_it_is(shown: TestClient) -> None:
+    library = shown.app.state.library  # type: ignore[attr-defined]
+    selection = Selection("door", "crossmodal-ekf", EPISODE)
+    traced, other = library.traced(selection), library.traced(selection.against("filter=crossmodal-pf")).trace
+    assert library.there(selection.against("filter=crossmodal-pf")) is other
+    assert library.there(selection.against("from=1&to=3&weights=image=0.123")) is None
+    scene = Scene(lambda step: None, dark=False)
+    try:
+        scene.show(traced, 45, other)
+        nodes = scene.viser.server.scene._handle_from_node_name
+        there = {name: nodes[name] for name in ("/other/pole", "/other/ghost")}
+        ghost = traced.checkpoint.task.ghost
+        assert ghost is not None
+        placed = ghost(other.estimate_mean)
+        np.testing.assert_allclose(there["/other/ghost"].position, placed.position[45], atol=1e-6)
+        np.testing.assert_allclose(there["/other/pole"].position[:2], placed.anchor[45, :2], atol=1e-6)
+        scene.show(traced, 46)
+        assert not any(name.startswith("/other") for name in nodes)
+    finally:
+        scene.close()
