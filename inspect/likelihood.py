@@ -200,7 +200,8 @@ class MapEngine:
         assert trace.log_likelihood is not None
         prior, of_particles = trace.prior_log_weights[step], trace.log_likelihood[step]
         scale = filter_.scale(torch.from_numpy(prior)[None], torch.from_numpy(of_particles)[None])[0]
-        log_weights = None if evidence.log_weights is None else evidence.log_weights[0]
+        # The trace's: they may have been set by hand.
+        log_weights = None if trace.weights is None else torch.from_numpy(trace.weights[step]).log()
         values = torch.cat([each, mixture(each - scale, log_weights).unsqueeze(0)])
         return values.unflatten(1, (size, size)).numpy()
 

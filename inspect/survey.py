@@ -16,6 +16,7 @@ from beliefscope.filters.evaluate import LEFT_OUT
 from beliefscope.inspect import measures
 from beliefscope.inspect.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.weights import position_regret
 
 RECENT = 0.5
 """s: what happened that short a time ago still counts as happening."""
@@ -138,26 +139,6 @@ def disagreement(trace: Trace) -> Array:
     return np.sqrt((apart * white).sum(-1) / apart.shape[-1]).max(axis=1)
 
 
-def regret(trace: Trace) -> Array:
-    """(T,) m: the fused position's error less the least that mixing the modalities' own positions could have left.
-
-    With a weight for each component, the best mixture is anywhere between the modalities in each of them; with one
-    weight for all, on a line between two of them (of more than two, this is the best that two can do).
-    """
-    where = list(measures.task_of(trace).map_indices)
-    off = measures.errors(trace)[..., where]
-    alone, fused = off[:, :-1], np.linalg.norm(off[:, -1], axis=-1)
-    assert trace.acting is not None
-    if trace.acting.shape[-1] > 1:
-        least = np.maximum(0.0, np.maximum(alone.min(axis=1), -alone.max(axis=1)))
-        return fused - np.linalg.norm(least, axis=-1)
-    i, j = np.array(list(combinations(range(len(trace.modalities)), 2))).T
-    across = alone[:, j] - alone[:, i]
-    length = np.maximum((across**2).sum(-1), np.finfo(float).tiny)
-    share = np.clip(-(alone[:, i] * across).sum(-1) / length, 0.0, 1.0)
-    return fused - np.linalg.norm(alone[:, i] + share[..., None] * across, axis=-1).min(axis=1)
-
-
 def _angle(index: int, name: str) -> Score:
     return Score(f"{name.replace('_', ' ')} error", "rad", lambda trace: np.abs(measures.errors(trace)[:, -1, index]))
 
@@ -185,7 +166,7 @@ SCORES: dict[str, Score] = {
     "nees": Score("NEES", "", lambda trace: measures.nees(trace)[:, -1], _no_covariance),
     "ess": Score("particles to effective ones", "x", _collapse, _no_particles),
     "disagreement": Score("modalities apart", "sigma", disagreement, _no_fusion),
-    "regret": Score("regret of the weights", "m", regret, _no_fusion),
+    "regret": Score("regret of the weights", "m", position_regret, _no_fusion),
 }
 """By name; those of the task's angles come after ``error``."""
 

@@ -307,6 +307,14 @@ def oracle_weights(errors: Array, near: Array) -> Array:
     return best / best.sum(-1, keepdims=True)
 
 
+def position_regret(trace: Trace) -> Array:
+    """(T,) m: the fused position's error less that with the oracle's weights; below zero where the filter does better
+    than any convex weights, as a product of experts can.
+    """
+    steps = _steps(trace)
+    return steps["fused"][:, 0] - steps["hindsight"][:, 0]
+
+
 def _steps(trace: Trace) -> dict[str, Array]:
     """By step: weights (T, K, W), regret (T, W), errors of position and components (T, 1 + n), alone (T, K, 1 + n)."""
     assert trace.acting is not None

@@ -10,6 +10,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.counterfactual import compare
+from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.replay import Edit, Replay
 from beliefscope.inspect.trace import ARRAYS, Trace, trace
 
@@ -66,3 +67,15 @@ def test_bad_edits(replay: Replay) -> None:
         replay.edited(Edit(40, 101))
     with pytest.raises(BadInput, match="'touch' does not exist"):
         replay.edited(Edit(40, 60, weights={"touch": 0.5}))
+
+
+@pytest.mark.parametrize("replay", ["crossmodal-pf"], indirect=True)  # an EKF's maps are its posteriors
+def test_maps_are_fused_with_the_beta_that_was_set_by_hand(replay: Replay) -> None:
+    edited = replay.edited(Edit(20, 40, weights={"image": 1.0}))
+    step, size = 25, 21
+    image, haptics, fused = MapEngine(replay.checkpoint, edited).map(step, size=size).log_likelihood
+    # The mixture subtracts one number from each model's map; with all weight on one nothing else remains.
+    np.testing.assert_allclose(fused - fused.max(), image - image.max(), atol=1e-4)  # float32 of log-likelihoods
+    assert np.abs((fused - fused.max()) - (haptics - haptics.max())).max() > 1.0
+    same = (MapEngine(replay.checkpoint, one).map(step - 10, size=size) for one in (edited, replay.original))
+    np.testing.assert_array_equal(*(one.log_likelihood for one in same))

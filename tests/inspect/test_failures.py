@@ -16,8 +16,9 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.inspect import measures
 from beliefscope.inspect.failures import failures_of, find_failures, stretches
-from beliefscope.inspect.survey import GROUPS, Survey, disagreement, regret, scores_of
+from beliefscope.inspect.survey import GROUPS, Survey, disagreement, scores_of
 from beliefscope.inspect.trace import Trace, trace
+from beliefscope.inspect.weights import position_regret
 
 EPISODES = 5
 CUT = 60  # steps: enough for every group, and quick
@@ -193,11 +194,11 @@ def test_regret_is_what_a_scan_over_all_shares_finds(traces: list[Trace]) -> Non
     mixed = np.linalg.norm(shares * off[:, 0] + (1 - shares) * off[:, 1], axis=-1).min(axis=0)
     expected = measures.position_error(one)[:, -1] - mixed
     apart = np.linalg.norm(off[:, 0] - off[:, 1], axis=-1).max()
-    np.testing.assert_allclose(regret(one), expected, atol=apart / 4000)  # half a cell of the scan
+    np.testing.assert_allclose(position_regret(one), expected, atol=apart / 4000)  # half a cell of the scan
     assert one.acting is not None
     assert one.acting.shape[-1] == 1
     each = replace(one, acting=np.repeat(one.acting, 2, axis=-1))  # a weight for each component can do no worse
-    assert (regret(each) >= regret(one) - 1e-12).all()
+    assert (position_regret(each) >= position_regret(one) - 1e-12).all()
 
 
 def test_angles_have_a_score_of_their_own_and_wrap() -> None:
