@@ -13,8 +13,9 @@ def moment_link(
     """``?task=...&step=...``, as the page's own address says it.
 
     Args:
-        filter_, data: names as the page shows them. recipe: text. by: name of the score, which chooses what the time
-            line draws: the angle that it is of, the particles of ``ess``, the weights as they acted of ``regret``.
+        filter_, data: names as the page shows them. recipe: text. by: name of the score that ranks the page's list of
+            failures; it chooses what the time line draws too: the angle that it is of, the particles of ``ess``, the
+            weights as they acted of ``regret``.
     """
     kept: dict[str, str | int] = {
         "task": task.name,
@@ -29,5 +30,7 @@ def moment_link(
     }
     if recipe:
         kept["recipe"] = recipe
+    if by != "error":
+        kept["by"] = by
     # Browsers' URLSearchParams leave the star as it is and encode the tilde.
     return "?" + urlencode(kept, safe="*").replace("~", "%7E")

@@ -312,7 +312,7 @@ function momentColumns(found, score) {
     { title: 'episode', text: (m) => String(m.episode) },
     { title: 'step', text: (m) => String(m.step), number, hint: (m) => `Of steps ${m.first} to ${m.last}, in which it stays high` },
     { title: unit ? `${called(score)} ${unit}` : called(score), text: (m) => significant(own * m.value), number, help: sentence(score.title) },
-    { title: 'what happened', text: (m) => m.group, hint: (m) => [m.group, ...m.also].join(', ') },
+    { title: 'what was happening', text: (m) => m.group, hint: (m) => [m.group, ...m.also].join(', ') },
   ];
   const modalities = found.layers.slice(0, -1);
   found.layers.forEach((layer, i) => {

@@ -55,6 +55,7 @@ def test_a_document_with_links(run: Run, line: list[object], given: Settings) ->
         "track": "error",
         "tab": "scene",
         "recipe": "blackout=0.4",
+        "by": "angle",
     }
     assert "--data" in document["serve"]
 

@@ -1,0 +1,117 @@
+"""Where a filter fails, on the page: looked for, gone to, shared, and the episodes sorted, in Chromium."""
+
+from __future__ import annotations
+
+from typing import Any
+from urllib.parse import parse_qsl
+
+import pytest
+
+pytestmark = pytest.mark.browser
+
+TAB = "?tab=failures&filter=crossmodal-ekf"
+API = "api/failures/door/crossmodal-ekf"
+READY = "() => document.querySelector('#failures').dataset.state === 'ready'"
+
+
+def looked(open_page: Any, more: str = "", **options: Any) -> Any:
+    """The tab, once failures have been looked for; they need not be looked for twice."""
+    page = open_page(TAB + more, **options)
+    page.until("() => ['unasked', 'ready'].includes(document.querySelector('#failures').dataset.state)")
+    if page.page.locator("#failures").get_attribute("data-state") == "unasked":
+        page.page.get_by_role("button", name="Look for failures").click()
+    page.until(READY)
+    return page
+
+
+def at(page: Any, moment: dict[str, Any]) -> None:
+    """Waits until maps and scene are at a moment."""
+    page.until(f"() => beliefscope.state().episode === {moment['episode']}")
+    page.settle(moment["step"])
+
+
+def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) -> None:
+    page = looked(open_page, "&step=40", permissions=["clipboard-read", "clipboard-write"])
+    scores = {score["name"]: score for score in page.page.request.get(page.url + API).json()["scores"]}
+    worst, second, *_ = moments = scores["error"]["moments"]
+    rows = page.page.locator("#failures .moments tbody tr")
+    assert rows.count() == len(moments)
+    rows.first.click()
+    at(page, worst)
+    assert page.state["tab"] == "failures"
+    assert rows.first.get_attribute("class") == "here"
+    marked = page.page.locator("#marks button")
+    assert marked.count() == sum(m["episode"] == worst["episode"] for m in moments)
+    assert f"{100 * worst['value']:.2f} cm" in marked.first.get_attribute("aria-label")
+    rows.first.get_by_role("button", name="Copy link").click()
+    page.until("() => document.querySelector('#failures .link').textContent === '✓'")
+    copied = page.page.evaluate("() => navigator.clipboard.readText()")
+    page.picture("failures")
+
+    page.page.keyboard.press("n")
+    at(page, second)
+    page.page.keyboard.press("b")
+    at(page, worst)
+    page.page.get_by_text("angle", exact=True).first.click()  # by another measure, which the time line draws
+    page.until("() => location.search.includes('by=angle')")
+    assert page.state["component"] == "angle"
+    assert rows.count() == scores["angle"]["total"]
+    page.page.get_by_text("ESS", exact=True).click()
+    page.until("() => document.querySelector('#failures .verdict').textContent.includes('has no particles')")
+
+    other = open_page("?" + copied.partition("?")[2])
+    at(other, worst)
+    assert dict(parse_qsl(copied.partition("?")[2]))["step"] == str(other.state["step"])
+    assert other.state["filter"] == "crossmodal-ekf"
+
+
+def column(page: Any, name: str) -> list[str]:
+    """What a column of the episodes says."""
+    table = page.page.locator("#failures .episodes")
+    place = table.locator("thead th").all_text_contents().index(name)
+    return table.locator(f"tbody tr td:nth-child({place + 1})").all_text_contents()
+
+
+def test_episodes_are_sorted_and_opened(open_page: Any) -> None:
+    page = looked(open_page, "&list=episodes", viewport={"width": 1440, "height": 900}, color_scheme="dark")
+    episodes = page.page.request.get(page.url + API).json()["episodes"]
+    by_worst = sorted(episodes, key=lambda one: -one["worst"])
+    known = [str(one["index"]) for one in by_worst]
+    listed = column(page, "episode")
+    assert listed[: len(known)] == known  # the worst first, those that nobody looked at last
+    assert len(listed) == len(set(listed)) > len(known)
+    assert column(page, "RMSE cm")[-1] == "\N{EN DASH}"
+    page.page.get_by_role("button", name="RMSE cm").click()
+    rmse = [float(text) for text in column(page, "RMSE cm")[: len(known)]]
+    assert rmse == sorted(rmse, reverse=True)
+    assert rmse[0] == pytest.approx(100 * max(one["rmse"] for one in episodes), abs=0.005)
+    page.page.get_by_role("button", name="RMSE cm").click()
+    assert [float(text) for text in column(page, "RMSE cm")[: len(known)]] == rmse[::-1]
+    page.page.get_by_role("button", name="contact", exact=True).focus()
+    page.page.keyboard.press("Enter")
+    shares = [int(text.removesuffix(" %")) for text in column(page, "contact")]
+    assert shares == sorted(shares)
+    assert page.page.evaluate("() => document.activeElement.textContent") == "contact"  # it may be turned round at once
+    page.picture("episodes")
+
+    worst = by_worst[0]
+    row = page.page.locator("#failures .episodes tbody tr").filter(
+        has=page.page.get_by_role("button", name=f"Episode {worst['index']}", exact=True)
+    )
+    row.get_by_role("button").click()
+    page.until(f"() => beliefscope.state().episode === {worst['index']} && beliefscope.state().step === 0")
+    box = row.locator("svg").bounding_box()
+    page.page.mouse.click(box["x"] + 0.6 * box["width"], box["y"] + 5)
+    page.until(f"() => Math.abs(beliefscope.state().step - {0.6 * worst['steps']}) <= 1")  # steps are thin
+    assert row.get_attribute("class") == "here"
+
+
+def test_before_the_search_there_are_episodes_all_the_same(open_page: Any) -> None:
+    page = open_page("?tab=failures&list=episodes&filter=image-ekf&among=all")
+    page.until("() => document.querySelector('#failures').dataset.state === 'unasked'")
+    catalog = page.page.request.get(f"{page.url}api/catalog").json()
+    (door,) = (task for task in catalog["tasks"] if task["name"] == "door")
+    assert column(page, "episode") == [str(one["index"]) for one in door["data"][0]["episodes"]]
+    assert set(column(page, "worst cm")) == {"\N{EN DASH}"}
+    page.page.keyboard.press("n")  # there is none to go to: it says what to do
+    assert page.page.get_by_role("button", name="Look for failures").is_visible()
