@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.study import nees_bounds
+from beliefscope.inspect import measures
+from beliefscope.inspect.consistency import innovations
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
@@ -90,12 +93,16 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
     Returns:
         descriptions ``{"name", "shape", "offset"}`` (offset in bytes) and one buffer of float32 that they point into.
     """
+    innovation = innovations(trace)
     arrays: dict[str, NDArray[Any] | None] = {
         "truth": trace.episode.states,
         "estimate_mean": trace.estimate_mean,
         "estimate_sigma": _sigma(trace.estimate_covariance) if trace.has_covariance else None,
         "modality_mean": trace.modality_mean if trace.alone else None,
         "modality_sigma": _sigma(trace.modality_covariance) if trace.alone else None,
+        "nees": measures.nees(trace) if trace.has_covariance else None,
+        "innovation": None if innovation is None else innovation[0],
+        "innovation_sigma": None if innovation is None else _sigma(innovation[1]),
         "weights": trace.weights,
         "acting": trace.acting,
         "contact": trace.episode.contact,
@@ -138,6 +145,7 @@ def header(
         "seed": trace.seed,
         "recipe": str(trace.recipe),
         "settings": dict(trace.settings),
+        "nees_bounds": nees_bounds(len(components), 1) if trace.has_covariance else None,
         "no_maps": no_maps,
         "pictures": None if shown is None else list(shown.shape[1:]),
         "columns": described,
@@ -171,6 +179,6 @@ def _numbers(array: NDArray[np.float32]) -> list[float | None]:
     return [float(value) if math.isfinite(value) else None for value in array]
 
 
-def _sigma(covariance: NDArray[np.float32]) -> NDArray[np.float32]:
+def _sigma(covariance: NDArray[Any]) -> NDArray[Any]:
     """(..., n, n) -> (..., n): standard deviations."""
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

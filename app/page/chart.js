@@ -1,16 +1,19 @@
 /** One track of the time line: a uPlot chart without cursor, legend or axis of its own, with shaded stretches. */
 
 import { colour, line, translucent } from './palette.js';
+import { significant } from './units.js';
 
 /**
  * @typedef {object} Series
  * @property {string} name truth, fused, a modality @property {ArrayLike<number>} values
  * @property {ArrayLike<number>} [sigma] draws a band of two of them on either side
+ * @property {boolean} [other] of the trace that is drawn over the first
  * @typedef {object} Track
- * @property {string} title @property {string} unit @property {Series[]} series
+ * @property {string} title @property {string} unit @property {string} [help] what it is @property {Series[]} series
  * @property {[number, number]} [limits] of the y axis; fitted to what is in view otherwise
- * @property {boolean} [fromZero]
- * @property {number} [digits] of the values in the legend
+ * @property {boolean} [fromZero] @property {boolean} [log] whether the y axis is logarithmic
+ * @property {[number, number]} [bounds] between which values should be
+ * @property {number} [digits] of the values in the legend; three that are significant otherwise
  * @property {string} [note] said in place of a plot
  * @typedef {{contact: [number, number][], black: [number, number][]}} Shading stretches of steps
  */
@@ -18,15 +21,26 @@ import { colour, line, translucent } from './palette.js';
 /** px beside and below a track's plot. */
 export const GUTTER = { left: 46, right: 12, axis: 33 };
 const BLACK_STRIP = 8; // px
+const LOWEST = 0.1; // of the lower bound: a logarithmic axis goes no further down
 export const FONT = '10px system-ui, sans-serif';
+
+/** How a line is drawn. Where two traces are compared, the first's lines are whole and the other's dashed. */
+export function style({ name, other = false }, compared) {
+  const own = line(name);
+  if (!compared) return own;
+  return other ? { ...own, dash: [5, 4], width: Math.min(own.width, 1.75) } : { ...own, dash: [] };
+}
 
 /**
  * @param {HTMLElement} parent @param {Track} track @param {Shading} shading
- * @param {{width: number, height: number, window: () => [number, number], steps: number, withAxis: boolean, stepName: string}} frame
+ * @param {object} frame
+ * @param {number} frame.width @param {number} frame.height px @param {() => [number, number]} frame.window steps in view
+ * @param {number} frame.steps @param {boolean} frame.withAxis @param {string} frame.stepName
+ * @param {boolean} frame.compared whether another trace is drawn over the first
  * @returns {uPlot}
  */
 export function chart(parent, track, shading, frame) {
-  const ink = { stroke: colour('muted'), grid: { stroke: colour('grid'), width: 1 }, ticks: { stroke: colour('grid'), size: 4, width: 1 }, font: FONT };
+  const ink = { stroke: colour('muted'), grid: { stroke: colour('grid'), width: 1, show: !track.note }, ticks: { stroke: colour('grid'), size: 4, width: 1 }, font: FONT };
   const steps = Float64Array.from({ length: frame.steps }, (_, t) => t);
   const data = [steps];
   const series = [{}];
@@ -38,10 +52,11 @@ export function chart(parent, track, shading, frame) {
     series.push({ ...edge }, { ...edge });
     bands.push({ series: [data.length - 2, data.length - 1], fill: translucent(line(name).stroke, name === 'fused' ? 0.2 : 0.08) });
   }
-  for (const { name, values } of track.series) {
-    data.push(values);
-    series.push({ ...line(name), points: { show: false } });
+  for (const one of track.series) {
+    data.push(one.values);
+    series.push({ ...style(one, frame.compared), points: { show: false } });
   }
+  if (!track.series.length) [data[1], series[1]] = [new Array(frame.steps).fill(null), {}]; // an axis needs a line
   return new uPlot(
     {
       width: frame.width,
@@ -52,19 +67,25 @@ export function chart(parent, track, shading, frame) {
       select: { show: false },
       scales: {
         x: { time: false, range: () => frame.window() },
-        y: { range: () => track.limits ?? fitted(track, frame.window()) },
+        y: { distr: track.log ? 3 : 1, range: () => track.limits ?? (track.note ? [0, 1] : fitted(track, frame.window())) },
       },
       axes: [
         stepAxis(ink, frame),
-        { ...ink, size: GUTTER.left, gap: 3, space: 20 },
+        { ...ink, size: GUTTER.left, gap: 3, space: 20, ...heights(track) },
       ],
       series,
       bands,
-      hooks: { drawClear: [(plot) => shade(plot, shading)] },
+      hooks: { drawClear: [(plot) => shade(plot, shading)], drawAxes: [(plot) => track.bounds && between(plot, track.bounds)] },
     },
     data,
     parent,
   );
+}
+
+/** The y axis of a logarithmic chart names powers of ten, that of none nothing. */
+function heights({ log, note }) {
+  if (note) return { values: (_, splits) => splits.map(() => '') };
+  return log ? { values: (_, splits) => splits.map((v) => (v && Math.abs(Math.log10(v) - Math.round(Math.log10(v))) < 1e-9 ? significant(v) : '')) } : {};
 }
 
 /** Only the lowest track names the steps; the others have the same grid. (uPlot draws no axis after one not shown.) */
@@ -93,6 +114,7 @@ function fitted(track, [from, to]) {
       take(part[Math.ceil(0.98 * (part.length - 1))]);
     }
   }
+  if (track.log) return [Math.min(Math.max(low, LOWEST * track.bounds[0]), 0.5 * track.bounds[0]), Math.max(1.3 * high, 2 * track.bounds[1])];
   if (track.fromZero) low = 0;
   if (!(high > low)) [low, high] = Number.isFinite(low) ? [low - 1, low + 1] : [0, 1];
   const margin = 0.06 * (high - low);
@@ -111,6 +133,30 @@ export function shade(plot, { contact, black }) {
   for (const [left, width] of contact.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, width, bbox.height);
   ctx.fillStyle = hatch(ctx);
   for (const [left, width] of black.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, Math.max(width, 1), BLACK_STRIP * devicePixelRatio);
+  ctx.restore();
+}
+
+/** Where values should lie. @param {uPlot} plot @param {[number, number]} bounds */
+export function between(plot, bounds) {
+  const { ctx, bbox } = plot;
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.clip();
+  const [high, low] = bounds.map((v) => plot.valToPos(v, 'y', true)).sort((a, b) => a - b);
+  ctx.globalAlpha = 0.1;
+  ctx.fillStyle = colour('truth');
+  ctx.fillRect(bbox.left, high, bbox.width, low - high);
+  ctx.globalAlpha = 1;
+  ctx.strokeStyle = colour('muted');
+  ctx.lineWidth = devicePixelRatio;
+  ctx.setLineDash([4 * devicePixelRatio, 3 * devicePixelRatio]);
+  for (const y of [high, low]) {
+    ctx.beginPath();
+    ctx.moveTo(bbox.left, y);
+    ctx.lineTo(bbox.left + bbox.width, y);
+    ctx.stroke();
+  }
   ctx.restore();
 }
 

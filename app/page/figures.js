@@ -1,6 +1,6 @@
 /** What a diagnostic found, drawn: curves over the steps with the page's cursor, plots, pictures and tables. */
 
-import { FONT, GUTTER, shade } from './chart.js';
+import { FONT, GUTTER, between, shade } from './chart.js';
 import { copied } from './clipboard.js';
 import { COLOUR_TABLE, SIGNED_TABLE, colour, line, sample, swatch, variable } from './palette.js';
 import { stretches } from './trace.js';
@@ -274,30 +274,6 @@ function padded([low, high]) {
 function spacing(xs) {
   const sorted = [...new Set(xs)].sort((a, b) => a - b);
   return Math.min(...sorted.slice(1).map((x, i) => x - sorted[i]), sorted.length > 1 ? Infinity : 1);
-}
-
-/** Where the values should lie. */
-function between(plot, bounds) {
-  const { ctx, bbox } = plot;
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
-  const [high, low] = bounds.map((v) => plot.valToPos(v, 'y', true)).sort((a, b) => a - b);
-  ctx.globalAlpha = 0.1;
-  ctx.fillStyle = colour('truth');
-  ctx.fillRect(bbox.left, high, bbox.width, low - high);
-  ctx.globalAlpha = 1;
-  ctx.strokeStyle = colour('muted');
-  ctx.lineWidth = devicePixelRatio;
-  ctx.setLineDash([4 * devicePixelRatio, 3 * devicePixelRatio]);
-  for (const y of [high, low]) {
-    ctx.beginPath();
-    ctx.moveTo(bbox.left, y);
-    ctx.lineTo(bbox.left + bbox.width, y);
-    ctx.stroke();
-  }
-  ctx.restore();
 }
 
 /** The lines, points or bars of a plot. */

@@ -190,7 +190,6 @@ class Page {
     const set = (key) => (value) => this.#store.set({ [key]: value });
     choice($('#components'), trace.components.map((c) => [c.name, spoken(c.name)]), state.component, set('component'));
     choice($('#weights'), trace.has('weights') && trace.has('acting') ? [['raw', 'β raw'], ['acting', 'as it acted']] : [], state.weights, set('weights'));
-    choice($('#track'), trace.particles ? [['error', 'error'], ['particles', 'particles']] : [], state.track, set('track'));
     this.timeline.redraw();
     this.numbers.show(trace, state.component);
     this.numbers.move(state.step);
@@ -268,6 +267,8 @@ class Page {
       ' ': () => this.clock.toggle(),
       ArrowLeft: by(-1),
       ArrowRight: by(1),
+      PageUp: (event) => this.#step(this.timeline.tenth, event.timeStamp),
+      PageDown: (event) => this.#step(-this.timeline.tenth, event.timeStamp),
       Home: (event) => this.#step(-Infinity, event.timeStamp),
       End: (event) => this.#step(Infinity, event.timeStamp),
       '<': () => this.clock.changeSpeed(-1),
@@ -278,6 +279,10 @@ class Page {
       'ctrl+z': () => this.undo.undo(),
       'ctrl+shift+z': () => this.undo.redo(),
       'ctrl+y': () => this.undo.redo(),
+      '+': () => this.timeline.zoom(0.5),
+      '=': () => this.timeline.zoom(0.5),
+      '-': () => this.timeline.zoom(2),
+      0: () => this.timeline.whole(),
       1: () => this.#store.set({ tab: 'scene' }),
       2: () => this.#store.set({ tab: 'rerun' }),
       3: () => this.#store.set({ tab: 'diagnostics' }),

@@ -1,5 +1,6 @@
 /** The one state of the page, and its address: a pasted link opens the same moment. */
 
+import { KINDS } from './tracks.js';
 import { spoken } from './units.js';
 
 /**
@@ -11,7 +12,8 @@ import { spoken } from './units.js';
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
  * @property {'scene' | 'rerun' | 'diagnostics' | 'failures' | 'compare'} tab
  * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
- * @property {'error' | 'particles'} track the lowest chart
+ * @property {string} track the lowest chart: a name of `KINDS` (tracks.js)
+ * @property {string} window steps that the time line shows, as 20-60; empty for all of them
  * @property {string} diagnostic that is open, empty for the list of all
  * @property {string} options of the open one, as in an address: size=21
  * @property {'episode' | 'held-out'} over what diagnostics are made: this episode, or all that are held out
@@ -21,7 +23,7 @@ import { spoken } from './units.js';
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
-const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare'], weights: ['raw', 'acting'], track: ['error', 'particles'], over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'] };
+const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'] };
 const WORST = 'error'; // the measure that ranks failures where none is chosen
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
@@ -74,10 +76,11 @@ export class Store {
 
 /** @param {State} state @returns {string} what follows the `?` says all of it that a link should keep. */
 export function address(state) {
-  const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track, diagnostic, options, over, by, group } = state;
+  const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track, window, diagnostic, options, over, by, group } = state;
   const kept = { task, filter, data, episode, step, component, weights, track, tab };
   if (recipe) kept.recipe = recipe;
   if (state.against) kept.against = state.against;
+  if (window) kept.window = window;
   if (diagnostic) kept.diagnostic = diagnostic;
   if (options) kept.options = options;
   if (over !== CHOICES.over[0]) kept.over = over;
@@ -115,6 +118,7 @@ export function resolve(search, catalog) {
     step: number(asked, 'step', 0, null, problems),
     angle: asked.has('angle') && Number.isFinite(Number(asked.get('angle'))) ? Number(asked.get('angle')) : null,
     component: pick('component', task.components.map((c) => c.name), task.map.x),
+    window: stretch(asked, problems),
     diagnostic: asked.get('diagnostic') ?? '',
     options: asked.get('options') ?? '',
     by: asked.get('by') ?? WORST,
@@ -124,6 +128,14 @@ export function resolve(search, catalog) {
   };
   for (const [key, values] of Object.entries(CHOICES)) state[key] = pick(key, values, values[0], spoken(key));
   return { state, problems };
+}
+
+function stretch(asked, problems) {
+  const text = asked.get('window') ?? '';
+  const [, from, to] = /^(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)$/.exec(text) ?? [];
+  if (!text || Number(from) < Number(to)) return text;
+  problems.push(`The link asks for window “${text}”, which cannot be shown. It is the first and the last step in view, as 20-60.`);
+  return '';
 }
 
 function number(asked, key, fallback, allowed, problems) {

@@ -1,54 +1,79 @@
 /** The time line: charts one above the other with one step axis, one cursor, and the hand that scrubs and zooms. */
 
-import { GUTTER, chart } from './chart.js';
+import { GUTTER, chart, style } from './chart.js';
 import { Marks } from './marks.js';
-import { swatch } from './palette.js';
+import { sample, variable } from './palette.js';
 import { stretches } from './trace.js';
-import { shownError, tracks } from './tracks.js';
-import { fixed } from './units.js';
+import { KINDS, shownError, tracks } from './tracks.js';
+import { fixed, significant } from './units.js';
 
 const CLOSEST = 8; // steps that the strongest zoom still shows
 const NOTE = 26; // px of a line in place of a plot
 const LINE = 14; // px of a legend's
+const MEANT = 4; // px from which a drag is one
 
 export class TimeLine {
   #element;
   #host;
   #store;
+  #kind;
   #trace = null;
+  #other = null;
+  #otherName = '';
   #tracks = [];
+  /** @type {{plot: uPlot, track: import('./chart.js').Track, top: number, height: number}[]} px in the host */
   #charts = [];
-  #window = [0, 1];
-  #plot = { left: 0, width: 1 }; // px from the host's left edge
-  #edge = 0; // px from the window's
+  /** @type {{cell: HTMLElement, values: ArrayLike<number>, digits?: number}[]} the values in the legends */
+  #cells = [];
+  #window = [0, 1]; // steps
+  #plot = { left: 0, width: 1 }; // px in the host
+  #corner = { left: 0, top: 0 }; // px of the host's in the browser's window
+  #at = 0; // the cursor's step
   #hover = null;
+  #drag = null;
   #cursor = mark('cursor');
   #pointer = mark('hover');
+  #level = mark('level');
+  #stretch = mark('stretch');
   #marks;
+  #told;
 
   /** @param {HTMLElement} element that takes the hand @param {import('./state.js').Store} store */
   constructor(element, store) {
     [this.#element, this.#store] = [element, store];
-    this.#host = element.querySelector('#tracks');
-    this.#host.append(this.#cursor, this.#pointer);
+    [this.#host, this.#told] = ['#tracks', '#told'].map((part) => element.querySelector(part));
+    this.#level.append(document.createElement('span'));
+    this.#host.append(this.#cursor, this.#pointer, this.#level, this.#stretch);
+    this.#cursor.hidden = false;
     this.#marks = new Marks(element.querySelector('#marks'), store);
+    this.#kind = document.querySelector('#track');
+    this.#kind.replaceChildren(...Object.entries(KINDS).map(([kind, name]) => new Option(name, kind)));
+    this.#kind.addEventListener('change', () => store.set({ track: this.#kind.value }));
+    store.listen(({ window }, changed) => changed.has('window') && window !== this.#written && this.#look(...this.#read(window)));
     new ResizeObserver(() => this.#build()).observe(element);
     this.#takeHand();
   }
 
   /** @param {import('./trace.js').Trace} trace */
   show(trace) {
-    const same = this.#trace?.steps === trace.steps;
+    const same = (this.#trace?.steps ?? trace.steps) === trace.steps;
     this.#trace = trace;
-    if (!same) this.#window = this.#all;
+    this.#at = this.#store.state.step;
+    this.#window = this.#possible(same ? this.#read(this.#store.state.window) : this.#all);
     this.#marks.set([]);
     this.redraw();
+    this.#look(...this.#window);
   }
 
   /** Builds the charts anew: for another trace, other choices, other colours. */
   redraw() {
     if (!this.#trace) return;
-    this.#tracks = tracks(this.#trace, this.#store.state);
+    const { state } = this.#store;
+    this.#tracks = tracks(this.#trace, state, this.#compared);
+    [this.#kind.value, this.#kind.disabled] = [state.track, false];
+    const key = document.querySelector('#against-key');
+    [key.hidden, key.title, key.lastChild.textContent] = [!this.#compared, this.#otherName, this.#otherName];
+    document.querySelector('#timeline').classList.toggle('compared', Boolean(this.#compared));
     this.#build();
   }
 
@@ -56,11 +81,13 @@ export class TimeLine {
   move(step) {
     if (!this.#trace) return;
     const [from, to] = this.#window;
-    if (step < from || step > to) this.#look(step - (to - from) / 4, step + (3 * (to - from)) / 4);
+    const moved = step !== this.#at; // else it may be out of sight
+    this.#at = step;
+    if (moved && (step < from || step > to)) return this.#look(step - (to - from) / 4, step + (3 * (to - from)) / 4);
     place(this.#cursor, this.#x(step));
     this.#marks.move(step);
     this.#host.setAttribute('aria-valuenow', String(step));
-    this.#host.setAttribute('aria-valuetext', `step ${step}, ${fixed(step * this.#trace.dt)} s`);
+    this.#host.setAttribute('aria-valuetext', this.#spoken(step));
     if (this.#hover === null) this.#tell(step);
   }
 
@@ -74,9 +101,28 @@ export class TimeLine {
     if (this.#trace) this.#marks.move(this.#store.state.step);
   }
 
+  /**
+   * Draws another trace over the one that is shown, dashed, as long as that is of the same episode.
+   * @param {import('./trace.js').Trace | null} trace null: away with it @param {string} [name] what it is called
+   */
+  against(trace, name = '') {
+    [this.#other, this.#otherName] = [trace, name];
+    this.redraw();
+  }
+
   /** Shows the whole episode. */
   whole() {
-    this.#look(...this.#all);
+    if (this.#trace) this.#look(...this.#all);
+  }
+
+  /** Shows more steps or fewer, the cursor staying where it is. @param {number} factor of the steps in view */
+  zoom(factor) {
+    if (this.#trace) this.#zoomAt(this.#store.state.step, factor);
+  }
+
+  /** A tenth of the steps in view. */
+  get tenth() {
+    return Math.max(1, Math.round((this.#window[1] - this.#window[0]) / 10));
   }
 
   /** The step in view at which the fused error is largest. */
@@ -88,8 +134,22 @@ export class TimeLine {
     return worst;
   }
 
+  get #compared() {
+    return this.#other?.alongside(this.#trace) ? this.#other : null;
+  }
+
   get #all() {
     return [0, Math.max(1, this.#trace.steps - 1)];
+  }
+
+  /** The window as the state has it: empty for the whole episode. */
+  get #written() {
+    const [[from, to], [first, last]] = [this.#window, this.#all];
+    return to - from >= last - first ? '' : `${shorter(from)}-${shorter(to)}`;
+  }
+
+  #read(window) {
+    return window ? window.split('-').map(Number) : this.#all;
   }
 
   #x(step) {
@@ -99,54 +159,105 @@ export class TimeLine {
 
   #step(event) {
     const [from, to] = this.#window;
-    return from + ((event.clientX - this.#edge - this.#plot.left) / this.#plot.width) * (to - from);
+    return from + ((event.clientX - this.#corner.left - this.#plot.left) / this.#plot.width) * (to - from);
   }
 
-  #look(from, to) {
+  #nearest(event) {
+    return Math.min(Math.max(Math.round(this.#step(event)), 0), this.#trace.steps - 1);
+  }
+
+  /** As many steps as are asked for where that can be, and only such as there are. */
+  #possible([from, to]) {
     const [first, last] = this.#all;
     const span = Math.min(Math.max(to - from, Math.min(CLOSEST, last)), last - first);
     const start = Math.min(Math.max(from, first), last - span);
-    this.#window = [start, start + span];
-    for (const plot of this.#charts) plot.setScale('x', { min: start, max: start + span });
+    return [start, start + span];
+  }
+
+  /** Brings steps into view. */
+  #look(from, to) {
+    if (!this.#trace) return;
+    this.#window = this.#possible([from, to]);
+    const window = this.#written;
+    this.#store.set({ window });
+    const [min, max] = this.#window;
+    for (const { plot } of this.#charts) plot.setScale('x', { min, max });
     this.#placeMarks();
     this.move(this.#store.state.step);
-    document.querySelector('#whole').disabled = span >= last - first;
+    document.querySelector('#whole').disabled = !window;
+  }
+
+  #zoomAt(step, factor) {
+    const [from, to] = this.#window;
+    const middle = Math.min(Math.max(step, from), to);
+    this.#look(middle - (middle - from) * factor, middle + (to - middle) * factor);
   }
 
   #build() {
-    for (const plot of this.#charts) plot.destroy();
-    this.#charts = [];
+    for (const { plot } of this.#charts) plot.destroy();
+    [this.#charts, this.#cells] = [[], []];
     this.#host.querySelectorAll('.track').forEach((row) => row.remove());
     const [height, wide] = [this.#host.clientHeight, this.#host.clientWidth];
     if (!this.#trace || height < 60) return;
+    const trace = this.#trace;
     const legendWidth = parseFloat(getComputedStyle(this.#element).getPropertyValue('--legend-width'));
     const left = legendWidth + GUTTER.left;
     this.#plot = { left, width: wide - left - GUTTER.right };
-    this.#edge = this.#host.getBoundingClientRect().left;
-    const trace = this.#trace;
+    this.#measure();
     const shading = { contact: stretches(trace.contact), black: stretches(trace.black) };
+    const lowest = this.#tracks.length - 1;
     const heights = shares(this.#tracks, height - GUTTER.axis);
     this.#tracks.forEach((track, i) => {
-      const withAxis = i === this.#tracks.length - 1;
       const row = document.createElement('div');
       row.className = 'track';
-      row.append(legend(track, trace));
+      row.append(this.#legend(track));
       this.#host.append(row);
-      if (track.note) return row.append(note(track.note));
-      this.#charts.push(
-        chart(row, track, shading, {
-          width: wide - legendWidth,
-          height: heights[i] + (withAxis ? GUTTER.axis - 4 : 0),
-          window: () => this.#window,
-          steps: trace.steps,
-          withAxis,
-          stepName: `step (${fixed(trace.dt, 2)} s each)`,
-        }),
-      );
+      if (track.note) row.append(note(track.note, heights[i]));
+      if (track.note && i < lowest) return;
+      const frame = {
+        width: wide - legendWidth,
+        height: heights[i] + (i === lowest ? GUTTER.axis - 4 : 0),
+        window: () => this.#window,
+        steps: trace.steps,
+        withAxis: i === lowest,
+        stepName: `step (${fixed(trace.dt, 2)} s each)`,
+        compared: Boolean(this.#compared),
+      };
+      this.#charts.push({ plot: chart(row, track, shading, frame), track, top: row.offsetTop, height: heights[i] });
     });
     this.#host.setAttribute('aria-valuemax', String(trace.steps - 1));
     this.#placeMarks();
     this.move(this.#store.state.step);
+  }
+
+  /** Names, lines and values of a track; what is cut short is said in full under the pointer. */
+  #legend({ title, unit, help, series, digits }) {
+    const element = document.createElement('div');
+    element.className = 'legend';
+    const heading = document.createElement('h3');
+    heading.textContent = unit ? `${title} (${unit})` : title;
+    heading.title = help ?? heading.textContent;
+    const list = document.createElement('dl');
+    for (const name of new Set(series.map((s) => s.name))) {
+      const term = document.createElement('dt');
+      const own = series.find((s) => s.name === name);
+      const { dash, width } = style(own, this.#compared);
+      term.append(sample(variable(name), dash, width), this.#trace.called(name));
+      list.append(term);
+      for (const other of this.#compared ? [false, true] : [false]) {
+        const cell = document.createElement('dd');
+        const shown = series.find((s) => s.name === name && Boolean(s.other) === other);
+        if (shown) this.#cells.push({ cell, values: shown.values, digits });
+        list.append(cell);
+      }
+    }
+    element.append(heading, list);
+    return element;
+  }
+
+  #measure() {
+    const { left, top } = this.#host.getBoundingClientRect();
+    this.#corner = { left, top };
   }
 
   #placeMarks() {
@@ -158,34 +269,61 @@ export class TimeLine {
 
   /** Writes the values at a step into the legends. */
   #tell(step) {
-    const { dt } = this.#trace;
-    this.#element.querySelector('#told').textContent = `${this.#hover === null ? 'cursor' : 'pointer'} ${step} · ${fixed(step * dt)} s`;
-    const rows = this.#host.querySelectorAll('.track');
-    this.#tracks.forEach((track, i) => {
-      const cells = rows[i]?.querySelectorAll('dd') ?? [];
-      track.series.forEach((series, s) => cells[s] && (cells[s].textContent = fixed(series.values[step], track.digits)));
-    });
+    this.#told.textContent = `${this.#hover === null ? 'cursor' : 'pointer'} ${step} · ${fixed(step * this.#trace.dt)} s`;
+    for (const { cell, values, digits } of this.#cells) {
+      cell.textContent = digits === undefined ? significant(values[step]) : fixed(values[step], digits);
+    }
+  }
+
+  /** A step as it is read out. */
+  #spoken(step) {
+    const trace = this.#trace;
+    const parts = [`step ${step}`, `${fixed(step * trace.dt)} s`, `${fixed(trace.error('fused', 'position')[step])} cm off`];
+    if (trace.contact[step]) parts.push('in contact');
+    if (trace.black[step]) parts.push('black picture');
+    return parts.join(', ');
   }
 
   #takeHand() {
     const element = this.#element;
-    const scrub = (event) => {
-      const step = Math.min(Math.max(Math.round(this.#step(event)), 0), this.#trace.steps - 1);
-      this.#store.set({ step }, { inputTime: event.timeStamp });
-    };
+    element.addEventListener('pointerenter', () => this.#measure());
     element.addEventListener('pointerdown', (event) => {
-      if (!this.#trace || event.button !== 0) return;
+      if (!this.#trace || event.button > 1) return;
+      const kind = event.button === 1 ? 'pan' : event.shiftKey ? 'zoom' : 'scrub';
+      this.#drag = { kind, x: event.clientX, step: this.#step(event), window: this.#window };
       element.setPointerCapture(event.pointerId);
-      scrub(event);
+      this.#pointAt(null);
+      this.#pull(event);
     });
-    element.addEventListener('pointermove', (event) => {
-      if (!this.#trace) return;
-      if (element.hasPointerCapture(event.pointerId)) scrub(event);
-      this.#pointAt(event);
-    });
+    element.addEventListener('mousedown', (event) => event.button === 1 && event.preventDefault()); // the browser's own scrolling
+    element.addEventListener('pointermove', (event) => this.#trace && (this.#drag ? this.#pull(event) : this.#pointAt(event)));
+    element.addEventListener('pointerup', (event) => this.#release(event));
+    element.addEventListener('pointercancel', () => this.#release(null));
     element.addEventListener('pointerleave', () => this.#pointAt(null));
-    element.addEventListener('dblclick', () => this.#trace && this.whole());
+    element.addEventListener('dblclick', () => this.whole());
     element.addEventListener('wheel', (event) => this.#turn(event), { passive: false });
+  }
+
+  /** The hand moves while it holds something. */
+  #pull(event) {
+    const { kind, x, step, window } = this.#drag;
+    if (kind === 'scrub') return this.#store.set({ step: this.#nearest(event) }, { inputTime: event.timeStamp });
+    if (kind === 'pan') {
+      const shift = ((x - event.clientX) / this.#plot.width) * (window[1] - window[0]);
+      return this.#look(window[0] + shift, window[1] + shift);
+    }
+    const [left, right] = [step, this.#step(event)].sort((a, b) => a - b).map((edge) => this.#x(Math.min(Math.max(edge, this.#window[0]), this.#window[1])));
+    this.#stretch.hidden = false;
+    this.#stretch.style.width = `${right - left}px`;
+    place(this.#stretch, left);
+  }
+
+  #release(event) {
+    const drag = this.#drag;
+    this.#drag = null;
+    this.#stretch.hidden = true;
+    if (!event || drag?.kind !== 'zoom' || Math.abs(event.clientX - drag.x) < MEANT) return;
+    this.#look(...[drag.step, this.#step(event)].sort((a, b) => a - b));
   }
 
   #turn(event) {
@@ -197,54 +335,49 @@ export class TimeLine {
       const shift = ((to - from) * sideways) / 1000;
       this.#look(from + shift, to + shift);
     } else {
-      const middle = Math.min(Math.max(this.#step(event), from), to);
-      const factor = Math.exp(event.deltaY / 500);
-      this.#look(middle - (middle - from) * factor, middle + (to - middle) * factor);
+      this.#zoomAt(this.#step(event), Math.exp(event.deltaY / 500));
     }
   }
 
+  /** The crosshair, and the values under it in place of the cursor's. */
   #pointAt(event) {
+    if (!this.#trace) return;
     const step = event && Math.round(this.#step(event));
     this.#hover = step !== null && step >= this.#window[0] && step <= this.#window[1] ? step : null;
-    this.#pointer.hidden = this.#hover === null;
+    const y = event ? event.clientY - this.#corner.top : -1;
+    const under = this.#hover !== null && this.#charts.find(({ track, top, height }) => !track.note && y > top && y < top + height);
+    [this.#pointer.hidden, this.#level.hidden] = [this.#hover === null, !under];
     if (this.#hover !== null) place(this.#pointer, this.#x(this.#hover));
-    if (this.#trace) this.#tell(this.#hover ?? this.#store.state.step);
+    if (under) {
+      const value = under.plot.posToVal(y - under.top - under.plot.bbox.top / devicePixelRatio, 'y');
+      const { digits } = under.track;
+      this.#level.style.transform = `translateY(${y.toFixed(1)}px)`;
+      this.#level.firstChild.textContent = digits === undefined ? significant(value) : fixed(value, digits);
+    }
+    this.#tell(this.#hover ?? this.#store.state.step);
   }
 }
 
+const shorter = (step) => String(Number(step.toFixed(1)));
+
 function mark(kind) {
   const element = document.createElement('div');
-  element.className = `mark ${kind}`;
-  element.hidden = kind === 'hover';
+  [element.className, element.hidden] = [`mark ${kind}`, true];
   return element;
 }
 
-/** px for each track: what its legend needs, and an even share of what is left. */
+/** px for each track: what its legend needs, and an even share of what is left. The lowest is always a chart, for its axis. */
 function shares(tracks, height) {
-  const needed = tracks.map(({ note, series }) => (note ? NOTE : 3 + LINE * (1 + series.length)));
-  const spare = (height - needed.reduce((a, b) => a + b, 0)) / tracks.filter((track) => !track.note).length;
-  return tracks.map(({ note }, i) => Math.floor(needed[i] + (note ? 0 : spare)));
+  const plain = ({ note }, i) => note && i < tracks.length - 1;
+  const needed = tracks.map((track, i) => (plain(track, i) ? NOTE : 3 + LINE * (1 + Math.max(new Set(track.series.map((s) => s.name)).size, 2))));
+  const spare = (height - needed.reduce((a, b) => a + b, 0)) / tracks.filter((track, i) => !plain(track, i)).length;
+  return tracks.map((track, i) => Math.floor(needed[i] + (plain(track, i) ? 0 : spare)));
 }
 
 const place = (element, x) => (element.style.transform = `translateX(${x.toFixed(2)}px)`);
 
-function note(text) {
+function note(text, height) {
   const element = document.createElement('p');
-  [element.className, element.style.height, element.textContent] = ['why', `${NOTE}px`, text];
-  return element;
-}
-
-function legend(track, trace) {
-  const element = document.createElement('div');
-  element.className = 'legend';
-  const title = document.createElement('h3');
-  title.textContent = track.unit ? `${track.title} (${track.unit})` : track.title;
-  const list = document.createElement('dl');
-  for (const { name } of track.series) {
-    const term = document.createElement('dt');
-    term.append(swatch(name), trace.called(name));
-    list.append(term, document.createElement('dd'));
-  }
-  element.append(title, list);
+  [element.className, element.style.height, element.textContent] = ['why', `${height}px`, text];
   return element;
 }

@@ -44,6 +44,11 @@ export class Trace {
     return source === FUSED && !this.fuses ? 'estimate' : source;
   }
 
+  /** Whether another trace is of the same episode, step by step; filter and recipe may differ. */
+  alongside({ selection, steps }) {
+    return steps === this.steps && ['task', 'data', 'episode'].every((key) => selection[key] === this.selection[key]);
+  }
+
   has(column) {
     return this.#columns.has(column);
   }
@@ -87,11 +92,34 @@ export class Trace {
     return this.#slice('effective_sample_size');
   }
 
+  /** (T,) or undefined: squared error over the claimed covariance, over the number of components; 1 on average. */
+  nees(source) {
+    const k = this.modalities.indexOf(source);
+    return this.#slice('nees', k < 0 ? this.modalities.length : k);
+  }
+
+  /** (T,) or undefined: what a modality measured less what was predicted. */
+  innovation(modality, component) {
+    return this.#scaled('innovation', component, this.modalities.indexOf(modality), component);
+  }
+
+  /** (T,) or undefined: the standard deviation that prediction and measurement claim together. */
+  innovationSigma(modality, component) {
+    return this.#scaled('innovation_sigma', component, this.modalities.indexOf(modality), component);
+  }
+
+  /** (T,) A source's estimate less the truth; angles wrapped. */
+  offset(source, component) {
+    return this.#cached(`offset ${source} ${component}`, () =>
+      difference(this.mean(source, component), this.truth(component), this.shown(component).unit),
+    );
+  }
+
   /** (T,) Distance of a source's position to the true one, cm; of an angle, degrees. @param {number | 'position'} what */
   error(source, what) {
     return this.#cached(`error ${source} ${what}`, () => {
-      if (what !== 'position') return difference(this.mean(source, what), this.truth(what), this.shown(what).unit).map(Math.abs);
-      const [x, y] = this.position.map((i) => difference(this.mean(source, i), this.truth(i), 'cm'));
+      if (what !== 'position') return this.offset(source, what).map(Math.abs);
+      const [x, y] = this.position.map((i) => this.offset(source, i));
       return x.map((dx, t) => Math.hypot(dx, y[t]));
     });
   }
@@ -108,9 +136,7 @@ export class Trace {
   surprise(step) {
     if (!this.has('estimate_sigma')) return undefined;
     const each = this.components.map(({ name }, i) => {
-      const off = this.mean(FUSED, i)[step] - this.truth(i)[step];
-      const error = this.shown(i).unit === '°' ? wrapped(off) : off;
-      return [Math.abs(error) / this.sigma(FUSED, i)[step], name];
+      return [Math.abs(this.offset(FUSED, i)[step]) / this.sigma(FUSED, i)[step], name];
     });
     return each.sort((a, b) => b[0] - a[0])[0];
   }
