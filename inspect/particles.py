@@ -242,8 +242,8 @@ def modes(points: Array, weights: Array) -> NDArray[np.int64]:
 
     The density is smoothed over the cloud, whitened by its own covariance, with a Gaussian kernel of Silverman's width
     ``ESS^(-1/6)`` standard deviations. Modes are the connected regions above a share of its peak that hold at least
-    ``LEAST`` of its weight; the height at which most of them part counts (``HEIGHTS``). Two equal ones part when they
-    are about 4 of their own standard deviations away from each other.
+    ``LEAST`` of its weight; the height at which most of them part counts (``HEIGHTS``). Of 300
+    particles in two equal clouds half of the sets part at 4.5 of their own standard deviations, nine of ten at 5.
     """
     steps = len(weights)
     away = points - (weights[..., None] * points).sum(1, keepdims=True)

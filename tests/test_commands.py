@@ -85,6 +85,33 @@ def test_figures_of_the_paper(run: Run, folder: Path) -> None:
         assert not (folder / "wrong.svg").exists()
 
 
+def test_counterfactual_says_what_an_edit_did(run: Run, folder: Path) -> None:
+    """The text, the JSON, the figure and the edited trace agree, and a trace keeps what was edited."""
+    line = "counterfactual door --filter crossmodal-pf --particles 50 --from 40 --to 60"
+    outputs = "-o what.svg --trace edited.trace"
+    code, out, _ = run(f"{line} --recipe blackout --weights image=0.9 {outputs} --json -")
+    found = json.loads(out)
+    assert code == 0
+    assert found["edit"]["weights"] == {"image": 0.9}
+    assert (found["edit"]["from"], found["edit"]["to"]) == (40, 60)
+    edited = load_trace(folder / "edited.trace")
+    assert edited.settings["edits"] == [found["edit"]]
+    assert str(edited.recipe) == "blackout:from=40:to=60"
+    assert edited.weights is not None
+    np.testing.assert_allclose(edited.weights[40:60, 0], 0.9, rtol=1e-6)  # float32, through a logarithm
+    np.testing.assert_array_equal(edited.estimate_mean, np.float32(found["edited"]))
+    assert (folder / "what.svg").read_text().startswith("<?xml")
+    code, out, _ = run(f"{line} --recipe blackout --weights image=0.9")
+    title, *tables = out.split("\n\n")
+    assert (code, title) == (0, found["verdict"])
+    assert "Blackout, beta of image 0.9 over steps 40 to 59 moved the estimate by at most " in title
+    assert [table.splitlines()[0] for table in tables] == [
+        "Mean over steps",
+        "Largest difference of the estimates",
+        "Over the edited steps, mean",
+    ]
+
+
 def test_one_option_breaks_any_sensor(run: Run, folder: Path) -> None:
     run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
     faults = json.loads(run("recipes --json -")[1])
