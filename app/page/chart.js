@@ -15,7 +15,7 @@ import { significant } from './units.js';
  * @property {[number, number]} [bounds] between which values should be
  * @property {number} [digits] of the values in the legend; three that are significant otherwise
  * @property {string} [note] said in place of a plot
- * @typedef {{contact: [number, number][], black: [number, number][]}} Shading stretches of steps
+ * @typedef {{contact: [number, number][], black: [number, number][], edit?: [number, number][]}} Shading stretches of steps
  */
 
 /** px beside and below a track's plot. */
@@ -121,8 +121,8 @@ function fitted(track, [from, to]) {
   return [track.fromZero ? 0 : low - margin, high + margin];
 }
 
-/** Contact behind everything, as the paper draws it; black pictures hatched along the top edge. @param {uPlot} plot @param {Shading} shading */
-export function shade(plot, { contact, black }) {
+/** Contact behind everything, as the paper draws it; edited steps; black pictures hatched along the top edge. @param {uPlot} plot @param {Shading} shading */
+export function shade(plot, { contact, black, edit = [] }) {
   const { ctx, bbox } = plot;
   const across = ([first, last]) => {
     const left = Math.max(bbox.left, plot.valToPos(first - 0.5, 'x', true));
@@ -131,6 +131,8 @@ export function shade(plot, { contact, black }) {
   ctx.save();
   ctx.fillStyle = colour('contact-band');
   for (const [left, width] of contact.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, width, bbox.height);
+  ctx.fillStyle = translucent(colour('accent'), 0.12);
+  for (const [left, width] of edit.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, width, bbox.height);
   ctx.fillStyle = hatch(ctx);
   for (const [left, width] of black.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, Math.max(width, 1), BLACK_STRIP * devicePixelRatio);
   ctx.restore();

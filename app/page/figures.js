@@ -78,7 +78,7 @@ export class Figures {
     const steps = curves[0].values.length;
     const bounds = curves.map((c) => c.bounds).find(Boolean);
     const limits = padded(extent([...curves.flatMap((c) => c.values), ...(bounds ?? [])]));
-    const shading = { contact: bandOf(this.#found, 'contact'), black: bandOf(this.#found, 'blackout') };
+    const shading = { contact: bandOf(this.#found, 'contact'), black: bandOf(this.#found, 'blackout'), edit: bandOf(this.#found, 'edit') };
     const plot = new uPlot(
       {
         width: this.#width,

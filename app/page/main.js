@@ -180,7 +180,7 @@ class Page {
 
   /** The other run has come or gone: it is drawn over the time line, and in the scene. */
   #overlay(other, name) {
-    this.timeline.against?.(other, name);
+    this.timeline.against(other, name);
     this.#move();
   }
 

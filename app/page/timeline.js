@@ -204,7 +204,7 @@ export class TimeLine {
     const left = legendWidth + GUTTER.left;
     this.#plot = { left, width: wide - left - GUTTER.right };
     this.#measure();
-    const shading = { contact: stretches(trace.contact), black: stretches(trace.black) };
+    const shading = { contact: stretches(trace.contact), black: stretches(trace.black), edit: this.#compared?.edited };
     const lowest = this.#tracks.length - 1;
     const heights = shares(this.#tracks, height - GUTTER.axis);
     this.#tracks.forEach((track, i) => {

@@ -49,6 +49,11 @@ export class Trace {
     return steps === this.steps && ['task', 'data', 'episode'].every((key) => selection[key] === this.selection[key]);
   }
 
+  /** First and last step of each edit of the run. @returns {[number, number][]} */
+  get edited() {
+    return (this.header.settings?.edits ?? []).map(({ from, to }) => [from, to - 1]);
+  }
+
   has(column) {
     return this.#columns.has(column);
   }

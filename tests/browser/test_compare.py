@@ -1,0 +1,79 @@
+"""A run beside another one on the page: an edit over some steps, and another filter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.browser
+
+READY = "() => document.querySelector('#compare .result').dataset.state === 'ready'"
+RUN = "?filter=crossmodal-ekf&episode=9&step=45"
+
+
+def apart(page: Any) -> float:
+    """cm that the fused estimates are apart at the cursor, as the first chart says."""
+    return float(page.page.locator("#compare .curves figure").first.locator(".line b").first.text_content())
+
+
+def verdict(page: Any) -> str:
+    return page.page.locator("#compare .verdict").text_content()
+
+
+def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> None:
+    page = open_page(f"{RUN}&tab=diagnostics")  # whose tab is soon drawn
+    keyboard, form = page.page.keyboard, page.page.locator("#compare form")
+    keyboard.press("[")
+    keyboard.press("Shift+ArrowRight")
+    keyboard.press("]")
+    page.until("() => !document.querySelector('#compare').hidden")
+    assert [form.locator(f"[name={name}]").input_value() for name in ("from", "last")] == ["45", "55"]
+    form.get_by_role("button", name="Run beside").click()
+    assert "Nothing is edited yet" in form.locator(".wrong").text_content()
+    form.locator("[name=faults]").select_option("blackout=0.8")
+    form.get_by_role("button", name="Run beside").click()
+    page.until(READY)
+    assert page.state["against"] == "from=45&to=56&recipe=blackout=0.8"
+    assert "over steps 45 to 55" in verdict(page)
+    assert apart(page) > 0.0  # at the last edited step
+    assert page.page.locator("#against-key").text_content().strip() == "edited"
+    for _ in range(11):
+        keyboard.press("ArrowLeft")
+    page.until("() => beliefscope.state().step === 44 && document.querySelector('#readout b').textContent[0] === '4'")
+    assert apart(page) == 0.0  # at the last step before them
+    page.until("() => location.search.includes('against=') && location.search.includes('step=44')")
+
+    second = open_page("?" + page.page.url.partition("?")[2], viewport={"width": 1440, "height": 900})
+    second.until(READY)
+    assert second.state == page.state
+    assert verdict(second) == verdict(page)
+    second.picture("compare-edit")
+
+    keyboard.press("Control+z")
+    page.until("() => document.querySelector('#compare .result').dataset.state === 'empty'")
+    assert page.state["against"] == ""
+    assert page.page.locator("#against-key").is_hidden()
+    keyboard.press("Control+Shift+Z")
+    page.until(READY)
+    assert page.state["against"] == second.state["against"]
+
+
+def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
+    page = open_page(f"{RUN}&tab=compare&against=filter%3Dcrossmodal-pf", color_scheme="dark")
+    page.until(READY)
+    both = ["crossmodal-ekf", "crossmodal-pf"]
+    assert all(name in verdict(page) for name in both)
+    assert page.page.locator("#against-key").text_content().strip() == "crossmodal-pf"
+    heads = page.page.locator("#compare .table th").all_text_contents()
+    assert [head for head in heads if head in both] == both
+    assert page.page.locator("#compare [name=filter]").input_value() == "crossmodal-pf"
+    overflow = page.page.evaluate(
+        "() => ['#compare', '#compare form', '#timeline .bar'].map((e) => document.querySelector(e))"
+        ".map((e) => e.scrollWidth - e.clientWidth)"
+    )
+    assert max(overflow) <= 1
+    page.picture("compare-filters")
+    page.page.locator("#compare .clear").click()
+    page.until("() => beliefscope.state().against === '' && !location.search.includes('against')")
+    page.until("() => document.querySelector('#compare .result').dataset.state === 'empty'")
