@@ -32,6 +32,7 @@ from beliefscope.filters.checkpoint import write_atomically
 KINDS: dict[str, str] = {
     "diagnostic": "beliefscope.app.diagnostics:work",
     "failures": "beliefscope.app.failures:work",
+    "finetune": "beliefscope.app.finetune:work",
 }
 """Kind of job -> ``module:function`` of (arguments, report) -> result; ``report(share done, what it is doing)``."""
 

@@ -253,6 +253,19 @@ class Library:
                 self._hashes[task, name] = self.dataset(task, name)[1].hash
             return self._hashes[task, name]
 
+    def adopt(self, task: str, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
+        """Puts a filter on its task's shelf, before all others or behind those given; jobs find it by its name too."""
+        with self._lock:
+            self._shelf(task).place(name, checkpoint, first)
+            self.settings = replace(self.settings, checkpoints={**self.settings.checkpoints, name: path})
+
+    def dismiss(self, task: str, name: str) -> None:
+        """Takes it off again."""
+        with self._lock:
+            self._shelf(task).remove(name)
+            others = {key: given for key, given in self.settings.checkpoints.items() if key != name}
+            self.settings = replace(self.settings, checkpoints=others)
+
     def _found(self, selection: Selection) -> tuple[Checkpoint, Episode]:
         shelf = self._shelf(selection.task)
         checkpoint = shelf.filter(selection.filter)

@@ -19,8 +19,9 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
-from beliefscope.app import compare, diagnostics, failures, jobs
+from beliefscope.app import compare, diagnostics, failures, finetune, jobs
 from beliefscope.app.api import routes
+from beliefscope.app.children import with_children
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.security import Guard
 from beliefscope.app.session import Views
@@ -41,7 +42,7 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
         settings: what to show and where to keep things.
         warm: prepare the first page's trace and Rerun's viewer in the background at the start.
     """
-    library = Library(settings)
+    library = Library(with_children(settings))
     views = Views(library)
     work = jobs.Jobs(settings.workspace / "jobs")
     rerun = RerunViewer(settings.workspace / "cache")
@@ -71,6 +72,7 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
         diagnostics.routes(library, work),
         compare.routes(library),
         failures.routes(library, work),
+        finetune.routes(library, work),
     ):
         app.include_router(router)
     _add_files(app, rerun)

@@ -51,6 +51,17 @@ class Shelf:
                 found[SAMPLE] = open_dataset(sample_path(self.task.name), self.task)
         return found
 
+    def place(self, name: str, checkpoint: Checkpoint, first: bool) -> None:
+        """Puts a filter before all others, or behind those that were given."""
+        others = {key: value for key, value in self.given_filters.items() if key != name}
+        self.given_filters = {name: checkpoint, **others} if first else {**others, name: checkpoint}
+        vars(self).pop("filters", None)
+
+    def remove(self, name: str) -> None:
+        """Takes a filter that was given away again; one that is not there is none."""
+        self.given_filters.pop(name, None)
+        vars(self).pop("filters", None)
+
     def filter(self, name: str) -> Checkpoint:
         """Raises BadInput for a name that is not here."""
         if name not in self.filters:

@@ -1,0 +1,61 @@
+"""Fine-tuned filters that a workspace keeps: they stand on its server's shelf beside what was given, or before it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from beliefscope.app.library import Library, Settings
+from beliefscope.filters.checkpoint import load_checkpoint, write_atomically
+
+FILE = "kept.json"
+
+
+@dataclass(frozen=True)
+class Child:
+    """One that is kept. path: of its checkpoint. default: whether it comes before all others of its task."""
+
+    task: str
+    name: str
+    path: str
+    default: bool
+
+
+def read(workspace: Path) -> list[Child]:
+    """Those whose files are still there; of a file that cannot be read, none."""
+    with suppress(OSError, ValueError, TypeError):
+        found = [Child(**one) for one in json.loads((workspace / FILE).read_bytes())]
+        return [one for one in found if Path(one.path).is_file()]
+    return []
+
+
+def with_children(settings: Settings) -> Settings:
+    """The settings of a server that shows them too."""
+    kept = read(settings.workspace)
+    first = {one.name: Path(one.path) for one in kept if one.default}
+    last = {one.name: Path(one.path) for one in kept if not one.default}
+    return replace(settings, checkpoints={**first, **settings.checkpoints, **last}) if kept else settings
+
+
+def keep(library: Library, child: Child) -> None:
+    """Puts it on the shelf; as the default it takes the place of the one before. Raises BadInput for no checkpoint."""
+    others = [one for one in read(library.settings.workspace) if (one.task, one.name) != (child.task, child.name)]
+    if child.default:
+        others = [replace(one, default=one.default and one.task != child.task) for one in others]
+    library.adopt(child.task, child.name, load_checkpoint(Path(child.path)), Path(child.path), child.default)
+    _write(library.settings.workspace, [child, *others])
+
+
+def drop(library: Library, task: str, name: str) -> None:
+    """Takes it off the shelf; its file stays. What was there before it is what comes first again."""
+    library.dismiss(task, name)
+    workspace = library.settings.workspace
+    _write(workspace, [one for one in read(workspace) if (one.task, one.name) != (task, name)])
+
+
+def _write(workspace: Path, children: Sequence[Child]) -> None:
+    workspace.mkdir(parents=True, exist_ok=True)
+    write_atomically(workspace / FILE, json.dumps([asdict(one) for one in children], indent=2).encode())
