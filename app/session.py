@@ -13,8 +13,9 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from beliefscope.app.library import Library, Selection, Traced
+from beliefscope.app.mapwire import maps_message
 from beliefscope.app.scene import Scene
-from beliefscope.app.wire import Cursor, cursor, maps_message
+from beliefscope.app.wire import Cursor, cursor
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import no_maps
 from beliefscope.inspect.trace import Trace
@@ -112,7 +113,7 @@ class View:
             await websocket.send_json({"type": "no_maps", "serial": wanted.serial, "step": wanted.step})
         else:
             maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)
-            await websocket.send_bytes(maps_message(wanted.serial, trace, maps))
+            await websocket.send_bytes(maps_message(wanted.serial, traced.checkpoint.task, trace, maps))
         if not wanted.scene:
             return
         other = self._other(selection, wanted.against, len(trace))

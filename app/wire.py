@@ -1,8 +1,7 @@
-"""How traces, maps and cursors travel between the server and the page (docs/api.md). Binary is little-endian."""
+"""How traces and cursors travel between the server and the page (docs/api.md). Binary is little-endian."""
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +14,6 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.study import nees_bounds
 from beliefscope.inspect import measures
 from beliefscope.inspect.consistency import innovations
-from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
 MAP_SIZES = (41, 135)  # cells a side: what a drag shows, and the fine one that follows
@@ -150,33 +148,6 @@ def header(
         "pictures": None if shown is None else list(shown.shape[1:]),
         "columns": described,
     }
-
-
-def maps_message(serial: int, trace: Trace, maps: LikelihoodMap) -> bytes:
-    """One step's maps: header's length, JSON header, padding to a multiple of 4, then the layers as uint8."""
-    effector = trace.episode.observations.get("effector_position")
-    description = {
-        "type": "maps",
-        "serial": serial,
-        "step": maps.step,
-        "size": len(maps.offsets_x),
-        "angle": None if math.isnan(maps.angle) else float(maps.angle),
-        "layers": list(maps.layers),
-        "half_width": float(-maps.offsets_x[0] + 0.5 * (maps.offsets_x[1] - maps.offsets_x[0])),
-        "centre": maps.centre.tolist(),
-        "truth": _numbers(trace.episode.states[maps.step]),
-        "estimate": _numbers(trace.estimate_mean[maps.step]),
-        "log_max": _numbers(maps.log_likelihood.max(axis=(1, 2))),
-        "peak": maps.peaks().tolist(),
-        "effector": None if effector is None else effector[maps.step, :2].tolist(),
-    }
-    text = json.dumps(description).encode()
-    return len(text).to_bytes(4, "little") + text + b"\0" * (-len(text) % 4) + maps.normalised().tobytes()
-
-
-def _numbers(array: NDArray[np.float32]) -> list[float | None]:
-    """JSON knows neither NaN nor infinity: null."""
-    return [float(value) if math.isfinite(value) else None for value in array]
 
 
 def _sigma(covariance: NDArray[Any]) -> NDArray[Any]:

@@ -52,8 +52,9 @@ class Cells:
         values = torch.empty(len(self._models), size * size)
         for k, (model, seen) in enumerate(zip(self._models, observation, strict=True)):
             columns, rows = self._first(model, offsets, state)
-            encoder, join, head = layers(model.state_encoder[1:]), model.join_state.weight.T, layers(model.head[:-1])
-            last = model.head[-1]
+            *inner, last = model.head
+            assert isinstance(last, nn.Linear)
+            encoder, join, head = layers([*model.state_encoder][1:]), model.join_state.weight.T, layers(inner)
             for begin, end in chunks(size):
                 x, y = self._buffers.narrow(1, 0, (end - begin) * size)
                 here = slice(begin * size, end * size)
@@ -101,7 +102,7 @@ def chunks(size: int) -> Iterator[tuple[int, int]]:
     return ((row, min(row + rows, size)) for row in range(0, size, rows))
 
 
-def layers(stack: nn.Sequential) -> list[tuple[Tensor, ...]]:
+def layers(stack: Sequence[nn.Module]) -> list[tuple[Tensor, ...]]:
     """What ``through`` needs of each layer: of a ReLU nothing, of a residual one its weights and biases."""
     found: list[tuple[Tensor, ...]] = []
     for layer in stack:

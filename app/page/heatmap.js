@@ -27,6 +27,7 @@ export class Heatmaps {
   /** @param {import('./socket.js').Maps} maps @param {import('./trace.js').Trace} trace that they are of. */
   draw(maps, trace) {
     const first = this.#maps === null || this.#maps.layers.join() !== maps.layers.join();
+    maps.values = maps.cells.map((cells, l) => Uint8Array.from(cells, (q) => 255 * Math.exp(maps.log_range[l] * (q / 65535 - 1)) + 0.5));
     [this.#maps, this.#trace] = [maps, trace];
     // Of one measurement model alone the fused map is the same again.
     if (first) this.#figures = this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);

@@ -1,14 +1,11 @@
 /** The view's socket: sends the cursor, receives maps (docs/api.md). Never more than one cursor in flight. */
 
 import { openView } from './api.js';
+import { readMaps } from './mapvalues.js';
 
 /**
  * @typedef {import('./api.js').Selection & {step: number, angle: number | null, size: number}} Cursor
- * @typedef {object} Maps
- * @property {number} serial @property {number} step @property {number} size cells a side @property {number | null} angle
- * @property {string[]} layers @property {number} half_width m @property {number[]} centre m @property {number[]} truth
- * @property {number[]} estimate @property {number[]} log_max @property {number[][]} peak m, offsets
- * @property {number[] | null} effector m @property {Uint8Array[]} values by layer; row 0 is the smallest y offset
+ * @typedef {import('./mapvalues.js').Maps} Maps
  * @typedef {object} Handlers
  * @property {(view: {view: string, scene: string}) => void} view a new view has been opened
  * @property {(times: number) => boolean} pace of the scene: see frame.js
@@ -24,7 +21,6 @@ const PATIENCE = 10_000; // ms until an answer is taken for lost
 /** Where the scene is drawn slowly, it waits so many times as long as it takes: for a hand until it rests. */
 const PAUSE = { hand: Infinity, clock: 3, rest: 0 };
 const RETRY = { first: 500, most: 8000 }; // ms
-const decoder = new TextDecoder();
 
 export class ViewSocket {
   #handlers;
@@ -156,14 +152,4 @@ export class ViewSocket {
       this.#answered(message.serial);
     }
   }
-}
-
-/** @param {ArrayBuffer} buffer @returns {Maps} */
-function readMaps(buffer) {
-  const length = new DataView(buffer).getUint32(0, true);
-  const header = JSON.parse(decoder.decode(new Uint8Array(buffer, 4, length)));
-  const start = 4 + Math.ceil(length / 4) * 4;
-  const cells = header.size ** 2;
-  header.values = header.layers.map((_, layer) => new Uint8Array(buffer, start + layer * cells, cells));
-  return header;
 }

@@ -13,9 +13,12 @@ from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 
 from beliefscope.app.library import Traced
+from beliefscope.app.mapwire import LOG_RANGE, quantised
 from beliefscope.app.server import Settings
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.mapnumbers import measure_maps
+from beliefscope.inspect.measures import particle_log_weights
 from beliefscope.inspect.trace import load_trace
 
 
@@ -30,8 +33,11 @@ def maps(socket: WebSocketTestSession) -> tuple[dict[str, Any], np.ndarray[Any, 
     header = json.loads(data[4 : 4 + length])
     start = 4 + length + -length % 4
     assert start % 4 == 0
-    shape = (len(header["layers"]), header["size"], header["size"])
-    return header, np.frombuffer(data, np.uint8, offset=start).reshape(shape)
+    layers = len(header["layers"])
+    count = header["particles"] * (2 + layers)
+    header["cloud"] = np.frombuffer(data, "<f4", count, offset=start)
+    shape = (layers, header["size"], header["size"])
+    return header, np.frombuffer(data, "<u2", offset=start + 4 * count).reshape(shape)
 
 
 @pytest.fixture
@@ -50,13 +56,36 @@ def test_a_cursor_is_answered_with_maps_then_the_scene(
     assert socket.receive_json() == {"type": "drawn", "serial": 3, "step": 7}
     trace = load_trace(next((settings.workspace / "traces").iterdir()))
     expected = MapEngine(load_checkpoint(settings.checkpoints["crossmodal-pf"]), trace).map(7, angle=0.4, size=size)
-    np.testing.assert_array_equal(layers, expected.normalised())
+    log_max, log_range = (np.array(header[key])[:, None, None] for key in ("log_max", "log_range"))
+    told = log_max + log_range * (layers / 65535.0 - 1.0)
+    # Half a step of 64 nats in 65535 at most; all layers of this filter lie within 64 nats.
+    assert log_range.max() < LOG_RANGE
+    np.testing.assert_allclose(told, expected.log_likelihood, rtol=0, atol=0.5 * LOG_RANGE / 65535 + 1e-6)
+    assert (layers.max(axis=(1, 2)) == 65535).all()
+    particles, weights = np.split(header["cloud"], [2 * header["particles"]])
+    np.testing.assert_array_equal(particles.reshape(-1, 2), trace.particles[7, :, :2])
+    weights = weights.reshape(3, -1)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-5)  # 300 numbers of float32
+    np.testing.assert_allclose(weights, np.exp(particle_log_weights(trace)[7]), rtol=1e-4, atol=1e-7)
+    measured = measure_maps([expected], trace)
+    for name, value in header["numbers"].items():
+        np.testing.assert_allclose(value, getattr(measured, name)[0], rtol=1e-12)
     assert header["layers"] == ["image", "haptics", "fused"]
     assert (header["serial"], header["step"], header["size"], header["angle"]) == (3, 7, size, 0.4)
     assert header["half_width"] == pytest.approx(0.135)
     np.testing.assert_allclose(header["peak"], expected.peaks(), rtol=1e-6)
     np.testing.assert_allclose(header["truth"], trace.episode.states[7], rtol=1e-6)
     np.testing.assert_allclose(header["effector"], trace.episode.observations["effector_position"][7, :2], rtol=1e-6)
+
+
+def test_what_lies_deeper_than_can_be_told_is_told_as_if_it_lay_so_deep() -> None:
+    log = np.array([[[0.0, -63.0], [-64.0, -2000.0]], [[5.0, 5.0], [5.0, 5.0]]], dtype=np.float32)
+    cells, log_max, log_range = quantised(log)
+    assert log_max.tolist() == [0.0, 5.0]
+    assert log_range[0] == LOG_RANGE
+    assert cells[0, 1].tolist() == [0, 0]
+    assert cells[0, 0, 1] == round(65535 / 64)
+    assert (cells[1] == 65535).all()  # a flat layer
 
 
 def test_a_recipe_changes_what_the_maps_show(socket: WebSocketTestSession) -> None:
