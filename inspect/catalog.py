@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect import consistency, maps, particles, shapley, weights
+from beliefscope.inspect import consistency, maps, particles, saliency, shapley, weights
 from beliefscope.inspect.diagnostic import Diagnostic, Entry
 from beliefscope.inspect.trace import Trace
 
-ENTRIES: tuple[Entry, ...] = (maps.ENTRY, weights.ENTRY, consistency.ENTRY, particles.ENTRY, shapley.ENTRY)
+ENTRIES: tuple[Entry, ...] = (
+    maps.ENTRY,
+    weights.ENTRY,
+    consistency.ENTRY,
+    particles.ENTRY,
+    shapley.ENTRY,
+    saliency.ENTRY,
+)
 
 DIAGNOSTICS: dict[str, Entry] = {entry.name: entry for entry in ENTRIES}
 """By name, in the order in which they are shown."""
