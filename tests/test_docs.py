@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -57,3 +58,21 @@ def test_readme_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(example, "README.md", "exec"), names)
     assert names["error"].shape == (len(names["episode"]), 3)  # type: ignore[attr-defined, arg-type]
     assert "'fused'" in capsys.readouterr().out
+
+
+def test_the_sheet_of_keys_has_every_key() -> None:
+    page = ROOT / "app" / "page"
+    (table,) = re.findall(r"    keys\(\{\n(.*?)\n    \}\);", (page / "main.js").read_text(), re.DOTALL)
+    does = {key.strip("'") for key in re.findall(r"^      ('.+?'|\w+):", table, re.MULTILINE)}
+    (sheet,) = re.findall(r'<dialog id="keys".*?</dialog>', (page / "index.html").read_text(), re.DOTALL)
+    said = {unescape(key) for key in re.findall(r"<kbd>(.*?)</kbd>", sheet)}
+    called = {
+        " ": "space",
+        "ArrowLeft": "←",
+        "ArrowRight": "→",
+        "PageUp": "page ↑",
+        "PageDown": "page ↓",
+        "-": "\N{MINUS SIGN}",
+    }
+    called |= {"Home": "home", "End": "end", "=": "+", "ctrl+z": "ctrl z", "ctrl+y": "ctrl z", "ctrl+shift+z": "shift"}
+    assert {called.get(key, key) for key in does} | {"shift"} == said
