@@ -84,7 +84,7 @@ class Comparison(Diagnostic):
             return f"{self.names[1]} estimates exactly what {self.names[0]} does."
         first, second = (100 * float(value) for value in self.position[0])
         change = second / first - 1.0 if first else math.inf
-        text = f"{self.names[1]}: {second:.2f} cm RMSE over {self.steps[0]} steps, {self.names[0]}: {first:.2f}"
+        text = f"{self.names[0]}: {first:.2f} cm RMSE over {self.steps[0]} steps; {self.names[1]}: {second:.2f}"
         parts = [f"{text}, {_change(change)}{self._of_others()}."]
         if abs(change) >= LEVEL and (kind := self._worst()) is not None:
             before, after = (100 * float(value) for value in self.position[kind])
@@ -262,7 +262,9 @@ def _names(this: Trace, other: Trace) -> tuple[str, str]:
 
 def _change(share: float) -> str:
     if not math.isfinite(share):
-        return "which had none"
+        return "from none"
+    if share > 1.0:
+        return f"{1.0 + share:.1f} times as much"
     return "level" if abs(share) < LEVEL else f"{abs(100 * share):.0f} % {'more' if share > 0 else 'less'}"
 
 
