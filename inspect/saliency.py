@@ -149,9 +149,9 @@ class Saliency(Diagnostic):
         unit = f" ({self.unit})" if self.unit else ""
         sums: list[tuple[Value, ...]] = []
         for one in self.compared:
-            each = [self.factor * float(values.sum()) for values in one.integrated.values()]
-            change = self.factor * (self.value - one.value)
-            sums.append((self._baseline(one), *each, sum(each), change, 100.0 * one.gap, one.points))
+            each = [self.factor * values.sum() for values in one.integrated.values()]
+            numbers = [*each, sum(each), self.factor * (self.value - one.value), 100.0 * one.gap]
+            sums.append((self._baseline(one), *map(_rounded, numbers), one.points))
         tables = [
             Table(
                 f"Integrated gradients of {self.target}{unit}, by modality",
@@ -162,10 +162,10 @@ class Saliency(Diagnostic):
         rows: list[tuple[Value, ...]] = []
         for modality, channels in channel_names(find_task(self.task), self.inputs).items():
             for i, channel in enumerate(channels):
-                seen = (channel.factor * float(values[modality][i]) for values in (self.inputs, self.means))
-                paths = (self.factor * float(one.integrated[modality][i]) for one in self.compared)
-                alone = self.factor * float(self.occlusion[modality][i])
-                rows.append((modality, channel.name, channel.unit, *seen, *paths, alone))
+                seen = [channel.factor * values[modality][i] for values in (self.inputs, self.means)]
+                found = [*(one.integrated for one in self.compared), self.occlusion]
+                parts = [self.factor * values[modality][i] for values in found]
+                rows.append((modality, channel.name, channel.unit, *map(_rounded, [*seen, *parts])))
         if rows:
             paths_of = [f"from {one.baseline}" for one in self.compared]
             head = ("modality", "channel", "unit", "value", "training mean", *paths_of, "put to its mean")
@@ -184,6 +184,11 @@ class Saliency(Diagnostic):
             title = f"{name}: occlusion by {self.window} x {self.window} gray pixels"
             shown.append(Picture(title, self.factor * self.occlusion[name], self.unit))
         return shown
+
+
+def _rounded(value: float) -> float:
+    """To what single precision leaves of a small change; -0 is 0."""
+    return round(float(value), 4) + 0.0
 
 
 def integrate(
