@@ -1,7 +1,6 @@
 /** One track of the time line: a uPlot chart without cursor, legend or axis of its own, with shaded stretches. */
 
 import { colour, line, translucent } from './palette.js';
-import { significant } from './units.js';
 
 /**
  * @typedef {object} Series
@@ -71,7 +70,7 @@ export function chart(parent, track, shading, frame) {
       },
       axes: [
         stepAxis(ink, frame),
-        { ...ink, size: GUTTER.left, gap: 3, space: 20, ...heights(track) },
+        { ...ink, size: GUTTER.left, gap: 3, space: 20, ...heights(track, ink) },
       ],
       series,
       bands,
@@ -82,10 +81,12 @@ export function chart(parent, track, shading, frame) {
   );
 }
 
-/** The y axis of a logarithmic chart names powers of ten, that of none nothing. */
-function heights({ log, note }) {
+/** The y axis of a logarithmic chart has powers of ten alone, that of none names nothing. */
+function heights({ log, note }, { grid, ticks }) {
   if (note) return { values: (_, splits) => splits.map(() => '') };
-  return log ? { values: (_, splits) => splits.map((v) => (v && Math.abs(Math.log10(v) - Math.round(Math.log10(v))) < 1e-9 ? significant(v) : '')) } : {};
+  if (!log) return {};
+  const filter = (_, splits) => splits.map((v) => (Math.abs(Math.log10(v) - Math.round(Math.log10(v))) < 1e-9 ? v : null));
+  return { filter, grid: { ...grid, filter }, ticks: { ...ticks, filter }, values: (_, splits) => splits.map((v) => (v ? String(Number(v.toPrecision(1))) : '')) };
 }
 
 /** Only the lowest track names the steps; the others have the same grid. (uPlot draws no axis after one not shown.) */

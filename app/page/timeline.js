@@ -23,7 +23,7 @@ export class TimeLine {
   #tracks = [];
   /** @type {{plot: uPlot, track: import('./chart.js').Track, top: number, height: number}[]} px in the host */
   #charts = [];
-  /** @type {{cell: HTMLElement, values: ArrayLike<number>, digits?: number}[]} the values in the legends */
+  /** @type {{text: Text, values: ArrayLike<number>, digits?: number}[]} the values in the legends */
   #cells = [];
   #window = [0, 1]; // steps
   #plot = { left: 0, width: 1 }; // px in the host
@@ -44,7 +44,6 @@ export class TimeLine {
     [this.#host, this.#told] = ['#tracks', '#told'].map((part) => element.querySelector(part));
     this.#level.append(document.createElement('span'));
     this.#host.append(this.#cursor, this.#pointer, this.#level, this.#stretch);
-    this.#cursor.hidden = false;
     this.#marks = new Marks(element.querySelector('#marks'), store);
     this.#kind = document.querySelector('#track');
     this.#kind.replaceChildren(...Object.entries(KINDS).map(([kind, name]) => new Option(name, kind)));
@@ -84,6 +83,7 @@ export class TimeLine {
     const moved = step !== this.#at; // else it may be out of sight
     this.#at = step;
     if (moved && (step < from || step > to)) return this.#look(step - (to - from) / 4, step + (3 * (to - from)) / 4);
+    this.#cursor.hidden = step < from || step > to;
     place(this.#cursor, this.#x(step));
     this.#marks.move(step);
     this.#host.setAttribute('aria-valuenow', String(step));
@@ -243,11 +243,13 @@ export class TimeLine {
       const own = series.find((s) => s.name === name);
       const { dash, width } = style(own, this.#compared);
       term.append(sample(variable(name), dash, width), this.#trace.called(name));
+      term.title = term.textContent;
       list.append(term);
       for (const other of this.#compared ? [false, true] : [false]) {
         const cell = document.createElement('dd');
         const shown = series.find((s) => s.name === name && Boolean(s.other) === other);
-        if (shown) this.#cells.push({ cell, values: shown.values, digits });
+        const text = cell.appendChild(new Text());
+        if (shown) this.#cells.push({ text, values: shown.values, digits });
         list.append(cell);
       }
     }
@@ -270,8 +272,9 @@ export class TimeLine {
   /** Writes the values at a step into the legends. */
   #tell(step) {
     this.#told.textContent = `${this.#hover === null ? 'cursor' : 'pointer'} ${step} · ${fixed(step * this.#trace.dt)} s`;
-    for (const { cell, values, digits } of this.#cells) {
-      cell.textContent = digits === undefined ? significant(values[step]) : fixed(values[step], digits);
+    for (const { text, values, digits } of this.#cells) {
+      const value = digits === undefined ? significant(values[step]) : fixed(values[step], digits);
+      if (text.data !== value) text.data = value;
     }
   }
 

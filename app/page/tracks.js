@@ -84,7 +84,7 @@ function nees(trace) {
   const [low, high] = [fixed(bounds[0], 2), fixed(bounds[1], 1)];
   return {
     title: 'NEES/n',
-    unit: `${low} to ${high}`,
+    unit: `${low}–${high}`,
     help: `Squared error over the claimed covariance, by component: 1 on average. 95 % of a consistent filter's steps are between ${low} and ${high}; more is over-confident.`,
     series,
     bounds,
