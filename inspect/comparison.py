@@ -129,22 +129,19 @@ class Comparison(Diagnostic):
         units, factors = shown_units(task)
         rows: list[tuple[Value, ...]] = []
         for s, split in enumerate(self.splits):
-
-            def row(measure: str, unit: str, both: Array, split: str = split, s: int = s) -> tuple[Value, ...]:
-                first, second = (_number(float(value)) for value in both)
-                known = first is not None and second is not None
-                change = second - first if known else None  # type: ignore[operator]
-                relative = 100 * change / first if change is not None and first and unit in units else None
-                return (split, int(self.steps[s]), measure, unit, first, second, change, relative)
-
-            rows.append(row("position RMSE", "cm", 100 * self.position[s]))
+            kind = f"{split} ({self.steps[s]})"
             rows += [
-                row(f"{c.name} RMSE", units[i], factors[i] * self.rmse[s, i]) for i, c in enumerate(task.components)
+                _row(kind, "position RMSE (cm)", 100 * self.position[s], relative=True),
+                *(
+                    _row(kind, f"{c.name} RMSE ({units[i]})", factors[i] * self.rmse[s, i], relative=True)
+                    for i, c in enumerate(task.components)
+                ),
+                _row(kind, "NEES/n", self.nees[s]),
+                _row(kind, "NLL (nats)", self.nll[s]),
             ]
-            rows += [row("NEES/n", "", self.nees[s]), row("NLL", "nats", self.nll[s])]
             if self.share is not None:
-                rows += [row(f"share of {m}", "", self.share[s, k]) for k, m in enumerate(self.modalities)]
-        columns = ("steps", "count", "measure", "unit", *self.names, "difference", "difference, %")
+                rows += [_row(kind, f"share of {m}", self.share[s, k]) for k, m in enumerate(self.modalities)]
+        columns = ("steps", "measure", *self.names, "difference", "difference, %")
         return [Table("By kind of step", columns, tuple(rows))]
 
     def curves(self) -> list[Curve]:
@@ -258,6 +255,13 @@ def _names(this: Trace, other: Trace) -> tuple[str, str]:
     if recipes[0] == recipes[1]:
         return this.filter, other.filter
     return f"{this.filter}, {recipes[0]}", f"{other.filter}, {recipes[1]}"
+
+
+def _row(kind: str, measure: str, both: Array, relative: bool = False) -> tuple[Value, ...]:
+    """Both values, the other less this one and, where asked for, in % of this one."""
+    first, second = (float(value) for value in both)
+    change = 100.0 * (second - first) / first if relative and first else math.nan
+    return (kind, measure, *(_number(value) for value in (first, second, second - first, change)))
 
 
 def _change(share: float) -> str:

@@ -103,7 +103,7 @@ def test_another_filter_or_other_faults(
     found = compared(shown, against, **query)
     assert found["names"] == names
     (table,) = found["tables"]
-    assert table["columns"][4:6] == names
+    assert table["columns"][2:4] == names
     other = answered(shown, f"/api/trace/{EKF}", against=against, **query).json()
     assert [other["filter"], other["recipe"] or "as recorded"] == [
         "crossmodal-pf" if "filter=" in against else "crossmodal-ekf",
