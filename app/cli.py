@@ -18,6 +18,7 @@ from beliefscope.app.commands.collect import collect
 from beliefscope.app.commands.convert import convert
 from beliefscope.app.commands.counterfactual import counterfactual
 from beliefscope.app.commands.evaluate import evaluate
+from beliefscope.app.commands.export import export
 from beliefscope.app.commands.failures import failures
 from beliefscope.app.commands.figure import figure
 from beliefscope.app.commands.finetune import finetune
@@ -26,6 +27,7 @@ from beliefscope.app.commands.lineage import lineage
 from beliefscope.app.commands.modules import modules
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
+from beliefscope.app.commands.restore import restore
 from beliefscope.app.commands.serve import serve
 from beliefscope.app.commands.study import study
 from beliefscope.app.commands.trace import trace
@@ -45,6 +47,8 @@ COMMANDS = (
     study,
     trace,
     record,
+    restore,
+    export,
     inspect,
     counterfactual,
     figure,

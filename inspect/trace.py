@@ -271,14 +271,27 @@ ARRAYS_OF: dict[Kind, Callable[[Filter, Sequence[StepTrace], Evidence], dict[str
 
 def save_trace(trace: Trace, path: Path) -> None:
     """Writes a trace atomically as safetensors with a JSON header. Raises BadInput when the folder does not exist."""
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays_of(trace).items()}
+    write_atomically(
+        path, save(contiguous, metadata={"beliefscope-trace": json.dumps(header_of(trace), sort_keys=True)})
+    )
+
+
+def arrays_of(trace: Trace) -> dict[str, NDArray[Any]]:
+    """Every array of a trace by name; those of its episode are under ``episode/``."""
     episode = trace.episode
     arrays: dict[str, NDArray[Any]] = {
         name: getattr(trace, name) for name in ARRAYS if getattr(trace, name) is not None
     }
     arrays |= {f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")}
-    arrays |= {f"episode/observations/{key}": value for key, value in episode.observations.items()}
+    return arrays | {f"episode/observations/{key}": value for key, value in episode.observations.items()}
+
+
+def header_of(trace: Trace) -> dict[str, Any]:
+    """All of a trace that is not an array, as JSON values."""
+    episode = trace.episode
     apart = (*ARRAYS, "episode", "recipe", "settings")
-    header = {
+    return {
         "format": FORMAT,
         **{f.name: getattr(trace, f.name) for f in fields(Trace) if f.name not in apart},
         "recipe": trace.recipe.to_json(),
@@ -291,8 +304,6 @@ def save_trace(trace: Trace, path: Path) -> None:
             "provenance": dict(episode.provenance),
         },
     }
-    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    write_atomically(path, save(contiguous, metadata={"beliefscope-trace": json.dumps(header, sort_keys=True)}))
 
 
 def load_trace(path: Path) -> Trace:

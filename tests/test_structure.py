@@ -25,6 +25,7 @@ HEAVY = {
     "safetensors": ("filters", "inspect", "recordings", "app"),
     "rerun": ("recordings",),
     "pyarrow": ("recordings",),
+    "mcap": ("recordings",),
     "fastapi": ("app",),
     "starlette": ("app",),
     "uvicorn": ("app",),

@@ -1,0 +1,231 @@
+"""A trace for other tools: Parquet for pandas and its like, MCAP for Foxglove, npz for NumPy."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.filters.checkpoint import write_atomically
+from beliefscope.inspect.diagnostic import as_json
+from beliefscope.inspect.trace import Trace, arrays_of, header_of
+from beliefscope.recordings.columns import Column, columns
+from beliefscope.recordings.drawing import plane_height
+
+NAME = "beliefscope"
+"""Of what is kept beside the numbers: Parquet's and MCAP's metadata, an array of the npz."""
+
+
+def export_trace(trace: Trace, path: Path) -> None:
+    """Writes a trace as the path's ending says: ``.parquet``, ``.mcap`` or ``.npz`` (docs/recordings.md).
+
+    Raises BadInput for another ending, a folder that does not exist, and where the package for MCAP is missing.
+    """
+    write_atomically(path, FORMATS[export_format(path)](trace))
+
+
+def export_format(path: Path) -> str:
+    """``parquet``, ``mcap`` or ``npz``. Raises BadInput for another ending, or where its package is missing."""
+    suffix = path.suffix.removeprefix(".").lower()
+    if suffix not in FORMATS:
+        raise one_of("format of an export", suffix, FORMATS)
+    if suffix == "mcap":
+        try:
+            import mcap  # noqa: F401
+        except ImportError:
+            raise BadInput("an .mcap file needs the package mcap: pip install 'beliefscope[export]'") from None
+    return suffix
+
+
+def about(trace: Trace) -> dict[str, Any]:
+    """All of a trace that is not over its steps, as JSON values."""
+    start = {name: as_json(getattr(trace, name)) for name in ("start_mean", "start_covariance")}
+    return header_of(trace) | start | {"steps": len(trace)}
+
+
+def as_npz(trace: Trace) -> bytes:
+    """Every array by name, and the rest as JSON in the array ``beliefscope``; ``np.load`` reads it without pickle."""
+    data = io.BytesIO()
+    arrays: dict[str, Any] = {NAME: np.array(json.dumps(header_of(trace), sort_keys=True)), **arrays_of(trace)}
+    np.savez_compressed(data, **arrays)
+    return data.getvalue()
+
+
+def as_parquet(trace: Trace) -> bytes:
+    """One row a step; a column for each number by component and modality, lists where a step has many of one kind."""
+    steps = np.arange(len(trace))
+    fields = [pa.field("step", pa.int64()), pa.field("time", pa.float64(), metadata={"unit": "s"})]
+    arrays = [pa.array(steps), pa.array(steps * trace.episode.dt)]
+    for column in columns(trace):
+        values = pa.array(np.ascontiguousarray(column.values).ravel())
+        if column.values.ndim > 1:
+            values = pa.FixedSizeListArray.from_arrays(values, column.values.shape[1])
+        arrays.append(values)
+        shape = {"shape": ",".join(map(str, column.shape))} if len(column.shape) > 1 else {}
+        fields.append(pa.field(column.name, values.type, metadata={"unit": column.unit} | shape))
+    schema = pa.schema(fields, metadata={NAME: json.dumps(about(trace), sort_keys=True)})
+    data = io.BytesIO()
+    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), data, compression="zstd")
+    return data.getvalue()
+
+
+def as_mcap(trace: Trace) -> bytes:
+    """A topic for each array and each observation, JSON messages; pictures and particles as Foxglove's own schemas."""
+    from mcap.writer import Writer
+
+    data = io.BytesIO()
+    writer = Writer(data)
+    writer.start(library=NAME)
+    writer.add_metadata(NAME, {"trace": json.dumps(about(trace), sort_keys=True)})
+    topics = dict(_topics(trace))
+    channels = {}
+    for topic, (schema, _) in topics.items():
+        said = json.dumps(schema).encode()
+        number = writer.register_schema(schema["title"], encoding="jsonschema", data=said)
+        channels[topic] = writer.register_channel(topic, "json", number)
+    for step in range(len(trace)):
+        time = round(step * trace.episode.dt * 1e9)
+        for topic, (_, message) in topics.items():
+            said = json.dumps(message(step), allow_nan=False).encode()
+            writer.add_message(channels[topic], log_time=time, data=said, publish_time=time, sequence=step)
+    writer.finish()
+    return data.getvalue()
+
+
+FORMATS: dict[str, Callable[[Trace], bytes]] = {"parquet": as_parquet, "mcap": as_mcap, "npz": as_npz}
+"""Ending of a file -> what is in it."""
+
+Topics = list[tuple[str, tuple[dict[str, Any], Callable[[int], dict[str, Any]]]]]
+"""Topic -> JSON schema and the message of a step."""
+
+TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+BYTES = {"type": "string", "contentEncoding": "base64"}
+FLOAT32 = 7
+"""Foxglove's number for the type, in the fields of a point cloud."""
+
+
+def _topics(trace: Trace) -> Topics:
+    arrays: dict[str, list[Column]] = {}
+    found: Topics = []
+    for column in columns(trace):
+        if column.of == "observations" and len(column.shape) == 2 and column.values.dtype == np.uint8:
+            found.append((f"/observations/{column.parts[0]}", _pictures(column, trace)))
+        else:
+            arrays.setdefault(f"/{column.of}/{column.parts[0]}", []).append(column)
+    found += [(topic, _numbers(topic, group)) for topic, group in arrays.items()]
+    if trace.particles is not None and trace.log_weights is not None:
+        found.append(("/particles", _particles(trace)))
+    return found
+
+
+def _numbers(topic: str, group: list[Column]) -> tuple[dict[str, Any], Callable[[int], dict[str, Any]]]:
+    """``{"image": {"hinge_x": 0.8}}``; ``{"value": ..}`` where nothing is taken apart. What is not finite is null."""
+    schema: dict[str, Any] = {"title": f"{NAME}{topic.replace('/', '.')}", "type": "object", "properties": {}}
+    values: list[tuple[tuple[str, ...], list[Any]]] = []
+    for column in group:
+        path = column.parts[1:] or ("value",)
+        kind: dict[str, Any] = {"type": "boolean" if column.values.dtype == bool else "number"}
+        kind = {"type": "array", "items": kind} if column.values.ndim > 1 else kind
+        inner = schema
+        for part in path:
+            inner = inner["properties"].setdefault(part, {"type": "object", "properties": {}})
+        inner.clear()
+        inner.update(kind | ({"description": column.unit} if column.unit else {}))
+        values.append((path, as_json(column.values)))
+
+    def message(step: int) -> dict[str, Any]:
+        said: dict[str, Any] = {}
+        for path, rows in values:
+            inner = said
+            for part in path[:-1]:
+                inner = inner.setdefault(part, {})
+            inner[path[-1]] = rows[step]
+        return said
+
+    return schema, message
+
+
+def _pictures(column: Column, trace: Trace) -> tuple[dict[str, Any], Callable[[int], dict[str, Any]]]:
+    height, width = column.shape
+    numbers = {name: {"type": "integer"} for name in ("width", "height", "step")}
+    texts = {name: {"type": "string"} for name in ("frame_id", "encoding")}
+    schema = _schema("foxglove.RawImage", {"timestamp": TIME, **texts, **numbers, "data": BYTES})
+
+    def message(step: int) -> dict[str, Any]:
+        return {
+            "timestamp": _time(step, trace),
+            "frame_id": column.parts[0],
+            "encoding": "mono8",
+            "width": width,
+            "height": height,
+            "step": width,
+            "data": _packed(column.values[step]),
+        }
+
+    return schema, message
+
+
+def _particles(trace: Trace) -> tuple[dict[str, Any], Callable[[int], dict[str, Any]]]:
+    """Predicted particles on the plane of the map, and their weights after the observation, before resampling."""
+    assert trace.particles is not None
+    assert trace.log_weights is not None
+    task = find_task(trace.episode.task)
+    places = trace.particles[..., list(task.map_indices)]
+    height = np.full_like(places[..., :1], plane_height(trace, task))
+    points = np.concatenate([places, height, np.exp(trace.log_weights)[..., None]], axis=-1, dtype=np.float32)
+    fields = [{"name": name, "offset": 4 * i, "type": FLOAT32} for i, name in enumerate(("x", "y", "z", "weight"))]
+    zero, none = dict.fromkeys("xyz", 0.0), {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    number = {"type": "number"}
+    three, four = (_object(dict.fromkeys(names, number)) for names in ("xyz", "xyzw"))
+    field = _object({"name": {"type": "string"}, "offset": {"type": "integer"}, "type": {"type": "integer"}})
+    schema = _schema(
+        "foxglove.PointCloud",
+        {
+            "timestamp": TIME,
+            "frame_id": {"type": "string"},
+            "pose": _object({"position": three, "orientation": four}),
+            "point_stride": {"type": "integer"},
+            "fields": {"type": "array", "items": field},
+            "data": BYTES,
+        },
+    )
+
+    def message(step: int) -> dict[str, Any]:
+        return {
+            "timestamp": _time(step, trace),
+            "frame_id": "world",
+            "pose": {"position": zero, "orientation": none},
+            "point_stride": 16,
+            "fields": fields,
+            "data": _packed(points[step]),
+        }
+
+    return schema, message
+
+
+def _schema(title: str, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"title": title, **_object(properties)}
+
+
+def _object(properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+def _time(step: int, trace: Trace) -> dict[str, int]:
+    sec, nsec = divmod(round(step * trace.episode.dt * 1e9), 1_000_000_000)
+    return {"sec": sec, "nsec": nsec}
+
+
+def _packed(array: NDArray[Any]) -> str:
+    """Little endian, base64."""
+    return base64.b64encode(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()).decode()

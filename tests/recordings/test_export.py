@@ -1,0 +1,194 @@
+"""Traces for other tools and back from recordings: each file, read by its own reader, says what the trace says."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from beliefscope.app.cli import main
+from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.catalog import quick
+from beliefscope.inspect.trace import Trace, arrays_of, load_trace, save_trace, trace
+from beliefscope.recordings.columns import columns
+from beliefscope.recordings.export import export_trace
+from beliefscope.recordings.write import write_recording
+
+Compare = Callable[[Trace, Trace], None]
+
+
+@pytest.fixture(scope="module", params=["door crossmodal-pf", "door crossmodal-ekf", "push image-ekf"])
+def run(request: pytest.FixtureRequest) -> Trace:
+    task, name = request.param.split()
+    with open_dataset(sample_path(task)) as data:
+        recipe = Recipe.parse("blackout=0.3")
+        return trace(load_checkpoint(shipped(task, name)), data[9], 9, particles=40, recipe=recipe)
+
+
+def array_of(made: Trace, name: str) -> Any:
+    return getattr(made if hasattr(made, name) else made.episode, name)
+
+
+def test_columns_hold_every_number_once_under_its_name(run: Trace) -> None:
+    found = {column.name: column.values for column in columns(run)}
+    whole = {name: a for name, a in arrays_of(run).items() if not name.startswith("start_") and a.size}
+    assert sum(values.size for values in found.values()) == sum(array.size for array in whole.values())
+    components = ("hinge_x", "hinge_y", "angle") if run.episode.task == "door" else ("x", "y")
+    for i, component in enumerate(components):
+        np.testing.assert_array_equal(found[f"states.{component}"], run.episode.states[:, i])
+        np.testing.assert_array_equal(found[f"estimate_mean.{component}"], run.estimate_mean[:, i])
+        for k, modality in enumerate(run.modalities):
+            np.testing.assert_array_equal(found[f"modality_mean.{modality}.{component}"], run.modality_mean[:, k, i])
+        for j, other in enumerate(components):
+            name = f"estimate_covariance.{component}.{other}"
+            np.testing.assert_array_equal(found[name], run.estimate_covariance[:, i, j])
+        if run.particles is not None:
+            np.testing.assert_array_equal(found[f"particles.{component}"], run.particles[..., i])
+        if run.weights is not None and run.weights.shape[-1] > 1:
+            np.testing.assert_array_equal(found[f"weights.image.{component}"], run.weights[:, 0, i])
+    if run.log_likelihood is not None:
+        np.testing.assert_array_equal(found["log_likelihood.haptics"], run.log_likelihood[:, 1])
+        assert run.weights is not None
+        np.testing.assert_array_equal(found["weights.haptics"], run.weights[:, 1, 0])
+    assert {c.name: c.unit for c in columns(run)}[f"estimate_covariance.{components[0]}.{components[0]}"] == "m^2"
+
+
+def test_parquet(run: Trace, tmp_path: Path) -> None:
+    export_trace(run, tmp_path / "run.parquet")
+    table = pq.read_table(tmp_path / "run.parquet")
+    assert table.column("step").to_pylist() == list(range(len(run)))
+    np.testing.assert_allclose(table.column("time"), np.arange(len(run)) * run.episode.dt)
+    expected = list(columns(run))
+    assert table.column_names == ["step", "time", *(column.name for column in expected)]
+    for column in expected:
+        stored = table.column(column.name).combine_chunks()
+        values = stored.flatten() if column.values.ndim > 1 else stored
+        np.testing.assert_array_equal(values.to_numpy(zero_copy_only=False).reshape(column.values.shape), column.values)
+        assert values.to_numpy(zero_copy_only=False).dtype == column.values.dtype
+        assert table.field(column.name).metadata[b"unit"].decode() == column.unit
+    about = json.loads(table.schema.metadata[b"beliefscope"])
+    assert (about["filter"], about["data_hash"]) == (run.filter, run.data_hash)
+    np.testing.assert_array_equal(np.float32(about["start_mean"]), run.start_mean)
+    assert table.field("observations.image").metadata[b"shape"] == b"32,32"
+
+
+def test_parquet_in_pandas(run: Trace, tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    export_trace(run, tmp_path / "run.parquet")
+    frame = pandas.read_parquet(tmp_path / "run.parquet").set_index("step")
+    component = "hinge_x" if run.episode.task == "door" else "x"
+    error = frame[f"estimate_mean.{component}"] - frame[f"states.{component}"]
+    np.testing.assert_array_equal(error, run.estimate_mean[:, 0] - run.episode.states[:, 0])
+    assert np.stack(frame["observations.image"].to_list()).reshape(-1, 32, 32).dtype == np.uint8
+
+
+def test_npz(run: Trace, tmp_path: Path) -> None:
+    export_trace(run, tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz", allow_pickle=False) as file:
+        stored = dict(file)
+    assert json.loads(str(stored.pop("beliefscope")))["checkpoint_hash"] == run.checkpoint_hash
+    expected = arrays_of(run)
+    assert stored.keys() == expected.keys()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(stored[name], array)
+        assert stored[name].dtype == array.dtype
+
+
+def messages(path: Path) -> dict[str, list[tuple[int, dict[str, Any], dict[str, Any]]]]:
+    """Topic -> (time in ns, message, JSON schema), in the order of time."""
+    reader = pytest.importorskip("mcap.reader").make_reader(io.BytesIO(path.read_bytes()))
+    found: dict[str, list[Any]] = {}
+    for schema, channel, message in reader.iter_messages():
+        assert (channel.message_encoding, schema.encoding) == ("json", "jsonschema")
+        one = (message.log_time, json.loads(message.data), json.loads(schema.data))
+        found.setdefault(channel.topic, []).append(one)
+    return found
+
+
+def test_mcap(run: Trace, tmp_path: Path) -> None:
+    export_trace(run, tmp_path / "run.mcap")
+    found = messages(tmp_path / "run.mcap")
+    pictures = found.pop("/observations/image")
+    clouds = found.pop("/particles", None)
+    for topic, rows in found.items():
+        assert [time for time, _, _ in rows] == [round(t * run.episode.dt * 1e9) for t in range(len(run))]
+        assert rows[0][1].keys() == rows[0][2]["properties"].keys(), topic
+    for column in columns(run):
+        topic = f"/{column.of}/{column.parts[0]}"
+        if topic in found:
+            values = [message for _, message, _ in found[topic]]
+            for part in column.parts[1:] or ("value",):
+                values = [one[part] for one in values]
+            np.testing.assert_array_equal(np.array(values).astype(column.values.dtype), column.values)
+    images = run.episode.observations["image"]
+    for (_, message, schema), image in zip(pictures, images, strict=True):
+        assert (message["encoding"], message["height"], message["width"]) == ("mono8", *image.shape)
+        assert base64.b64decode(message["data"]) == image.tobytes()
+        assert schema["title"] == "foxglove.RawImage"
+    assert (clouds is None) == (run.particles is None)
+    if clouds is not None:
+        assert run.particles is not None
+        assert run.log_weights is not None
+        assert [field["name"] for field in clouds[0][1]["fields"]] == ["x", "y", "z", "weight"]
+        points = np.stack([np.frombuffer(base64.b64decode(one["data"]), "<f4").reshape(-1, 4) for _, one, _ in clouds])
+        np.testing.assert_array_equal(points[..., :2], run.particles[..., :2])
+        np.testing.assert_allclose(points[..., 3].sum(1), 1.0, atol=1e-5)  # float32 over 40 particles
+        np.testing.assert_allclose(points[..., 3], np.exp(run.log_weights), rtol=1e-6)
+
+
+def test_what_is_not_finite_is_null_in_json(run: Trace, tmp_path: Path) -> None:
+    odd = replace(run, estimate_covariance=np.full_like(run.estimate_covariance, np.nan))
+    export_trace(odd, tmp_path / "odd.mcap")
+    component = "hinge_x" if run.episode.task == "door" else "x"
+    (_, message, _), *_ = messages(tmp_path / "odd.mcap")["/trace/estimate_covariance"]
+    assert message[component][component] is None
+
+
+def test_without_the_package_mcap(run: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mcap", None)  # as if it were not installed
+    with pytest.raises(BadInput, match=r"pip install 'beliefscope\[export\]'"):
+        export_trace(run, tmp_path / "run.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def command(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    monkeypatch.setattr(sys, "argv", ["beliefscope", *line.split(), "--json", "-"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    return json.loads(capsys.readouterr().out)
+
+
+def test_what_comes_back_from_a_recording_says_the_same(
+    run: Trace,
+    assert_same: Compare,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """import gives the trace of the recording, diagnostics of it are the same, and so is what is exported of both."""
+    monkeypatch.chdir(tmp_path)
+    found = quick(run)
+    write_recording(run, "run.rrd", diagnostics=found)
+    save_trace(run, Path("made.trace"))
+    said = command("import run.rrd -o back.trace", monkeypatch, capsys)
+    assert (said["episode"], said["data_hash"]) == (9, run.data_hash)
+    again = load_trace(Path("back.trace"))
+    assert_same(run, again)
+    assert {name: one.to_dict() for name, one in quick(again).items()} == {n: d.to_dict() for n, d in found.items()}
+    for source, output in (("run.rrd", "one.parquet"), ("back.trace", "two.parquet"), ("made.trace", "three.parquet")):
+        command(f"export {source} -o {output}", monkeypatch, capsys)
+    one, two, three = (Path(f"{name}.parquet").read_bytes() for name in ("one", "two", "three"))
+    assert one == two == three
