@@ -15,7 +15,7 @@ def moment_link(
     Args:
         filter_, data: names as the page shows them. recipe: text. by: name of the score that ranks the page's list of
             failures; it chooses what the time line draws too: the angle that it is of, the particles of ``ess``, the
-            weights as they acted of ``regret``.
+            normalised squared error of ``nees``, the weights as they acted of ``regret``.
     """
     kept: dict[str, str | int] = {
         "task": task.name,
@@ -25,7 +25,7 @@ def moment_link(
         "step": step,
         "component": by if by in {c.name for c in task.components} else task.map_components[0],
         "weights": "acting" if by == "regret" else "raw",
-        "track": "particles" if by == "ess" else "error",
+        "track": {"ess": "particles", "nees": "nees"}.get(by, "error"),
         "tab": "scene",
     }
     if recipe:

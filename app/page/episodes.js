@@ -1,9 +1,10 @@
 /** The episodes of the data set as a table that can be sorted: what each is, and how the filter did on it where that is known. */
 
-import { walk } from './rows.js';
+import { stopAt, walk } from './rows.js';
 import { fixed, percent } from './units.js';
 
 const HEIGHT = 20; // of a sparkline, in its own units
+const SEEN = 0.95; // share of the episodes whose sparklines are not cut off
 
 /**
  * @typedef {{summary: import('./api.js').Summary, errors: object | undefined, failures: number | undefined}} Line
@@ -27,6 +28,12 @@ const COLUMNS = [
   { name: 'failures', title: 'failures', help: 'Moments by the chosen measure', value: ({ failures }) => failures ?? null, shown: ({ failures }) => fixed(failures, 0), surveyed: true },
 ];
 
+/** m at which the sparklines end: the few episodes that are worse by far are cut off, so that the others can be seen. */
+function scale(lines) {
+  const worst = lines.map(({ errors }) => errors?.worst ?? 0).filter(Boolean).sort((a, b) => a - b);
+  return worst[Math.ceil(SEEN * (worst.length - 1))] ?? 0;
+}
+
 const centimetres = (metres) => fixed(metres === undefined || metres === null ? null : 100 * metres, 2);
 
 export class Episodes {
@@ -38,7 +45,6 @@ export class Episodes {
   #score = null;
   #rows = new Map(); // by index
   #shown = '';
-  #scrolled = ''; // of which data set the open episode was brought into sight
 
   /** @param {HTMLElement} host @param {import('./state.js').Store} store @param {import('./api.js').Catalog} catalog */
   constructor(host, store, catalog) {
@@ -81,7 +87,7 @@ export class Episodes {
     this.#shown = shown;
     const focused = this.#host.contains(document.activeElement) ? document.activeElement.dataset.column : undefined;
     const lines = this.#lines;
-    const most = lines.reduce((worst, { errors }) => Math.max(worst, errors?.worst ?? 0), 0);
+    const most = scale(lines);
     const columns = COLUMNS.filter(({ surveyed, value }) => surveyed || lines.some((line) => value(line) !== ''));
     const top = document.createElement('tr');
     top.append(...columns.map((column) => this.#heading(column)), this.#scale(most));
@@ -90,10 +96,10 @@ export class Episodes {
     this.#host.querySelector('tbody').replaceChildren(...[...this.#rows.values()].map(({ row }) => row));
     if (focused) top.querySelector(`[data-column="${focused}"]`)?.focus();
     this.#here();
-    const set = `${task} ${data}`;
-    if (this.#scrolled === set) return;
-    this.#scrolled = set;
-    this.#rows.get(this.#store.state.episode)?.row.scrollIntoView({ block: 'nearest' });
+    this.#host.parentElement.scrollTop = 0;
+    // A list by index begins where one is; any other with its first.
+    const open = this.#rows.get(this.#store.state.episode);
+    if (open && this.#sort.name === 'index' && !this.#chosen) stopAt(open.row, false);
   }
 
   #heading({ name, title, help, words, surveyed }) {
@@ -113,7 +119,7 @@ export class Episodes {
 
   #scale(most) {
     const text = most ? `error over time, 0–${fixed(100 * most, 1)} cm` : 'error over time';
-    return Object.assign(document.createElement('th'), { scope: 'col', textContent: text, title: 'Of the position over time, the same scale for all; contact behind it. A click goes to that step' });
+    return Object.assign(document.createElement('th'), { scope: 'col', textContent: text, title: 'Of the position, contact behind it; one scale for all, cut off above it. A click goes to that step' });
   }
 
   #row(columns, line, most, i) {
@@ -143,7 +149,7 @@ export class Episodes {
     svg.setAttribute('role', 'img');
     svg.setAttribute('aria-label', `Error over time, at most ${centimetres(worst)} cm, at step ${at}`);
     const touched = contact.map((on, i) => (on ? `M${i} 0h1v${HEIGHT}h-1z` : '')).join('');
-    const y = (value) => (HEIGHT - 1 - ((HEIGHT - 2) * value) / most).toFixed(2);
+    const y = (value) => (HEIGHT - 1 - (HEIGHT - 2) * Math.min(1, value / most)).toFixed(2);
     const line = error.map((value, i) => (value === null ? '' : `${i && error[i - 1] !== null ? 'L' : 'M'}${i + 0.5} ${y(value)}`)).join('');
     for (const [kind, d] of [['contact', touched], ['error', line]]) {
       const path = document.createElementNS(svg.namespaceURI, 'path');

@@ -90,10 +90,7 @@ export class Failures {
     const place = Math.min(Math.max(this.#last + by, 0), this.#rows.length - 1);
     this.#open(place, inputTime);
     const { row } = this.#rows[place];
-    const focused = row.parentElement.contains(document.activeElement);
-    stopAt(row);
-    if (focused) row.querySelector('button').focus({ preventScroll: true });
-    row.scrollIntoView({ block: 'nearest' });
+    stopAt(row, row.parentElement.contains(document.activeElement));
   }
 
   /** Writes all that is known, by the chosen measure. */
@@ -234,8 +231,10 @@ export class Failures {
       this.#part('.scroll').scrollTop = 0;
       this.#last = -1;
     }
-    const rest = score?.moments && score.total - score.moments.length;
-    this.#part('.rest').textContent = rest ? `The worst ${score.moments.length} of ${score.total} are listed.` : '';
+    const group = score?.groups?.find((g) => g.name === this.#store.state.group);
+    const all = group ? group.moments : (score?.total ?? 0);
+    const left = `${moments.length} of ${all} are listed: those among the worst ${score?.moments?.length} of all.`;
+    this.#part('.rest').textContent = moments.length < all ? left : '';
     this.move(this.#store.state.step);
   }
 
@@ -284,7 +283,7 @@ const called = ({ name }) => NAMES[name] ?? name.replaceAll('_', ' ');
 /** What the time line has to draw for a measure. */
 function drawn(by, trace) {
   if (trace?.components.some(({ name }) => name === by)) return { component: by, track: 'error' };
-  return { error: { track: 'error' }, ess: { track: 'particles' }, regret: { weights: 'acting' } }[by] ?? {};
+  return { error: { track: 'error' }, nees: { track: 'nees' }, ess: { track: 'particles' }, regret: { weights: 'acting' } }[by] ?? {};
 }
 
 function said({ state, job, error }) {
@@ -311,7 +310,7 @@ function momentColumns(found, score) {
   const columns = [
     { title: 'episode', text: (m) => String(m.episode) },
     { title: 'step', text: (m) => String(m.step), number, hint: (m) => `Of steps ${m.first} to ${m.last}, in which it stays high` },
-    { title: unit ? `${called(score)} ${unit}` : called(score), text: (m) => significant(own * m.value), number, help: sentence(score.title) },
+    { title: unit ? `${score.title} ${unit}` : score.title, text: (m) => significant(own * m.value), number },
     { title: 'what was happening', text: (m) => m.group, hint: (m) => [m.group, ...m.also].join(', ') },
   ];
   const modalities = found.layers.slice(0, -1);
@@ -320,7 +319,7 @@ function momentColumns(found, score) {
     const name = modalities.length > 1 ? layer : 'error';
     if (modalities.length > 1 || layer === 'fused') columns.push({ title: `${name} cm`, text: (m) => fixed(100 * m.error[i], 2), number, help: 'Distance of its position from the truth' });
   });
-  if (score.name !== 'nees' && score.moments[0]?.nees !== null) columns.push({ title: 'NEES', text: (m) => significant(m.nees), number, help: 'Normalised squared error: mean 1 where the covariance is right' });
+  if (score.name !== 'nees' && score.moments[0]?.nees !== null) columns.push({ title: 'NEES', text: (m) => fixed(m.nees), number, help: 'Normalised squared error: mean 1 where the covariance is right' });
   if (modalities.length > 1 && score.moments[0]?.acting) columns.push({ title: 'follows', text: (m) => leading(modalities, m.acting), help: 'The modality that decides most, with its share as it acted' });
   return columns;
 }

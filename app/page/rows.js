@@ -9,13 +9,16 @@ export function walk(body) {
     if (to === undefined || place < 0) return;
     event.preventDefault();
     event.stopPropagation();
-    const row = rows[Math.min(Math.max(to, 0), rows.length - 1)];
-    stopAt(row);
-    row.querySelector('button').focus();
+    stopAt(rows[Math.min(Math.max(to, 0), rows.length - 1)], true);
   });
 }
 
-/** Makes a row the one where the tab key stops. @param {HTMLTableRowElement} row */
-export function stopAt(row) {
+/** Makes a row the one where the tab key stops, and brings it into sight. @param {HTMLTableRowElement} row @param {boolean} focus */
+export function stopAt(row, focus) {
   for (const button of row.parentElement.querySelectorAll('button')) button.tabIndex = row.contains(button) ? 0 : -1;
+  if (focus) row.querySelector('button').focus({ preventScroll: true });
+  const box = row.closest('.scroll');
+  const [seen, at] = [box.getBoundingClientRect(), row.getBoundingClientRect()];
+  const above = at.top - seen.top - row.closest('table').tHead.offsetHeight; // the head stays where it is
+  box.scrollTop += Math.min(0, above) + Math.max(0, at.bottom - seen.bottom);
 }
