@@ -1,37 +1,62 @@
-/** The likelihood maps, one a layer, side by side: offsets in cm from the true position, each relative to its own peak. */
+/** The likelihood maps, one a layer, side by side, with their numbers beneath. */
 
-import { COLOUR_TABLE, colour, line, variable } from './palette.js';
-import { fixed, signed } from './units.js';
+import { MARGIN, drawMap, paint } from './mapdraw.js';
+import { borders, cellAt, digits, ends, shades, valueAt } from './mapvalues.js';
+import { colour, gradient, variable } from './palette.js';
+import { fixed, percent, signed, spoken } from './units.js';
 
-const MARGIN = { left: 34, bottom: 30, top: 1, right: 5, gap: 9 }; // px around a map's square
-const SPACINGS = [1, 2, 5, 10, 20, 50, 100]; // cm between ticks
-const APART = 26; // px between them at least
-const SMALLEST = Math.log(0.5 / 255); // below this a byte is 0
-const HALO = ['rgb(255 255 255 / 0.55)', 3.5];
-const FONT = '10px system-ui, sans-serif';
+const LOOKS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud']; // of the state
+const SHARES = [0.5, 0.95]; // of the likelihood, that the regions hold
+const ROUND = 1.3; // times as long as wide below which a map has no axis
+const DIVERGING = 'diverging';
 
 export class Heatmaps {
+  #panel;
   #host;
+  #store;
   #figures = [];
   #maps = null;
   #trace = null;
+  #pinned = null; // {maps, selection}
   #hover = null; // [dx, dy] m
   #side = 0;
 
-  /** @param {HTMLElement} host */
-  constructor(host) {
-    this.#host = host;
-    new ResizeObserver(() => this.redraw()).observe(host);
+  /** @param {HTMLElement} panel with `#heatmaps` inside @param {import('./state.js').Store} store */
+  constructor(panel, store) {
+    [this.#panel, this.#store] = [panel, store];
+    this.#host = panel.querySelector('#heatmaps');
+    new ResizeObserver(() => this.redraw()).observe(this.#host);
+    store.listen((_, changed) => LOOKS.some((look) => changed.has(look)) && this.#shade());
   }
 
-  /** @param {import('./socket.js').Maps} maps @param {import('./trace.js').Trace} trace that they are of. */
+  /** @param {import('./mapvalues.js').Maps} maps @param {import('./trace.js').Trace} trace that they are of. */
   draw(maps, trace) {
     const first = this.#maps === null || this.#maps.layers.join() !== maps.layers.join();
-    maps.values = maps.cells.map((cells, l) => Uint8Array.from(cells, (q) => 255 * Math.exp(maps.log_range[l] * (q / 65535 - 1)) + 0.5));
     [this.#maps, this.#trace] = [maps, trace];
     // Of one measurement model alone the fused map is the same again.
     if (first) this.#figures = this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
-    this.redraw();
+    if (this.#pinned && !comparable(this.#pinned.maps, maps)) this.#pinned = null;
+    this.#shade();
+  }
+
+  /** Keeps these maps, to show what others gain or lose against them; or lets those go. */
+  pin() {
+    this.#pinned = this.#pinned || !this.#maps ? null : { maps: this.#maps, selection: this.#trace.selection };
+    if (this.#maps) this.#shade();
+    this.changed();
+  }
+
+  /** Set by who must know that the pinned maps have come or gone. */
+  changed = () => {};
+
+  get pinned() {
+    return this.#pinned;
+  }
+
+  /** What is shown, for a file. @returns {{maps: object, trace: object, figures: object[], title: string, look: object}} */
+  get shown() {
+    const figures = this.#figures.map((figure, layer) => this.#drawn(figure, layer));
+    return { maps: this.#maps, trace: this.#trace, figures, title: this.#title(), look: this.#look(0), pinned: this.#pinned };
   }
 
   redraw() {
@@ -40,19 +65,56 @@ export class Heatmaps {
     this.#figures.forEach((figure, layer) => this.#drawLayer(figure, layer));
   }
 
+  /** Colours and borders anew: for other maps, or other looks. */
+  #shade() {
+    if (!this.#maps) return;
+    const { scale, range, colours, regions } = this.#store.state;
+    const all = shades(this.#maps, scale, range, this.#pinned?.maps ?? null);
+    const table = this.#pinned ? DIVERGING : colours;
+    this.#figures.forEach((figure, layer) => {
+      figure.shade = all[layer];
+      figure.table = table;
+      figure.borders = regions === 'shown' ? borders(this.#maps, layer, SHARES) : [];
+      paint(figure.cells, all[layer], this.#maps.size, table);
+      this.#showBar(figure);
+    });
+    const kind = this.#panel.querySelector('#maps-kind');
+    kind.textContent = this.#pinned ? `Gain on step ${this.#pinned.maps.step}` : scale === 'log' ? 'Log-likelihood' : 'Likelihood';
+    kind.parentElement.title = this.#title();
+    kind.nextElementSibling.hidden = Boolean(this.#pinned);
+    kind.nextElementSibling.classList.toggle('roomy', scale === 'log');
+    this.#showPairs();
+    this.redraw();
+  }
+
+  /** What the colours say, in words. */
+  #title() {
+    const { scale, range } = this.#store.state;
+    if (this.#pinned) {
+      const { filter, episode } = this.#pinned.selection;
+      return `ln of the likelihood over that of step ${this.#pinned.maps.step} (${filter}, episode ${episode}), each as a density over the square`;
+    }
+    if (scale === 'log') return 'ln likelihood';
+    return range === 'same' ? 'likelihood over the highest peak of all' : 'likelihood over its own peak';
+  }
+
   #build(layers) {
     this.#host.querySelectorAll('figure').forEach((figure) => figure.remove());
     const fuses = layers.length > 1;
     return layers.map((name, layer) => {
       const figure = document.createElement('figure');
-      figure.innerHTML = '<h3></h3><canvas role="img"></canvas><figcaption></figcaption>';
+      figure.innerHTML =
+        '<div class="head"><h3></h3><span class="colours"><b></b><i></i><b></b></span></div><canvas role="img" tabindex="0"></canvas><figcaption><p></p><p></p><p></p></figcaption>';
       figure.style.setProperty('--line', `var(${variable(fuses ? name : 'fused')})`);
-      const [title, canvas, caption] = figure.children;
-      title.textContent = (fuses || name !== 'fused' ? name : 'estimate').replaceAll('+', ' + ');
+      const [head, canvas, caption] = figure.children;
+      head.children[0].textContent = (fuses || name !== 'fused' ? name : 'estimate').replaceAll('+', ' + ');
       canvas.addEventListener('pointermove', (event) => this.#point(event, layer));
-      canvas.addEventListener('pointerleave', () => this.#point(null, layer));
+      canvas.addEventListener('pointerleave', () => this.#probe(null));
+      canvas.addEventListener('pointerdown', (event) => event.preventDefault()); // the page's keys stay the page's
+      canvas.addEventListener('keydown', (event) => this.#walk(event));
+      canvas.addEventListener('blur', () => this.#probe(null));
       this.#host.append(figure);
-      return { name, canvas, caption, cells: document.createElement('canvas') };
+      return { name, canvas, bar: head.children[1], lines: [...caption.children], caption, cells: document.createElement('canvas') };
     });
   }
 
@@ -63,7 +125,8 @@ export class Heatmaps {
     const style = getComputedStyle(this.#host);
     const width = clientWidth - parseFloat(style.paddingLeft) - parseFloat(style.paddingRight);
     const across = (width - MARGIN.left - (count - 1) * MARGIN.gap - count * MARGIN.right) / count;
-    const text = 38; // title and caption
+    const { caption, bar } = this.#figures[0];
+    const text = caption.offsetHeight + bar.parentElement.offsetHeight + parseFloat(style.paddingTop) + parseFloat(style.paddingBottom);
     return Math.max(60, Math.floor(Math.min(across, clientHeight - MARGIN.bottom - MARGIN.top - text)));
   }
 
@@ -71,154 +134,123 @@ export class Heatmaps {
     return layer === 0 ? MARGIN.left : MARGIN.gap;
   }
 
-  #drawLayer({ name, canvas, caption, cells }, layer) {
-    const maps = this.#maps;
-    const side = this.#side;
-    const left = this.#left(layer);
-    const ratio = devicePixelRatio;
+  #look(layer) {
+    const { axes, cloud } = this.#store.state;
+    return { axes, cloud: cloud === 'shown', text: colour('muted'), withY: layer === 0, hover: this.#hover };
+  }
+
+  #drawn({ name, cells, borders, shade, table }, layer) {
+    return { name, cells, borders, shade, table, layer, maps: this.#maps, trace: this.#trace };
+  }
+
+  #drawLayer(figure, layer) {
+    const { canvas, name } = figure;
+    const [side, left, ratio] = [this.#side, this.#left(layer), devicePixelRatio];
     const [width, height] = [left + side + MARGIN.right, MARGIN.top + side + MARGIN.bottom];
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
       [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
       [canvas.style.width, canvas.style.height] = [`${width}px`, `${height}px`];
+      figure.caption.parentElement.style.width = `${width}px`;
     }
-    paint(cells, maps.values[layer], maps.size);
     const pen = canvas.getContext('2d');
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
-    pen.save();
     pen.translate(left, MARGIN.top);
-    pen.drawImage(cells, 0, 0, side, side);
-    this.#drawAxes(pen, side, layer === 0);
-    pen.beginPath();
-    pen.rect(0, 0, side, side);
-    pen.clip();
-    this.#drawMarks(pen, side, name);
-    pen.restore();
-    const [dx, dy] = maps.peak[layer].map((v) => signed(100 * v));
-    canvas.setAttribute('aria-label', `${name}: likelihood over offsets from the truth, peak at ${dx}, ${dy} cm`);
-    caption.textContent = this.#hover ? this.#valueAt(layer) : `peak ${dx}, ${dy} cm`;
-    caption.title = `ln likelihood at the peak: ${fixed(maps.log_max[layer], 2)}`;
+    drawMap(pen, this.#drawn(figure, layer), side, this.#look(layer));
+    const said = this.#numbers(layer);
+    canvas.setAttribute('aria-label', `${name}: ${this.#title()}; ${said.whole}. Arrow keys read values.`);
+    const lines = this.#hover ? this.#values(layer) : said.lines;
+    figure.lines.forEach((line, i) => (line.textContent = lines[i] ?? ''));
+    figure.caption.title = said.whole;
   }
 
-  #drawAxes(pen, side, withY) {
-    const half = 100 * this.#maps.half_width;
-    const spacing = SPACINGS.find((cm) => (cm / (2 * half)) * side > APART) ?? 2 * half;
-    pen.font = FONT;
-    pen.fillStyle = colour('muted');
-    pen.strokeStyle = colour('muted');
-    pen.lineWidth = 1;
-    pen.textBaseline = 'top';
-    pen.textAlign = 'center';
-    pen.beginPath();
-    for (let cm = -Math.floor(half / spacing) * spacing; cm <= half; cm += spacing) {
-      const at = Math.round(((cm + half) / (2 * half)) * side) + 0.5;
-      pen.moveTo(at, side);
-      pen.lineTo(at, side + 3);
-      pen.fillText(fixed(cm, 0), at, side + 5);
-      if (!withY) continue;
-      pen.moveTo(0, side - at);
-      pen.lineTo(-3, side - at);
-      pen.save();
-      pen.textAlign = 'right';
-      pen.textBaseline = 'middle';
-      pen.fillText(fixed(cm, 0), -5, side - at);
-      pen.restore();
-    }
-    pen.stroke();
-    pen.fillText('Δx (cm)', side / 2, side + 18);
-    if (!withY) return;
-    pen.save();
-    pen.translate(-MARGIN.left + 1, side / 2);
-    pen.rotate(-Math.PI / 2);
-    pen.fillText('Δy (cm)', 0, 0);
-    pen.restore();
+  #showBar({ bar, shade, table }) {
+    const [first, colours, last] = bar.children;
+    [first.textContent, last.textContent] = ends(shade, digits(shade));
+    colours.style.background = gradient(table);
+    const [from, to] = ends(shade, 2);
+    bar.title = `Colour: ${this.#title()}, from ${from} to ${to}`;
   }
 
-  /** Truth, estimates and the line to the end effector; y is up. */
-  #drawMarks(pen, side, name) {
-    const { half_width: half, centre, estimate, effector, step } = this.#maps;
-    const place = ([x, y]) => [((x - centre[0] + half) / (2 * half)) * side, ((centre[1] - y + half) / (2 * half)) * side];
-    const positionOf = (source) => this.#trace.position.map((i) => this.#trace.mean(source, i)[step] / 100);
-    const outlined = (colours, draw) => {
-      for (const [style, width] of colours) {
-        [pen.strokeStyle, pen.lineWidth] = [style, width];
-        pen.beginPath();
-        draw();
-        pen.stroke();
-      }
+  /** A layer's numbers: lines that fit beneath its map, and a whole one. */
+  #numbers(layer) {
+    const { peak, log_max, numbers } = this.#maps;
+    const at = this.#place(peak[layer]);
+    const area = [numbers.area50[layer], numbers.area95[layer]].map((m2) => short(1e4 * m2));
+    const entropy = fixed(numbers.entropy[layer] + Math.log(1e4), 2);
+    const long = numbers.elongation[layer] >= ROUND;
+    const off = fixed(degrees(numbers.off_line[layer]), 0);
+    const axis = !long ? 'no ridge' : numbers.off_line[layer] === null ? `axis ${fixed(degrees(numbers.axis[layer]), 0)}°` : `ridge ${off}° off hand`;
+    const ratio = `${fixed(numbers.elongation[layer], 1)} times as long as wide`;
+    return {
+      lines: [`peak ${at} cm`, `50 % ${area[0]}, 95 % ${area[1]} cm²`, `${axis} · entropy ${entropy}`],
+      whole:
+        `peak at ${at} cm, ln likelihood there ${fixed(log_max[layer], 2)}, at the truth ${fixed(numbers.truth[layer], 2)} of that; ` +
+        `50 % of the likelihood in ${area[0]} cm², 95 % in ${area[1]} cm²; entropy ${entropy} nats of a density per cm²; ` +
+        `${ratio}${long && numbers.off_line[layer] !== null ? `, the long axis ${off}° off the line from the truth to the hand` : ''}`,
     };
-    const [tx, ty] = place(centre);
-    if (effector) {
-      pen.setLineDash([4, 4]);
-      outlined([['rgb(255 255 255 / 0.75)', 1]], () => (pen.moveTo(tx, ty), pen.lineTo(...place(effector))));
-      pen.setLineDash([]);
-    }
-    // Open in the middle: a sharp peak is no larger than a mark.
-    outlined([['rgb(0 0 0 / 0.6)', 3.5], ['#fff', 1.5]], () => {
-      for (const [dx, dy] of [[1, 0], [0, 1], [-1, 0], [0, -1]]) {
-        pen.moveTo(tx + 4 * dx, ty + 4 * dy);
-        pen.lineTo(tx + 10 * dx, ty + 10 * dy);
-      }
-    });
-    if (name !== 'fused' && this.#trace.fuses) {
-      const [x, y] = place(positionOf(name));
-      outlined([HALO, [line(name).stroke, 2]], () => pen.arc(x, y, 5, 0, 2 * Math.PI));
-    }
-    const [x, y] = place(this.#trace.position.map((i) => estimate[i]));
-    outlined([HALO, [line('fused').stroke, 2]], () => {
-      pen.moveTo(x, y - 9);
-      for (const [dx, dy] of [[9, 0], [0, 9], [-9, 0]]) pen.lineTo(x + dx, y + dy);
-      pen.closePath();
-    });
-    if (!this.#hover) return;
-    const [hx, hy] = place([centre[0] + this.#hover[0], centre[1] + this.#hover[1]]);
-    outlined([['rgb(255 255 255 / 0.6)', 1]], () => {
-      pen.moveTo(0, hy);
-      pen.lineTo(side, hy);
-      pen.moveTo(hx, 0);
-      pen.lineTo(hx, side);
-    });
   }
 
-  #valueAt(layer) {
-    const { size, half_width: half, values } = this.#maps;
-    const [column, row] = this.#hover.map((d) => Math.min(Math.max(Math.floor(((d + half) / (2 * half)) * size), 0), size - 1));
-    const byte = values[layer][row * size + column];
-    const log = byte ? fixed(Math.log(byte / 255), 2) : `< ${fixed(SMALLEST, 1)}`;
-    return `${fixed(byte / 255, 3)} of peak, ln ${log}`;
+  /** How the modalities differ, pair by pair. */
+  #showPairs() {
+    const { layers, numbers } = this.#maps;
+    const pairs = [];
+    for (let i = 0; i < layers.length - 1; i++) {
+      for (let j = i + 1; j < layers.length - 1; j++) {
+        const [there, back] = [numbers.divergence[i][j], numbers.divergence[j][i]].map((nats) => short(nats));
+        pairs.push(`${layers[i]} to ${layers[j]}: KL ${there}, back ${back} nats, overlap ${percent(numbers.overlap[i][j])}`);
+      }
+    }
+    const line = this.#panel.querySelector('#maps-pairs');
+    line.textContent = line.title = pairs.join(' · ');
+  }
+
+  /** What is at the probe: a line beneath the map. */
+  #values(layer) {
+    const cell = cellAt(this.#maps, this.#hover);
+    const { log, relative, deep } = valueAt(this.#maps, layer, cell);
+    const gain = this.#pinned ? [`gain ${signed(this.#figures[layer].shade.values[cell], 2)} nats`] : [];
+    return [`${fixed(relative, 3)} of peak, ln ${deep ? '< ' : ''}${fixed(log, 2)}`, ...gain];
+  }
+
+  /** A place in cm, as the axes have it. @param {number[]} offset m */
+  #place(offset) {
+    const world = this.#store.state.axes === 'world';
+    return offset.map((d, i) => (world ? fixed(100 * (d + this.#maps.centre[i])) : signed(100 * d))).join(', ');
   }
 
   #point(event, layer) {
     if (!this.#maps) return;
     const { half_width: half } = this.#maps;
-    this.#hover = null;
-    if (event) {
-      const x = (event.offsetX - this.#left(layer)) / this.#side;
-      const y = (event.offsetY - MARGIN.top) / this.#side;
-      if (x >= 0 && x <= 1 && y >= 0 && y <= 1) this.#hover = [(2 * x - 1) * half, (1 - 2 * y) * half];
-    }
-    const where = this.#hover?.map((d) => signed(100 * d));
-    document.querySelector('#maps-value').textContent = where ? `at ${where[0]}, ${where[1]} cm` : '';
+    const x = (event.offsetX - this.#left(layer)) / this.#side;
+    const y = (event.offsetY - MARGIN.top) / this.#side;
+    this.#probe(x >= 0 && x <= 1 && y >= 0 && y <= 1 ? [(2 * x - 1) * half, (1 - 2 * y) * half] : null);
+  }
+
+  /** Arrow keys move the probe cell by cell, and what it finds is read out. */
+  #walk(event) {
+    const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (event.key === 'Escape') this.#probe(null);
+    if (!way || !this.#maps) return;
+    event.preventDefault();
+    const { half_width: half, size } = this.#maps;
+    const far = ((event.shiftKey ? 5 : 1) * 2 * half) / size;
+    const from = this.#hover ?? [0, 0];
+    this.#probe(way.map((d, i) => Math.min(Math.max(from[i] + far * d, -half * (1 - 1 / size)), half * (1 - 1 / size))));
+    const found = this.#figures.map(({ name }, layer) => `${spoken(name)} ${this.#values(layer).join(', ')}`);
+    this.#panel.querySelector('#maps-spoken').textContent = `${this.#place(this.#hover)} cm: ${found.join('; ')}`;
+  }
+
+  #probe(offset) {
+    if (offset === this.#hover) return;
+    this.#hover = offset;
+    this.#panel.querySelector('#maps-value').textContent = offset && this.#maps ? `at ${this.#place(offset)} cm` : '';
     this.redraw();
   }
 }
 
-/** Bytes to colours, turned over so that y is up. */
-function paint(canvas, values, size) {
-  if (canvas.width !== size || canvas.height !== size) [canvas.width, canvas.height] = [size, size];
-  const pen = canvas.getContext('2d');
-  const image = pen.createImageData(size, size);
-  const pixels = new Uint32Array(image.data.buffer);
-  for (let row = 0; row < size; row++) {
-    const to = (size - 1 - row) * size;
-    for (let column = 0; column < size; column++) pixels[to + column] = COLOUR_TABLE[values[row * size + column]];
-  }
-  pen.putImageData(image, 0, 0);
-}
+const comparable = (a, b) => a.layers.join() === b.layers.join() && Math.abs(a.half_width - b.half_width) < 1e-6;
+const degrees = (radians) => (radians === null ? null : (radians * 180) / Math.PI);
 
-/** The colour bar: every colour once. @param {HTMLCanvasElement} canvas 256 x 1 */
-export function paintColourBar(canvas) {
-  const image = new ImageData(256, 1);
-  new Uint32Array(image.data.buffer).set(COLOUR_TABLE);
-  canvas.getContext('2d').putImageData(image, 0, 0);
-}
+/** Few digits: of areas and divergences, whose size says more than their digits. */
+const short = (value) => fixed(value, value < 10 ? 1 : 0);

@@ -6,9 +6,10 @@ import { Clock } from './clock.js';
 import { Compare } from './compare.js';
 import { Diagnostics } from './diagnostics.js';
 import { Failures } from './failures.js';
-import { Heatmaps, paintColourBar } from './heatmap.js';
+import { Heatmaps } from './heatmap.js';
 import { Jobs } from './jobs.js';
 import { keys } from './keys.js';
+import { mapTools } from './maptools.js';
 import { Numbers } from './numbers.js';
 import { Theme, swatch, tellApart } from './palette.js';
 import { Messages, say } from './panel.js';
@@ -32,7 +33,6 @@ const messages = new Messages($('#messages'));
 const stats = { scrub: [], scene: [], maps: null, drawn: null };
 
 bodies.forEach((body) => say(body, 'loading', 'Loading …'));
-paintColourBar($('.colourbar canvas'));
 start().catch((error) => {
   const line = error instanceof api.ServerError ? error.message : `The page failed: ${error.message}`;
   if (!(error instanceof api.ServerError)) console.error(error);
@@ -70,7 +70,8 @@ class Page {
     this.theme = new Theme((dark) => this.#recolour(dark));
     this.clock = new Clock(store);
     this.timeline = new TimeLine($('#timeline .body'), store);
-    this.heatmaps = new Heatmaps($('#heatmaps'));
+    this.heatmaps = new Heatmaps($('#maps'), store);
+    this.showMapTools = mapTools($('#maps-options'), $('#maps-view'), store, this.heatmaps);
     this.camera = new Camera($('#camera'));
     this.numbers = new Numbers($('#numbers'));
     this.slice = new Slice($('#slice-label'), $('#slice-true'), store);
@@ -173,6 +174,7 @@ class Page {
     $('#worst').disabled = false;
     $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s) => [swatch(s), ` ${trace.called(s)}  `]));
     $('#sigma-key').hidden = !trace.has('estimate_sigma');
+    this.showMapTools(trace);
     this.compare.show(trace);
     this.#choose();
     this.#move();
@@ -292,6 +294,7 @@ class Page {
       j: () => this.jobs.toggle(),
       c: () => this.#nextComponent(),
       e: () => this.#goWorst(),
+      m: () => this.heatmaps.pin(),
       s: () => this.save(),
       d: () => this.theme.toggle(),
       '?': () => $('#keys').showModal(),

@@ -6,6 +6,12 @@ const VIRIDIS = [
   0x1f988b, 0x22a884, 0x35b779, 0x54c568, 0x7ad151, 0xa5db36, 0xd2e21b, 0xfde725,
 ];
 
+/** Cividis, matplotlib's, likewise: made for eyes that do not tell red from green. */
+const CIVIDIS = [
+  0x00224e, 0x002e6c, 0x1e3a6f, 0x35456c, 0x47516c, 0x575d6d, 0x666970, 0x757575,
+  0x848279, 0x948e77, 0xa59c74, 0xb7a96e, 0xc8b866, 0xdbc75a, 0xeed649, 0xfee838,
+];
+
 /** One meaning has one colour and one dash everywhere, so that lines differ without colour too. */
 const DASHES = { truth: [], fused: [], image: [7, 3], haptics: [2, 2.5] };
 const WIDTHS = { truth: 1.25, fused: 2.25 };
@@ -34,6 +40,13 @@ function colourTable(stops) {
 
 export const COLOUR_TABLE = colourTable(VIRIDIS);
 export const SIGNED_TABLE = colourTable(DIVERGING);
+
+const STOPS = { viridis: VIRIDIS, cividis: CIVIDIS, diverging: DIVERGING };
+/** By name, for the maps. */
+export const TABLES = { viridis: COLOUR_TABLE, cividis: colourTable(CIVIDIS), diverging: SIGNED_TABLE };
+
+/** A colour table for CSS, from left to right. */
+export const gradient = (name) => `linear-gradient(90deg, ${STOPS[name].map((stop) => `#${stop.toString(16).padStart(6, '0')}`).join(', ')})`;
 
 /** @param {string} name of a colour in page.css. @returns {string} as it is now, light or dark. */
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
