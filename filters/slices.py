@@ -78,7 +78,9 @@ class Slice:
 
     @classmethod
     def of(cls, value: Any) -> Slice:
-        """From ``to_json``'s values; all but the name may be left out. Raises BadInput for anything else."""
+        """From its text or from ``to_json``'s values, all but the name may be left out. Raises BadInput for others."""
+        if isinstance(value, str):
+            return cls.parse(value)
         if not isinstance(value, Mapping) or not isinstance(value.get("name"), str):
             raise BadInput(f'slice is {value!r}, not an object such as {{"name": "contact", "contact": true}}')
         for key in value:

@@ -139,3 +139,22 @@ export async function record(trace) {
   const maps = Math.ceil(trace.steps / RECORDED_MAPS);
   return (await post('/api/recordings', { ...trace.selection, maps })).json();
 }
+
+/**
+ * @typedef {object} Run of fine-tuning (docs/api.md) @property {string} run @property {string} task @property {string} filter
+ * @property {object} settings @property {Job | null} job @property {string | null} child @property {'kept' | 'default' | null} place
+ */
+
+const finetuneUrl = ({ task, filter, data }) => `/api/finetune/${encodeURIComponent(task)}/${encodeURIComponent(filter)}?${new URLSearchParams({ data })}`;
+
+/** What of a filter can be trained, on what, and the runs so far. */
+export const finetuning = async (selection, signal) => (await ask(finetuneUrl(selection), { signal })).json();
+
+/** Has it trained further, or goes on with the run of the same settings. @returns {Promise<Run>} */
+export const startFinetune = async (selection, settings) => (await post(finetuneUrl(selection), settings)).json();
+
+/** A run, how far it is, and what it found. */
+export const tuned = async (run, signal) => (await ask(`/api/tuned/${encodeURIComponent(run)}`, { signal })).json();
+
+/** What becomes of a child. @param {'accept' | 'keep' | 'roll-back'} act @returns {Promise<Run>} */
+export const decide = async (run, act) => (await ask(`/api/tuned/${encodeURIComponent(run)}/${act}`, { method: 'POST' })).json();

@@ -26,7 +26,7 @@ export class Figures {
     new ResizeObserver(() => host.clientWidth !== this.#width && this.redraw()).observe(host);
   }
 
-  /** @param {import('./api.js').Found | null} found @param {import('./trace.js').Trace} trace that the page shows */
+  /** @param {import('./api.js').Found | null} found @param {import('./trace.js').Trace | null} trace that the page shows, null where it is of no single one */
   show(found, trace) {
     if (found === this.#found && trace === this.#trace) return;
     [this.#found, this.#trace] = [found, trace];
@@ -148,7 +148,7 @@ export class Figures {
         select: { show: false },
         scales: { x: { time: false, range: () => (x[1] > x[0] ? x : [x[0] - 1, x[0] + 1]) }, y: { range: () => y } },
         axes: [
-          { ...ink(), ...small, size: 16, gap: 2, space: 40, ...(bars && xs.every(Number.isInteger) ? { incrs: [1, 2, 5, 10, 20, 50, 100, 1000] } : {}) },
+          { ...ink(), ...small, size: 16, gap: 2, space: 40, ...(bars && xs.every(Number.isInteger) ? { incrs: [1, 2, 5, 10, 20, 50, 100, 1000] } : {}), ...(plot.names?.length ? { space: 1, size: 58, rotate: -38, values: (_, at) => at.map((x) => plot.names[x] ?? '') } : {}) },
           { ...ink(), ...small, label: plot.y_label, size: 40, gap: 3, space: 24 },
         ],
         series: [{}, { show: false }],
@@ -207,7 +207,7 @@ export class Figures {
   }
 
   get #layers() {
-    return new Set(['truth', 'fused', ...this.#trace.modalities]);
+    return new Set(['truth', 'fused', ...(this.#trace?.modalities ?? [])]);
   }
 }
 

@@ -6,6 +6,7 @@ import { Clock } from './clock.js';
 import { Compare } from './compare.js';
 import { Diagnostics } from './diagnostics.js';
 import { Failures } from './failures.js';
+import { Finetune } from './finetune.js';
 import { Heatmaps } from './heatmap.js';
 import { Jobs } from './jobs.js';
 import { keys } from './keys.js';
@@ -81,6 +82,7 @@ class Page {
     this.diagnostics = new Diagnostics($('#diagnostics'), store, this.jobs);
     this.failures = new Failures($('#failures'), store, this.jobs, this.timeline, catalog);
     this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.#overlay(other, name));
+    this.finetune = new Finetune($('#finetune'), catalog, store, this.jobs, sheet);
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
     this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
@@ -125,6 +127,7 @@ class Page {
     if (any('against') && this.#trace) this.compare.choose();
     if (any('task', 'filter', 'data', 'recipe', 'among')) this.failures.load();
     else if (any('by', 'group', 'list')) this.failures.draw();
+    if (any('task', 'filter', 'run')) this.finetune.load();
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
     if (any('component', 'weights', 'track')) this.#choose();
@@ -231,6 +234,7 @@ class Page {
     this.rerun.open = tab === 'rerun';
     this.diagnostics.open = tab === 'diagnostics';
     this.compare.open = tab === 'compare';
+    this.finetune.open = tab === 'finetune';
     if (this.#trace) this.rerun.move(this.#store.state.step, false);
   }
 
@@ -245,6 +249,7 @@ class Page {
     this.heatmaps.redraw();
     this.diagnostics.redraw();
     this.compare.redraw();
+    this.finetune.redraw();
   }
 
   #goWorst() {
@@ -291,6 +296,7 @@ class Page {
       f: () => this.#store.set({ tab: 'failures' }),
       n: (event) => this.failures.go(1, event.timeStamp),
       b: (event) => this.failures.go(-1, event.timeStamp),
+      t: () => this.#store.set({ tab: 'finetune' }),
       j: () => this.jobs.toggle(),
       c: () => this.#nextComponent(),
       e: () => this.#goWorst(),

@@ -1,8 +1,8 @@
-/** The left of the page: tabs for the 3D scene, for Rerun's viewer, for the diagnostics, for failures and for comparisons. */
+/** The left of the page: tabs for the 3D scene, for Rerun's viewer, for the diagnostics, for failures, for comparisons and for fine-tuning. */
 
 import { say } from './panel.js';
 
-const TABS = ['scene', 'rerun', 'diagnostics', 'failures', 'compare'];
+const TABS = ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune'];
 
 /** The scene's frame: another page of the server's, which follows the cursor by itself. */
 export class Scene {

@@ -34,7 +34,7 @@ def test_a_slice_is_read_from_its_text_and_printed_and_travels_as_json(text: str
     slice_ = Slice.parse(text)
     assert slice_ == TEXTS[text]
     assert Slice.parse(str(slice_)) == slice_
-    assert Slice.of(slice_.to_json()) == slice_
+    assert Slice.of(slice_.to_json()) == Slice.of(text) == slice_
 
 
 def test_no_fault_has_a_parameter_that_a_slice_would_take_for_its_own() -> None:
