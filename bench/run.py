@@ -13,6 +13,7 @@ import sys
 
 import collect
 import filters
+import finetune
 import loading
 import maps
 import page
@@ -24,6 +25,7 @@ from rich.table import Table
 PARTS = {
     "collect": collect.measure,
     "filters": filters.measure,
+    "finetune": finetune.measure,
     "maps": maps.measure,
     "loading": loading.measure,
     "recordings": recordings.measure,
