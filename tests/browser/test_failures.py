@@ -24,10 +24,9 @@ def looked(open_page: Any, more: str = "", **options: Any) -> Any:
     return page
 
 
-def at(page: Any, moment: dict[str, Any]) -> None:
-    """Waits until maps and scene are at a moment."""
-    page.until(f"() => beliefscope.state().episode === {moment['episode']}")
-    page.settle(moment["step"])
+def chosen(page: Any, episode: int, step: int) -> None:
+    """Waits until the page's state is at a moment."""
+    page.until(f"() => beliefscope.state().episode === {episode} && beliefscope.state().step === {step}")
 
 
 def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) -> None:
@@ -37,7 +36,8 @@ def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) 
     rows = page.page.locator("#failures .moments tbody tr")
     assert rows.count() == len(moments)
     rows.first.click()
-    at(page, worst)
+    chosen(page, worst["episode"], worst["step"])
+    page.settle(worst["step"])
     assert page.state["tab"] == "failures"
     assert rows.first.get_attribute("class") == "here"
     marked = page.page.locator("#marks button")
@@ -49,9 +49,9 @@ def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) 
     page.picture("failures")
 
     page.page.keyboard.press("n")
-    at(page, second)
+    chosen(page, second["episode"], second["step"])
     page.page.keyboard.press("b")
-    at(page, worst)
+    chosen(page, worst["episode"], worst["step"])
     page.page.get_by_text("angle", exact=True).first.click()  # by another measure, which the time line draws
     page.until("() => location.search.includes('by=angle')")
     assert page.state["component"] == "angle"
@@ -60,8 +60,9 @@ def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) 
     page.until("() => document.querySelector('#failures .verdict').textContent.includes('has no particles')")
 
     other = open_page("?" + copied.partition("?")[2])
-    at(other, worst)
-    assert dict(parse_qsl(copied.partition("?")[2]))["step"] == str(other.state["step"])
+    chosen(other, worst["episode"], worst["step"])
+    other.settle(worst["step"])
+    assert dict(parse_qsl(copied.partition("?")[2]))["step"] == str(worst["step"])
     assert other.state["filter"] == "crossmodal-ekf"
 
 
@@ -99,7 +100,7 @@ def test_episodes_are_sorted_and_opened(open_page: Any) -> None:
         has=page.page.get_by_role("button", name=f"Episode {worst['index']}", exact=True)
     )
     row.get_by_role("button").click()
-    page.until(f"() => beliefscope.state().episode === {worst['index']} && beliefscope.state().step === 0")
+    chosen(page, worst["index"], 0)
     box = row.locator("svg").bounding_box()
     page.page.mouse.click(box["x"] + 0.6 * box["width"], box["y"] + 5)
     page.until(f"() => Math.abs(beliefscope.state().step - {0.6 * worst['steps']}) <= 1")  # steps are thin
