@@ -32,8 +32,8 @@ PIECES, POINTS, MOST_POINTS = 8, 4, 2048
 AT_ONCE = 64
 """Copies of the step that are run as one batch."""
 
-BASELINES: dict[str, str] = {"gray": "pictures of the mean gray", "black": "black pictures"}
-"""What pictures are compared with. Channels are compared with their training mean."""
+BASELINES: dict[str, str] = {"gray": "gray pictures", "black": "black pictures"}
+"""What pictures are compared with; gray is the training mean, over all pixels. Channels: their training mean."""
 
 MEAN = "the mean"
 """The baseline of a filter without pictures."""
@@ -100,7 +100,7 @@ class Saliency(Diagnostic):
             sums = ", ".join(
                 f"{name} {self._said(float(values.sum()), '+')}" for name, values in one.integrated.items()
             )
-            sentence = f"Against {self._baseline(one)}, where it is {self._said(one.value)}: {sums}"
+            sentence = f"From {self._baseline(one)} ({self._said(one.value)}): {sums}"
             if strongest := self._strongest(one):
                 sentence += f", most of all channels {strongest}"
             sentences.append(f"{sentence}.")
@@ -132,7 +132,7 @@ class Saliency(Diagnostic):
         """The baseline in words, channels included."""
         felt = [name for name in self.inputs if name not in self.pictured]
         pictures = [BASELINES[one.baseline]] if self.pictured else []
-        return " and ".join(pictures + ([f"the mean of {' and '.join(felt)}"] if felt else []))
+        return " and ".join(pictures + [f"mean {name}" for name in felt])
 
     def _strongest(self, one: Compared) -> str:
         """The channel with the largest attribution; empty where none is large enough to show."""
@@ -155,7 +155,7 @@ class Saliency(Diagnostic):
         tables = [
             Table(
                 f"Integrated gradients of {self.target}{unit}, by modality",
-                ("against", *self.inputs, "sum", "change to explain", "missed (%)", "points"),
+                ("from", *self.inputs, "sum", "change to explain", "missed (%)", "points"),
                 tuple(sums),
             )
         ]
@@ -179,9 +179,13 @@ class Saliency(Diagnostic):
         for name in self.pictured:
             shown.append(Picture(f"{name} at step {self.step}", self.inputs[name], "gray", signed=False))
             for one in self.compared:
-                title = f"{name}: integrated gradients from {one.baseline}"
-                shown.append(Picture(title, self.factor * one.integrated[name], f"{self.unit} per pixel".strip()))
-            title = f"{name}: occlusion by {self.window} x {self.window} gray pixels"
+                title = f"{name}, integrated from {one.baseline}"
+                shown.append(
+                    Picture(
+                        title, self.factor * one.integrated[name], f"{self.unit}/pixel" if self.unit else "per pixel"
+                    )
+                )
+            title = f"{name}, occluded {self.window} x {self.window} by gray"
             shown.append(Picture(title, self.factor * self.occlusion[name], self.unit))
         return shown
 

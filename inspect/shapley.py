@@ -97,13 +97,13 @@ class Shapley(Diagnostic):
             said = changes[0].format("the position RMSE"), *(change.format("it") for change in changes[1:])
             none, every = 100.0 * one.rmse[0, 0], 100.0 * one.rmse[-1, 0]
             sentences.append(
-                f"{WHEN.get(one.split, 'Over all steps')} {', '.join(said)}: from {none:.2f} cm by {self.nothing} "
-                f"to {every:.2f} cm with {'all' if len(self.modalities) > 1 else 'it'}."
+                f"{WHEN.get(one.split, 'Over all steps')} {', '.join(said)} ({none:.2f} cm by {self.nothing}, "
+                f"{every:.2f} cm with {'all' if len(self.modalities) > 1 else 'it'})."
             )
         if len(self.modalities) > 1:
             whole = 100.0 * self.splits[0].rmse[:, 0]
-            missed = [f"{whole[-1 - 2**k]:.2f} cm where {name} is left out" for k, name in enumerate(self.modalities)]
-            sentences.append(f"Over all steps {whole[-1]:.2f} cm, {', '.join(missed)}.")
+            missed = [f"{whole[-1 - 2**k]:.2f} cm without {name}" for k, name in enumerate(self.modalities)]
+            sentences.append(f"All steps: {whole[-1]:.2f} cm, {', '.join(missed)}.")
         if not self.off:
             sentences.append(f"Runs start at the truth, which favours {self.nothing}.")
         if self.trajectories < FEWEST:

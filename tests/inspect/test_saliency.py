@@ -317,7 +317,7 @@ def test_a_filter_without_pictures_has_one_baseline() -> None:
     assert [one.baseline for one in found.compared] == ["the mean"]
     assert list(found.inputs) == ["haptics"]
     assert not found.pictures()
-    assert "Against the mean of haptics," in found.verdict
+    assert "From mean haptics (" in found.verdict
 
 
 def test_channels_have_names_and_units() -> None:
