@@ -207,14 +207,14 @@ class Library:
                 self._traced.popitem(last=False)
             return known
 
-    def there(self, selection: Selection) -> Trace | None:
-        """The selection's trace if it is in memory. Nothing is computed for it."""
+    def there(self, selection: Selection) -> Traced | None:
+        """The selection's trace if it is in memory and done. Nothing is computed for it."""
         with self._lock:
             known = self._traced.get(self._keys.get(selection, ""))
             if known is None or not known.done.done() or known.done.exception() is not None:
                 return None
             self._traced.move_to_end(known.key)
-            return known.trace
+            return known
 
     def key(self, selection: Selection) -> str:
         """Hash of everything its trace depends on; the trace need not be there. Raises BadInput as ``traced``."""

@@ -34,8 +34,11 @@ NUMBERS = (
 )
 
 
-def maps_message(serial: int, task: Task, trace: Trace, maps: LikelihoodMap) -> bytes:
-    """Header's length, JSON header, padding to a multiple of 4, float32 particles, then the layers as uint16."""
+def maps_message(serial: int, task: Task, trace: Trace, maps: LikelihoodMap, other: bool = False) -> bytes:
+    """Header's length, JSON header, padding to a multiple of 4, float32 particles, then the layers as uint16.
+
+    Other: whether they are of the other run.
+    """
     effector = trace.episode.observations.get("effector_position")
     cells, log_max, log_range = quantised(maps.log_likelihood)
     cloud = particles(trace, maps.step, task)
@@ -43,6 +46,7 @@ def maps_message(serial: int, task: Task, trace: Trace, maps: LikelihoodMap) -> 
     description = {
         "type": "maps",
         "serial": serial,
+        "other": other,
         "step": maps.step,
         "size": len(maps.offsets_x),
         "angle": None if math.isnan(maps.angle) else float(maps.angle),

@@ -18,7 +18,6 @@ from beliefscope.app.scene import Scene
 from beliefscope.app.wire import Cursor, cursor
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import no_maps
-from beliefscope.inspect.trace import Trace
 
 log = logging.getLogger("beliefscope.app")
 
@@ -109,22 +108,26 @@ class View:
         trace = traced.trace
         if wanted.step >= len(trace):
             raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(trace) - 1}.")
+        other = self._other(selection, wanted.against, len(trace))
         if no_maps(traced.checkpoint, trace):
             await websocket.send_json({"type": "no_maps", "serial": wanted.serial, "step": wanted.step})
         else:
+            if wanted.beside and other is not None and not no_maps(other.checkpoint, other.trace):
+                theirs = await asyncio.to_thread(other.map, wanted.step, wanted.angle, wanted.size)
+                message = maps_message(wanted.serial, other.checkpoint.task, other.trace, theirs, other=True)
+                await websocket.send_bytes(message)
             maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)
             await websocket.send_bytes(maps_message(wanted.serial, traced.checkpoint.task, trace, maps))
         if not wanted.scene:
             return
-        other = self._other(selection, wanted.against, len(trace))
-        await asyncio.to_thread(self.scene.show, traced, wanted.step, other)
+        await asyncio.to_thread(self.scene.show, traced, wanted.step, None if other is None else other.trace)
         await websocket.send_json({"type": "drawn", "serial": wanted.serial, "step": wanted.step})
 
-    def _other(self, selection: Selection, against: str, steps: int) -> Trace | None:
+    def _other(self, selection: Selection, against: str, steps: int) -> Traced | None:
         """The other run, once it is there: the page has it computed over HTTP, and is told there what is wrong."""
         with contextlib.suppress(BadInput):
             other = self._library.there(selection.against(against)) if against else None
-            return other if other is not None and len(other) == steps else None
+            return other if other is not None and len(other.trace) == steps else None
         return None
 
     async def _ready_before_newer(self, traced: Traced) -> bool:

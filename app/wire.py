@@ -26,7 +26,8 @@ class Cursor:
 
     Serial: the page's own count of its cursors. Recipe: how the sensors are broken. Scene: whether the 3D scene
     follows, or only the maps. Data: name of the data set; empty for the task's first. Against: what differs in the
-    other run, whose estimate the scene shows too (``Selection.against``); empty without one.
+    other run, whose estimate the scene shows too (``Selection.against``); empty without one. Beside: whether its maps
+    are wanted too.
     """
 
     serial: int
@@ -40,6 +41,7 @@ class Cursor:
     scene: bool = True
     data: str = ""
     against: str = ""
+    beside: bool = False
 
 
 def cursor(message: dict[str, Any]) -> Cursor:
@@ -58,9 +60,10 @@ def cursor(message: dict[str, Any]) -> Cursor:
     size = message.get("size", MAP_SIZES[0])
     if size not in MAP_SIZES:
         raise BadInput(f"cursor's 'size' is {' or '.join(map(str, MAP_SIZES))}; got {size!r}.")
-    scene = message.get("scene", True)
-    if not isinstance(scene, bool):
-        raise BadInput(f"cursor's 'scene' is true or false; got {scene!r}.")
+    scene, beside = message.get("scene", True), message.get("beside", False)
+    for key, flag in (("scene", scene), ("beside", beside)):
+        if not isinstance(flag, bool):
+            raise BadInput(f"cursor's {key!r} is true or false; got {flag!r}.")
     return Cursor(
         task=message["task"],
         filter=message["filter"],
@@ -70,6 +73,7 @@ def cursor(message: dict[str, Any]) -> Cursor:
         scene=scene,
         data=data,
         against=against,
+        beside=beside,
         **integers,
     )
 

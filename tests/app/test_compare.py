@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -158,8 +159,9 @@ def test_dashes_lie_on_their_edges_and_cover_about_half(shape: str) -> None:
 def test_the_scene_shows_the_other_run_where_it_is(shown: TestClient) -> None:
     library = shown.app.state.library  # type: ignore[attr-defined]
     selection = Selection("door", "crossmodal-ekf", EPISODE)
-    traced, other = library.traced(selection), library.traced(selection.against("filter=crossmodal-pf")).trace
-    assert library.there(selection.against("filter=crossmodal-pf")) is other
+    traced, its = library.traced(selection), library.traced(selection.against("filter=crossmodal-pf"))
+    other = its.trace
+    assert library.there(selection.against("filter=crossmodal-pf")) is its
     assert library.there(selection.against("from=1&to=3&weights=image=0.123")) is None
     scene = Scene(lambda step: None, dark=False)
     try:
@@ -175,3 +177,32 @@ def test_the_scene_shows_the_other_run_where_it_is(shown: TestClient) -> None:
         assert not any(name.startswith("/other") for name in nodes)
     finally:
         scene.close()
+
+
+def test_maps_of_the_other_run_come_before_this_ones(shown: TestClient) -> None:
+    against = "filter=crossmodal-pf"
+    compared(shown, against)
+    view = shown.post("/api/views").json()
+    cursor = {
+        "type": "cursor",
+        "task": "door",
+        "filter": "crossmodal-ekf",
+        "episode": EPISODE,
+        "step": 45,
+        "angle": None,
+    }
+    with shown.websocket_connect(f"ws://localhost:8000{view['socket']}") as socket:
+        for serial, extra in enumerate(({}, {"against": against}, {"against": against, "beside": True})):
+            socket.send_json({**cursor, "serial": serial, "size": 41, "scene": False, **extra})
+            of = [header(socket.receive_bytes()) for _ in range(1 + len(extra) // 2)]
+            assert [one["other"] for one in of] == [True, False][-len(of) :]
+            assert {one["serial"] for one in of} == {serial}
+        alone = {**cursor, "filter": "crossmodal-pf", "serial": 9, "size": 41, "scene": False}
+        socket.send_json(alone)
+        assert header(socket.receive_bytes())["peak"] == of[0]["peak"] != of[1]["peak"]
+
+
+def header(message: bytes) -> dict[str, Any]:
+    size = int.from_bytes(message[:4], "little")
+    found: dict[str, Any] = json.loads(message[4 : 4 + size])
+    return found
