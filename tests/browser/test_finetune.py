@@ -41,10 +41,10 @@ def test_a_filter_is_tuned_judged_accepted_and_rolled_back(open_page: Any, serve
     before = page.page.evaluate(FILTERS)
     with page.page.expect_navigation():
         panel.get_by_role("button", name="Accept").click()
-    page.until(f\"{SHOWN} !== 'crossmodal-ekf'\")
+    page.until(f"{SHOWN} !== 'crossmodal-ekf'")
     child = page.state["filter"]
     assert page.page.evaluate(FILTERS) == [child, *before]
     with page.page.expect_navigation():
         panel.get_by_role("button", name="Roll back").click()
-    page.until(f\"{SHOWN} === 'crossmodal-ekf'\")
+    page.until(f"{SHOWN} === 'crossmodal-ekf'")
     assert page.page.evaluate(FILTERS) == before
