@@ -16,6 +16,9 @@ export class Compare {
   #overlay;
   #trace = null;
   #other = null;
+  #gain;
+  /** What the other run is called; empty without one. */
+  name = '';
   #loading = new AbortController();
   #open = false;
 
@@ -27,6 +30,9 @@ export class Compare {
   constructor(host, catalog, store, sheet, overlay) {
     [this.#catalog, this.#store, this.#overlay] = [catalog, store, overlay];
     this.#result = host.querySelector('.result');
+    this.#gain = host.querySelector('.gain');
+    this.#gain.addEventListener('change', ({ target }) => store.set({ beside: target.checked ? 'gain' : 'alone' }));
+    store.listen((_, changed) => changed.has('beside') && this.#showGain());
     this.#figures = new Figures(host.querySelector('.figures'), store);
     this.#form = new Edit(host.querySelector('form'), catalog, store, sheet, (against) => api.check({ ...store.state, against }));
     say(this.#result, 'loading', 'Loading …');
@@ -90,8 +96,18 @@ export class Compare {
   }
 
   #draw(other, name) {
-    if (other !== this.#other) this.#overlay(other, name);
-    this.#other = other;
+    if (other === this.#other) return;
+    [this.#other, this.name] = [other, name];
+    this.#overlay(other, name);
+    this.#showGain();
+  }
+
+  /** Whether the maps show what they gain on the other run's, or why they cannot. */
+  #showGain() {
+    const [box, text] = this.#gain.children;
+    const none = this.#other && whyNoGain(this.#trace, this.#other);
+    [box.checked, box.disabled] = [this.#store.state.beside === 'gain' && !none, Boolean(none)];
+    text.textContent = none ?? `In the maps, show what this run gains on ${this.name === 'edited' ? 'the edited one' : this.name}`;
   }
 
   #show(found) {
@@ -99,4 +115,11 @@ export class Compare {
     this.#figures.show(found, this.#trace);
     if (this.#open) this.#figures.move(this.#store.state.step);
   }
+}
+
+/** Why the maps of two runs cannot be set against each other, in a line; null where they can. */
+function whyNoGain(trace, other) {
+  if (trace.header.no_maps || other.header.no_maps) return `No gain in the maps: ${trace.header.no_maps ?? other.header.no_maps}.`;
+  if (trace.modalities.join() === other.modalities.join()) return null;
+  return 'No gain in the maps: the runs do not have the same modalities.';
 }

@@ -18,6 +18,7 @@ export class Heatmaps {
   #maps = null;
   #trace = null;
   #pinned = null; // {maps, selection}
+  #besideName = '';
   #hover = null; // [dx, dy] m
   #side = 0;
 
@@ -29,8 +30,12 @@ export class Heatmaps {
     store.listen((_, changed) => LOOKS.some((look) => changed.has(look)) && this.#shade());
   }
 
-  /** @param {import('./mapvalues.js').Maps} maps @param {import('./trace.js').Trace} trace that they are of. */
-  draw(maps, trace) {
+  /**
+   * @param {import('./mapvalues.js').Maps} maps @param {import('./trace.js').Trace} trace that they are of
+   * @param {string} besideName of the other run, whose maps may be beside them
+   */
+  draw(maps, trace, besideName = '') {
+    this.#besideName = besideName;
     const first = this.#maps === null || this.#maps.layers.join() !== maps.layers.join();
     [this.#maps, this.#trace] = [maps, trace];
     // Of one measurement model alone the fused map is the same again.
@@ -46,6 +51,17 @@ export class Heatmaps {
     this.changed();
   }
 
+  /** The maps that the shown ones are set against: those pinned, or the other run's at this step; null without any. */
+  get #base() {
+    const beside = this.#maps?.beside;
+    return this.#pinned ?? (beside && comparable(beside, this.#maps) ? { maps: beside, name: this.#besideName } : null);
+  }
+
+  /** What the base is called. */
+  get #baseName() {
+    return this.#base.name ?? `step ${this.#base.maps.step}`;
+  }
+
   /** Set by who must know that the pinned maps have come or gone. */
   changed = () => {};
 
@@ -56,7 +72,7 @@ export class Heatmaps {
   /** What is shown, for a file. @returns {{maps: object, trace: object, figures: object[], title: string, look: object}} */
   get shown() {
     const figures = this.#figures.map((figure, layer) => this.#drawn(figure, layer));
-    return { maps: this.#maps, trace: this.#trace, figures, title: this.#title(), look: this.#look(0), pinned: this.#pinned };
+    return { maps: this.#maps, trace: this.#trace, figures, title: this.#title(), look: this.#look(0), pinned: this.#base };
   }
 
   redraw() {
@@ -69,8 +85,9 @@ export class Heatmaps {
   #shade() {
     if (!this.#maps) return;
     const { scale, range, colours, regions } = this.#store.state;
-    const all = shades(this.#maps, scale, range, this.#pinned?.maps ?? null);
-    const table = this.#pinned ? DIVERGING : colours;
+    const base = this.#base;
+    const all = shades(this.#maps, scale, range, base?.maps ?? null);
+    const table = base ? DIVERGING : colours;
     this.#figures.forEach((figure, layer) => {
       figure.shade = all[layer];
       figure.table = table;
@@ -79,9 +96,9 @@ export class Heatmaps {
       this.#showBar(figure);
     });
     const kind = this.#panel.querySelector('#maps-kind');
-    kind.textContent = this.#pinned ? `Gain on step ${this.#pinned.maps.step}` : scale === 'log' ? 'Log-likelihood' : 'Likelihood';
+    kind.textContent = base ? `Gain on ${this.#baseName}` : scale === 'log' ? 'Log-likelihood' : 'Likelihood';
     kind.parentElement.title = this.#title();
-    kind.nextElementSibling.hidden = Boolean(this.#pinned);
+    kind.nextElementSibling.hidden = Boolean(base);
     kind.nextElementSibling.classList.toggle('roomy', scale === 'log');
     this.#showPairs();
     this.redraw();
@@ -90,6 +107,7 @@ export class Heatmaps {
   /** What the colours say, in words. */
   #title() {
     const { scale, range } = this.#store.state;
+    if (this.#base?.name) return `ln of the likelihood over that of the other run (${this.#baseName}), each as a density over the square`;
     if (this.#pinned) {
       const { filter, episode } = this.#pinned.selection;
       return `ln of the likelihood over that of step ${this.#pinned.maps.step} (${filter}, episode ${episode}), each as a density over the square`;
@@ -209,7 +227,7 @@ export class Heatmaps {
   #values(layer) {
     const cell = cellAt(this.#maps, this.#hover);
     const { log, relative, deep } = valueAt(this.#maps, layer, cell);
-    const gain = this.#pinned ? [`gain ${signed(this.#figures[layer].shade.values[cell], 2)} nats`] : [];
+    const gain = this.#base ? [`gain ${signed(this.#figures[layer].shade.values[cell], 2)} nats`] : [];
     return [`${fixed(relative, 3)} of peak, ln ${deep ? '< ' : ''}${fixed(log, 2)}`, ...gain];
   }
 

@@ -101,7 +101,7 @@ class Page {
       pace: (times) => this.scene.pace(times),
       maps: (maps, inputTime) => {
         if (!this.#trace) return;
-        this.heatmaps.draw(maps, this.#trace);
+        this.heatmaps.draw(maps, this.#trace, this.compare.name);
         say($('#heatmaps'), 'ready');
         stats.maps = { serial: maps.serial, step: maps.step, size: maps.size };
         if (inputTime !== null) keep(stats.scrub, performance.now() - inputTime);
@@ -131,7 +131,7 @@ class Page {
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
     if (any('component', 'weights', 'track')) this.#choose();
-    if (any('step', 'angle')) this.#move();
+    if (any('step', 'angle', 'beside')) this.#move();
   }
 
   /** Loads the trace that the state names and shows it in every panel. */
@@ -207,7 +207,7 @@ class Page {
     for (const panel of [this.timeline, this.camera, this.numbers, this.slice, this.diagnostics, this.failures]) panel.move(step);
     this.compare.move(step);
     this.rerun.move(step, origin === 'rerun');
-    this.socket.move({ ...trace.selection, step, angle, against: state.against }, inputTime);
+    this.socket.move({ ...trace.selection, step, angle, against: state.against, beside: state.beside === 'gain' }, inputTime);
     this.#read(state);
     const [count, time] = $('#readout').children;
     count.textContent = `${step} / ${trace.steps - 1}`;

@@ -4,7 +4,8 @@ import { fixed, signed } from './units.js';
 
 /**
  * @typedef {object} Maps of one step
- * @property {number} serial @property {number} step @property {number} size cells a side, S @property {number | null} angle rad
+ * @property {number} serial @property {boolean} other whether they are of the other run @property {Maps | null} beside the other run's at this step
+ * @property {number} step @property {number} size cells a side, S @property {number | null} angle rad
  * @property {string[]} layers L names @property {number} half_width m @property {number[]} centre m @property {number[]} truth
  * @property {number[]} estimate @property {number[]} log_max @property {number[]} log_range nats below the peak that are told apart
  * @property {number[][]} peak m, offsets @property {number[] | null} effector m

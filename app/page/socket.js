@@ -32,6 +32,7 @@ export class ViewSocket {
   #inFlight = null;
   #sent = new Map();
   #last = null;
+  #beside = null; // the other run's maps, which come before this one's
   #rest = 0;
   #lost = 0;
   #pause = RETRY.first;
@@ -129,6 +130,11 @@ export class ViewSocket {
   #heard(data) {
     if (data instanceof ArrayBuffer) {
       const maps = readMaps(data);
+      if (maps.other) {
+        this.#beside = maps;
+        return;
+      }
+      maps.beside = this.#beside?.serial === maps.serial ? this.#beside : null;
       const sent = this.#sent.get(maps.serial);
       this.#handlers.maps(maps, sent?.inputTime ?? null);
       this.#answered(maps.serial);

@@ -25,8 +25,8 @@ import { spoken } from './units.js';
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
-/** How likelihood maps are shown: the colours' scale, whether all share its range, the axes, what lies on top. */
-const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], cloud: ['hidden', 'shown'] };
+/** How likelihood maps are shown: the colours' scale, whether all share its range, the axes, what lies on top, what they gain on the other run. */
+const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
 const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
 const WORST = 'error'; // the measure that ranks failures where none is chosen
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
