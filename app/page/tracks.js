@@ -28,8 +28,12 @@ function over(track, other) {
   const lines = other.series.filter((s) => s.name !== 'truth').map(({ name, values }) => ({ name, values, other: true }));
   if (track.note) return { ...other, series: lines };
   const limits = track.limits && other.limits && [Math.min(track.limits[0], other.limits[0]), Math.max(track.limits[1], other.limits[1])];
-  return { ...track, limits, series: [...track.series, ...lines] };
+  const both = { ...track, limits, series: [...track.series, ...lines] };
+  // One filter has weights of a network, the other only shares.
+  return kindOf(track) === kindOf(other) ? both : { ...both, title: `${kindOf(track)} / ${kindOf(other).toLowerCase()}`, help: `${track.title}; dashed: ${other.title}` };
 }
+
+const kindOf = ({ title }) => title.split(',')[0];
 
 /** @returns {import('./chart.js').Track} or, where nothing is weighed, a line that says so. */
 function weights(trace, chosen, component) {
