@@ -82,6 +82,7 @@ export class TimeLine {
     const [from, to] = this.#window;
     const moved = step !== this.#at; // else it may be out of sight
     this.#at = step;
+    if (moved && this.#hover !== null && !this.#store.state.playing) this.#pointAt(null); // who moves the cursor wants its values
     if (moved && (step < from || step > to)) return this.#look(step - (to - from) / 4, step + (3 * (to - from)) / 4);
     this.#cursor.hidden = step < from || step > to;
     place(this.#cursor, this.#x(step));
@@ -228,6 +229,7 @@ export class TimeLine {
     this.#host.setAttribute('aria-valuemax', String(trace.steps - 1));
     this.#placeMarks();
     this.move(this.#store.state.step);
+    this.#tell(this.#hover ?? this.#store.state.step);
   }
 
   /** Names, lines and values of a track; what is cut short is said in full under the pointer. */

@@ -1,0 +1,155 @@
+"""The time line: its tracks, its zoom, marked moments, and another trace drawn over the first."""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.browser
+
+EPISODE = 9
+HEAD = f"?filter=crossmodal-ekf&episode={EPISODE}&step=40"
+MINUS = "\N{MINUS SIGN}"
+
+OTHER = """async () => {
+  const api = await import('/static/api.js');
+  const { task: name, data, episode } = beliefscope.state();
+  const task = (await api.catalog()).tasks.find((t) => t.name === name);
+  const selection = { task: name, filter: 'unimodal-ekf', data, episode, recipe: '' };
+  const other = await api.loadTrace(task, selection, () => {}, new AbortController().signal);
+  beliefscope.timeline.against(other, 'unimodal-ekf');
+}"""
+SHOWN = """(track) => {
+  const rows = [];
+  for (const cell of document.querySelectorAll('#tracks .track')[track].querySelectorAll('dt, dd')) {
+    if (cell.tagName === 'DT') rows.push([cell.textContent]);
+    else rows.at(-1).push(cell.textContent);
+  }
+  return rows;
+}"""
+
+
+def column(page: Any, name: str, filter_: str = "crossmodal-ekf") -> np.ndarray[Any, Any]:
+    """A column of a trace, as the server gives it."""
+    url = f"{page.url}api/trace/door/{filter_}/{EPISODE}"
+    one = next(c for c in page.page.request.get(url).json()["columns"] if c["name"] == name)
+    buffer = page.page.request.get(f"{url}/columns").body()
+    return np.frombuffer(buffer, "<f4", int(np.prod(one["shape"])), one["offset"]).reshape(one["shape"])
+
+
+def told(page: Any, track: int) -> dict[str, list[float | None]]:
+    """What a track's legend says: name -> its value, and the other trace's."""
+    rows = page.page.evaluate(SHOWN, track)
+    return {name: [float(v.replace(MINUS, "-")) if v else None for v in values] for name, *values in rows}
+
+
+def near(value: float) -> Any:
+    """As far as one digit after the point tells."""
+    return pytest.approx(value, abs=0.051)
+
+
+def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
+    page = open_page(HEAD + "&track=nees&window=20-60")
+    mouse, slider = page.page.mouse, page.page.locator("#tracks")
+    nees = column(page, "nees")
+    names = ("image", "haptics", "fused")
+    assert page.page.evaluate("() => document.querySelector('#whole').disabled") is False
+    assert {name: value for name, (value,) in told(page, 2).items()} == {
+        n: pytest.approx(v, rel=6e-3) for n, v in zip(names, nees[40], strict=True)
+    }
+
+    # The values under the pointer, in the place of the cursor's; nothing moves.
+    box = slider.bounding_box()
+    left, width = 140 + 46, box["width"] - 140 - 46 - 12  # px of the plots at this size of window
+
+    def at(step: float, window: tuple[float, float]) -> float:
+        return box["x"] + left + width * (step - window[0]) / (window[1] - window[0])
+
+    rows = (
+        "() => JSON.stringify([...document.querySelectorAll('#tracks .track')].map((r) => r.getBoundingClientRect()))"
+    )
+    before = page.page.evaluate(rows)
+    mouse.move(at(30, (20, 60)), box["y"] + 100)
+    assert page.page.locator("#told").text_content() == "pointer 30 · 3.0 s"
+    assert told(page, 2)["fused"] == [pytest.approx(nees[30, 2], rel=6e-3)]
+    assert page.page.evaluate(rows) == before
+    mouse.move(box["x"] + 300, box["y"] - 200)
+    assert page.page.locator("#told").text_content() == "cursor 40 · 4.0 s"
+
+    # Shift and drag: closer, the cursor staying; keys; the link opens the same stretch.
+    page.page.keyboard.down("Shift")
+    mouse.move(at(35, (20, 60)), box["y"] + 60)
+    mouse.down()
+    mouse.move(at(55, (20, 60)), box["y"] + 60)
+    mouse.up()
+    page.page.keyboard.up("Shift")
+    assert [float(v) for v in page.state["window"].split("-")] == pytest.approx([35, 55], abs=0.2)
+    assert page.state["step"] == 40
+    page.page.keyboard.press("-")
+    assert [float(v) for v in page.state["window"].split("-")] == pytest.approx([30, 70], abs=0.3)
+    page.page.keyboard.press("PageUp")
+    page.until("() => beliefscope.state().step === 44")
+    page.until("() => location.search.includes('step=44') && location.search.includes('window=')")
+    second = open_page("?" + page.page.url.partition("?")[2])
+    assert second.state == page.state
+    assert slider.get_attribute("aria-valuenow") == "44"
+    assert re.fullmatch(r"step 44, 4\.4 s, \d\.\d cm off(, in contact)?", slider.get_attribute("aria-valuetext"))
+    page.page.keyboard.press("0")
+    assert page.state["window"] == ""
+
+    # What there is of the others, and why there is not.
+    page.page.locator("#track").select_option("innovation")
+    page.until("() => document.querySelector('#tracks .track:last-of-type h3').textContent.startsWith('Innovation')")
+    image, haptics = 100 * column(page, "innovation")[44, :, 0]
+    assert told(page, 2) == {"image": [near(image)], "haptics": [near(haptics)]}
+    page.page.locator("#track").select_option("particles")
+    page.until("() => document.querySelector('#tracks .why')?.textContent.includes('a Gaussian and no particles')")
+    page.until("() => location.search.includes('track=particles')")
+    page.picture("timeline-why-not")
+
+
+def test_marked_moments_and_another_trace(open_page: Any) -> None:
+    page = open_page(HEAD + "&track=signed", color_scheme="dark")
+    moments = [{"step": s, "label": f"{s / 10} cm", "measure": "error"} for s in (70, 12, 55)]
+    page.page.evaluate("(moments) => beliefscope.timeline.mark(moments)", moments)
+    marks = page.page.locator("#marks button")
+    assert [m.get_attribute("aria-label") for m in marks.all()] == [
+        f"Step {s}: error, {s / 10} cm" for s in (12, 55, 70)
+    ]
+    marks.nth(1).click()
+    page.until("() => beliefscope.state().step === 55")
+    centres = [page.page.locator(s).bounding_box() for s in ("#marks [aria-current]", "#tracks .cursor")]
+    assert np.diff([c["x"] + c["width"] / 2 for c in centres]) == pytest.approx(0, abs=1)
+    page.page.keyboard.press("ArrowRight")  # from mark to mark, not from step to step
+    page.page.keyboard.press("Enter")
+    page.until("() => beliefscope.state().step === 70")
+    page.page.keyboard.press("+")
+    page.until(
+        "() => [...document.querySelectorAll('#marks button')].map((b) => b.hidden).join() === 'true,false,false'"
+    )
+    page.page.keyboard.press("0")
+
+    page.page.evaluate(OTHER)
+    page.until("() => !document.querySelector('#against-key').hidden")
+    assert page.page.locator("#against-key").text_content() == "unimodal-ekf"
+    here, there = (100 * column(page, "estimate_mean", f)[70, 0] for f in ("crossmodal-ekf", "unimodal-ekf"))
+    assert told(page, 1)["fused"] == [near(here), near(there)]
+    truth = 100 * column(page, "truth")[70, 0]
+    assert told(page, 2)["fused"] == [near(here - truth), near(there - truth)]
+    time.sleep(0.2)
+    page.picture("timeline-against")
+    assert (
+        page.page.evaluate(
+            "() => Math.max(...[...document.querySelectorAll('.bar')].map((e) => e.scrollWidth - e.clientWidth))"
+        )
+        <= 1
+    )
+
+    # Of another episode neither the marks nor the other trace say anything.
+    page.page.locator("#episode").select_option("8")
+    page.until("() => document.querySelector('#against-key').hidden && !document.querySelector('#marks button')")
+    assert len(told(page, 1)["fused"]) == 1
