@@ -1,0 +1,146 @@
+"""The likelihood maps as an instrument: their looks are in the address, their values and files are the engine's."""
+
+from __future__ import annotations
+
+import csv
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
+from beliefscope.inspect.mapnumbers import measure_maps
+from beliefscope.inspect.trace import Trace, trace
+
+pytestmark = pytest.mark.browser
+
+STEP = 25
+LINK = f"?filter=crossmodal-pf&step={STEP}&tab=diagnostics"
+
+
+@pytest.fixture(scope="module")
+def engine() -> MapEngine:
+    checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
+    with open_dataset(sample_path("door")) as data:
+        episode = data[9]
+    return MapEngine(checkpoint, trace(checkpoint, episode, episode_index=9))
+
+
+@pytest.fixture(scope="module")
+def told(engine: MapEngine) -> LikelihoodMap:
+    return engine.map(STEP)
+
+
+def numbers(text: str) -> list[float]:
+    return [float(n.replace("\N{MINUS SIGN}", "-")) for n in re.findall("[+\N{MINUS SIGN}]?\\d+(?:\\.\\d+)?", text)]
+
+
+def test_values_and_files_are_the_engines(
+    open_page: Any, engine: MapEngine, told: LikelihoodMap, tmp_path: Path
+) -> None:
+    page = open_page(LINK)
+    assert page.state["episode"] == 9
+    check_numbers(page, told, engine.trace)
+    check_probe(page, told)
+    page.page.locator("#maps-view").click()
+    files = {}
+    for kind in ("csv", "svg", "png"):
+        with page.page.expect_download() as download:
+            page.page.locator(f"#maps-options [data-as={kind}]").click()
+        files[kind] = tmp_path / download.value.suggested_filename
+        download.value.save_as(files[kind])
+    assert files["csv"].name == "door-crossmodal-pf-episode9-step25-maps.csv"
+    rows = list(csv.reader(line for line in files["csv"].read_text().splitlines() if not line.startswith("#")))
+    assert rows[0] == ["dx_cm", "dy_cm", "x_cm", "y_cm"] + [f"{m}_ln_likelihood_nats" for m in told.layers]
+    cells = np.array(rows[1:], dtype=float)
+    # Four decimals of values in 65535 steps of a range below 64 nats; places to three decimals of a cm.
+    np.testing.assert_allclose(cells[:, 4:].T.reshape(told.log_likelihood.shape), told.log_likelihood, atol=6e-4)
+    dx, dy = np.meshgrid(100.0 * told.offsets_x, 100.0 * told.offsets_y)
+    np.testing.assert_allclose(cells[:, :2], np.stack([dx.ravel(), dy.ravel()], axis=1), atol=1e-3)
+    np.testing.assert_allclose(cells[:, 2:4] - cells[:, :2], 100.0 * told.centre[None].repeat(len(cells), 0), atol=2e-3)
+    drawing = ElementTree.parse(files["svg"]).getroot()
+    assert len(drawing.findall(".//{*}clipPath")) == 3
+    texts = [text.text for text in drawing.iter("{http://www.w3.org/2000/svg}text")]
+    assert {*told.layers, "Δx (cm)"} <= {*texts}
+    assert files["png"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def check_numbers(page: Any, told: LikelihoodMap, run: Trace) -> None:
+    """What stands beneath the maps, as it is rounded there."""
+    measured = measure_maps([told], run)
+    for layer, figure in enumerate(page.page.locator("#heatmaps figcaption").all()):
+        peak, areas, ridge = figure.locator("p").all_text_contents()
+        assert numbers(peak) == pytest.approx((100.0 * told.peaks()[layer]).tolist(), abs=0.051)
+        want = [1e4 * a[0, layer] for a in (measured.area50, measured.area95)]
+        assert numbers(areas)[1::2] == pytest.approx(want, abs=0.51)
+        assert numbers(ridge)[-1] == pytest.approx(measured.entropy[0, layer] + np.log(1e4), abs=0.0051)
+        if "ridge" in ridge and "no" not in ridge:
+            assert numbers(ridge)[0] == pytest.approx(np.degrees(measured.off_line[0, layer]), abs=0.51)
+    pair = numbers(page.page.locator("#maps-pairs").text_content())
+    assert pair[:2] == pytest.approx([measured.divergence[0, 0, 1], measured.divergence[0, 1, 0]], abs=0.051)
+    assert pair[2] == pytest.approx(100.0 * measured.overlap[0, 0, 1], abs=0.51)
+
+
+def check_probe(page: Any, told: LikelihoodMap) -> None:
+    """Arrow keys on a map read its values, and leave the step alone."""
+    heights = "() => document.querySelector('#maps').offsetHeight"
+    before = page.page.evaluate(heights)
+    page.page.locator("#heatmaps canvas").nth(1).focus()
+    for key in ("ArrowRight", "Shift+ArrowUp"):
+        page.page.keyboard.press(key)
+    assert page.state["step"] == STEP
+    assert page.page.locator("#maps-value").text_content() == "at +0.2, +1.0 cm"
+    values = told.log_likelihood[:, 67 + 5, 67 + 1]
+    relative = np.exp(values - told.log_likelihood.max(axis=(1, 2)))
+    for layer, caption in enumerate(page.page.locator("#heatmaps figcaption").all_text_contents()):
+        assert numbers(caption) == pytest.approx([relative[layer], values[layer]], abs=0.0061)
+    assert "haptics" in page.page.locator("#maps-spoken").text_content()
+    assert page.page.evaluate(heights) == before
+    page.page.keyboard.press("Escape")
+    assert page.page.locator("#maps-value").text_content() == ""
+
+
+def test_looks_are_in_the_address_and_a_pinned_moment_is_what_others_gain_on(
+    open_page: Any, told: LikelihoodMap
+) -> None:
+    page = open_page(LINK)
+    plain = page.maps()
+    page.page.locator("#maps-view").click()
+    for look, value in [("scale", "log"), ("range", "same"), ("axes", "world"), ("cloud", "shown")]:
+        before = page.maps()
+        page.page.locator(f"#maps-{look} label", has=page.page.locator(f"[value={value}]")).click()
+        page.until(f"() => location.search.includes('{look}={value}')")
+        assert page.maps() != before
+    top = told.log_likelihood.max()
+    lowest = max(told.log_likelihood.min(), top - 40.0)
+    ends = page.page.locator("#heatmaps .colours b").all_text_contents()
+    assert [numbers(end)[0] for end in ends] == pytest.approx(3 * [lowest, top], abs=0.51)
+    page.picture("maps-log-world")
+    second = open_page("?" + page.page.url.partition("?")[2])
+    assert second.state == page.state
+    page.page.locator("#maps-scale label").first.click()
+    page.page.keyboard.press("Escape")
+    page.page.locator("h1").click()
+    page.page.keyboard.press("m")
+    page.page.locator("#heatmaps canvas").first.hover()
+    said = page.page.locator("#heatmaps figcaption").all_text_contents()
+    assert all(text.endswith("gain 0.00 nats") for text in said)  # on itself
+    page.page.keyboard.press("Shift+ArrowRight")
+    page.settle(STEP + 10)
+    assert page.page.locator("#maps-kind").text_content() == f"Gain on step {STEP}"
+    said = page.page.locator("#heatmaps figcaption").all_text_contents()
+    assert not any(text.endswith("gain 0.00 nats") for text in said)
+    page.picture("maps-gain")
+    page.page.keyboard.press("m")
+    page.page.keyboard.press("Shift+ArrowLeft")
+    page.settle(STEP)
+    for look in ("range", "axes", "cloud"):
+        page.page.evaluate(f"() => document.querySelector('#maps-{look} input').click()")
+    page.page.mouse.move(5, 5)
+    page.until("() => !location.search.includes('axes=')")
+    assert page.maps() == plain
