@@ -32,7 +32,7 @@ export class Failures {
   /** @type {Map<string, Result>} */
   #results = new Map();
   #loading = new AbortController();
-  #rows = []; // of the moments that are listed: {moment, row, button}
+  #rows = []; // of the moments, as they were listed last: {moment, row, button}
   #last = -1; // place of the moment that was gone to last
   #listed = ''; // what the rows are of
 
@@ -57,9 +57,12 @@ export class Failures {
   /** Marks the row at the cursor. */
   move(step) {
     const { episode } = this.#store.state;
-    this.#rows.forEach(({ moment, row, button }, i) => {
-      const here = moment.episode === episode && moment.step === step;
-      if (here) this.#last = i;
+    const at = (moment) => moment.episode === episode && moment.step === step;
+    const place = this.#moments.findIndex(at);
+    if (place >= 0) this.#last = place;
+    if (this.#host.hidden) return;
+    this.#rows.forEach(({ moment, row, button }) => {
+      const here = at(moment);
       if (here === row.classList.contains('here')) return;
       row.classList.toggle('here', here);
       if (here) button.setAttribute('aria-current', 'true');
@@ -72,6 +75,7 @@ export class Failures {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
     const key = this.#key;
+    this.#last = -1;
     if (!this.#results.has(key)) this.#keep(key, { state: 'loading' });
     this.draw();
     if (this.#results.get(key).state === 'ready') return;
@@ -86,15 +90,18 @@ export class Failures {
 
   /** Goes to the next moment of the list, or the one before. @param {1 | -1} by */
   go(by, inputTime) {
-    if (!this.#rows.length) return this.#store.set({ tab: 'failures' });
-    const place = Math.min(Math.max(this.#last + by, 0), this.#rows.length - 1);
-    this.#open(place, inputTime);
-    const { row } = this.#rows[place];
-    stopAt(row, row.parentElement.contains(document.activeElement));
+    const moments = this.#moments;
+    if (!moments.length) return this.#store.set({ tab: 'failures' });
+    this.#last = Math.min(Math.max(this.#last + by, 0), moments.length - 1);
+    this.#open(moments[this.#last], inputTime);
+    const table = this.#part('.moments');
+    if (table.checkVisibility()) stopAt(this.#rows[this.#last].row, table.contains(document.activeElement));
   }
 
-  /** Writes all that is known, by the chosen measure. */
+  /** Writes all that is known, by the chosen measure; only marks it on the time line while another tab is shown. */
   draw() {
+    this.#mark();
+    if (this.#host.hidden) return;
     const { state } = this.#store;
     const known = this.#known;
     const set = (key) => (value) => this.#store.set({ [key]: value });
@@ -113,7 +120,6 @@ export class Failures {
     this.#groups(score);
     this.#list(score);
     this.#episodes.show(known.found ?? null, score && !score.why_not ? score : null);
-    this.#mark();
   }
 
   #part(selector) {
@@ -240,7 +246,7 @@ export class Failures {
 
   #row(columns, moment, score, i) {
     const row = document.createElement('tr');
-    const go = button('', 'title', (event) => this.#open(i, event.timeStamp));
+    const go = button('', 'title', (event) => this.#open(moment, event.timeStamp));
     const what = `${score.title} ${withUnit(moment.value, score.unit)}`;
     go.setAttribute('aria-label', `Episode ${moment.episode}, step ${moment.step}: ${what}, ${moment.group}`);
     columns.forEach(({ text, hint, number }, c) => {
@@ -262,9 +268,7 @@ export class Failures {
     return { moment, row, button: go };
   }
 
-  #open(place, inputTime) {
-    this.#last = place;
-    const { episode, step } = this.#rows[place].moment;
+  #open({ episode, step }, inputTime) {
     this.#store.set({ episode, step, playing: false }, { inputTime });
   }
 

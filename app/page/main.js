@@ -233,6 +233,7 @@ class Page {
     this.showTab(tab);
     this.rerun.open = tab === 'rerun';
     this.diagnostics.open = tab === 'diagnostics';
+    this.failures.draw();
     this.compare.open = tab === 'compare';
     this.finetune.open = tab === 'finetune';
     if (this.#trace) this.rerun.move(this.#store.state.step, false);
