@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import asdict
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, HTTPException, Request
 from fastapi.responses import FileResponse, JSONResponse, Response
-from pydantic import TypeAdapter, ValidationError
 
 from beliefscope.app.api import PATIENCE, Asked
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Selection, Settings, Traced
+from beliefscope.app.options import described, parse, says_how_far
 from beliefscope.app.work import Report
 from beliefscope.datasets.corrupt import Recipe
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import one_of
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostic import Entry
 from beliefscope.inspect.trace import Trace
@@ -121,47 +120,11 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             report(0.5 * (i + 1) / len(episodes), f"{i + 1} of {len(episodes)} episodes are filtered")
         measuring = f"measuring {len(traces)} episodes" if len(traces) > 1 else f"measuring episode {episodes[0]}"
         report(0.5, measuring)
-        more = {"progress": lambda share: report(0.5 + 0.5 * share, measuring)} if _says_how_far(entry) else {}
+        more = {"progress": lambda share: report(0.5 + 0.5 * share, measuring)} if says_how_far(entry) else {}
         found = entry(traces, traced.checkpoint, **arguments["options"], **more)
         return {"trajectories": len(traces), **found.views()}
     finally:
         library.close()
-
-
-def described(entry: Entry) -> dict[str, Any]:
-    """An entry as JSON; an option's default is text, empty where there is none to be shown."""
-    parameters = inspect.signature(entry.run).parameters
-    options = [
-        {"name": name, "meaning": meaning, "default": _shown(parameters[name].default)}
-        for name, meaning in entry.options.items()
-    ]
-    return {
-        "name": entry.name,
-        "title": entry.title,
-        "question": entry.question,
-        "slow": entry.slow,
-        "options": options,
-    }
-
-
-def parse(entry: Entry, texts: Mapping[str, str]) -> dict[str, Any]:
-    """The entry's options from texts, as the types that its function takes; an empty one is its default.
-
-    Raises BadInput for an option that the entry does not have, and for a text that its type does not take.
-    """
-    hints = get_type_hints(entry.run)
-    options: dict[str, Any] = {}
-    for name, text in texts.items():
-        if name not in entry.options:
-            raise one_of(f"option of {entry.name}", name, entry.options)
-        if not text:
-            continue
-        try:
-            options[name] = TypeAdapter(hints.get(name, str)).validate_strings(text)
-        except ValidationError as error:
-            said = error.errors()[0]["msg"]
-            raise BadInput(f"{entry.name}'s {name!r} is {text!r}: {said}. It is {entry.options[name]}.") from None
-    return options
 
 
 class _Made:
@@ -221,11 +184,3 @@ def _link(entry: Entry, asked: Selection, options: Mapping[str, Any], episodes: 
     kept = {"task": asked.task, "filter": asked.filter, "data": asked.data, "episode": asked.episode}
     opened = {"recipe": str(asked.recipe), "diagnostic": entry.name, "options": urlencode(options), "over": episodes}
     return "?" + urlencode(kept | {"tab": "diagnostics"} | {name: text for name, text in opened.items() if text})
-
-
-def _says_how_far(entry: Entry) -> bool:
-    return "progress" in inspect.signature(entry.run).parameters
-
-
-def _shown(default: Any) -> str:
-    return "" if default in (None, inspect.Parameter.empty) else str(default)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,6 +30,12 @@ def inspect(
     only: Annotated[
         list[str] | None, typer.Option("--only", metavar="NAME", help="This diagnostic alone. May be repeated.")
     ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option", metavar="NAME=VALUE", help="Of the diagnostics that have it: step=68. May be repeated."
+        ),
+    ] = None,
     every: Annotated[bool, typer.Option("--all", help="The slow ones as well.")] = False,
     figures: Annotated[
         Path | None, typer.Option("--figures", metavar="DIR", help="Write a figure of each there; made if new.")
@@ -45,8 +52,10 @@ def inspect(
     Examples:
       beliefscope inspect run.trace
       beliefscope inspect runs/*.trace --only consistency --figures figures --format pdf
+      beliefscope inspect run.trace --only saliency --option step=68 --option target=beta:image
       beliefscope inspect run.trace --filter mine.safetensors --all --json -
     """
+    from beliefscope.app.options import parse, says_how_far
     from beliefscope.inspect.catalog import DIAGNOSTICS
     from beliefscope.inspect.plotting import FORMATS, write_figure
     from beliefscope.inspect.trace import load_trace
@@ -55,6 +64,12 @@ def inspect(
     for name in only or ():
         if name not in DIAGNOSTICS:
             raise one_of("diagnostic", name, DIAGNOSTICS)
+    chosen = {name: entry for name, entry in DIAGNOSTICS.items() if not only or name in only}
+    given = pairs(options or (), {name for entry in chosen.values() for name in entry.options})
+    parsed = {
+        name: parse(entry, {option: given[option] for option in entry.options if option in given})
+        for name, entry in chosen.items()
+    }
     if format_ not in FORMATS:
         raise one_of("format of a figure", format_, FORMATS)
     if figures is not None and figures.exists() and not figures.is_dir():
@@ -72,7 +87,6 @@ def inspect(
     found: dict[str, Any] = {}
     refused: dict[str, str] = {}
     text = []
-    chosen = {name: entry for name, entry in DIAGNOSTICS.items() if not only or name in only}
     with console.progress("Inspecting") as advance:
         for done, (name, entry) in enumerate(chosen.items()):
             why = next(filter(None, (entry.refusal(trace, made_by) for trace in traces)), None)
@@ -81,7 +95,9 @@ def inspect(
             if why is not None:
                 refused[name] = why
             else:
-                result = entry(traces, made_by)
+                share = lambda part, done=done: advance((done + part) / len(chosen))  # noqa: E731
+                more = {"progress": share} if says_how_far(entry) else {}
+                result = entry(traces, made_by, **parsed[name], **more)
                 found[name] = result.to_dict()
                 tables = [console.grid(one.title, one.columns, one.rows) for one in result.tables()]
                 text.append("\n\n".join([f"{entry.title}: {result.verdict}", *tables]))
@@ -100,6 +116,19 @@ def inspect(
         "not_made": refused,
     }
     console.result(document, "\n\n".join(text), json)
+
+
+def pairs(texts: Iterable[str], known: Collection[str]) -> dict[str, str]:
+    """Texts such as ``step=68`` by name. Raises BadInput for one of another form, and for a name that is not known."""
+    values: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise BadInput(f"--option {text!r} has no value; write NAME=VALUE, such as step=68")
+        if name not in known:
+            raise one_of("option", name, sorted(known))
+        values[name] = value
+    return values
 
 
 def shipped_by_hash(trace: Trace) -> Checkpoint | None:
