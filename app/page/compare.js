@@ -17,7 +17,7 @@ export class Compare {
   #trace = null;
   #other = null;
   #gain;
-  /** What the other run is called; empty without one. */
+  /** What the other run is called in a sentence; empty without one. */
   name = '';
   #loading = new AbortController();
   #open = false;
@@ -25,7 +25,7 @@ export class Compare {
   /**
    * @param {HTMLElement} host @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store
    * @param {import('./recipes.js').FaultSheet} sheet
-   * @param {(other: import('./trace.js').Trace | null, name: string) => void} overlay is told of the other run as it comes and goes
+   * @param {(other: import('./trace.js').Trace | null, label: string) => void} overlay is told of the other run as it comes and goes
    */
   constructor(host, catalog, store, sheet, overlay) {
     [this.#catalog, this.#store, this.#overlay] = [catalog, store, overlay];
@@ -85,7 +85,7 @@ export class Compare {
       const selection = { ...this.#trace.selection, against };
       const other = await api.loadTrace(task, selection, wait, signal);
       const found = await api.comparison(selection, signal);
-      this.#draw(other, found.names[1]);
+      this.#draw(other, found.names[1], found.edit ? 'the edited run' : found.names[1]);
       this.#show(found);
       say(this.#result, 'ready');
     } catch (error) {
@@ -95,10 +95,10 @@ export class Compare {
     }
   }
 
-  #draw(other, name) {
+  #draw(other, label, name = label) {
     if (other === this.#other) return;
     [this.#other, this.name] = [other, name];
-    this.#overlay(other, name);
+    this.#overlay(other, label);
     this.#showGain();
   }
 
@@ -107,7 +107,7 @@ export class Compare {
     const [box, text] = this.#gain.children;
     const none = this.#other && whyNoGain(this.#trace, this.#other);
     [box.checked, box.disabled] = [this.#store.state.beside === 'gain' && !none, Boolean(none)];
-    text.textContent = none ?? `In the maps, show what this run gains on ${this.name === 'edited' ? 'the edited one' : this.name}`;
+    text.textContent = none ?? `In the maps, show what this run gains on ${this.name}`;
   }
 
   #show(found) {

@@ -68,6 +68,8 @@ def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
     heads = page.page.locator("#compare .table th").all_text_contents()
     assert [head for head in heads if head in both] == both
     assert page.page.locator("#compare [name=filter]").input_value() == "crossmodal-pf"
+    page.page.locator("#compare .gain input").check()
+    page.until("() => document.querySelector('#maps-kind').textContent === 'Gain on crossmodal-pf'")
     overflow = page.page.evaluate(
         "() => ['#compare', '#compare form', '#timeline .bar'].map((e) => document.querySelector(e))"
         ".map((e) => e.scrollWidth - e.clientWidth)"
@@ -77,3 +79,4 @@ def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
     page.page.locator("#compare .clear").click()
     page.until("() => beliefscope.state().against === '' && !location.search.includes('against')")
     page.until("() => document.querySelector('#compare .result').dataset.state === 'empty'")
+    page.until("() => document.querySelector('#maps-kind').textContent === 'Likelihood'")
