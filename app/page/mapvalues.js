@@ -61,8 +61,10 @@ export function shades(maps, scale, range, pinned) {
 
 /** (S x S) log-likelihood, nats. @param {Maps} maps */
 export function log(maps, layer) {
-  const [max, span] = [maps.log_max[layer], maps.log_range[layer]];
-  return Float32Array.from(maps.cells[layer], (q) => max + span * (q / STEPS - 1));
+  const [cells, max, span] = [maps.cells[layer], maps.log_max[layer], maps.log_range[layer]];
+  const values = new Float32Array(cells.length);
+  for (let i = 0; i < cells.length; i++) values[i] = max + span * (cells[i] / STEPS - 1);
+  return values;
 }
 
 /** How much more likely a place is than in the pinned maps: the logarithm of two densities' ratio, over the offsets from the truth. */
@@ -115,12 +117,13 @@ export function valueAt(maps, layer, cell) {
  *  @param {number[]} shares @returns {number[][]} */
 export function borders(maps, layer, shares) {
   const [cells, span] = [maps.cells[layer], maps.log_range[layer]];
-  const likelihood = (q) => Math.exp(span * (q / STEPS - 1));
   const ordered = cells.slice().sort();
-  const total = ordered.reduce((sum, q) => sum + likelihood(q), 0);
+  const likelihood = new Float64Array(ordered.length);
+  let total = 0;
+  for (let i = 0; i < ordered.length; i++) total += likelihood[i] = Math.exp(span * (ordered[i] / STEPS - 1));
   return shares.map((share) => {
     let [held, i] = [0, ordered.length];
-    while (i > 0 && held < share * total) held += likelihood(ordered[--i]);
+    while (i > 0 && held < share * total) held += likelihood[--i];
     return contour(cells, maps.size, ordered[i] - 0.5);
   });
 }
