@@ -12,7 +12,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostic import Curve, Diagnostic, Entry, Table, Value
 from beliefscope.inspect.likelihood import COARSE, MapEngine, no_maps
 from beliefscope.inspect.mapnumbers import MapNumbers, measure_maps
-from beliefscope.inspect.measures import splits
+from beliefscope.inspect.measures import blackout, splits
 from beliefscope.inspect.trace import Trace
 
 Mask = NDArray[np.bool_]
@@ -30,6 +30,7 @@ class Maps(Diagnostic):
     Attributes:
         numbers: of B steps. felt: the layers whose ridge is spoken of: modalities that know where the hand is.
         kinds: kind of step -> mask (B,), first steps of each trace left out. trajectories: traces. size: cells a side.
+        contact, blackout: (B,), first steps as well.
     """
 
     numbers: MapNumbers
@@ -37,6 +38,8 @@ class Maps(Diagnostic):
     kinds: dict[str, Mask]
     trajectories: int
     size: int
+    contact: Mask
+    blackout: Mask
 
     @property
     def verdict(self) -> str:
@@ -98,7 +101,7 @@ class Maps(Diagnostic):
         return shown
 
     def bands(self) -> dict[str, Mask]:
-        return {} if self.trajectories > 1 else {kind: self.kinds[kind] for kind in ("contact", "blackout")}
+        return {} if self.trajectories > 1 else {"contact": self.contact, "blackout": self.blackout}
 
 
 def maps(
@@ -127,7 +130,9 @@ def maps(
         name for name in parts[0].layers[:-1] if any("effector_position" in keys.get(m, ()) for m in name.split("+"))
     )
     together = {kind: np.concatenate([each[kind] for each in kinds]) for kind in kinds[0]}
-    return Maps(MapNumbers(layers=parts[0].layers, **joined), felt, together, len(traces), size)
+    contact = np.concatenate([trace.episode.contact.astype(bool) for trace in traces])
+    black = np.concatenate([blackout(trace) for trace in traces])
+    return Maps(MapNumbers(layers=parts[0].layers, **joined), felt, together, len(traces), size, contact, black)
 
 
 ENTRY = Entry(

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.evaluate import LEFT_OUT
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostic import Diagnostic, Entry, as_json
+from beliefscope.inspect.measures import blackout
 from beliefscope.inspect.plotting import write_figure
 from beliefscope.inspect.trace import Trace
 
@@ -70,6 +73,14 @@ def test_not_a_number_becomes_none() -> None:
     assert numbers["by_layer"][0]["nis"] is None  # of no Kalman filter
     values = {"a": np.array([1.0, np.nan]), "b": (np.float32("inf"), np.int64(3)), "c": np.array([True])}
     assert as_json(values) == {"a": [1.0, None], "b": [None, 3], "c": [True]}
+
+
+def test_bands_behind_the_maps_numbers_are_those_of_all_steps() -> None:
+    trace, checkpoint = plant.real("crossmodal-ekf"), load_checkpoint(shipped("door", "crossmodal-ekf"))
+    assert trace.episode.contact[:LEFT_OUT].any()
+    bands = DIAGNOSTICS["maps"]([trace], checkpoint, size=5).bands()
+    np.testing.assert_array_equal(bands["contact"], trace.episode.contact)
+    np.testing.assert_array_equal(bands["blackout"], blackout(trace))
 
 
 def test_views_fit_the_trace(made: tuple[Diagnostic, Diagnostic, Trace]) -> None:
