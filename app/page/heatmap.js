@@ -40,7 +40,8 @@ export class Heatmaps {
     [this.#maps, this.#trace] = [maps, trace];
     // Of one measurement model alone the fused map is the same again.
     if (first) this.#figures = this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
-    if (this.#pinned && !comparable(this.#pinned.maps, maps)) this.#pinned = null;
+    const kept = this.#pinned;
+    if (kept && (kept.selection.task !== trace.selection.task || !comparable(kept.maps, maps))) this.pin(); // lets them go
     this.#shade();
   }
 
