@@ -113,11 +113,8 @@ class View:
             await websocket.send_json({"type": "no_maps", "serial": wanted.serial, "step": wanted.step})
         else:
             if wanted.beside and other is not None and not no_maps(other.checkpoint, other.trace):
-                theirs = await asyncio.to_thread(other.map, wanted.step, wanted.angle, wanted.size)
-                message = maps_message(wanted.serial, other.checkpoint.task, other.trace, theirs, other=True)
-                await websocket.send_bytes(message)
-            maps = await asyncio.to_thread(traced.map, wanted.step, wanted.angle, wanted.size)
-            await websocket.send_bytes(maps_message(wanted.serial, traced.checkpoint.task, trace, maps))
+                await websocket.send_bytes(await asyncio.to_thread(_maps, wanted, other, True))
+            await websocket.send_bytes(await asyncio.to_thread(_maps, wanted, traced))
         if not wanted.scene:
             return
         await asyncio.to_thread(self.scene.show, traced, wanted.step, None if other is None else other.trace)
@@ -198,6 +195,12 @@ class Views:
         """Close every view and its threads."""
         views, self._views = list(self._views.values()), {}
         await asyncio.gather(*(asyncio.to_thread(view.scene.close) for view in views))
+
+
+def _maps(wanted: Cursor, traced: Traced, other: bool = False) -> bytes:
+    """The maps of a cursor, as they are sent. Other: of the other run."""
+    maps = traced.map(wanted.step, wanted.angle, wanted.size)
+    return maps_message(wanted.serial, traced.checkpoint.task, traced.trace, maps, other=other)
 
 
 async def _quietly(sending: Any) -> None:
