@@ -180,7 +180,7 @@ class Moment:
             assert isinstance(trace.predicted, Gaussian)
             assert trace.modality is not None
             posterior, predicted = (
-                MultivariateNormal(belief.mean[:, k], belief.covariance[:, k]).log_prob(self.place)
+                MultivariateNormal(belief.mean[:, k].double(), belief.covariance[:, k].double()).log_prob(self.place)
                 for belief in (trace.modality, trace.predicted)
             )
             return posterior - predicted

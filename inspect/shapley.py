@@ -368,7 +368,7 @@ ENTRY = Entry(
     needs="checkpoint",
     slow=True,
     options={
-        "off": "start off the truth by so many standard deviations of the first belief, drawn by seed and episode; "
-        "0, the default, starts at the truth as the trace did"
+        "off": "by how many standard deviations of the first belief the runs start off the truth, drawn by seed and "
+        "episode; 0, the default: at the truth, as the trace did"
     },
 )
