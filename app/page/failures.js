@@ -229,7 +229,7 @@ export class Failures {
       this.#listed = listed;
       const columns = score?.moments ? momentColumns(found, score) : [];
       const top = document.createElement('tr');
-      top.append(...columns.map(({ title, help }) => Object.assign(document.createElement('th'), { scope: 'col', textContent: title, title: help ?? '' })));
+      top.append(...columns.map(({ title, help, number }) => Object.assign(document.createElement('th'), { scope: 'col', className: number ? 'number' : '', textContent: title, title: help ?? '' })));
       if (columns.length) top.append(Object.assign(document.createElement('th'), { scope: 'col', ariaLabel: 'Link' }));
       this.#part('.moments thead').replaceChildren(...(columns.length ? [top] : []));
       this.#rows = moments.map((moment, i) => this.#row(columns, moment, score, i));
