@@ -19,7 +19,7 @@ from beliefscope.app.children import Child
 from beliefscope.app.commands.finetune import curves, errors, of
 from beliefscope.app.jobs import UNDER_WAY, Job, Jobs
 from beliefscope.app.library import Library, Settings
-from beliefscope.app.link import moment_link
+from beliefscope.app.link import beside, moment_link
 from beliefscope.app.work import Report
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
 from beliefscope.filters.finetune import FineTune, finetune
@@ -29,6 +29,7 @@ from beliefscope.filters.slices import slices_of
 from beliefscope.filters.tuning import Look
 from beliefscope.inspect.change import Change, change_of
 from beliefscope.inspect.diagnostic import as_json
+from beliefscope.inspect.differences import Worsening
 
 KIND = "finetune"
 TUNING = 0.8
@@ -175,20 +176,16 @@ def _document(found: Change, child: Checkpoint, about: Mapping[str, Any], data: 
     name = _called(about["filter"], child.hash)
     views = found.views()
     moments = found.table_of(found.moments).title
-    record = child.record
+    record, weighed = child.record, child.filter.architecture.fusion == "crossmodal"
+
+    def link(m: Worsening) -> str:
+        return moment_link(child.task, name, data, m.episode, m.step, m.recipe)
+
     return {
         "child": {"name": name, "hash": child.hash} | {key: record[key] for key in ("best_step", "steps", "seconds")},
         "change": views | {"tables": [one for one in views["tables"] if one["title"] != moments]},
         "frozen": found.frozen,
-        "moments": [
-            as_json(m)
-            | {
-                "link": moment_link(child.task, name, data, m.episode, m.step, m.recipe)
-                + "&"
-                + urlencode({"against": urlencode({"filter": about["filter"]})})
-            }
-            for m in found.moments
-        ],
+        "moments": [as_json(m) | {"link": beside(link(m), m, about["filter"], weighed)} for m in found.moments],
     }
 
 

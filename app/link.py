@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
 from beliefscope.datasets.task import Task
+
+if TYPE_CHECKING:
+    from beliefscope.inspect.differences import Worsening
 
 
 def moment_link(
@@ -34,3 +38,14 @@ def moment_link(
         kept["by"] = by
     # Browsers' URLSearchParams leave the star as it is and encode the tilde.
     return "?" + urlencode(kept, safe="*").replace("~", "%7E")
+
+
+def beside(link: str, moment: Worsening, other: str, weighed: bool) -> str:
+    """A moment's link that shows another run beside: the one of the filter ``other``, which it got worse than.
+
+    A moment of one modality alone is shown by the same filter with all of beta on that one, where it is ``weighed``.
+    """
+    against: dict[str, str | int] = {"filter": other}
+    if weighed and len(moment.only) == 1:
+        against = {"from": 0, "to": moment.last + 1, "weights": f"{moment.only[0]}=1"}
+    return f"{link}&{urlencode({'against': urlencode(against)})}"

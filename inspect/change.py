@@ -292,11 +292,11 @@ def _numbers(d: Difference) -> tuple[Value, ...]:
 
 
 def _percent(effect: float) -> float | None:
-    return 100.0 * math.expm1(min(effect, 30.0)) if math.isfinite(effect) else None
+    return round(100.0 * math.expm1(min(effect, 30.0)), 2) if math.isfinite(effect) else None
 
 
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _known(effect: float) -> float | None:
+    return round(effect, 4) if math.isfinite(effect) else None
 
 
 def _judged(d: Difference) -> str:

@@ -55,7 +55,7 @@ def change(
       beliefscope change parent.safetensors child.safetensors --data door.h5 -o report
       beliefscope change crossmodal-pf child.safetensors --slice black-in-contact:recipe=blackout=1:contact=yes
     """
-    from beliefscope.app.link import moment_link
+    from beliefscope.app.link import beside, moment_link
     from beliefscope.app.shelf import SAMPLE, short_names
     from beliefscope.datasets.catalog import TASKS
     from beliefscope.filters.catalog import filters_of
@@ -76,9 +76,13 @@ def change(
     ships = {name for known in TASKS.values() for name in filters_of(known)}
     paths = [Path(text) for text in (before, after) if is_path(text)]
     named = {str(path): name for name, path in short_names(paths, ships).items()}
-    name = named.get(str(Path(after)), after)
+    first, name = (named.get(str(Path(text)), text) for text in (before, after))
+    weighed = pair[1].filter.architecture.fusion == "crossmodal"
     data_name = SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
-    links = [moment_link(task, name, data_name, m.episode, m.step, m.recipe) for m in found.moments]
+    links = [
+        beside(moment_link(task, name, data_name, m.episode, m.step, m.recipe), m, first, weighed)
+        for m in found.moments
+    ]
     document = found.to_dict() | {
         "data_hash": data_hash,
         "frozen": list(found.frozen),

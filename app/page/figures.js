@@ -148,7 +148,7 @@ export class Figures {
         select: { show: false },
         scales: { x: { time: false, range: () => (x[1] > x[0] ? x : [x[0] - 1, x[0] + 1]) }, y: { range: () => y } },
         axes: [
-          { ...ink(), ...small, size: 16, gap: 2, space: 40, ...(bars && xs.every(Number.isInteger) ? { incrs: [1, 2, 5, 10, 20, 50, 100, 1000] } : {}), ...(plot.names?.length ? { space: 1, size: 58, rotate: -38, values: (_, at) => at.map((x) => plot.names[x] ?? '') } : {}) },
+          { ...ink(), ...small, size: 16, gap: 2, space: 40, ...(bars && xs.every(Number.isInteger) ? { incrs: [1, 2, 5, 10, 20, 50, 100, 1000] } : {}), ...(plot.names?.length ? { space: 1, size: 58, rotate: 38, values: (_, at) => at.map((x) => plot.names[x] ?? '') } : {}) },
           { ...ink(), ...small, label: plot.y_label, size: 40, gap: 3, space: 24 },
         ],
         series: [{}, { show: false }],

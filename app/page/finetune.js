@@ -42,7 +42,7 @@ const FORM = `
     <div class="row doing"><progress aria-label="Progress of the fine-tuning" max="1"></progress><button type="button" class="text act"></button></div>
     <div class="row decide"></div>
     <div class="figures live"></div>
-    <section class="moments" hidden><h4>Moments that got worse</h4><ol></ol></section>
+    <section class="moments" hidden><h4>Moments that got worse (cm)</h4><ol></ol></section>
     <div class="figures report"></div>
   </article>
   <p class="note"></p>`;
@@ -284,13 +284,13 @@ export class Finetune {
       ...moments.map((m) => {
         const line = document.createElement('li');
         const link = Object.assign(document.createElement('a'), { href: `/${m.link}`, textContent: `episode ${m.episode}, step ${m.step}` });
-        link.title = 'Opens it on the shown child, with its parent beside it';
+        link.title = `Opens it on the child, with ${m.only.length ? `${m.only.join(' + ')} alone` : 'its parent'} beside it`;
         link.addEventListener('click', (event) => {
           if (this.#run.place) return;
           event.preventDefault();
           this.#decide('keep', link.href); // a link opens what is on the shelf
         });
-        line.append(link, ` ${m.slice}${m.contact ? ', in contact' : ''}: ${fixed(100 * m.before, 2)} → ${fixed(100 * m.after, 2)} cm`);
+        line.append(link, ` ${m.slice}${m.contact ? ', in contact' : ''}: ${fixed(100 * m.before, 2)} → ${fixed(100 * m.after, 2)}`);
         return line;
       }),
     );

@@ -70,7 +70,8 @@ def test_a_child_is_made_held_against_its_parent_and_placed(
         }
         for moment in found["moments"]:
             link = dict(parse_qsl(moment["link"][1:]))
-            assert (link["filter"], link["against"]) == (name, "filter=crossmodal-ekf")
+            alone = f"from=0&to={moment['last'] + 1}&weights={moment['only'][0]}%3D1" if moment["only"] else None
+            assert (link["filter"], link["against"]) == (name, alone or "filter=crossmodal-ekf")
         path = settings.workspace / "finetune" / run / "child.safetensors"
         assert load_checkpoint(path).record["parent"]["hash"] == parent.hash
         assert list((path.parent / "log").iterdir())

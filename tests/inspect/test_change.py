@@ -26,7 +26,10 @@ from beliefscope.filters.slices import Slice
 from beliefscope.inspect.change import Change, change_of
 from beliefscope.inspect.differences import differences
 from beliefscope.inspect.drift import heard
+from beliefscope.inspect.measures import position_error
+from beliefscope.inspect.replay import Edit, Replay
 from beliefscope.inspect.tally import measures_of, spread
+from beliefscope.inspect.trace import trace
 
 EPISODES = (9, 19, 29, 39, 49, 59)
 """Of those held out: enough for intervals."""
@@ -120,6 +123,15 @@ def test_moments_are_where_the_error_rose_most() -> None:
     assert rises == sorted(rises, reverse=True)
     assert min(rises) > 0.0
     assert all(m.first <= m.step <= m.last and m.episode in EPISODES for m in moments)
+
+
+def test_a_moment_of_one_modality_alone_is_what_the_edit_of_its_link_shows(data: Dataset) -> None:
+    moment = changed(True).moments[0]
+    episode = episode_of(data, moment.episode, 60)
+    replay = Replay(HURT, trace(HURT, episode, moment.episode))
+    edited = replay.edited(Edit(0, moment.last + 1, weights={moment.only[0]: 1.0}))
+    # Beta one-hot is the modality alone to rounding, and a trace keeps single precision.
+    assert position_error(edited)[moment.step, -1] == pytest.approx(moment.after, rel=1e-3)
 
 
 def test_what_was_frozen_is_proved_by_its_hash_and_what_was_not_drifts() -> None:
