@@ -39,7 +39,7 @@ const FORM = `
   <article hidden tabindex="-1">
     <div class="row"><button type="button" class="text quiet back">‹ New run</button><h3></h3></div>
     <p class="verdict" aria-live="polite"></p>
-    <div class="row doing"><progress aria-label="Progress of the fine-tuning" max="1"></progress><button type="button" class="text act"></button></div>
+    <div class="row doing"><progress aria-label="Progress of the fine-tuning" max="1"></progress><button type="button" class="text act">Pause</button></div>
     <div class="row decide"></div>
     <div class="figures live"></div>
     <section class="moments" hidden><h4>Moments that got worse (cm)</h4><ol></ol></section>
