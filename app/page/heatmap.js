@@ -5,7 +5,7 @@ import { borders, cellAt, digits, ends, shades, valueAt } from './mapvalues.js';
 import { colour, gradient, variable } from './palette.js';
 import { fixed, percent, signed, spoken } from './units.js';
 
-const LOOKS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud']; // of the state
+const LOOKS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom']; // of the state
 const SHARES = [0.5, 0.95]; // of the likelihood, that the regions hold
 const ROUND = 1.3; // times as long as wide below which a map has no axis
 const DIVERGING = 'diverging';
@@ -149,13 +149,18 @@ export class Heatmaps {
     return Math.max(60, Math.floor(Math.min(across, clientHeight - MARGIN.bottom - MARGIN.top - text)));
   }
 
+  /** Half of the shown square's side, m. */
+  get #half() {
+    return this.#maps.half_width / Number(this.#store.state.zoom);
+  }
+
   #left(layer) {
     return layer === 0 ? MARGIN.left : MARGIN.gap;
   }
 
   #look(layer) {
-    const { axes, cloud } = this.#store.state;
-    return { axes, cloud: cloud === 'shown', text: colour('muted'), withY: layer === 0, hover: this.#hover };
+    const { axes, cloud, zoom } = this.#store.state;
+    return { axes, zoom: Number(zoom), cloud: cloud === 'shown', text: colour('muted'), withY: layer === 0, hover: this.#hover };
   }
 
   #drawn({ name, cells, borders, shade, table }, layer) {
@@ -240,7 +245,7 @@ export class Heatmaps {
 
   #point(event, layer) {
     if (!this.#maps) return;
-    const { half_width: half } = this.#maps;
+    const half = this.#half;
     const x = (event.offsetX - this.#left(layer)) / this.#side;
     const y = (event.offsetY - MARGIN.top) / this.#side;
     this.#probe(x >= 0 && x <= 1 && y >= 0 && y <= 1 ? [(2 * x - 1) * half, (1 - 2 * y) * half] : null);
@@ -252,10 +257,11 @@ export class Heatmaps {
     if (event.key === 'Escape') this.#probe(null);
     if (!way || !this.#maps) return;
     event.preventDefault();
-    const { half_width: half, size } = this.#maps;
-    const far = ((event.shiftKey ? 5 : 1) * 2 * half) / size;
+    const { half_width: whole, size } = this.#maps;
+    const cell = (2 * whole) / size;
+    const edge = this.#half - cell / 2;
     const from = this.#hover ?? [0, 0];
-    this.#probe(way.map((d, i) => Math.min(Math.max(from[i] + far * d, -half * (1 - 1 / size)), half * (1 - 1 / size))));
+    this.#probe(way.map((d, i) => Math.min(Math.max(from[i] + (event.shiftKey ? 5 : 1) * cell * d, -edge), edge)));
     const found = this.#figures.map(({ name }, layer) => `${spoken(name)} ${this.#values(layer).join(', ')}`);
     this.#panel.querySelector('#maps-spoken').textContent = `${this.#place(this.#hover)} cm: ${found.join('; ')}`;
   }

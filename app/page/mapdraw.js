@@ -15,7 +15,7 @@ const STRENGTHS = [0.95, 0.5]; // of the regions' borders, the smallest first
  * @typedef {object} Drawn one layer, ready to be drawn
  * @property {string} name @property {number} layer @property {import('./mapvalues.js').Maps} maps @property {import('./trace.js').Trace} trace
  * @property {HTMLCanvasElement} cells @property {number[][]} borders of regions, see `mapvalues.borders`
- * @typedef {{axes: 'offset' | 'world', cloud: boolean, text: string, withY: boolean, hover: number[] | null}} Look text: its colour
+ * @typedef {{axes: 'offset' | 'world', zoom: number, cloud: boolean, text: string, withY: boolean, hover: number[] | null}} Look text: its colour
  */
 
 /** Colours of the cells, turned over so that y is up. @param {import('./mapvalues.js').Shade} shade */
@@ -37,19 +37,21 @@ export function paint(canvas, { values, low, high }, size, colours) {
 
 /** A map with its axes and marks; its square's upper left corner is the pen's origin. @param {Drawn} drawn @param {Look} look */
 export function drawMap(pen, drawn, side, look) {
-  pen.drawImage(drawn.cells, 0, 0, side, side);
+  const { cells } = drawn;
+  const cut = cells.width / look.zoom; // of the cells, in the middle
+  pen.drawImage(cells, (cells.width - cut) / 2, (cells.width - cut) / 2, cut, cut, 0, 0, side, side);
   drawAxes(pen, drawn, side, look);
   pen.save();
   pen.beginPath();
   pen.rect(0, 0, side, side);
   pen.clip();
-  drawn.borders.forEach((segments, i) => drawBorder(pen, segments, side, STRENGTHS[i]));
+  drawn.borders.forEach((segments, i) => drawBorder(pen, segments, side, look.zoom, STRENGTHS[i]));
   drawMarks(pen, drawn, side, look);
   pen.restore();
 }
 
-function drawAxes(pen, { maps, trace }, side, { axes, text, withY }) {
-  const half = 100 * maps.half_width;
+function drawAxes(pen, { maps }, side, { axes, zoom, text, withY }) {
+  const half = (100 * maps.half_width) / zoom;
   const spacing = SPACINGS.find((cm) => (cm / (2 * half)) * side > APART) ?? 2 * half;
   const middle = axes === 'world' ? maps.centre.map((m) => 100 * m) : [0, 0];
   pen.font = FONT;
@@ -94,19 +96,21 @@ function ticks(middle, half, spacing, side) {
   return found;
 }
 
-function drawBorder(pen, segments, side, strength) {
+function drawBorder(pen, segments, side, zoom, strength) {
+  const at = (share) => ((share - 0.5) * zoom + 0.5) * side;
   outlined(pen, [['rgb(0 0 0 / 0.3)', 2.25], [`rgb(255 255 255 / ${strength})`, 1]], () => {
     for (let i = 0; i < segments.length; i += 4) {
-      pen.moveTo(segments[i] * side, (1 - segments[i + 1]) * side);
-      pen.lineTo(segments[i + 2] * side, (1 - segments[i + 3]) * side);
+      pen.moveTo(at(segments[i]), at(1 - segments[i + 1]));
+      pen.lineTo(at(segments[i + 2]), at(1 - segments[i + 3]));
     }
   });
 }
 
 /** Particles, truth, estimates and, in contact, the line to the end effector; y is up. */
-function drawMarks(pen, drawn, side, { cloud, hover }) {
+function drawMarks(pen, drawn, side, { cloud, zoom, hover }) {
   const { maps, trace, name } = drawn;
-  const { half_width: half, centre, estimate, effector, step } = maps;
+  const { centre, estimate, effector, step } = maps;
+  const half = maps.half_width / zoom;
   const place = ([x, y]) => [((x - centre[0] + half) / (2 * half)) * side, ((centre[1] - y + half) / (2 * half)) * side];
   const [tx, ty] = place(centre);
   if (effector && trace.contact[step]) {

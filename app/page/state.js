@@ -19,14 +19,14 @@ import { spoken } from './units.js';
  * @property {'episode' | 'held-out'} over what diagnostics are made: this episode, or all that are held out
  * @property {'held-out' | 'all'} among which episodes failures are looked for @property {'moments' | 'episodes'} list what is listed of them
  * @property {string} by measure that ranks failures @property {string} group the only one that is listed, empty for all
- * @property {string} scale of the maps, `range`, `axes`, `colours`, `regions`, `cloud`: see `MAPS`
+ * @property {string} scale of the maps, `range`, `axes`, `colours`, `regions`, `cloud`, `zoom`: see `MAPS`
  * @property {string} run of fine-tuning that is open, empty for a new one
  * @property {boolean} playing @property {number} speed
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 /** How likelihood maps are shown: the colours' scale, whether all share its range, the axes, what lies on top, what they gain on the other run. */
-const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
+const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], zoom: ['1', '4'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
 const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
 const WORST = 'error'; // the measure that ranks failures where none is chosen
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time

@@ -85,10 +85,13 @@ export class SvgPen {
     this.#write(`<text x="${number(x)}" y="${number(y)}" ${paint('fill', this.fillStyle)} ${style}>${escaped(text)}</text>`);
   }
 
-  /** @param {HTMLCanvasElement} canvas */
-  drawImage(canvas, x, y, width, height) {
-    const place = `x="${number(x)}" y="${number(y)}" width="${number(width)}" height="${number(height)}"`;
-    this.#write(`<image ${place} preserveAspectRatio="none" href="${canvas.toDataURL()}"/>`);
+  /** @param {HTMLCanvasElement} canvas @param {number[]} numbers the part that is shown, all of it by default, and where: x, y, width, height of both */
+  drawImage(canvas, ...numbers) {
+    const part = numbers.length > 4 ? numbers.slice(0, 4) : [0, 0, canvas.width, canvas.height];
+    const [x, y, width, height] = numbers.slice(-4).map(number);
+    const place = `x="${x}" y="${y}" width="${width}" height="${height}" viewBox="${part.map(number).join(' ')}" preserveAspectRatio="none"`;
+    const image = `<image width="${canvas.width}" height="${canvas.height}" preserveAspectRatio="none" href="${canvas.toDataURL()}"/>`;
+    this.#write(`<svg ${place}>${image}</svg>`);
   }
 
   /** All that was drawn, as a document. */
