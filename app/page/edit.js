@@ -90,7 +90,8 @@ export class Edit {
   #read(against) {
     const asked = new URLSearchParams(against);
     this.#kind = kindOf(against);
-    if (asked.has('filter')) this.#form.elements.filter.value = asked.get('filter');
+    const { filter } = this.#form.elements;
+    if ([...filter.options].some(({ value }) => value === asked.get('filter'))) filter.value = asked.get('filter');
     if (this.#kind === 'recipe') this.#recipe = asked.get('recipe');
     if (this.#kind !== 'edit') return;
     this.#setSpan(Number(asked.get('from')), Number(asked.get('to')) - 1);
@@ -149,6 +150,7 @@ export class Edit {
     const foreign = this.#trace.header.kind === 'foreign';
     const refused = foreign && `${this.#trace.header.filter} is a filter from outside, whose steps cannot be taken again one by one: it cannot be edited.`;
     this.#form.querySelector('[data-kind="edit"] > .why-not').textContent = refused ? sentence(refused) : '';
+    this.#form.querySelector('.betas').hidden = foreign;
     for (const field of this.#form.querySelectorAll('[data-kind="edit"] :is(input, select)')) field.disabled = foreign;
     this.#form.querySelector('.run').disabled = (this.#kind === 'edit' && foreign) || (this.#kind === 'filter' && this.#form.elements.filter.disabled);
   }

@@ -13,10 +13,12 @@ export function pickers(catalog, store, sheet) {
   const current = () => named(catalog.tasks, store.state.task);
   const names = (list) => list.map(({ name }) => [name, name]);
   fill(task, names(catalog.tasks));
+  // Who chooses what this run is compared with sees the two change places.
+  const swapped = (key, value) => (store.state.against === `${key}=${value}` ? { against: `${key}=${store.state[key]}` } : {});
   const showRecipe = recipePicker(document.getElementById('recipe'), sheet, {
     none: 'as recorded',
     chosen: () => store.state.recipe,
-    choose: (recipe) => store.set({ recipe }),
+    choose: (recipe) => store.set({ recipe, ...swapped('recipe', recipe) }),
     check: (recipe) => check({ ...store.state, recipe, against: '' }),
   });
   fill(speed, SPEEDS.map((s) => [s, `${s}×`]));
@@ -36,7 +38,7 @@ export function pickers(catalog, store, sheet) {
   data.addEventListener('change', () => {
     store.set({ data: data.value, episode: named(current().data, data.value).first, step: 0, playing: false });
   });
-  filter.addEventListener('change', () => store.set({ filter: filter.value }));
+  filter.addEventListener('change', () => store.set({ filter: filter.value, ...swapped('filter', filter.value) }));
   episode.addEventListener('change', () => store.set({ episode: Number(episode.value), step: 0, playing: false }));
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
   const show = (state, changed = new Set(['task'])) => {

@@ -76,6 +76,9 @@ def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
     )
     assert max(overflow) <= 1
     page.picture("compare-filters")
+    page.page.locator("#filter").select_option("crossmodal-pf")  # the two change places
+    page.until("() => document.querySelector('#maps-kind').textContent === 'Gain on crossmodal-ekf'")
+    assert page.state["against"] == "filter=crossmodal-ekf"
     page.page.locator("#compare .clear").click()
     page.until("() => beliefscope.state().against === '' && !location.search.includes('against')")
     page.until("() => document.querySelector('#compare .result').dataset.state === 'empty'")
