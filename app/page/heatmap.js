@@ -26,7 +26,7 @@ export class Heatmaps {
   constructor(panel, store) {
     [this.#panel, this.#store] = [panel, store];
     this.#host = panel.querySelector('#heatmaps');
-    new ResizeObserver(() => this.redraw()).observe(this.#host);
+    new ResizeObserver(() => this.#resize()).observe(this.#host);
     store.listen((_, changed) => LOOKS.some((look) => changed.has(look)) && this.#shade());
   }
 
@@ -76,9 +76,15 @@ export class Heatmaps {
     return { maps: this.#maps, trace: this.#trace, figures, title: this.#title(), look: this.#look(0), pinned: this.#base };
   }
 
+  /** Reads the layout, which costs: only where it may have changed. */
+  #resize() {
+    if (this.#figures.length) this.#side = this.#fit();
+    this.redraw();
+  }
+
   redraw() {
     if (!this.#maps) return;
-    this.#side = this.#fit();
+    if (!this.#side) this.#side = this.#fit();
     this.#figures.forEach((figure, layer) => this.#drawLayer(figure, layer));
   }
 
@@ -118,6 +124,7 @@ export class Heatmaps {
   }
 
   #build(layers) {
+    this.#side = 0;
     this.#host.querySelectorAll('figure').forEach((figure) => figure.remove());
     const fuses = layers.length > 1;
     return layers.map((name, layer) => {
