@@ -91,7 +91,9 @@ class Change(Diagnostic):
             return f"{self.filters[1]} does exactly what {self.filters[0]} does: nothing is mended and nothing damaged."
         if len(self.episodes) < FEWEST:
             return f"{len(self.episodes)} episodes are too few to tell what changed: intervals need {FEWEST}."
-        return f"{_sentence('Mends', self.mended())}; {_sentence('damages', self.damaged())}."
+        errors = [d for d in self.differences if d.is_error]
+        mended, damaged = self.mended(), self.damaged()
+        return f"{_sentence('Mends', mended, errors, -1.0)}; {_sentence('damages', damaged, errors, 1.0)}."
 
     def tables(self) -> list[Table]:
         errors, beliefs = ([d for d in self.differences if d.is_error is kind] for kind in (True, False))
@@ -258,14 +260,26 @@ MEASURES = {"nll": "NLL", "nees": "NEES", "coverage95": "coverage of 95 %"}
 """Measures whose names are not words."""
 
 
-def _sentence(verb: str, found: Sequence[Difference]) -> str:
-    """What the first of them is, with its numbers, and how many more there are."""
-    if not found:
+def _sentence(verb: str, found: Sequence[Difference], errors: Sequence[Difference], sign: float) -> str:
+    """What the first of them is, with its numbers, and how many more there are.
+
+    Where there is none: whether the intervals exclude any, or else the error that changed most in this direction.
+
+    Args:
+        errors: all of them. sign: of the effect, 1 where worse.
+    """
+    if found:
+        return f"{verb} {_numbered(found[0])}{f' and {len(found) - 1} more' if len(found) > 1 else ''}"
+    possible = [d for d in errors if max(sign * d.low, sign * d.high) >= math.log1p(LEVEL)]
+    if not possible:
         return f"{verb} nothing beyond {100 * LEVEL:.0f} %"
-    values, change, interval = _told(found[0])
-    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
-    first = f"{found[0].slice}: {_title(found[0])} {values} ({change}, 95 % interval {interval})"
-    return f"{verb} {first}{more}"
+    most = max(possible, key=lambda d: sign * d.effect)
+    return f"{verb} nothing for certain" + (f", most likely {_numbered(most)}" if sign * most.effect > 0.0 else "")
+
+
+def _numbered(d: Difference) -> str:
+    values, change, interval = _told(d)
+    return f"{d.slice}: {_title(d)} {values} ({change}, 95 % interval {interval})"
 
 
 def _title(d: Difference) -> str:

@@ -84,7 +84,8 @@ def _grow(tree: Tree, found: Lineage, of: Ancestor) -> None:
 def _line(one: Ancestor, orphan: bool = False) -> str:
     numbers = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in one.rmse.items())
     parts = [f"{one.path} {one.hash[:12]} {one.task} {one.name}"]
-    parts += [f"RMSE {numbers}"] if numbers else []
+    data = one.record.get("data_hash")  # numbers on other data do not compare
+    parts += [f"RMSE {numbers}{f', data {data[:12]}' if data else ''}"] if numbers else []
     parts += [one.command] if one.command else []
     parts += [f"made from {str(one.parent)[:12]}, which is not here"] if orphan else []
     return "\n".join(parts)

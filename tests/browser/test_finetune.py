@@ -32,7 +32,7 @@ def test_a_filter_is_tuned_judged_accepted_and_rolled_back(open_page: Any, serve
     panel.get_by_role("button", name="Fine-tune").click()
     page.until(f"() => {STATE} === 'ready'", 180.0)  # PyTorch, training, and both filters over all held-out episodes
     assert page.state["run"]
-    assert "beyond 2 %" in panel.locator(".verdict").text_content()
+    assert "; damages " in panel.locator(".verdict").text_content()
     assert panel.locator("h3").text_content() == "crossmodal-ekf: virtual_sensors.haptics.state on haptics alone"
     assert "virtual sensors.image" in panel.get_by_label("Modules", exact=True).last.text_content()
     page.until("() => document.querySelectorAll('#finetune .live canvas').length === 2")

@@ -24,7 +24,7 @@ from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.slices import Slice
 from beliefscope.inspect.change import Change, change_of
-from beliefscope.inspect.differences import differences
+from beliefscope.inspect.differences import Difference, differences
 from beliefscope.inspect.drift import heard
 from beliefscope.inspect.measures import position_error
 from beliefscope.inspect.replay import Edit, Replay
@@ -112,9 +112,26 @@ def test_planted_damage_is_found_where_it_was_planted() -> None:
     alone = [d for d in found.differences if d.slice == "image alone"]
     assert alone
     assert all(d.effect == 0.0 for d in alone)
-    assert found.verdict.startswith("Mends nothing beyond 2 %; damages haptics alone: hinge x ")
+    assert "; damages haptics alone: hinge x " in found.verdict
     assert found.moments[0].slice == "haptics alone"
     assert changed(False).verdict.startswith("Mends haptics alone: hinge x ")
+
+
+def verdict_of(low: float, effect: float, high: float) -> str:
+    """Where all that changed is one error, by so much."""
+    one = Difference("contact", "position", "m", 0.01, 0.01 * math.exp(effect), effect, low, high)
+    return replace(changed(True), differences=(one,)).verdict
+
+
+def test_the_verdict_says_no_more_than_the_intervals() -> None:
+    assert verdict_of(-0.01, 0.001, 0.01) == "Mends nothing beyond 2 %; damages nothing beyond 2 %."
+    assert verdict_of(-0.01, 0.10, 0.20) == (
+        "Mends nothing beyond 2 %; damages nothing for certain, most likely contact: position 1 -> 1.11 cm (+10.5 %, "
+        "95 % interval -0.995 to +22.1)."
+    )
+    assert verdict_of(-0.10, 0.01, 0.01).startswith("Mends nothing for certain; damages nothing beyond 2 %.")
+    assert verdict_of(0.05, 0.10, 0.20).startswith("Mends nothing beyond 2 %; damages contact: position 1 -> 1.11 cm")
+    assert verdict_of(-0.20, -0.10, -0.05).startswith("Mends contact: position 1 -> 0.905 cm (-9.52 %, ")
 
 
 def test_moments_are_where_the_error_rose_most() -> None:
