@@ -73,12 +73,10 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
     @router.get("/api/tuned/{run}")
     def how(run: str) -> dict[str, Any]:
         about = _known(library, run)
-        job = jobs.find(KIND, run)
-        found = None
-        if job is not None and job.state == "done":
-            with suppress(OSError, ValueError):
-                found = json.loads(jobs.result(job.id).read_bytes())
-        return _shown(library, jobs, about) | {"progress": _progress(_folder(library, run)), "found": found}
+        shown, folder = _shown(library, jobs, about), _folder(library, run)
+        # Not the job's own result: a child that is kept outlasts its job.
+        found = _read(folder / "found.json") if shown["child"] else None
+        return shown | {"progress": _read(folder / "progress.json"), "found": found}
 
     @router.post("/api/tuned/{run}/{act}")
     def decide(run: str, act: Act) -> dict[str, Any]:
@@ -168,7 +166,8 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     finally:
         library.close()
     document: dict[str, Any] = as_json(_document(found, child, arguments, data_name))
-    return document
+    write_atomically(folder / "found.json", json.dumps(document, allow_nan=False).encode())
+    return {"verdict": found.verdict}
 
 
 def _document(found: Change, child: Checkpoint, about: Mapping[str, Any], data: str) -> dict[str, Any]:
@@ -222,11 +221,8 @@ def _folder(library: Library, run: str) -> Path:
 
 def _runs(library: Library) -> list[dict[str, Any]]:
     """All that were asked for in this workspace, the newest first."""
-    found = []
-    for path in (library.settings.workspace / "finetune").glob("*/run.json"):
-        with suppress(OSError, ValueError):
-            found.append(json.loads(path.read_bytes()))
-    return sorted(found, key=lambda run: -run["asked"])
+    found = map(_read, (library.settings.workspace / "finetune").glob("*/run.json"))
+    return sorted(filter(None, found), key=lambda run: -run["asked"])
 
 
 def _known(library: Library, run: str) -> dict[str, Any]:
@@ -247,9 +243,10 @@ def _shown(library: Library, jobs: Jobs, about: Mapping[str, Any]) -> dict[str, 
     return {**about, "job": None if job is None else asdict(job), "child": name, "place": place}
 
 
-def _progress(folder: Path) -> dict[str, Any] | None:
+def _read(path: Path) -> dict[str, Any] | None:
+    """JSON; None where it is not there."""
     with suppress(OSError, ValueError):
-        found: dict[str, Any] = json.loads((folder / "progress.json").read_bytes())
+        found: dict[str, Any] = json.loads(path.read_bytes())
         return found
     return None
 

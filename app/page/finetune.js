@@ -33,6 +33,7 @@ const FORM = `
       <label>Who speaks <select name="only"></select></label>
     </div>
     <div class="row numbers"></div>
+    <div class="row"><label title="Of the slice, only these steps are learned from: episodes, and steps of them. All training episodes where it is empty.">Only at <input name="moments" placeholder="9, 31:20-60" autocomplete="off" spellcheck="false"></label></div>
     <div class="row"><button class="text start">Fine-tune</button> <label class="past" hidden>Runs so far <select name="past"></select></label></div>
     <p class="wrong" role="alert"></p>
   </form>
@@ -188,6 +189,7 @@ export class Finetune {
     const preset = value('preset');
     const settings = Object.fromEntries(NUMBERS.map(([name]) => [name, Number(value(name))]));
     settings.train = preset === OWN ? this.#tree.trained : [preset];
+    settings.moments = value('moments').split(/[\s,]+/).filter(Boolean);
     const [contact, only] = [value('contact'), value('only')];
     const named = this.#offer.slices.find((one) => one.name === value('slice'));
     if (named) settings.mix = [{ slice: plain(named), share: 1 }];

@@ -88,6 +88,9 @@ def test_a_child_is_made_held_against_its_parent_and_placed(
         assert client.post(f"/api/tuned/{run}/roll-back").json()["place"] is None
         assert filters(client) == before
         assert path.is_file()
+        client.delete(f"/api/jobs/{shown['job']['id']}")
+        again = client.get(f"/api/tuned/{run}").json()
+        assert (again["job"], again["found"]) == (None, found), "a child outlasts its job"
     assert load_checkpoint(settings.checkpoints["crossmodal-ekf"]).hash == parent.hash  # type: ignore[arg-type]
 
 
