@@ -261,8 +261,8 @@ def told(sized: str, record: dict[str, Any]) -> str:
         for key in keys
     ]
     lines += ["", console.grid("On held-out episodes", ["", "before", "after", "change"], rows)]
-    frozen = record["frozen"]
-    lines += ["", f"Frozen: {frozen['tensors']} tensors, hash {frozen['after'][:12]} before and after."]
+    count, proof = record["frozen"]["tensors"], record["frozen"]["after"][:12]
+    lines += ["", f"Frozen: {count} tensors, hash {proof} before and after." if count else "Nothing was frozen."]
     return "\n".join(lines)
 
 
