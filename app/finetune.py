@@ -129,7 +129,7 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         data_hash = library.data_hash(task, data_name)
         path = folder / "child.safetensors"
         with curves(folder / "log") as write:
-            diary = _Diary(folder, asked.steps)
+            diary = Diary(folder, asked.steps)
 
             def looked(found: Look) -> None:
                 diary.look(found)
@@ -148,6 +148,7 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 command=f"fine-tuned on the page from {name}",
                 report=stepped,
                 looked=looked,
+                resumed=diary.resume,
                 partial=folder / "child.partial",
             )
             diary.write()
@@ -188,17 +189,22 @@ def _document(found: Change, child: Checkpoint, about: Mapping[str, Any], data: 
     }
 
 
-class _Diary:
+class Diary:
     """How a run goes, in a file that the server reads: the loss of each step, and all looks."""
 
     def __init__(self, folder: Path, steps: int) -> None:
         self._path, self._steps, self._written = folder / "progress.json", steps, 0.0
+        self._before = (_read(self._path) or {}).get("losses", [])  # of a run that was stopped
         self._losses: list[tuple[int, float]] = []
         self._looks: list[Look] = []
 
     @property
     def errors(self) -> str:
         return errors(self._looks[0], self._looks[-1]) if self._looks else ""
+
+    def resume(self, step: int) -> None:
+        """The run goes on after this step."""
+        self._losses = [(at, loss) for at, loss in self._before if at <= step]
 
     def look(self, found: Look) -> None:
         self._looks.append(found)

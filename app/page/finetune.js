@@ -229,8 +229,8 @@ export class Finetune {
     if (!run) return;
     const { job, found, progress } = run;
     this.#part('h3').textContent = `${run.filter}: ${run.settings.train.map((name) => name.replace('-only', '')).join(', ') || 'all'} on ${learned(run)}`;
-    this.#part('.verdict').textContent = found ? found.change.verdict : job ? told(job) : 'It was given up.';
-    this.#part('article').dataset.state = found ? 'ready' : job && underWay(job) ? 'working' : 'ended';
+    this.#part('.verdict').textContent = found ? found.change.verdict : job ? said(job) : 'Its job is forgotten. It goes on where it stood.';
+    this.#part('article').dataset.state = found ? 'ready' : job && (underWay(job) || job.state === 'cancelled') ? 'working' : 'ended';
     const [bar, act] = this.#part('.doing').children;
     this.#part('.doing').hidden = Boolean(found);
     [bar.hidden, bar.value] = [!underWay(job ?? {}), job?.progress ?? 0];
@@ -308,6 +308,8 @@ function curvesOf({ losses, looks }, task) {
   plots.push({ title: 'Validation', x_label: 'step', y_label: `RMSE of the ${of} (cm)`, kind: 'line', diagonal: false, lines: places.map(error) });
   return { curves: [], bands: {}, tables: [], pictures: [], plots: plots.filter(({ lines }) => lines.length && lines[0].x.length) };
 }
+
+const said = (job) => (job.state === 'cancelled' ? 'Paused. It goes on from its last look at the validation episodes.' : told(job));
 
 const learned = ({ settings }) => settings.mix.map(({ slice }) => slice.name).join(' and ') || 'nominal data';
 

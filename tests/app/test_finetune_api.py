@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
 
 import pytest
 from starlette.testclient import TestClient
 
+from beliefscope.app.finetune import Diary
 from beliefscope.app.server import Settings
 from beliefscope.filters.checkpoint import load_checkpoint
 
@@ -92,6 +95,19 @@ def test_a_child_is_made_held_against_its_parent_and_placed(
         again = client.get(f"/api/tuned/{run}").json()
         assert (again["job"], again["found"]) == (None, found), "a child outlasts its job"
     assert load_checkpoint(settings.checkpoints["crossmodal-ekf"]).hash == parent.hash  # type: ignore[arg-type]
+
+
+def test_a_run_that_was_stopped_keeps_the_losses_of_its_steps(tmp_path: Path) -> None:
+    before = Diary(tmp_path, 9)
+    for step in range(1, 6):
+        before.step(step, 1.0 / step)
+    before.write()
+    after = Diary(tmp_path, 9)
+    after.resume(4)  # its last look; the fifth step is done anew
+    after.step(5, 0.25)
+    after.write()
+    losses = json.loads((tmp_path / "progress.json").read_text())["losses"]
+    assert losses == [[1, 1.0], [2, 0.5], [3, pytest.approx(1 / 3)], [4, 0.25], [5, 0.25]]
 
 
 @pytest.mark.parametrize(
