@@ -20,7 +20,7 @@ export class Marks {
   /** @param {Moment[]} moments in place of those that were there before */
   set(moments) {
     const ordered = [...moments].sort((a, b) => a.step - b.step);
-    this.#buttons = ordered.map((moment, i) => this.#button(moment, i));
+    this.#buttons = ordered.map((moment) => this.#button(moment));
     this.#host.replaceChildren(...this.#buttons.map(({ button }) => button));
     this.#host.hidden = !moments.length;
   }
@@ -33,6 +33,7 @@ export class Marks {
       button.style.transform = `translateX(${(at ?? 0).toFixed(2)}px)`;
       button.classList.toggle('leftward', at > width / 2);
     }
+    if (!this.#seen.some((button) => button.tabIndex === 0)) this.#stopAt(this.#seen[0]);
   }
 
   /** Shows which of them the cursor is at. */
@@ -44,26 +45,37 @@ export class Marks {
     }
   }
 
-  #button({ step, label, measure }, i) {
+  #button({ step, label, measure }) {
     const button = document.createElement('button');
     button.type = 'button';
-    button.tabIndex = i ? -1 : 0;
+    button.tabIndex = -1;
     button.setAttribute('aria-label', `Step ${step}: ${measure && !label.startsWith(measure) ? `${measure}, ` : ''}${label}`);
     button.addEventListener('pointerdown', (event) => event.stopPropagation()); // it is no scrub
-    button.addEventListener('click', (event) => this.#store.set({ step, playing: false }, { inputTime: event.timeStamp }));
+    button.addEventListener('click', (event) => {
+      this.#store.set({ step, playing: false }, { inputTime: event.timeStamp });
+      if (event.detail) button.blur(); // who came with the mouse goes on with the page's keys
+    });
     return { step, button, here: false };
   }
 
   /** One stop of the tab key for all; the arrows go from one to the next. */
   #walk(event) {
     const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    const seen = this.#buttons.map(({ button }) => button).filter((button) => !button.hidden);
+    const seen = this.#seen;
     const place = seen.indexOf(document.activeElement);
     if (!by || place < 0) return;
     event.preventDefault();
     event.stopPropagation();
     const next = seen[Math.min(Math.max(place + by, 0), seen.length - 1)];
-    for (const { button } of this.#buttons) button.tabIndex = button === next ? 0 : -1;
+    this.#stopAt(next);
     next.focus();
+  }
+
+  get #seen() {
+    return this.#buttons.map(({ button }) => button).filter((button) => !button.hidden);
+  }
+
+  #stopAt(stop) {
+    for (const { button } of this.#buttons) button.tabIndex = button === stop ? 0 : -1;
   }
 }

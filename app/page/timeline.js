@@ -48,17 +48,20 @@ export class TimeLine {
     this.#kind = document.querySelector('#track');
     this.#kind.replaceChildren(...Object.entries(KINDS).map(([kind, name]) => new Option(name, kind)));
     this.#kind.addEventListener('change', () => store.set({ track: this.#kind.value }));
-    store.listen(({ window }, changed) => changed.has('window') && window !== this.#written && this.#look(...this.#read(window)));
+    store.listen(({ window }, changed) => {
+      if (this.#trace && changed.has('window') && window !== this.#written) this.#look(...this.#read(window));
+    });
     new ResizeObserver(() => this.#build()).observe(element);
     this.#takeHand();
   }
 
   /** @param {import('./trace.js').Trace} trace */
   show(trace) {
+    const { step, window } = this.#store.state;
     const same = (this.#trace?.steps ?? trace.steps) === trace.steps;
+    this.#at = this.#trace ? -1 : step; // a link may look elsewhere than at its cursor; later it is to be seen
     this.#trace = trace;
-    this.#at = this.#store.state.step;
-    this.#window = this.#possible(same ? this.#read(this.#store.state.window) : this.#all);
+    this.#window = this.#possible(same ? this.#read(window) : this.#all);
     this.#marks.set([]);
     this.redraw();
     this.#look(...this.#window);

@@ -124,6 +124,9 @@ def test_marked_moments_and_another_trace(open_page: Any) -> None:
     page.until("() => beliefscope.state().step === 55")
     centres = [page.page.locator(s).bounding_box() for s in ("#marks [aria-current]", "#tracks .cursor")]
     assert np.diff([c["x"] + c["width"] / 2 for c in centres]) == pytest.approx(0, abs=1)
+    page.page.keyboard.press("ArrowRight")
+    page.until("() => beliefscope.state().step === 56")
+    marks.nth(1).focus()
     page.page.keyboard.press("ArrowRight")  # from mark to mark, not from step to step
     page.page.keyboard.press("Enter")
     page.until("() => beliefscope.state().step === 70")
