@@ -26,7 +26,7 @@ OPTIONS = {
     "finetune": "--filter --train --freeze --slice --recipe --nominal --moment --data --skip-bad "
     "--steps --length --rate --pull --seed --log -o --json",
     "modules": "--filter --train --freeze --depth --json",
-    "change": "--data --skip-bad --slice --particles --seed -o --json",
+    "change": "--task --data --skip-bad --slice --particles --seed -o --json",
     "lineage": "--export -o --json",
     "evaluate": "--filter --data --skip-bad --recipe --only --particles --seed --json",
     "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
@@ -196,6 +196,14 @@ BAD = [
     "serve --data other.h5 --data cut.h5",
     "serve --filter other.safetensors",
     "serve --checkpoint ./missing",
+    "change crossmodal-ekf crossmodal-pf",
+    "change crossmodal-ekf missing.safetensors",
+    "change crossmodal-ekf ekf.safetensors --slice dark",
+    "change crossmodal-ekf ekf.safetensors -o taken",
+    "lineage nowhere",
+    "lineage notes.txt",
+    "lineage ekf.safetensors --export nothing -o copy",
+    "lineage ekf.safetensors --export ekf.safetensors",
 ]
 
 

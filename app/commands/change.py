@@ -32,6 +32,9 @@ SliceTexts = Annotated[
 def change(
     before: Annotated[str, typer.Argument(metavar="BEFORE", help=Either)],
     after: Annotated[str, typer.Argument(metavar="AFTER", help=Either)],
+    task_: Annotated[
+        str | None, typer.Option("--task", metavar="TASK", help="Of both, where neither is a file.")
+    ] = None,
     data: DataPath = None,
     skip_bad: SkipBad = False,
     slices: SliceTexts = None,
@@ -52,6 +55,7 @@ def change(
     \b
     Examples:
       beliefscope change crossmodal-ekf child.safetensors
+      beliefscope change unimodal-ekf crossmodal-ekf --task push
       beliefscope change parent.safetensors child.safetensors --data door.h5 -o report
       beliefscope change crossmodal-pf child.safetensors --slice black-in-contact:recipe=blackout=1:contact=yes
     """
@@ -66,7 +70,7 @@ def change(
     check(None, json)
     if output is not None and (output.exists() or not output.parent.is_dir()):
         raise BadInput(f"output {str(output)!r} is there already, or its folder is not; give the name of a new folder")
-    pair = both(before, after)
+    pair = both(before, after, task_)
     task = pair[0].task
     chosen = [Slice.parse(text, slices_of(task)) for text in slices or []]
     with dataset(task, data, skip_bad) as episodes, console.progress("Comparing") as advance:
@@ -98,15 +102,15 @@ def change(
     console.result(document, text, json)
 
 
-def both(before: str, after: str) -> tuple[Checkpoint, Checkpoint]:
-    """Two checkpoints, of which one may be a name that ships. Raises BadInput for what is not there."""
+def both(before: str, after: str, task: str | None) -> tuple[Checkpoint, Checkpoint]:
+    """Two checkpoints by file or by a name that ships for the task. Raises BadInput for what is not there."""
     from beliefscope.filters.checkpoint import load_checkpoint
 
     loaded = {text: load_checkpoint(Path(text)) for text in (before, after) if is_path(text)}
-    if not loaded:
-        raise BadInput(f"{before!r} and {after!r} are both names; give at least one as a .safetensors file")
-    task = next(iter(loaded.values())).task.name
-    first, second = (loaded.get(text) or checkpoint(task, text) for text in (before, after))
+    if task is None and not loaded:
+        raise BadInput(f"{before!r} and {after!r} are names of filters; say of which task: --task door")
+    known = task or next(iter(loaded.values())).task.name
+    first, second = (loaded.get(text) or checkpoint(known, text) for text in (before, after))
     return first, second
 
 
