@@ -38,7 +38,7 @@ class FineTune:
         moments: of chosen episodes, all that is learned of the slices; without any, of all training episodes.
         length: steps of a window. windows: in a step. steps: of the optimiser, at most.
         rate: Adam's learning rate, which falls to a twentieth. rates: patterns with rates of their own, the last that
-            matches counts; without, ``dynamics.log_noise`` has ten times the rate.
+            matches counts; without, ``dynamics.log_noise`` has ten times the rate, picture encoders a third.
         pull: strength of the decay towards the parent's weights. check: steps between two looks at the validation
             episodes. patience: looks without a better one that end the run.
         particles, likelihood_weight: as in training (``train.Plan``). seed: of all draws.
@@ -52,7 +52,7 @@ class FineTune:
     length: int = 32
     windows: int = 16
     steps: int = 300
-    rate: float = 1e-3
+    rate: float = 3e-4
     rates: tuple[tuple[str, float], ...] = ()
     pull: float = 1.0
     check: int = 25

@@ -16,6 +16,7 @@ from beliefscope.filters.evaluate import LEFT_OUT, metrics
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.mix import Mix, spread
 from beliefscope.filters.modules import matching
+from beliefscope.filters.networks import ImageEncoder
 from beliefscope.filters.rollout import rollout, start_at_truth
 
 if TYPE_CHECKING:
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 LONGEST, WINDOWS, PARTICLES = 100, 32, 100
 """Of a look: steps of a window and windows of each slice, at most; particles."""
 
-FINE_NOISE = 10.0
-"""Times the rate for the process noise: one number that scales all else, and logarithmic."""
+NOISE, PICTURES = 10.0, 1 / 3
+"""Times the rate, as in training: process noise, which is logarithmic and scales all else, and picture encoders."""
 
 
 @dataclass(frozen=True)
@@ -101,19 +102,22 @@ class Tuning:
         self.looks: list[Look] = []
         self.done = self.best_step = self.since = 0
         self.loss = 0.0
-        self.rates = {name: self._rate(name) for name in trained}
+        self.rates = self._rates()
         groups = [
             {"params": [p for name, p in trained.items() if self.rates[name] == rate], "rate": rate}
             for rate in dict.fromkeys(self.rates.values())
         ]
         self.optimiser = torch.optim.Adam(groups, lr=settings.rate)
 
-    def _rate(self, name: str) -> float:
-        rate = self.settings.rate * (FINE_NOISE if name == "dynamics.log_noise" else 1.0)
+    def _rates(self) -> dict[str, float]:
+        rate = self.settings.rate
+        seeing = {id(p) for m in self.filter.modules() if isinstance(m, ImageEncoder) for p in m.parameters()}
+        rates = {name: rate * PICTURES if id(p) in seeing else rate for name, p in self.trained.items()}
+        if "dynamics.log_noise" in rates:
+            rates["dynamics.log_noise"] = rate * NOISE
         for pattern, other in self.settings.rates:
-            if matching([name], pattern):
-                rate = other
-        return rate
+            rates |= dict.fromkeys(matching(rates, pattern), other)
+        return rates
 
     @property
     def finished(self) -> bool:

@@ -85,7 +85,7 @@ def finetune(
         typer.Option(
             "--rate",
             metavar="R|PATTERN=R",
-            help="Adam's learning rate, 0.001 without; of the parts that a pattern matches: 'weight_model=0.0001'.",
+            help="Adam's learning rate, 0.0003 without; of the parts that a pattern matches: 'weight_model=0.0001'.",
         ),
     ] = None,
     pull: Annotated[
@@ -191,7 +191,7 @@ def finetune(
 
 def rates(given: Sequence[str]) -> tuple[float, tuple[tuple[str, float], ...]]:
     """Reads ``0.001`` and ``PATTERN=0.001``: the base rate and those of patterns. Raises BadInput for anything else."""
-    base, own = 1e-3, []
+    base, own = 3e-4, []
     for text in given:
         pattern, _, number = text.rpartition("=")
         try:
