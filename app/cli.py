@@ -27,6 +27,7 @@ from beliefscope.app.commands.lineage import lineage
 from beliefscope.app.commands.modules import modules
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
+from beliefscope.app.commands.report import report
 from beliefscope.app.commands.restore import restore
 from beliefscope.app.commands.serve import serve
 from beliefscope.app.commands.study import study
@@ -50,6 +51,7 @@ COMMANDS = (
     restore,
     export,
     inspect,
+    report,
     counterfactual,
     figure,
     failures,
