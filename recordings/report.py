@@ -35,10 +35,10 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect import measures, paper, weights
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostic import Table, as_json
-from beliefscope.inspect.likelihood import MapEngine, no_maps
+from beliefscope.inspect.likelihood import FINE, MapEngine, no_maps
 from beliefscope.inspect.plotting import charts_of, write_figure
 from beliefscope.inspect.trace import Trace
-from beliefscope.recordings.reportfigures import error_figure, moment_figure
+from beliefscope.recordings.reportfigures import error_figure, moment_figure, zoom_of
 from beliefscope.recordings.reportpage import page
 from beliefscope.recordings.reportparts import (
     Moment,
@@ -187,23 +187,28 @@ class Writer:
         moment = self.report.moments[number]
         trace, step = self.report.traces[moment.trace], moment.step
         name = f"moment-{number + 1}"
-        map_, data = None, []
+        map_ = drawn = None
+        zoom, data = 1, []
         if self.no_maps is None:
-            map_ = self._engine(moment.trace).map(step)
+            map_ = drawn = self._engine(moment.trace).map(step, size=FINE)
             buffer = io.BytesIO()
             arrays: dict[str, Any] = {f.name: np.asarray(getattr(map_, f.name)) for f in fields(map_)}
             np.savez_compressed(buffer, **arrays)
             data.append(self.write(f"data/{name}-maps.npz", buffer.getvalue()))
             caption = (
                 "What the filter was given, and likelihood maps over offsets from the truth, each over its maximum. "
-                "Cross hairs: the truth. Dots: each layer's own estimate, which rests on its prediction as well."
+                "Cross hairs: the truth. Rings: each layer's own estimate, which rests on its prediction as well."
             )
+            zoom = zoom_of(map_)
+            if zoom > 1:
+                caption += f" The middle of the map, {zoom} times narrower than its square."
+                drawn = self._engine(moment.trace).map(step, size=FINE * zoom)
         else:
             caption = (
                 f"What the filter was given, and its estimates as offsets from the truth. No maps: {self.no_maps}."
             )
         shown = (
-            self.figure(name, caption, moment_figure(trace, step, map_), *data),
+            self.figure(name, caption, moment_figure(trace, step, drawn, zoom), *data),
             self.table(name, moment_table(trace, step, map_)),
         )
         title = f"{number + 1}. Episode {trace.episode_index}, step {step}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import patheffects, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -18,6 +18,23 @@ from beliefscope.inspect.trace import Trace
 
 A_ROW = 4
 """Panels of a moment side by side."""
+
+ZOOMS = (6, 4, 2)
+HELD = 0.98
+"""Share of each layer's likelihood that the middle of a map holds, for the rest to be left out."""
+
+EDGE = [patheffects.withStroke(linewidth=2.6, foreground="white")]
+
+
+def zoom_of(map_: LikelihoodMap) -> int:
+    """How many times narrower than the map the middle is that holds nearly all that every layer finds likely."""
+    share = np.exp(map_.log_likelihood - map_.log_likelihood.max(axis=(1, 2), keepdims=True)).astype(np.float64)
+    share /= share.sum(axis=(1, 2), keepdims=True)
+    for zoom in ZOOMS:
+        x, y = (np.abs(offsets) <= np.abs(map_.offsets_x).max() / zoom for offsets in (map_.offsets_x, map_.offsets_y))
+        if (share[:, y][:, :, x].sum(axis=(1, 2)) >= HELD).all():
+            return zoom
+    return 1
 
 
 def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int, str]]]) -> Figure:
@@ -51,9 +68,12 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
     return figure
 
 
-def moment_figure(trace: Trace, step: int, map_: LikelihoodMap | None) -> Figure:
+def moment_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int = 1) -> Figure:
     """The pictures that the filter was given and each layer's map, its own estimate upon it; all offsets are from the
     truth. Without maps: where the estimates are.
+
+    Args:
+        zoom: how many times narrower than the map the square is that is drawn.
     """
     task = measures.task_of(trace)
     pictures = {key: one[step] for key, one in trace.episode.observations.items() if one.ndim == 3}
@@ -87,12 +107,12 @@ def moment_figure(trace: Trace, step: int, map_: LikelihoodMap | None) -> Figure
                 extent = (-half, half, -half, half)
                 look = {"cmap": "viridis", "vmin": 0.0, "vmax": 1.0, "origin": "lower", "extent": extent}
                 axes.imshow(np.exp(log - log.max()), interpolation="nearest", **look)
-                hair = [-half, -0.15 * half, np.nan, 0.15 * half, half]
+                hair = [-half, -0.15 * half / zoom, np.nan, 0.15 * half / zoom, half]
                 for x, y in ((hair, [0.0] * 5), ([0.0] * 5, hair)):
                     axes.plot(x, y, color="white", lw=0.5, alpha=0.7)
                 if layer == "fused" or layer in trace.alone:
                     _estimate(axes, where[layer], colour(layer, trace.modalities), layer)
-            axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
+            axes.set(xlim=(-half / zoom, half / zoom), ylim=(-half / zoom, half / zoom), aspect="equal")
             axes.set_title(layer, loc="left", fontsize=7.5)
             axes.set_xlabel(f"{task.map_components[0].replace('_', ' ')} offset (cm)")
             if i == 0 or (first + i) % columns == 0:
@@ -103,4 +123,5 @@ def moment_figure(trace: Trace, step: int, map_: LikelihoodMap | None) -> Figure
 
 
 def _estimate(axes: Axes, place: np.ndarray, shade: str, name: str) -> None:
-    axes.plot(*place, marker="o", ms=4.5, mfc=shade, mec="white", mew=0.8, ls="", label=name, zorder=4)
+    """A ring, so that what lies beneath is seen."""
+    axes.plot(*place, marker="o", ms=7, mfc="none", mec=shade, mew=1.3, ls="", label=name, path_effects=EDGE, zorder=4)

@@ -130,8 +130,9 @@ def moment_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     columns = ["layer", *(f"{c.name} error ({u})" for c, u in zip(task.components, units, strict=True))]
     columns += ["position error (cm)"]
     columns += ["NEES/n"] if trace.has_covariance else []
-    columns += ["beta"] if trace.weights is not None else []
-    columns += ["acting share"] if trace.acting is not None else []
+    for name, share in (("beta", trace.weights), ("acting share", trace.acting)):
+        if share is not None:
+            columns.append(name if share.shape[-1] == 1 else f"{name} (mean)")
     columns += ["map: peak off truth (cm)", "map: 95 % region (cm²)"] if numbers is not None else []
     rows: list[tuple[Value, ...]] = []
     for i, layer in enumerate(measures.layers(trace)):

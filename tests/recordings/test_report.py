@@ -21,8 +21,10 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
+from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace, save_trace, trace
 from beliefscope.recordings.report import FORMAT, compose, new_folder, write_report
+from beliefscope.recordings.reportfigures import zoom_of
 from beliefscope.recordings.reportmath import mathml
 from beliefscope.recordings.reportparts import accuracy, moment_table, worst_moments
 from beliefscope.recordings.reporttext import definitions, methods
@@ -171,8 +173,18 @@ def test_moment_table_has_known_errors(run_: Trace) -> None:
     off = run_.estimate_mean[40].astype(float) - run_.episode.states[40]
     assert rows["fused"]["hinge_x error (cm)"] == pytest.approx(100 * off[0])
     assert rows["fused"]["position error (cm)"] == pytest.approx(100 * np.hypot(off[0], off[1]))
-    shares = [float(rows[name]["acting share"]) for name in run_.modalities]  # type: ignore[arg-type]
+    shares = [float(rows[name]["acting share (mean)"]) for name in run_.modalities]  # type: ignore[arg-type]
     assert sum(shares) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("wide", "zoom"), [(0.05, 1), (0.025, 2), (0.01, 4), (0.004, 6)])
+def test_a_map_is_drawn_as_near_as_holds_what_it_says(
+    new_trace: Callable[..., Trace], new_map: Callable[..., LikelihoodMap], wide: float, zoom: int
+) -> None:
+    flat = new_map(new_trace("ekf"), 0, 135)
+    x, y = np.meshgrid(flat.offsets_x, flat.offsets_y)
+    round_ = np.repeat((-0.5 * (x**2 + y**2) / wide**2)[None], 3, axis=0)
+    assert zoom_of(replace(flat, log_likelihood=round_)) == zoom
 
 
 @pytest.mark.parametrize("kind", ["ekf", "ukf", "pf", "lstm", "foreign"])
