@@ -122,7 +122,16 @@ class Change(Diagnostic):
             self.table_of(self.moments),
             Table(
                 "Modules",
-                ("module", "class", "parameters", "weights changed %", "output drift %", "frozen", "SHA-256"),
+                (
+                    "module",
+                    "class",
+                    "parameters",
+                    "gradient",
+                    "weights changed %",
+                    "output drift %",
+                    "frozen",
+                    "SHA-256",
+                ),
                 tuple(
                     _module_row(m)
                     for m in self.modules
@@ -208,11 +217,13 @@ def change_of(
     members = [data[index] for index in indices]
     found = tally(filters, chosen, members, particles=particles, seed=seed, progress=progress)
     counts = found.sums[:, 0, :, 0]
+    child = (after.record.get("parent") or {}).get("hash") == before.hash
+    gradients = {name: sizes[0] for name, sizes in after.record.get("parts", {}).items()} if child else {}
     return Change(
         task=task.name,
         filters=(before.name, after.name),
         hashes=(before.hash, after.hash),
-        child=(after.record.get("parent") or {}).get("hash") == before.hash,
+        child=child,
         episodes=indices,
         seed=seed,
         particles=particles if "pf" in (before.kind, after.kind) else None,
@@ -222,7 +233,7 @@ def change_of(
         levels=LEVELS,
         calibration=curve(found.sums.sum(0)).swapaxes(0, 1),
         moments=worsenings(found, chosen, indices, members, task.dt),
-        modules=module_changes(*filters, spread(members, task, PROBED)),
+        modules=module_changes(*filters, spread(members, task, PROBED), gradients),
     )
 
 
@@ -325,5 +336,6 @@ def _part_row(part: Part) -> tuple[Value, ...]:
 
 def _module_row(m: ModuleChange) -> tuple[Value, ...]:
     changed, drift = (None if math.isnan(x) else 100.0 * x for x in (m.weights, m.drift))
+    gradient = None if math.isnan(m.gradient) else m.gradient
     hashes = m.hashes[0][:12] if m.same else " -> ".join(digest[:12] for digest in m.hashes)
-    return m.name, m.kind, m.parameters, changed, drift, "same" if m.same else "", hashes
+    return m.name, m.kind, m.parameters, gradient, changed, drift, "same" if m.same else "", hashes

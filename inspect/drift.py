@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -28,6 +29,8 @@ class ModuleChange:
         weights: norm of the parameters' change over their norm before; NaN where that is zero.
         drift: root mean square of its output's change over that of its output before, where both filters look at the
             same observations and begin a step at the same, true state; NaN for a module that is not called as a whole.
+        gradient: norm of the loss's gradient by its parameters, root mean square over the steps of the fine-tuning that
+            made the one after of the one before; NaN where nothing of it was trained, or not so.
         hashes: SHA-256 of its parameters and buffers, before and after.
     """
 
@@ -36,6 +39,7 @@ class ModuleChange:
     parameters: int
     weights: float
     drift: float
+    gradient: float
     hashes: tuple[str, str]
 
     @property
@@ -45,11 +49,14 @@ class ModuleChange:
 
 
 @torch.no_grad()
-def module_changes(before: Filter, after: Filter, batch: Batch) -> tuple[ModuleChange, ...]:
+def module_changes(
+    before: Filter, after: Filter, batch: Batch, gradients: Mapping[str, float] | None = None
+) -> tuple[ModuleChange, ...]:
     """Of every module with tensors that both have, in the filter's order; the filter itself is not among them.
 
     Args:
         batch: T = 1: the steps that outputs are compared at.
+        gradients: of the parameters that were trained: norm of the gradient, root mean square over the steps.
     """
     others = dict(after.named_modules())
     outputs = [heard(filter_, batch) for filter_ in (before, after)]
@@ -59,6 +66,7 @@ def module_changes(before: Filter, after: Filter, batch: Batch) -> tuple[ModuleC
         if not name or not states[0] or _shapes(states[0]) != _shapes(states[1]):
             continue
         parameters = [[p.flatten() for p in m.parameters()] for m in (module, others[name])]
+        within = [size for key, size in (gradients or {}).items() if key.startswith(f"{name}.")]
         changes.append(
             ModuleChange(
                 name=name,
@@ -66,6 +74,7 @@ def module_changes(before: Filter, after: Filter, batch: Batch) -> tuple[ModuleC
                 parameters=sum(p.numel() for p in parameters[0]),
                 weights=_relative(*parameters),
                 drift=_relative(*(outputs[i].get(name, []) for i in (0, 1))),
+                gradient=math.hypot(*within) if within else math.nan,
                 hashes=(_digest(states[0]), _digest(states[1])),
             )
         )

@@ -49,7 +49,11 @@ def altered(checkpoint: Checkpoint, change: Callable[[Filter], None]) -> Checkpo
     filter_ = copy.deepcopy(checkpoint.filter)
     with torch.no_grad():
         change(filter_)
-    record = {"parent": {"hash": checkpoint.hash, "settings": {}}}
+    parts = {
+        "virtual_sensors.haptics.state.bias": [4.0, 3.0, 1.0],
+        "virtual_sensors.haptics.state.weight": [3.0, 0.0, 1.0],
+    }
+    record = {"parent": {"hash": checkpoint.hash, "settings": {}}, "parts": parts}
     return replace(checkpoint, filter=filter_, hash=hashlib.sha256(b"child").hexdigest(), record=record)
 
 
@@ -161,6 +165,8 @@ def test_what_was_frozen_is_proved_by_its_hash_and_what_was_not_drifts() -> None
     assert not sensor.same
     assert sensor.weights == pytest.approx(3.0 / float(torch.cat([bias, weight.flatten()]).norm()), rel=1e-5)
     assert sensor.drift > 0.0
+    assert sensor.gradient == modules["virtual_sensors.haptics"].gradient == pytest.approx(5.0)  # 3 and 4 of its parts
+    assert math.isnan(modules["dynamics"].gradient)
     assert modules["virtual_sensors.haptics.encoders"].drift == 0.0
     assert modules["weight_model"].drift == modules["dynamics"].drift == 0.0
 
