@@ -33,6 +33,7 @@ KINDS: dict[str, str] = {
     "diagnostic": "beliefscope.app.diagnostics:work",
     "failures": "beliefscope.app.failures:work",
     "finetune": "beliefscope.app.finetune:work",
+    "report": "beliefscope.app.reports:work",
 }
 """Kind of job -> ``module:function`` of (arguments, report) -> result; ``report(share done, what it is doing)``."""
 
@@ -56,7 +57,7 @@ class Job:
         id: hash of its kind and of all that its result depends on. title: for people.
         progress: 0..1. message: what it is doing, in a line. error: why it ended without a result, in a line.
         asked, started, ended: s since 1970; None where it has not come to that.
-        server: process id of the server that has it. link: what follows the page's ``?`` to see its result.
+        server: process id of the server that has it. link: from the page's root to its result: ``?...``, or a file.
     """
 
     id: str

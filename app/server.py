@@ -19,7 +19,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
-from beliefscope.app import compare, diagnostics, failures, finetune, jobs
+from beliefscope.app import compare, diagnostics, failures, finetune, jobs, reports
 from beliefscope.app.api import routes
 from beliefscope.app.children import with_children
 from beliefscope.app.library import Library, Settings
@@ -73,6 +73,7 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
         compare.routes(library),
         failures.routes(library, work),
         finetune.routes(library, work),
+        reports.routes(library, work),
     ):
         app.include_router(router)
     _add_files(app, rerun)

@@ -92,7 +92,7 @@ def report(
         raise BadInput(f"{files[0]} was made by checkpoint {first.checkpoint_hash[:12]}, not by {filter_!r}")
     chosen = [_moment(text, traces) for text in moments or ()]
     link, opened = _links(traces, made_by, filter_, data, url)
-    commands = [*(_command(trace, file, filter_, data) for file, trace in zip(files, traces, strict=True))]
+    commands = [*(trace_command(trace, file.name, filter_, data) for file, trace in zip(files, traces, strict=True))]
     given = [*(f"--moment={text}" for text in moments or ()), *(["--all"] if every else [])]
     given += ["--title", heading] if heading else []
     given += ["--filter", filter_] if filter_ else []
@@ -180,14 +180,14 @@ def _links(
     return link, f"A link opens its moment in the dashboard while this runs: {served}."
 
 
-def _command(trace: Trace, file: Path, filter_: str, data: Path | None) -> str:
-    """What makes the trace again."""
+def trace_command(trace: Trace, file: str, filter_: str, data: Path | None) -> str:
+    """What makes the trace again. filter_: as named on a command line; the trace's own name where it is empty."""
     if trace.settings.get("edits"):
-        return f"# {file.name} was edited by hand: its settings are in manifest.json"
+        return f"# {file} was edited by hand: its settings are in manifest.json"
     given = ["--data", str(data)] if data else []
     given += ["--recipe", str(trace.recipe)] if trace.recipe else []
     particles = trace.settings.get("particles", 300)
     given += ["--particles", str(particles)] if particles != 300 else []
     words = ["beliefscope", "trace", trace.episode.task, "--filter", filter_ or trace.filter]
-    words += ["--episode", str(trace.episode_index), *given, "--seed", str(trace.seed), "-o", file.name]
+    words += ["--episode", str(trace.episode_index), *given, "--seed", str(trace.seed), "-o", file]
     return shlex.join(words)

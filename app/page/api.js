@@ -134,6 +134,10 @@ export const job = async (id) => (await ask(`/api/jobs/${id}`)).json();
 /** Cancels a job that is under way, forgets one that has ended. @returns {Promise<Job>} */
 export const cancel = async (id) => (await ask(`/api/jobs/${id}`, { method: 'DELETE' })).json();
 
+/** Has a report of a run made. The job's link is where it lies. @returns {Promise<{job: Job}>} */
+export const report = async ({ task, filter, episode, data, recipe }) =>
+  (await ask(`/api/reports/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, recipe })}`, { method: 'POST' })).json();
+
 /** Writes a recording of a trace, with maps at even steps. @param {Trace} trace @returns {Promise<Recording>} */
 export async function record(trace) {
   const maps = Math.ceil(trace.steps / RECORDED_MAPS);

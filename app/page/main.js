@@ -86,12 +86,22 @@ class Page {
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
     this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
+    $('#report').addEventListener('click', () => this.#report());
     store.listen((state, changed) => this.#follow(state, changed));
     this.#takeKeys();
     this.#takeButtons();
     this.#showTab(store.state.tab);
     this.#load();
     window.beliefscope = { state: () => ({ ...store.state }), stats, timeline: this.timeline, rerun: { getState: () => this.rerun.getState() } };
+  }
+
+  /** Has a report written; its job becomes the link to it. */
+  async #report() {
+    if (!this.#trace) return;
+    const problem = await api.report(this.#trace.selection).then(() => '', (error) => `The report was not asked for: ${error.message}`);
+    messages.say('report', problem);
+    if (!problem && $('#jobs').hidden) this.jobs.toggle();
+    else this.jobs.refresh();
   }
 
   /** The view's socket tells. */

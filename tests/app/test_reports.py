@@ -1,0 +1,37 @@
+"""Reports over HTTP: asked for, made by a job, and downloaded."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from starlette.testclient import TestClient
+
+from beliefscope.app.library import Settings
+from beliefscope.app.server import create_app
+
+ORIGIN = "http://localhost:8000"
+PATIENCE = 120.0  # s: a job imports PyTorch first
+
+
+def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
+    app = create_app(Settings(tmp_path / "workspace"), warm=False)
+    with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
+        asked = client.post("/api/reports/door/crossmodal-ekf/9", params={"data": "sample", "recipe": "blackout=0.4"})
+        assert asked.status_code == 202
+        job = asked.json()["job"]
+        assert client.get(f"/{job['link']}").status_code == 404
+        end = time.monotonic() + PATIENCE
+        while (job := client.get(f"/api/jobs/{job['id']}").json())["state"] in ("waiting", "running"):
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        assert job["state"] == "done", job["error"]
+        page = client.get(f"/{job['link']}")
+        assert page.status_code == 200
+        assert "attachment" in page.headers["content-disposition"]
+        assert f"{ORIGIN}/?task=door&amp;filter=crossmodal-ekf&amp;data=sample&amp;episode=9&amp;step=" in page.text
+        assert "recipe=blackout%3D0.4" in page.text
+        again = client.post("/api/reports/door/crossmodal-ekf/9", params={"data": "sample", "recipe": "blackout=0.4"})
+        assert again.json()["job"]["state"] == "done", "what is there is not made again"
+        assert client.get("/api/reports/door-nosuch-episode9-00000000.html").status_code == 404
+        assert client.post("/api/reports/door/nosuch/9").status_code in (400, 404)
