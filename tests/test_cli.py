@@ -24,7 +24,7 @@ OPTIONS = {
     "convert": "--data --skip-bad -o --json",
     "train": "--filter --data --skip-bad --preset --recipe --seed --log -o --json",
     "finetune": "--filter --train --freeze --slice --recipe --nominal --moment --data --skip-bad "
-    "--steps --length --rate --pull --seed --log -o --json",
+    "--steps --length --rate --pull --seed --log --rerun -o --json",
     "modules": "--filter --train --freeze --depth --json",
     "change": "--task --data --skip-bad --slice --particles --seed -o --json",
     "lineage": "--export -o --json",
@@ -167,6 +167,8 @@ BAD = [
     f"finetune {EKF} --moment 9:30-20 -o new.safetensors",
     f"finetune {EKF} --rate fast -o new.safetensors",
     "finetune door -o new.safetensors",
+    f"finetune {EKF} --rerun nowhere -o new.safetensors",
+    f"finetune {EKF} --log new --rerun nowhere -o new.safetensors",
     "finetune missing.safetensors -o new.safetensors",
     f"modules {EKF} --freeze weigth_model",
     f"trace {EKF} --episode 100000 -o new.trace",

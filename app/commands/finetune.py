@@ -98,8 +98,14 @@ def finetune(
     seed: Seed = 0,
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="DIR", help="Write losses and errors there, for TensorBoard."),
+        typer.Option(
+            "--log", metavar="DIR", help="Write losses and errors there, for TensorBoard and as Rerun's run-1.rrd."
+        ),
     ] = None,
+    rerun: Annotated[
+        str,
+        typer.Option("--rerun", metavar="URL", help="Of an open Rerun viewer, to show them live; --log is needed too."),
+    ] = "",
     json: Json = None,
 ) -> None:
     """Train parts of a filter further.
@@ -126,6 +132,8 @@ def finetune(
     check(output, json)
     if log is not None and (log.exists() and not log.is_dir()):
         raise BadInput(f"--log {str(log)!r} is a file; give the name of a folder")
+    if rerun and log is None:
+        raise BadInput(f"--rerun {rerun!r} shows what --log writes; give --log DIR too")
     if filter_ is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is missing: say which filter of task {target!r} to fine-tune")
     parent = load_checkpoint(Path(target)) if filter_ is None else checkpoint(target, filter_)
@@ -149,7 +157,7 @@ def finetune(
         seed=seed,
     )
     partial = output.with_name(f"{output.name}.partial")
-    with dataset(parent.task, data, skip_bad) as episodes, console.bars() as move, curves(log) as write:
+    with dataset(parent.task, data, skip_bad) as episodes, console.bars() as move, curves(log, rerun) as write:
         looks: list[Look] = []
 
         def looked(found: Look) -> None:
@@ -274,16 +282,22 @@ def share(before: float | None, after: float | None, key: str) -> str | None:
 
 
 @contextmanager
-def curves(folder: Path | None) -> Iterator[Callable[[int, dict[str, float]], None]]:
-    """Yields (step, numbers by name) -> None, which writes TensorBoard's event file into the folder."""
+def curves(folder: Path | None, viewer: str = "") -> Iterator[Callable[[int, dict[str, float]], None]]:
+    """Yields (step, numbers by name) -> None, which writes TensorBoard's event file and Rerun's into the folder.
+
+    viewer: address of a Rerun viewer, for the same there; empty for none.
+    """
     if folder is None:
         yield lambda step, numbers: None
         return
     from tensorboardX import SummaryWriter
 
-    with SummaryWriter(str(folder)) as writer:
+    from beliefscope.recordings.tuning import tuning_curves
+
+    with tuning_curves(folder, viewer) as record, SummaryWriter(str(folder)) as writer:
 
         def write(step: int, numbers: dict[str, float]) -> None:
+            record(step, numbers)
             for name, value in numbers.items():
                 writer.add_scalar(re.sub("[^a-zA-Z0-9/]+", "_", name), value, step)
 
