@@ -1,4 +1,4 @@
-"""The pictures of docs/walkthrough.md, and the sentences that the page shows in them.
+"""The pictures of README.md and docs/walkthrough.md, and the sentences that the page shows in them.
 
 python bench/walkthrough.py [FOLDER]    # docs/images by default; needs Chromium and the package's [dev] extra
 """
@@ -36,17 +36,30 @@ class Shot:
 
 
 SHOTS = (
-    Shot("failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Look for failures"),
-    Shot("moment", {"tab": "scene"}, "#maps-pairs"),
-    Shot("weights", {"tab": "diagnostics", "diagnostic": "weights"}, READY),
-    Shot("shapley", {"tab": "diagnostics", "diagnostic": "shapley"}, READY, "Compute"),
     Shot(
-        "saliency",
+        "page",
+        {
+            "task": "door",
+            "filter": "crossmodal-pf",
+            "data": "sample",
+            "episode": 9,
+            "step": 25,
+            "component": "angle",
+            "recipe": "blackout=0.4",
+        },
+        "#maps-pairs",
+    ),
+    Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Look for failures"),
+    Shot("walkthrough-moment", {"tab": "scene"}, "#maps-pairs"),
+    Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, READY),
+    Shot("walkthrough-shapley", {"tab": "diagnostics", "diagnostic": "shapley"}, READY, "Compute"),
+    Shot(
+        "walkthrough-saliency",
         {"tab": "diagnostics", "diagnostic": "saliency", "options": "step=68&target=beta:image"},
         READY,
         "Compute",
     ),
-    Shot("edit", {"tab": "compare", "against": "from=30&to=76&weights=haptics=0"}, "#compare .verdict"),
+    Shot("walkthrough-edit", {"tab": "compare", "against": "from=30&to=76&weights=haptics=0"}, "#compare .verdict"),
 )
 
 
@@ -69,7 +82,9 @@ def take(page: Page, shot: Shot) -> str:
             raise TimeoutError(f"{shot.name}: nothing in {shot.says} within {PATIENCE:g} s")
         page.wait_for_timeout(200)
     # The moment's own maps and scene come after what was waited for.
-    drawn = f"() => beliefscope.stats.maps?.size === 135 && beliefscope.stats.maps.step === {MOMENT['step']}"
+    drawn = (
+        f"() => beliefscope.stats.maps?.size === 135 && beliefscope.stats.maps.step === {(MOMENT | shot.asked)['step']}"
+    )
     while not page.evaluate(drawn):
         page.wait_for_timeout(200)
     page.wait_for_timeout(1000 * SETTLING)
@@ -87,7 +102,7 @@ def main(folder: Path = IMAGES) -> None:
             page = browser.new_page(viewport=SIZE, color_scheme="light")
             page.goto(f"{url}?{urlencode(MOMENT | shot.asked)}", timeout=1000 * PATIENCE)
             print(f"{shot.name}: {take(page, shot)}", flush=True)
-            page.screenshot(path=folder / f"walkthrough-{shot.name}.png", timeout=1000 * PATIENCE)
+            page.screenshot(path=folder / f"{shot.name}.png", timeout=1000 * PATIENCE)
             page.close()
         browser.close()
 
