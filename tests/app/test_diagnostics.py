@@ -173,6 +173,7 @@ def test_a_slow_one_is_a_job_that_is_asked_for(shown: TestClient) -> None:
     assert answered(shown, url("maps")).json() == {"job": None}  # with other options it is another one
 
 
+@pytest.mark.long
 def test_over_all_held_out_episodes_it_has_bounds(shown: TestClient) -> None:
     answered(shown, url("consistency"))
     assert shown.get(url("consistency"), params={"episodes": "held-out"}).json() == {"job": None}

@@ -51,6 +51,7 @@ def test_what_can_be_trained_is_a_tree_with_presets_and_slices(client: TestClien
     assert offer["runs"] == []
 
 
+@pytest.mark.long
 def test_a_child_is_made_held_against_its_parent_and_placed(
     settings: Settings, open_client: Callable[..., TestClient]
 ) -> None:

@@ -66,6 +66,7 @@ def test_what_a_filter_has_not_is_said(open_page: Any, serve: Any, tmp_path: Pat
     assert page.state["step"] == 0
 
 
+@pytest.mark.long
 def test_a_task_of_ones_own(open_page: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, own = tmp_path / "ball.h5", tmp_path / "own.safetensors"
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), str(data)])

@@ -300,6 +300,7 @@ def test_save_a_recording_open_it_and_move_both_ways(open_page: Any, tmp_path: P
     page.picture("rerun")
 
 
+@pytest.mark.long
 def test_a_server_that_goes_and_comes_back(open_page: Any, serve: Any) -> None:
     first = serve()
     page = open_page("?step=5", url=first.url)

@@ -322,6 +322,7 @@ def logged(folder: Path) -> dict[str, list[tuple[int, float]]]:
     return found
 
 
+@pytest.mark.long
 def test_train_goes_on_after_a_kill_and_logs_its_losses(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
