@@ -8,7 +8,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from concurrent.futures import TimeoutError as NotYet
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -16,7 +15,7 @@ from fastapi import APIRouter, Depends, HTTPException, Request
 from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope.app.api import PATIENCE, Asked
-from beliefscope.app.jobs import Job, Jobs
+from beliefscope.app.jobs import Jobs, under_way
 from beliefscope.app.library import Library, Selection, Settings, Traced
 from beliefscope.app.options import described, parse, says_how_far
 from beliefscope.app.work import Report
@@ -77,7 +76,7 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         job = jobs.find("diagnostic", _key(library, entry, _selections(library, asked, episodes), options))
         if job is not None and job.state == "done":
             return FileResponse(jobs.result(job.id), media_type="application/json")
-        return _under_way(job)
+        return under_way(job)
 
     @router.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
     def compute(entry: Named, asked: Asked, options: Options, episodes: Episodes = None) -> Response:
@@ -99,7 +98,7 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
             [f"{entry.title} of {asked.filter}", f"{asked.task} {where}", *filter(None, [str(asked.recipe)])]
         )
         key = _key(library, entry, selections, options)
-        return _under_way(jobs.submit("diagnostic", title, arguments, key, _link(entry, asked, options, episodes)))
+        return under_way(jobs.submit("diagnostic", title, arguments, key, _link(entry, asked, options, episodes)))
 
     return router
 
@@ -157,10 +156,6 @@ def _there(traced: Traced) -> Trace | None:
 
 def _not_yet(traced: Traced) -> JSONResponse:
     return JSONResponse({"progress": traced.progress}, status_code=202)
-
-
-def _under_way(job: Job | None) -> JSONResponse:
-    return JSONResponse({"job": None if job is None else asdict(job)}, status_code=202)
 
 
 def _allow(entry: Entry, trace: Trace, traced: Traced) -> None:

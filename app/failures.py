@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends
-from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.responses import FileResponse, Response
 
-from beliefscope.app.jobs import Job, Jobs
+from beliefscope.app.jobs import Jobs, under_way
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.link import moment_link
 from beliefscope.app.work import Report
@@ -55,7 +55,7 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         job = jobs.find("failures", _key(library, _arguments(library, asked)))
         if job is not None and job.state == "done" and jobs.result(job.id).is_file():
             return FileResponse(jobs.result(job.id), media_type="application/json")
-        return _under_way(job)
+        return under_way(job)
 
     @router.post("/api/failures/{task}/{filter}", status_code=202)
     def look(asked: Asked) -> Response:
@@ -65,7 +65,7 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         title = ", ".join([f"Failures of {asked.filter}", f"{asked.task} {where}", *filter(None, [recipe])])
         kept = {name: arguments[name] for name in ("task", "filter", "data", "among", "recipe") if arguments[name]}
         link = "?" + urlencode(kept | {"tab": "failures"})
-        return _under_way(jobs.submit("failures", title, arguments, _key(library, arguments), link))
+        return under_way(jobs.submit("failures", title, arguments, _key(library, arguments), link))
 
     return router
 
@@ -174,7 +174,3 @@ def _key(library: Library, arguments: Mapping[str, Any]) -> str:
     named = tuple(arguments[name] for name in ("task", "filter", "data", "among", "recipe", "episodes"))
     hashes = (library.checkpoint(task, filter_).hash, library.data_hash(task, data))
     return hashlib.sha256(repr((named, hashes, library.settings.seed, library.settings.particles)).encode()).hexdigest()
-
-
-def _under_way(job: Job | None) -> JSONResponse:
-    return JSONResponse({"job": None if job is None else asdict(job)}, status_code=202)

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fastapi import APIRouter, HTTPException
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope import __version__
 from beliefscope.datasets.errors import BadInput, one_of
@@ -300,6 +300,11 @@ def routes(jobs: Jobs) -> APIRouter:
         return FileResponse(jobs.result(id), media_type="application/json")
 
     return router
+
+
+def under_way(job: Job | None) -> JSONResponse:
+    """The answer where a job has to end first; None where nobody asked for it."""
+    return JSONResponse({"job": None if job is None else asdict(job)}, status_code=202)
 
 
 def _id(kind: str, key: str) -> str:

@@ -12,7 +12,7 @@ from fastapi import APIRouter, HTTPException, Request
 from fastapi.responses import FileResponse, Response
 
 from beliefscope.app.api import Asked
-from beliefscope.app.commands.failures import serving
+from beliefscope.app.commands.given import serving
 from beliefscope.app.commands.report import trace_command
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Selection, Settings
@@ -71,6 +71,7 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         settings = library.settings
         given, data = settings.checkpoints.get(of.filter), settings.data.get(of.data)
         path = str(given) if isinstance(given, Path) else None
+        served = serving([path] if path else [], data, settings.seed)
 
         def link(index: int, step: int) -> str:
             return arguments["url"] + moment_link(task, of.filter, of.data, of.episode, step, str(recipe))
@@ -79,7 +80,7 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             [trace],
             traced.checkpoint,
             link=link,
-            opened=f"A link opens its moment in the dashboard while this runs: {serving(path, data, settings.seed)}.",
+            opened=f"A link opens its moment in the dashboard while this runs: {served}.",
             commands=(trace_command(trace, "run.trace", path or "", data), "beliefscope report run.trace -o report"),
             progress=lambda share: report(0.1 + 0.4 * share, "measuring"),
         )

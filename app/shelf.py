@@ -169,6 +169,13 @@ def short_names(paths: Iterable[Path], taken: Collection[str] = ()) -> dict[str,
     return {name(path): path for path in parts}
 
 
+def served_names(filters: Iterable[str | Path], data: Path | None) -> tuple[dict[str, str], str]:
+    """The names that ``serve`` gives to these files: of filters by path, and of the data, the sample set if None."""
+    ships = {name for task in TASKS.values() for name in filters_of(task)}
+    named = {str(path): name for name, path in short_names([Path(one) for one in filters], ships).items()}
+    return named, SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
+
+
 def _parts(path: Path) -> tuple[str, ...]:
     whole = path.resolve()
     return (whole if whole.is_dir() else whole.with_suffix("")).parts[1:]

@@ -218,7 +218,6 @@ def change_of(
     found = tally(filters, chosen, members, particles=particles, seed=seed, progress=progress)
     counts = found.sums[:, 0, :, 0]
     child = (after.record.get("parent") or {}).get("hash") == before.hash
-    gradients = {name: sizes[0] for name, sizes in after.record.get("parts", {}).items()} if child else {}
     return Change(
         task=task.name,
         filters=(before.name, after.name),
@@ -233,7 +232,7 @@ def change_of(
         levels=LEVELS,
         calibration=curve(found.sums.sum(0)).swapaxes(0, 1),
         moments=worsenings(found, chosen, indices, members, task.dt),
-        modules=module_changes(*filters, spread(members, task, PROBED), gradients),
+        modules=module_changes(*filters, spread(members, task, PROBED), after.record.get("parts") if child else None),
     )
 
 

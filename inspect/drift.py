@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ from torch import Tensor, nn
 
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.filter import Filter
+from beliefscope.filters.modules import digest, moved, within
 from beliefscope.filters.rollout import start_at_truth
 
 PARTICLES = 30
@@ -50,13 +50,13 @@ class ModuleChange:
 
 @torch.no_grad()
 def module_changes(
-    before: Filter, after: Filter, batch: Batch, gradients: Mapping[str, float] | None = None
+    before: Filter, after: Filter, batch: Batch, ran: Mapping[str, Sequence[float]] | None = None
 ) -> tuple[ModuleChange, ...]:
     """Of every module with tensors that both have, in the filter's order; the filter itself is not among them.
 
     Args:
         batch: T = 1: the steps that outputs are compared at.
-        gradients: of the parameters that were trained: norm of the gradient, root mean square over the steps.
+        ran: of the fine-tuning between them, as ``moved`` takes it.
     """
     others = dict(after.named_modules())
     outputs = [heard(filter_, batch) for filter_ in (before, after)]
@@ -66,7 +66,6 @@ def module_changes(
         if not name or not states[0] or _shapes(states[0]) != _shapes(states[1]):
             continue
         parameters = [[p.flatten() for p in m.parameters()] for m in (module, others[name])]
-        within = [size for key, size in (gradients or {}).items() if key.startswith(f"{name}.")]
         changes.append(
             ModuleChange(
                 name=name,
@@ -74,8 +73,8 @@ def module_changes(
                 parameters=sum(p.numel() for p in parameters[0]),
                 weights=_relative(*parameters),
                 drift=_relative(*(outputs[i].get(name, []) for i in (0, 1))),
-                gradient=math.hypot(*within) if within else math.nan,
-                hashes=(_digest(states[0]), _digest(states[1])),
+                gradient=moved(name, ran)["gradient"] if ran and any(within(key, name) for key in ran) else math.nan,
+                hashes=(digest(module, states[0]), digest(others[name], states[1])),
             )
         )
     return tuple(changes)
@@ -128,11 +127,3 @@ def _relative(before: list[Tensor], after: list[Tensor]) -> float:
         return 0.0
     norm = float(a.norm())
     return float((b - a).norm()) / norm if norm else float("nan")
-
-
-def _digest(state: dict[str, Tensor]) -> str:
-    digest = hashlib.sha256()
-    for key, value in sorted(state.items()):
-        digest.update(f"{key} {value.dtype} {tuple(value.shape)} ".encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-import os
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import DataPath, Json, Particles, Seed, SkipBad, check, checkpoint, dataset
+from beliefscope.app.commands.given import (
+    DataPath,
+    Json,
+    Particles,
+    Seed,
+    SkipBad,
+    check,
+    checkpoint,
+    dataset,
+    is_path,
+    serving,
+)
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
@@ -60,9 +69,7 @@ def change(
       beliefscope change crossmodal-pf child.safetensors --slice black-in-contact:recipe=blackout=1:contact=yes
     """
     from beliefscope.app.link import beside, moment_link
-    from beliefscope.app.shelf import SAMPLE, short_names
-    from beliefscope.datasets.catalog import TASKS
-    from beliefscope.filters.catalog import filters_of
+    from beliefscope.app.shelf import served_names
     from beliefscope.filters.slices import Slice, slices_of
     from beliefscope.inspect.change import change_of
     from beliefscope.inspect.diagnostic import as_json
@@ -76,13 +83,10 @@ def change(
     with dataset(task, data, skip_bad) as episodes, console.progress("Comparing") as advance:
         found = change_of(*pair, episodes, slices=chosen, particles=particles, seed=seed, progress=advance)
         data_hash = episodes.hash
-    # The names that `serve` gives to the same files.
-    ships = {name for known in TASKS.values() for name in filters_of(known)}
     paths = [Path(text) for text in (before, after) if is_path(text)]
-    named = {str(path): name for name, path in short_names(paths, ships).items()}
+    named, data_name = served_names(paths, data)
     first, name = (named.get(str(Path(text)), text) for text in (before, after))
     weighed = pair[1].filter.architecture.fusion == "crossmodal"
-    data_name = SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
     links = [
         beside(moment_link(task, name, data_name, m.episode, m.step, m.recipe), m, first, weighed)
         for m in found.moments
@@ -112,16 +116,6 @@ def both(before: str, after: str, task: str | None) -> tuple[Checkpoint, Checkpo
     known = task or next(iter(loaded.values())).task.name
     first, second = (loaded.get(text) or checkpoint(known, text) for text in (before, after))
     return first, second
-
-
-def is_path(text: str) -> bool:
-    return text.endswith(".safetensors") or os.sep in text
-
-
-def serving(filters: list[Path], data: Path | None, seed: int) -> str:
-    """The command whose page shows the moments."""
-    given = [*(["--data", str(data)] if data else []), *(part for one in filters for part in ("--filter", str(one)))]
-    return shlex.join(["beliefscope", "serve", *given, *(["--seed", str(seed)] if seed else [])])
 
 
 def write(folder: Path, document: dict[str, Any], text: str, figure: Any) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,7 +20,9 @@ from beliefscope.app.commands.given import (
     check,
     checkpoint,
     dataset,
+    is_path,
     recipe,
+    serving,
     whole,
 )
 
@@ -71,10 +71,8 @@ def failures(
       beliefscope failures door --filter mine.safetensors --data door.h5 --by angle --top 5 --json -
     """
     from beliefscope.app.link import moment_link
-    from beliefscope.app.shelf import SAMPLE, short_names
-    from beliefscope.datasets.catalog import TASKS
+    from beliefscope.app.shelf import served_names
     from beliefscope.datasets.errors import one_of
-    from beliefscope.filters.catalog import filters_of
     from beliefscope.inspect.diagnostic import as_json
     from beliefscope.inspect.failures import find_failures
     from beliefscope.inspect.survey import GROUPS
@@ -89,11 +87,9 @@ def failures(
         found = find_failures(
             tested, episodes, indices, by=by, recipe=broken, seed=seed, particles=particles, progress=advance
         )
-    is_path = filter_.endswith(".safetensors") or os.sep in filter_
-    # The names that `serve` gives to the same files.
-    ships = {name for known in TASKS.values() for name in filters_of(known)}
-    filter_name = next(iter(short_names([Path(filter_)], ships))) if is_path else filter_
-    data_name = SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
+    files = [filter_] if is_path(filter_) else []
+    named, data_name = served_names(files, data)
+    filter_name = named.get(str(Path(filter_)), filter_)
     moments = found.worst(top, group)
     base = "" if url is None else url.rstrip("/") + "/"
     links = [
@@ -101,7 +97,7 @@ def failures(
     ]
     document = found.to_dict() | {
         "moments": [as_json(m) | {"link": link} for m, link in zip(moments, links, strict=True)],
-        "serve": serving(filter_ if is_path else None, data, seed),
+        "serve": serving(files, data, seed),
     }
     lines = [found.verdict, *map(text, (found.table_of_groups(), found.table_of(moments)))]
     if url is not None:
@@ -109,12 +105,6 @@ def failures(
     if particles != 300 and found.particles:
         console.say("note: the page filters with 300 particles, so its numbers at these moments are others")
     console.result(document, "\n\n".join(lines[:3]) + "".join(f"\n{line}" for line in lines[3:]), json)
-
-
-def serving(filter_: str | None, data: Path | None, seed: int) -> str:
-    """The command whose page shows what was looked at."""
-    given = [*(["--data", str(data)] if data else []), *(["--filter", filter_] if filter_ else [])]
-    return shlex.join(["beliefscope", "serve", *given, *(["--seed", str(seed)] if seed else [])])
 
 
 def text(table: Table) -> str:

@@ -19,10 +19,8 @@ from beliefscope.app.commands.given import (
     SkipBad,
     TaskName,
     check,
-    checkpoint,
-    dataset,
     described,
-    recipe,
+    one_run,
     title,
     whole,
 )
@@ -67,7 +65,6 @@ def figure(
     from beliefscope.inspect import paper
     from beliefscope.inspect.likelihood import no_maps
     from beliefscope.inspect.plotting import figure_format, write_figure
-    from beliefscope.inspect.trace import trace
 
     check(output, json)
     if kind not in KINDS:
@@ -75,18 +72,14 @@ def figure(
     figure_format(output)
     if kind == "weights" and steps:
         raise BadInput(f"--step {steps[0]}: the weights are drawn over all steps; only maps have a step")
-    loaded = checkpoint(task, filter_)
-    broken = recipe(recipe_, loaded.task)
-    with dataset(loaded.task, data, skip_bad) as episodes, console.progress("Filtering") as advance:
-        index = episodes.held_out()[0] if episode is None else episode
-        made = trace(loaded, episodes[index], index, seed, particles, broken, advance)
+    loaded, made = one_run(task, filter_, data, skip_bad, episode, recipe_, particles, seed)
     document: dict[str, Any] = {"figure": kind}
     if kind == "maps":
         if why := no_maps(loaded, made):
             raise BadInput(why)
         chosen = paper.steps_by_contact(made, steps or ())
         if False not in chosen:
-            console.say(f"episode {index} is in contact at every step: no map without")
+            console.say(f"episode {made.episode_index} is in contact at every step: no map without")
         write_figure(paper.maps_figure(loaded, made, chosen), output)
         document["shown"] = {paper.STATES[state]: step for state, step in chosen.items()}
     else:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Iterable
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -132,16 +133,27 @@ def checkpoint(task: str, name_or_path: str) -> Checkpoint:
         from beliefscope.filters.foreign import load_foreign
 
         return load_foreign(name_or_path, known.name)
-    is_path = name_or_path.endswith(".safetensors") or os.sep in name_or_path
-    loaded = load_checkpoint(Path(name_or_path) if is_path else shipped(known.name, name_or_path))
+    loaded = load_checkpoint(Path(name_or_path) if is_path(name_or_path) else shipped(known.name, name_or_path))
     if loaded.task.name != known.name:
         raise BadInput(f"filter {name_or_path!r} is for task {loaded.task.name!r}, not for {known.name!r}")
     return loaded
 
 
+def is_path(name_or_path: str) -> bool:
+    """Whether a filter is named by its file."""
+    return name_or_path.endswith(".safetensors") or os.sep in name_or_path
+
+
 def is_code(name_or_path: str) -> bool:
     """Whether a filter is named as uvicorn names an app: ``package.module:build``, ``path/to/file.py:build``."""
     return ":" in name_or_path and not name_or_path.endswith(".safetensors")
+
+
+def serving(filters: Iterable[str | Path], data: Path | None, seed: int) -> str:
+    """The command whose page shows what was looked at; filters and data are those that do not ship."""
+    given = ["--data", str(data)] if data else []
+    given += [part for one in filters for part in ("--filter", str(one))]
+    return shlex.join(["beliefscope", "serve", *given, *(["--seed", str(seed)] if seed else [])])
 
 
 def recipe_text(text: str) -> str:
@@ -169,16 +181,16 @@ def of_one_run(command: Callable[..., None]) -> Callable[..., None]:
     The command is called with the checkpoint, the trace, and its own options, among them ``output`` and ``json``, which
     are looked at before anything is computed.
     """
-    signatures = [inspect.signature(function) for function in (_one_run, command)]
+    signatures = [inspect.signature(function) for function in (one_run, command)]
     shared, own = (list(signature.parameters.values()) for signature in signatures)
-    hints = _hints(_one_run) | _hints(command)
+    hints = _hints(one_run) | _hints(command)
     options = [p.replace(kind=p.KEYWORD_ONLY, annotation=hints[p.name]) for p in (*shared, *own[2:])]
 
     @wraps(command)
     def run(**values: Any) -> None:
         check(values["output"], values["json"])
         named = {p.name: values.pop(p.name) for p in shared}
-        command(*_one_run(**named), **values)
+        command(*one_run(**named), **values)
 
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in options}
@@ -190,7 +202,7 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     return get_type_hints(function, localns={"Checkpoint": Any, "Trace": Any}, include_extras=True)
 
 
-def _one_run(
+def one_run(
     task: TaskName,
     filter_: FilterName,
     data: DataPath = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.failures import serving
-from beliefscope.app.commands.given import DataPath, Json, check, checkpoint, is_code
+from beliefscope.app.commands.given import DataPath, Json, check, checkpoint, is_code, is_path, serving
 from beliefscope.app.commands.inspect import shipped_by_hash
 from beliefscope.datasets.errors import BadInput
 
@@ -141,10 +139,9 @@ def _links(
 ) -> tuple[Callable[[int, int], str], str]:
     """(index of a trace, step) -> link, empty where there is none; and how links are opened, or why there are none."""
     from beliefscope.app.link import moment_link
-    from beliefscope.app.shelf import SAMPLE, short_names
-    from beliefscope.datasets.catalog import TASKS, find_task
+    from beliefscope.app.shelf import served_names
+    from beliefscope.datasets.catalog import find_task
     from beliefscope.datasets.store import open_dataset, sample_path
-    from beliefscope.filters.catalog import filters_of
 
     first, task = traces[0], find_task(traces[0].episode.task)
     if made_by is None:
@@ -165,10 +162,9 @@ def _links(
     if not known:
         which = "the episodes that ship" if data is None else str(data)
         return lambda index, step: "", f"No links reopen them: they are not the dashboard's own runs over {which}."
-    is_path = filter_.endswith(".safetensors") or os.sep in filter_ or is_code(filter_)
-    ships = {name for one in TASKS.values() for name in filters_of(one)}
-    filter_name = next(iter(short_names([Path(filter_)], ships))) if is_path else filter_ or first.filter
-    data_name = SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
+    files = [filter_] if is_path(filter_) or is_code(filter_) else []
+    named, data_name = served_names(files, data)
+    filter_name = named.get(str(Path(filter_)), filter_ or first.filter)
     base = url.rstrip("/") + "/"
 
     def link(index: int, step: int) -> str:
@@ -176,7 +172,7 @@ def _links(
         asked = moment_link(task, filter_name, data_name, trace.episode_index, step, str(trace.recipe))
         return base + asked if index in known else ""
 
-    served = serving(filter_ if is_path else None, data, first.seed)
+    served = serving(files, data, first.seed)
     return link, f"A link opens its moment in the dashboard while this runs: {served}."
 
 
