@@ -257,12 +257,10 @@ def consistency(traces: Sequence[Trace]) -> Consistency:
     first = traces[0]
     made = [_measured(trace) for trace in traces]
     pooled = {name: np.concatenate([one[name] for one in made]) for name in made[0]}
-    owner = np.repeat(np.arange(len(traces)), [len(trace) for trace in traces])
-    masks = [measures.splits(trace) for trace in traces]
+    owner, splits = measures.owners(traces), measures.pooled_splits(traces)
     by_layer = []
     for k, layer in enumerate(measures.layers(first)):
-        for split in masks[0]:
-            where = np.concatenate([mask[split] for mask in masks])
+        for split, where in splits.items():
             steps = {name: values[where, k] for name, values in pooled.items()}
             # Of a filter that is not ours, what a modality alone believes may not be known.
             if np.isfinite(steps["nees"]).any():

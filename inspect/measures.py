@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -97,6 +98,17 @@ def splits(trace: Trace) -> dict[str, Mask]:
     """Kind of step -> its mask (T,), first steps left out: ``all``, ``contact``, ``no contact``, ``blackout``."""
     contact, keep = trace.episode.contact.astype(bool), counted(trace)
     return {"all": keep, "contact": keep & contact, "no contact": keep & ~contact, "blackout": keep & blackout(trace)}
+
+
+def pooled_splits(traces: Sequence[Trace]) -> dict[str, Mask]:
+    """``splits`` of all traces, end to end: kind of step -> mask (sum of T,)."""
+    masks = [splits(trace) for trace in traces]
+    return {split: np.concatenate([mask[split] for mask in masks]) for split in masks[0]}
+
+
+def owners(traces: Sequence[Trace]) -> NDArray[np.int64]:
+    """(sum of T,): which of the traces each step is of, where all are laid end to end."""
+    return np.repeat(np.arange(len(traces)), [len(trace) for trace in traces])
 
 
 def stretches(mask: Mask) -> NDArray[np.int64]:

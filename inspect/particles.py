@@ -186,16 +186,14 @@ def particle_health(traces: Sequence[Trace]) -> ParticleHealth:
     assert first.particles is not None
     made = [of_trace(trace) for trace in traces]
     pooled = {f.name: np.concatenate([getattr(one, f.name) for one in made]) for f in fields(ParticleSteps)}
-    masks = [measures.splits(trace) for trace in traces]
+    masks = measures.pooled_splits(traces)
     count = first.particles.shape[1]
     splits = []
-    for split in masks[0]:
-        where = np.concatenate([mask[split] for mask in masks])
+    for split, where in masks.items():
         if where.any():
             splits.append(_of_steps(split, count, {name: values[where] for name, values in pooled.items()}))
-    counted = np.concatenate([mask["all"] for mask in masks])
-    at = int(np.where(counted, pooled["effective"], np.inf).argmin())
-    owner = np.repeat(np.arange(len(traces)), [len(trace) for trace in traces])[at]
+    at = int(np.where(masks["all"], pooled["effective"], np.inf).argmin())
+    owner = measures.owners(traces)[at]
     return ParticleHealth(
         filter=first.filter,
         modalities=first.modalities,

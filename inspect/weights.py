@@ -242,11 +242,9 @@ def audit(traces: Sequence[Trace]) -> WeightAudit:
     first = traces[0]
     made = [_steps(trace) for trace in traces]
     pooled = {name: np.concatenate([one[name] for one in made]) for name in made[0]}
-    owner = np.repeat(np.arange(len(traces)), [len(trace) for trace in traces])
-    masks = [measures.splits(trace) for trace in traces]
+    owner = measures.owners(traces)
     splits = []
-    for split in masks[0]:
-        where = np.concatenate([mask[split] for mask in masks])
+    for split, where in measures.pooled_splits(traces).items():
         if where.any():
             steps = {name: values[where] for name, values in pooled.items()}
             rmse = {name: np.sqrt(np.square(steps[name]).mean(0)) for name in ("fused", "hindsight", "alone")}
