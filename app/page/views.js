@@ -60,5 +60,7 @@ export function tabs(store) {
       buttons[i].tabIndex = name === shown ? 0 : -1;
       document.querySelector(`#${name}`).hidden = name !== shown;
     });
+    // Where the tabs do not all fit, the chosen one is in sight.
+    buttons[TABS.indexOf(shown)].scrollIntoView({ block: 'nearest', inline: 'nearest' });
   };
 }
