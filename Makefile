@@ -2,15 +2,20 @@
 #   PYTHON=...     the interpreter to make .venv with (3.11 or newer)
 #   PIP_FLAGS=...  more flags for pip, such as another package index
 #   ARGS=...       more arguments for the command: make serve ARGS="--port 9000"
+#   JOBS=...       processes that share the test files among them (2)
 
 PYTHON    ?= $(shell command -v python3.11 || command -v python3)
 PIP_FLAGS ?=
 ARGS      ?=
+JOBS      ?= 2
 
 VENV := .venv
 BIN  := $(VENV)/bin
 # Compiling every module of every package would add half a minute to the first start; Python compiles what it imports.
 PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_FLAGS)
+
+# A file's tests stay in one process: they share a server, a browser, a small training.
+PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .PHONY: help install serve test lint check check-all bench clean
@@ -44,7 +49,7 @@ serve: $(VENV)/installed
 	@$(BIN)/beliefscope serve $(ARGS)
 
 test: install
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(PYTEST) $(ARGS)
 
 lint: install
 	@$(BIN)/ruff check .
@@ -54,7 +59,7 @@ lint: install
 check: lint test
 
 check-all: lint
-	@$(BIN)/python -m pytest -m "" $(ARGS)
+	@$(PYTEST) -m "" $(ARGS)
 
 bench: install
 	@$(BIN)/python bench/run.py $(ARGS)

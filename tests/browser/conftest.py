@@ -76,7 +76,8 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
         server.stop()
 
 
-@pytest.fixture(scope="session")
+# Of one file: while Playwright runs, its thread has an event loop, and tests of other files may want one of their own.
+@pytest.fixture(scope="module")
 def browser(chromium: str) -> Iterator[Any]:
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
