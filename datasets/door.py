@@ -205,5 +205,6 @@ DOOR = Task(
     positions={"effector_position": (0, 1), "control": (0, 1)},
     replay=_replay,
     ghost=panel_ghost,
+    camera=CAMERA,
     simulate=simulate_door,
 )

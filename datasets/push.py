@@ -202,5 +202,6 @@ PUSH = Task(
     positions={"effector_position": (0, 1), "control": (0, 1)},
     replay=lambda _: push_model(),
     ghost=puck_ghost,
+    camera=CAMERA,
     simulate=simulate_push,
 )

@@ -160,6 +160,7 @@ def _task(name: str, rate: int, yaw: bool) -> Task:
         positions={"effector_position": (0, 1), "control": (0, 1)},
         replay=replay,
         ghost=ghost,
+        camera=CAMERA,
     )
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import one_of
+
+if TYPE_CHECKING:
+    from beliefscope.datasets.camera import Camera
 
 Unit = Literal["m", "rad"]
 Array = NDArray[np.float64]
@@ -59,6 +62,7 @@ class Task:
             map components: shift these and the map components alike, and nothing else that is felt changes.
         replay: builds the ``mujoco.MjModel`` of an episode, whose ``qpos`` it replays; None where there is no replay.
         ghost: states (..., n) -> ``Ghost``, to draw true and estimated objects; None where there is nothing to draw.
+        camera: which took the pictures; None where that is not known.
         simulate: (seed, index, steps) -> that episode of the collection with that seed; None where the task cannot be
             simulated.
     """
@@ -74,6 +78,7 @@ class Task:
     positions: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     replay: Callable[[Episode], Any] | None = None
     ghost: Callable[[ArrayLike], Ghost] | None = None
+    camera: Camera | None = None
     simulate: Callable[[int, int, int], Episode] | None = None
 
     def index(self, component: str) -> int:
