@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl
 
 from beliefscope.app.shelf import Shelf, shelves
 from beliefscope.app.wire import MAP_SIZES, columns
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
@@ -41,7 +41,7 @@ class Settings:
         checkpoints: filter's name as shown -> file, or a filter from outside; before (or in place of) those that ship.
         hosts: names the server answers to beside the loopback's.
         particles: of particle filters. seed: of the filters' randomness.
-        tasks: the user's own, as ``find_task`` knows them.
+        tasks: the user's own, as ``load_task`` knows them.
     """
 
     workspace: Path
@@ -66,7 +66,7 @@ class Settings:
     def of_json(cls, shown: Mapping[str, Any]) -> Settings:
         """What ``to_json`` gave. The user's own tasks are in ``TASKS`` then; filters from outside are made again."""
         for name in shown["tasks"]:
-            find_task(name)
+            load_task(name)
         return cls(
             Path(shown["workspace"]),
             {name: Path(path) for name, path in shown["data"].items()},

@@ -15,7 +15,15 @@ TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, *PUSH_REAL_TA
 
 
 def find_task(name: str) -> Task:
-    """The task of that name.
+    """The task of that name. Names may come out of files: nothing is run. Raises BadInput for an unknown one."""
+    if name in TASKS:
+        return TASKS[name]
+    unknown = one_of("task", name, TASKS)
+    raise BadInput(f"{unknown} One of your own is named by its file: path/to/file.py:NAME.")
+
+
+def load_task(name: str) -> Task:
+    """The task that a user names, who may run code of their own; never for names out of files.
 
     ``path/to/file.py:NAME`` and ``package.module:NAME`` stand for a task of the user's own: the file is run, and its
     task is from then on in ``TASKS`` under its own name.
@@ -23,12 +31,7 @@ def find_task(name: str) -> Task:
     Raises:
         BadInput: for an unknown name, and where a file cannot be run, holds no such task, or one that is not coherent.
     """
-    if name in TASKS:
-        return TASKS[name]
-    if ":" in name:
-        return _foreign(name)
-    unknown = one_of("task", name, TASKS)
-    raise BadInput(f"{unknown} One of your own is named by its file: path/to/file.py:NAME.")
+    return _foreign(name) if ":" in name and name not in TASKS else find_task(name)
 
 
 _FOREIGN: dict[tuple[str, str], Task] = {}

@@ -15,7 +15,7 @@ from pathlib import Path
 import mujoco
 
 import beliefscope
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, write_dataset
@@ -47,7 +47,7 @@ def collect(
     Raises:
         BadInput: for an unknown task, a count that is too small, or a place that cannot be written.
     """
-    chosen, path = find_task(task), Path(path)
+    chosen, path = load_task(task), Path(path)
     if chosen.simulate is None:
         raise BadInput(f"Task {task!r} cannot be simulated: its data are recorded ones.")
     for name, value, least in (("episodes", episodes, 1), ("steps", steps, 2), ("seed", seed, 0)):
@@ -98,20 +98,20 @@ class _Parts:
 
     def make(self, index: int) -> None:
         """Simulate this episode."""
-        task = find_task(self.task)
+        task = load_task(self.task)
         assert task.simulate is not None
         write_dataset(self._part(index), task, [task.simulate(self.seed, index, self.steps)])
 
     def join(self, episodes: int) -> None:
         """Make the one file of them, in the folder so that a kill leaves nothing beside it, and drop the folder."""
         joined = self._folder / "all.h5"
-        write_dataset(joined, find_task(self.task), (self._read(i) for i in range(episodes)))
+        write_dataset(joined, load_task(self.task), (self._read(i) for i in range(episodes)))
         os.replace(joined, self._whole)
         shutil.rmtree(self._folder)
 
     def _part(self, index: int) -> Path:
         made_by = f"{beliefscope.__version__}-mujoco{mujoco.__version__}"
-        return self._folder / f"{find_task(self.task).name}-seed{self.seed}-steps{self.steps}-{index}-{made_by}.h5"
+        return self._folder / f"{load_task(self.task).name}-seed{self.seed}-steps{self.steps}-{index}-{made_by}.h5"
 
     def _read(self, index: int) -> Episode:
         with open_dataset(self._part(index)) as part:

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from beliefscope.datasets import own
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
@@ -214,7 +214,7 @@ def load_foreign(source: str, task: str = "", unsaid: str = "") -> Foreign:
         raise BadInput(
             f"{source} does not say which task it is for: give it an attribute task, or name one with --task"
         )
-    known = find_task(task)
+    known = load_task(task)
     if meant and meant != known.name:
         raise BadInput(f"filter {source!r} is for task {meant!r}, not for {known.name!r}")
     return Foreign(

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from scipy.stats import chi2
 
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.catalog import find_task, load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
@@ -43,7 +43,7 @@ class Cell:
     """One filter to be trained once, and what its numbers depend on.
 
     Attributes:
-        task: its name. source: what ``find_task`` knows it by: the name, or ``path/to/file.py:NAME``.
+        task: its name. source: what ``load_task`` knows it by: the name, or ``path/to/file.py:NAME``.
         filter, seed, preset: names the architecture and the plan.
         data: file or folder of the episodes. data_hash: of them. skip_bad: leave out those that cannot be used.
     """
@@ -65,7 +65,7 @@ class Cell:
 
     def depends_on(self) -> Document:
         """What a document must hold to be this cell's, as JSON gives it back."""
-        find_task(self.source)
+        load_task(self.source)
         return {
             "task": self.task,
             "filter": self.filter,
@@ -147,7 +147,7 @@ def _trained(cell: Cell, folder: Path, report: Report | None) -> Document:
 
 @lru_cache(maxsize=1)
 def _episodes(source: str, data: Path, skip_bad: bool, data_hash: str) -> tuple[Episode, ...]:
-    with open_dataset(data, find_task(source), skip_bad) as dataset:
+    with open_dataset(data, load_task(source), skip_bad) as dataset:
         if dataset.hash != data_hash:
             raise BadInput(f"{data} was changed while the study ran: its hash is now {dataset.hash[:12]}.")
         return tuple(dataset)

@@ -17,7 +17,7 @@ import pytest
 from beliefscope.app.cli import main
 from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.datasets import catalog
-from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.inspect.catalog import DIAGNOSTICS
@@ -101,7 +101,7 @@ def test_whole_way(folder: Path) -> None:
     measured = result("evaluate", SPEC, "--filter", folder / "own.safetensors", "--data", folder / "own.h5")
     assert set(measured["rmse"]) == {"x_cm", "y_cm", "position_cm"}
     with fresh():
-        find_task(SPEC)
+        load_task(SPEC)
         with open_dataset(folder / "own.h5") as data:
             assert measured["data_hash"] == data.hash
             traced = load_trace(folder / "own.trace")
@@ -112,7 +112,7 @@ def test_whole_way(folder: Path) -> None:
 
 def test_page_shows_it(folder: Path, tmp_path: Path) -> None:
     with fresh():
-        find_task(SPEC)
+        load_task(SPEC)
         library = Library(Settings(tmp_path, {"own": folder / "own.h5"}, {"own": folder / "own.safetensors"}))
         try:
             catalog = library.catalog()
@@ -179,5 +179,5 @@ def test_files_that_are_no_tasks(
     (tmp_path / "own.py").write_text(content.format(name=name or "mine", keys=keys or "('felt',)", y=y or "y"))
     before = dict(TASKS)
     with pytest.raises(BadInput, match=message):
-        find_task(spec)
+        load_task(spec)
     assert before == TASKS

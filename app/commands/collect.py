@@ -53,13 +53,13 @@ def collect(
     Example:
       beliefscope collect door --episodes 60 --steps 800 --seed 0 -o door.h5
     """
-    from beliefscope.datasets.catalog import find_task
+    from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.collect import collect as simulate
     from beliefscope.datasets.statistics import AUTHORS, scale, statistics
     from beliefscope.datasets.store import open_dataset
 
     check(output, json)
-    name = find_task(task).name
+    name = load_task(task).name
     count, length = (given or usual for given, usual in zip((episodes, steps), scale(name), strict=True))
     with console.progress(f"Simulating {name}") as advance:
         simulate(task, count, length, seed, workers, output, lambda done, of: advance(done / of))

@@ -34,11 +34,11 @@ def convert(
       beliefscope convert push-real --data mit_push -o pushes.h5
       beliefscope convert door --data panda_door_push_100.hdf5 -o doors.h5
     """
-    from beliefscope.datasets.catalog import find_task
+    from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.store import write_dataset
 
     check(output, json)
-    known = find_task(task)
+    known = load_task(task)
     with dataset(known, data, skip_bad) as episodes, console.progress("Converting") as advance:
 
         def counted() -> Iterator[Episode]:

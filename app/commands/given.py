@@ -125,10 +125,10 @@ def checkpoint(task: str, name_or_path: str) -> Checkpoint:
     """A path ends in .safetensors or holds a separator; with a colon it is a filter from outside, to be made by the
     function behind it; anything else names a checkpoint that ships.
     """
-    from beliefscope.datasets.catalog import find_task
+    from beliefscope.datasets.catalog import load_task
     from beliefscope.filters.checkpoint import load_checkpoint, shipped
 
-    known = find_task(task)
+    known = load_task(task)
     if is_code(name_or_path):
         from beliefscope.filters.foreign import load_foreign
 

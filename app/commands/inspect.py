@@ -56,6 +56,7 @@ def inspect(
       beliefscope inspect run.trace --filter mine.safetensors --all --json -
     """
     from beliefscope.app.options import parse, says_how_far
+    from beliefscope.datasets.catalog import find_task
     from beliefscope.inspect.catalog import DIAGNOSTICS
     from beliefscope.inspect.plotting import FORMATS, write_figure
     from beliefscope.inspect.trace import load_trace
@@ -78,7 +79,7 @@ def inspect(
     for path, trace in zip(paths, traces, strict=True):
         if trace.checkpoint_hash != traces[0].checkpoint_hash:
             raise BadInput(f"{path} is of another checkpoint than {paths[0]}: inspect the traces of one filter")
-    made_by = checkpoint(traces[0].episode.task, filter_) if filter_ else shipped_by_hash(traces[0])
+    made_by = checkpoint(find_task(traces[0].episode.task).name, filter_) if filter_ else shipped_by_hash(traces[0])
     if filter_ and made_by is not None and made_by.hash != traces[0].checkpoint_hash:
         raise BadInput(f"{paths[0]} was made by checkpoint {traces[0].checkpoint_hash[:12]}, not by {filter_!r}")
     if figures is not None:

@@ -60,7 +60,7 @@ def serve(
     from beliefscope.app.library import Settings
     from beliefscope.app.server import serve as serve_until_signal
     from beliefscope.app.shelf import SAMPLE, short_names
-    from beliefscope.datasets.catalog import TASKS, find_task
+    from beliefscope.datasets.catalog import TASKS, load_task
     from beliefscope.filters.catalog import filters_of
     from beliefscope.filters.foreign import load_foreign
 
@@ -79,7 +79,7 @@ def serve(
 
             webbrowser.open(url)
 
-    named = [find_task(name).name for name in task or ()]
+    named = [load_task(name).name for name in task or ()]
     code = [name for name in filter_ or () if is_code(name)]
     paths = [Path(name) for name in filter_ or () if not is_code(name)]
     foreign = [load_foreign(name, unsaid=named[0] if len(named) == 1 else "") for name in code]

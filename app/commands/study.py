@@ -102,7 +102,7 @@ def matrix(
 
     Raises BadInput for unknown names, and for data that cannot be used.
     """
-    from beliefscope.datasets.catalog import TASKS, find_task
+    from beliefscope.datasets.catalog import TASKS, load_task
     from beliefscope.datasets.store import sample_path
     from beliefscope.filters.catalog import filters_of
     from beliefscope.filters.study import Cell
@@ -121,13 +121,13 @@ def matrix(
             raise BadInput(f"--data is given twice for task {name!r}")
         files[name] = Path(file)
     sources = list(dict.fromkeys(tasks or [*(name for name in TASKS if name in files or ships(name)), *files]))
-    every = {name for source in sources for name in filters_of(find_task(source))}
+    every = {name for source in sources for name in filters_of(load_task(source))}
     for name in filters:
         if name not in every:
             raise one_of("filter", name, sorted(every))
     cells = []
     for source in sources:
-        task = find_task(source)
+        task = load_task(source)
         path = (files[source] if source in files else sample_path(task.name)).resolve()
         with dataset(task, path, skip_bad) as episodes:
             data_hash, splits = episodes.hash, {summary.split for summary in episodes.summaries}

@@ -76,7 +76,7 @@ def train(
       beliefscope train door --filter crossmodal-ekf --data door.h5 --preset full -o mine.safetensors
       beliefscope train door --filter crossmodal-pf --recipe force_bias:x=5,force_noise=3 -o hardened.safetensors
     """
-    from beliefscope.datasets.catalog import find_task
+    from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.corrupt import broken_copies
     from beliefscope.filters.catalog import architecture
     from beliefscope.filters.checkpoint import save_checkpoint
@@ -87,17 +87,17 @@ def train(
     check(output, json)
     if log is not None and (log.exists() and not log.is_dir()):
         raise BadInput(f"--log {str(log)!r} is a file; give the name of a folder")
-    chosen = architecture(find_task(task).name, filter_)
+    chosen = architecture(load_task(task).name, filter_)
     black = chances(blackouts)
     if preset not in PLANS:
         raise one_of("preset", preset, PLANS)
     # Where on this machine the data lie is no part of the record; their hash is.
     given = "" if data is None else f" --data {data.name}"
-    broken = recipe(recipe_, find_task(task))
+    broken = recipe(recipe_, load_task(task))
     partial = output.with_name(f"{output.name}.partial")
     given += f" --recipe {broken}" if broken else ""
     given += "" if black == BLACKOUTS else f" --blackouts {blackouts}"
-    with dataset(find_task(task), data, skip_bad) as episodes, console.bars() as move, losses(log) as write:
+    with dataset(load_task(task), data, skip_bad) as episodes, console.bars() as move, losses(log) as write:
 
         def report(stage: str, done: int, count: int, loss: float) -> None:
             move(stage, done / count, f"loss {loss:.3g}")

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from beliefscope.datasets import catalog
-from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.catalog import TASKS, find_task, load_task
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
@@ -72,7 +72,7 @@ def test_a_task_of_ones_own(open_page: Any, serve: Any, tmp_path: Path, monkeypa
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), str(data)])
     before = dict(TASKS)
     runpy.run_path(str(EXAMPLE), run_name="__main__")
-    name = find_task(f"{EXAMPLE}:TASK").name
+    name = load_task(f"{EXAMPLE}:TASK").name
     try:
         untrained(name, "crossmodal-pf", data, own)
     finally:
