@@ -41,7 +41,7 @@ class Settings:
         checkpoints: filter's name as shown -> file, or a filter from outside; before (or in place of) those that ship.
         hosts: names the server answers to beside the loopback's.
         particles: of particle filters. seed: of the filters' randomness.
-        tasks: the user's own, as ``load_task`` knows them.
+        tasks: the user's own, as ``load_task`` knows them. studies: name as shown -> folder of a study.
     """
 
     workspace: Path
@@ -51,6 +51,7 @@ class Settings:
     particles: int = 300
     seed: int = 0
     tasks: tuple[str, ...] = ()
+    studies: Mapping[str, Path] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """As JSON, for another process. A filter from outside is named by what makes it."""

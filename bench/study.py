@@ -1,6 +1,6 @@
 """Holds a study's results against what is expected of the filters, as a Markdown table.
 
-python bench/study.py docs/study/study.json
+python bench/study.py filters/pretrained/study.json
 """
 
 from __future__ import annotations

@@ -254,6 +254,7 @@ class Row:
     spread: Mapping[str, float | None]
     bounds: tuple[float, float] | None = None
     alone: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    each: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
 
 
 def nees_bounds(n: int, trajectories: int) -> tuple[float, float]:
@@ -277,13 +278,16 @@ def rows_of(documents: Mapping[Cell, Document | None]) -> list[Row]:
             failed = sum(d is not None and "error" in d for d in asked)
             finished += found
             for blackout in BLACKOUTS:
-                mean, spread = _over_seeds([_numbers(d, blackout) for d in found])
+                each = {str(d["seed"]): _numbers(d, blackout) for d in found}
+                mean, spread = _over_seeds(list(each.values()))
                 bounds = None
                 if mean.get("nees") is not None:
                     trajectories = found[0]["episodes"]["test"] or found[0]["episodes"]["val"]
                     bounds = nees_bounds(len(find_task(task).components), trajectories)
                 alone = _alone([d["metrics"][f"{blackout:g}"] for d in found])
-                rows.append(Row(task, name, blackout, len(found), len(asked), failed, mean, spread, bounds, alone))
+                rows.append(
+                    Row(task, name, blackout, len(found), len(asked), failed, mean, spread, bounds, alone, each)
+                )
         if finished:
             rows.append(Row(task, TRIVIAL, None, 0, 0, 0, finished[0]["trivial"], {}))
     return rows

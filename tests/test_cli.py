@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
 NAMES = [command.__name__ for command in COMMANDS]
 OPTIONS = {
-    "serve": "--port --host --workspace --task --data --filter --checkpoint --open --no-open --seed",
+    "serve": "--port --host --workspace --task --data --filter --checkpoint --study --open --no-open --seed",
     "collect": "--episodes --steps --seed --workers -o --json",
     "convert": "--data --skip-bad -o --json",
     "train": "--filter --data --skip-bad --preset --recipe --seed --log -o --json",
@@ -205,6 +205,7 @@ BAD = [
     "serve --data other.h5 --data cut.h5",
     "serve --filter other.safetensors",
     "serve --checkpoint ./missing",
+    "serve --study .",
     "change crossmodal-ekf crossmodal-pf",
     "change crossmodal-ekf missing.safetensors",
     "change crossmodal-ekf ekf.safetensors --slice dark",

@@ -40,6 +40,10 @@ def serve(
             "for the task that it names, or the one that --task does.",
         ),
     ] = None,
+    study: Annotated[
+        list[Path] | None,
+        typer.Option("--study", metavar="DIR", help="Folder of a study to show; may be given again."),
+    ] = None,
     open_page: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = False,
     seed: Seed = 0,
 ) -> None:
@@ -54,12 +58,14 @@ def serve(
       beliefscope serve --open
       beliefscope serve --port 0 --workspace ~/beliefscope
       beliefscope serve --data mit_push --filter mine.safetensors
+      beliefscope serve --study study
       beliefscope serve --task door --filter examples/04_own_filter.py:build
       beliefscope serve --task examples/own_task.py:TASK --data own.h5 --filter own.safetensors
     """
     from beliefscope.app.library import Settings
     from beliefscope.app.server import serve as serve_until_signal
     from beliefscope.app.shelf import SAMPLE, short_names
+    from beliefscope.app.study import SHIPPED, Study
     from beliefscope.datasets.catalog import TASKS, load_task
     from beliefscope.filters.catalog import filters_of
     from beliefscope.filters.foreign import load_foreign
@@ -91,5 +97,8 @@ def serve(
         hosts=(host,),
         seed=seed,
         tasks=tuple(task or ()),
+        studies=short_names(study or (), {SHIPPED}),
     )
+    for name, folder in settings.studies.items():
+        Study(name, folder, checkpoints=True).read()  # or it is not served
     serve_until_signal(settings, host=host, port=port, listening=listening)

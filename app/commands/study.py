@@ -155,7 +155,7 @@ def ships(task: str) -> bool:
 
 def write(folder: Path, cells: list[Cell], preset: str) -> tuple[list[Row], dict[str, Any]]:
     """Writes table, figure and overview of what is finished; returns the rows and the overview: what was asked for, how
-    far each cell is, and the table's numbers, unrounded."""
+    far each cell is, the hashes of what is trained, and the table's numbers, unrounded."""
     from dataclasses import asdict
 
     from beliefscope.filters.checkpoint import write_atomically
@@ -175,6 +175,7 @@ def write(folder: Path, cells: list[Cell], preset: str) -> tuple[list[Row], dict
         "seeds": 1 + max(cell.seed for cell in cells),
         "versions": versions(),
         "cells": {str(c): "missing" if d is None else d.get("error", "finished") for c, d in documents.items()},
+        "checkpoints": {str(c): d["checkpoint_hash"] for c, d in documents.items() if d and "error" not in d},
         "rows": [asdict(row) for row in rows],
     }
     write_atomically(folder / "study.json", json_format.dumps(overview, indent=1).encode())
