@@ -322,17 +322,26 @@ def load_trace(path: Path) -> Trace:
         raise BadInput(f"{str(path)!r} is a safetensors file, but not a trace of Beliefscope")
     if header.pop("format", None) != FORMAT:
         raise BadInput(f"{str(path)!r} is a trace of another format; this version reads format {FORMAT}")
-    prefix = "episode/observations/"
     try:
-        episode = Episode(
-            **header.pop("episode"),
-            **{name: arrays.pop(f"episode/{name}") for name in ("states", "controls", "contact", "qpos")},
-            observations={key.removeprefix(prefix): arrays.pop(key) for key in list(arrays) if key.startswith(prefix)},
-        )
-        header["recipe"] = stored_recipe(header.get("recipe"), header["settings"])
-        return Trace(**{**header, "modalities": tuple(header["modalities"])}, episode=episode, **arrays)
+        return trace_of(header, arrays)
     except (KeyError, TypeError) as error:
         raise BadInput(f"{str(path)!r} is not a whole trace: {error}") from None
+
+
+def trace_of(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> Trace:
+    """What ``header_of`` and ``arrays_of`` were made of. Raises KeyError or TypeError where that does not fit."""
+    of_episode: dict[str, Any] = {
+        name.removeprefix("episode/"): a for name, a in arrays.items() if name.startswith("episode/")
+    }
+    prefix = "observations/"
+    episode = Episode(
+        **header["episode"],
+        **{name: of_episode[name] for name in ("states", "controls", "contact", "qpos")},
+        observations={n.removeprefix(prefix): a for n, a in of_episode.items() if n.startswith(prefix)},
+    )
+    said = {name: value for name, value in header.items() if name not in ("format", "episode")}
+    said |= {"modalities": tuple(said["modalities"]), "recipe": stored_recipe(said.get("recipe"), said["settings"])}
+    return Trace(**said, episode=episode, **{n: a for n, a in arrays.items() if not n.startswith("episode/")})
 
 
 def stored_recipe(recipe: Any, settings: Mapping[str, Any]) -> Recipe:
