@@ -26,6 +26,7 @@ from fastapi import APIRouter, HTTPException
 from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope import __version__
+from beliefscope.app.work import how_it_ended
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import write_atomically
 
@@ -252,12 +253,7 @@ class Jobs:
     def _why(self, id: str, code: int) -> str:
         """What is known of a process that ended without saying why."""
         last = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "")
-        if code < 0:
-            name = signal.Signals(-code).name
-            memory = ", perhaps for want of memory" if -code == signal.SIGKILL else ""
-            how = f"its process was ended by signal {-code} ({name}){memory}"
-        else:
-            how = f"its process ended with exit code {code}"
+        how = f"its process {how_it_ended(code)}"
         return f"{how}; it said last: {last.strip()}" if last else how
 
     def _stop(self, id: str, then: State) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from beliefscope.app.shelf import Shelf, shelves
+from beliefscope.app.tracing import Tracer
 from beliefscope.app.wire import MAP_SIZES, columns
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.corrupt import WHOLE, Recipe
@@ -95,6 +96,17 @@ class Selection:
     data: str = ""
     edit: Edit | None = None
 
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values, for another process."""
+        edit = None if self.edit is None else self.edit.to_json()
+        return {**vars(self), "recipe": self.recipe.to_json(), "edit": edit}
+
+    @classmethod
+    def of_json(cls, shown: Mapping[str, Any]) -> Selection:
+        """What ``to_json`` gave."""
+        edit = None if shown["edit"] is None else Edit.of(shown["edit"])
+        return cls(**{**shown, "recipe": Recipe.of(shown["recipe"]), "edit": edit})
+
     def against(self, text: str) -> Selection:
         """The other run that this one is compared with, from what is different about it.
 
@@ -157,8 +169,10 @@ class Traced:
 class Library:
     """Everything a server can show. Methods may be called from any thread; they block, so not from the event loop."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, tracer: Tracer | None = None) -> None:
+        """Tracer: runs the filters in another process; without it a thread does."""
         self.settings = settings
+        self._tracer = tracer
         self._lock = threading.RLock()
         self._keys: dict[Selection, str] = {}
         self._hashing = threading.Lock()
@@ -289,7 +303,9 @@ class Library:
             traced.progress = fraction
 
         try:
-            if selection.edit is None:
+            if self._tracer is not None:
+                result = self._run_apart(self._tracer, selection, progress)
+            elif selection.edit is None:
                 result = self._run(traced.checkpoint, selection, episode, progress)
             else:
                 result = self._edited(traced.checkpoint, selection, selection.edit, episode, progress)
@@ -297,12 +313,28 @@ class Library:
         except BaseException as error:
             traced.done.set_exception(error)
 
+    def _file(self, selection: Selection) -> Path:
+        name = f"{selection.task}-{selection.filter}-episode{selection.episode}-{self.key(selection)[:16]}.trace"
+        return self.settings.workspace / "traces" / name
+
+    def _run_apart(self, tracer: Tracer, selection: Selection, progress: Callable[[float], None]) -> Trace:
+        """The trace from its file, which the other process writes where there is none that can be read."""
+        path = self._file(selection)
+        with suppress(BadInput):
+            return load_trace(path)
+        path.unlink(missing_ok=True)
+        tracer.run(self.settings.to_json(), selection.to_json(), path, progress)
+        try:
+            return load_trace(path)
+        finally:
+            if selection.edit is not None:  # edits are tried by the dozen, and each is soon made again
+                path.unlink(missing_ok=True)
+
     def _run(
         self, checkpoint: Checkpoint, selection: Selection, episode: Episode, progress: Callable[[float], None]
     ) -> Trace:
         """The trace from its file, or computed and written there."""
-        name = f"{selection.task}-{selection.filter}-episode{selection.episode}-{self.key(selection)[:16]}.trace"
-        path = self.settings.workspace / "traces" / name
+        path = self._file(selection)
         # A trace file that cannot be read is only a cache: it is computed and written again.
         with suppress(BadInput):
             return load_trace(path)
@@ -337,6 +369,8 @@ class Library:
     def close(self) -> None:
         """Give up what is being computed and close the data sets."""
         self._closing = True
+        if self._tracer is not None:
+            self._tracer.close()
         self._tracing.shutdown(wait=True, cancel_futures=True)
         with self._lock:
             if "_stock" in vars(self):

@@ -25,6 +25,7 @@ from beliefscope.app.children import with_children
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.security import Guard
 from beliefscope.app.session import Views
+from beliefscope.app.tracing import Tracer
 from beliefscope.app.vendor import UPLOT_FILES, RerunViewer, cached_file, installed
 from beliefscope.app.wire import MAP_SIZES
 from beliefscope.datasets.errors import BadInput
@@ -35,14 +36,16 @@ PAGE = Path(__file__).parent / "page"
 log = logging.getLogger("beliefscope.app")
 
 
-def create_app(settings: Settings, warm: bool = True) -> FastAPI:
+def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> FastAPI:
     """The application; it starts no thread before its lifespan begins and leaves none behind when that ends.
 
     Args:
         settings: what to show and where to keep things.
         warm: prepare the first page's trace and Rerun's viewer in the background at the start.
+        apart: run the filters in a process of their own; else a thread does.
     """
-    library = Library(with_children(settings))
+    tracer = Tracer() if apart else None
+    library = Library(with_children(settings), tracer)
     views = Views(library)
     work = jobs.Jobs(settings.workspace / "jobs")
     rerun = RerunViewer(settings.workspace / "cache")
@@ -51,7 +54,7 @@ def create_app(settings: Settings, warm: bool = True) -> FastAPI:
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         tidying = asyncio.create_task(views.tidy())
         stopping = threading.Event()
-        warming = threading.Thread(target=_warm, args=(library, rerun, stopping), name="warming")
+        warming = threading.Thread(target=_warm, args=(library, tracer, rerun, stopping), name="warming")
         if warm:
             warming.start()
         yield
@@ -105,7 +108,7 @@ def serve(
     if listening is None:
         listening = _print_url
     with _bound(host, port) as listener:  # first of all: without an address nothing is to be made
-        app = create_app(settings)
+        app = create_app(settings, apart=True)
         problems = app.state.library.problems()
         if problems:
             raise BadInput("; ".join(problems))
@@ -160,10 +163,11 @@ def _add_files(app: FastAPI, rerun: RerunViewer) -> None:
         return cached_file(request, uplot / name, media_type, {})
 
 
-def _warm(library: Library, rerun: RerunViewer, stopping: threading.Event) -> None:
+def _warm(library: Library, tracer: Tracer | None, rerun: RerunViewer, stopping: threading.Event) -> None:
     """Have ready what the first page asks for, maps before Rerun. What fails is told to the page that asks for it."""
     for prepare in (
         lambda: library.traced(library.default()).map(0, None, MAP_SIZES[0]),
+        tracer.start if tracer is not None else lambda: None,
         lambda: rerun.prepare(stopping.is_set),
     ):
         try:

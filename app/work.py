@@ -10,13 +10,14 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import signal
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from beliefscope.datasets.errors import BadInput
 
@@ -30,8 +31,7 @@ NICENESS = 5  # the page goes first
 def main(function: str, folder: Path) -> int:
     """Exit code: 0 where the result is written, else 1."""
     os.nice(NICENESS)
-    reports = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    reports = own_output()
     threading.Thread(target=_end_with_the_server, daemon=True).start()
     said = [0.0]
 
@@ -60,6 +60,21 @@ def main(function: str, folder: Path) -> int:
         tell(error=f"{type(error).__name__}: {error}")
         return 1
     return 0
+
+
+def own_output() -> TextIO:
+    """Standard output for ourselves, by lines; what others print from now on goes to standard error."""
+    output = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return output
+
+
+def how_it_ended(code: int) -> str:
+    """What the exit code of a process says: "was ended by signal 9 (SIGKILL), perhaps for want of memory"."""
+    if code >= 0:
+        return f"ended with exit code {code}"
+    memory = ", perhaps for want of memory" if -code == signal.SIGKILL else ""
+    return f"was ended by signal {-code} ({signal.Signals(-code).name}){memory}"
 
 
 def _end_with_the_server() -> None:
