@@ -21,7 +21,7 @@ from beliefscope import __version__
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.proxy import client_page
 from beliefscope.app.session import Views
-from beliefscope.app.wire import header, pictures
+from beliefscope.app.wire import header, layers, pictures
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.corrupt import Recipe, described
 from beliefscope.inspect.catalog import quick
@@ -90,9 +90,10 @@ def routes(library: Library, views: Views) -> APIRouter:
             trace = traced.done.result(timeout=PATIENCE)
         except NotYet:
             return JSONResponse({"progress": traced.progress}, status_code=202)
-        components = [{"name": c.name, "unit": c.unit} for c in traced.checkpoint.task.components]
-        described = header(trace, traced.columns[0], components, no_maps(traced.checkpoint, trace))
-        return JSONResponse(described | {"filter": asked.filter})
+        task, why = traced.checkpoint.task, no_maps(traced.checkpoint, trace)
+        components = [{"name": c.name, "unit": c.unit} for c in task.components]
+        described = header(trace, traced.columns[0], components, why)
+        return JSONResponse(described | {"filter": asked.filter, "scene": layers(task, trace, why)})
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
     def trace_columns(asked: OfTwo, request: Request) -> Response:

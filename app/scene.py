@@ -12,6 +12,8 @@ from beliefscope.app.drawing import Drawing
 from beliefscope.app.library import Traced
 from beliefscope.app.proxy import EmbeddedViser
 from beliefscope.app.shadow import Shadow
+from beliefscope.app.wire import Look
+from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
 PANEL_WIDTH = 180  # pixels
@@ -32,6 +34,8 @@ class Scene:
         self._moved = moved
         self._lock = threading.Lock()
         self._drawing: Drawing | None = None
+        self._look = Look()
+        self._shown: tuple[int, LikelihoodMap | None] = (0, None)
         self._other: Trace | None = None
         self._shadow: Shadow | None = None
         self._closed = False
@@ -48,8 +52,22 @@ class Scene:
         )
         self._server.flush()
 
-    def show(self, traced: Traced, step: int, other: Trace | None = None) -> None:
-        """Draw a step of a trace and send it to the browser. Other: the run of its episode that it is compared with."""
+    def look(self, look: Look) -> None:
+        """Draw what is shown as it is wanted, now and from now on."""
+        with self._lock:
+            self._look = look
+            if self._closed or self._drawing is None:
+                return
+            with self._server.atomic():
+                self._drawing.look(look)
+                self._drawing.move(*self._shown)
+            self._server.flush()
+
+    def show(self, traced: Traced, step: int, other: Trace | None = None, maps: LikelihoodMap | None = None) -> None:
+        """Draw a step of a trace and send it to the browser.
+
+        Other: the run of its episode that it is compared with. Maps: of the step, where it has any.
+        """
         with self._lock:
             if self._closed:
                 return
@@ -57,7 +75,8 @@ class Scene:
                 self._build(traced)
             assert self._drawing is not None
             with self._server.atomic():
-                self._drawing.move(step)
+                self._shown = step, maps
+                self._drawing.move(step, maps)
                 if other is not self._other:
                     self._shade(traced, other)
                 if self._shadow is not None:
@@ -77,7 +96,7 @@ class Scene:
         with server.atomic():
             server.scene.reset()
             server.gui.reset()
-            self._drawing, self._shadow, self._other = Drawing(server, traced), None, None
+            self._drawing, self._shadow, self._other = Drawing(server, traced, self._look), None, None
             self._slider = server.gui.add_slider("step", 0, max(1, len(traced.trace) - 1), 1, 0)
             self._slider.on_update(self._on_slider)
             self._fold_panel()

@@ -15,9 +15,9 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.mapwire import maps_message
 from beliefscope.app.scene import Scene
-from beliefscope.app.wire import Cursor, cursor
+from beliefscope.app.wire import Cursor, cursor, look
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.likelihood import no_maps
+from beliefscope.inspect.likelihood import LikelihoodMap, no_maps
 
 log = logging.getLogger("beliefscope.app")
 
@@ -74,8 +74,10 @@ class View:
                     self._arrived.set()
                 case "theme":
                     await asyncio.to_thread(self.scene.set_dark, message.get("dark") is True)
+                case "look":
+                    await asyncio.to_thread(self.scene.look, look(message))
                 case other:
-                    raise BadInput(f"Message type {other!r} does not exist. Available: cursor, theme.")
+                    raise BadInput(f"Message type {other!r} does not exist. Available: cursor, look, theme.")
         except json.JSONDecodeError as error:
             await _tell_error(websocket, serial, f"Not JSON: {error}.")
         except BadInput as error:
@@ -109,15 +111,18 @@ class View:
         if wanted.step >= len(trace):
             raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(trace) - 1}.")
         other = self._other(selection, wanted.against, len(trace))
+        maps = None
         if no_maps(traced.checkpoint, trace):
             await websocket.send_json({"type": "no_maps", "serial": wanted.serial, "step": wanted.step})
         else:
             if wanted.beside and other is not None and not no_maps(other.checkpoint, other.trace):
-                await websocket.send_bytes(await asyncio.to_thread(_maps, wanted, other, True))
-            await websocket.send_bytes(await asyncio.to_thread(_maps, wanted, traced))
+                _, beside = await asyncio.to_thread(_maps, wanted, other, True)
+                await websocket.send_bytes(beside)
+            maps, message = await asyncio.to_thread(_maps, wanted, traced)
+            await websocket.send_bytes(message)
         if not wanted.scene:
             return
-        await asyncio.to_thread(self.scene.show, traced, wanted.step, None if other is None else other.trace)
+        await asyncio.to_thread(self.scene.show, traced, wanted.step, None if other is None else other.trace, maps)
         await websocket.send_json({"type": "drawn", "serial": wanted.serial, "step": wanted.step})
 
     def _other(self, selection: Selection, against: str, steps: int) -> Traced | None:
@@ -197,10 +202,10 @@ class Views:
         await asyncio.gather(*(asyncio.to_thread(view.scene.close) for view in views))
 
 
-def _maps(wanted: Cursor, traced: Traced, other: bool = False) -> bytes:
-    """The maps of a cursor, as they are sent. Other: of the other run."""
+def _maps(wanted: Cursor, traced: Traced, other: bool = False) -> tuple[LikelihoodMap, bytes]:
+    """The maps of a cursor, and as they are sent. Other: of the other run."""
     maps = traced.map(wanted.step, wanted.angle, wanted.size)
-    return maps_message(wanted.serial, traced.checkpoint.task, traced.trace, maps, other=other)
+    return maps, maps_message(wanted.serial, traced.checkpoint.task, traced.trace, maps, other=other)
 
 
 async def _quietly(sending: Any) -> None:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from viser import ViserServer
 
-from beliefscope.app.drawing import BELIEF_ABOVE, OUTLINES, POLE_RADIUS, UP, Array, rgb
+from beliefscope.app.drawing import BELIEF_ABOVE, OUTLINES, POLE_RADIUS
+from beliefscope.app.scenery import SMALL, UP, Array, rgb
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.trace import Trace
 
@@ -28,9 +29,7 @@ class Shadow:
         self._height = float(self._anchors[0, 2]) + above  # below the labels of this run
         self._root = scene.add_frame("/other", show_axes=False)
         self._pole: Any = scene.add_cylinder("/other/pole", POLE_RADIUS / 2, self._height, color=hue, cast_shadow=False)
-        self._label: Any = scene.add_label(
-            "/other/label", "other run", font_screen_scale=0.7, anchor="bottom-center", depth_test=False
-        )
+        self._label: Any = scene.add_label("/other/label", "other run", anchor="bottom-center", **SMALL)
         self._outline: Any = None
         if self._ghost is not None:
             self._outline = scene.add_frame("/other/ghost", show_axes=False)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.corrupt import WHOLE, Recipe
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.task import Task
 from beliefscope.filters.study import nees_bounds
 from beliefscope.inspect import measures
 from beliefscope.inspect.consistency import innovations
@@ -42,6 +43,62 @@ class Cursor:
     data: str = ""
     against: str = ""
     beside: bool = False
+
+
+LAYERS = ("replay", "objects", "estimates", "contours", "particles", "force", "map", "camera")
+"""What the 3D scene is made of: each can be hidden."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a 3D scene is looked at.
+
+    Hidden: of ``LAYERS``. Ground: the maps' layer that lies on the floor, ``fused`` where the maps do not have it.
+    Tint: particles by their weight, or by the share of each modality in it. Scale, range, colours: as the page's maps.
+    """
+
+    hidden: frozenset[str] = frozenset()
+    ground: str = "fused"
+    tint: Literal["weight", "share"] = "weight"
+    scale: Literal["normalised", "log"] = "normalised"
+    range: Literal["own", "same"] = "own"
+    colours: Literal["viridis", "cividis"] = "viridis"
+
+
+def look(message: dict[str, Any]) -> Look:
+    """Reads a ``look`` message. Raises BadInput for what cannot be hidden, and for an unknown choice."""
+    given: dict[str, Any] = {"hidden": frozenset()}
+    hidden = message.get("hidden", [])
+    if not isinstance(hidden, list):
+        raise BadInput(f"look's 'hidden' is a list of layers; got {hidden!r}.")
+    for name in hidden:
+        if name not in LAYERS:
+            raise one_of("layer of the scene", name, LAYERS)
+    given["hidden"] = frozenset(hidden)
+    for key, kind in get_type_hints(Look).items():
+        if key == "hidden" or key not in message:
+            continue
+        if not isinstance(message[key], str):
+            raise BadInput(f"look's {key!r} is text; got {message[key]!r}.")
+        if get_args(kind) and message[key] not in get_args(kind):
+            raise one_of(f"look's {key!r}", message[key], get_args(kind))
+        given[key] = message[key]
+    return Look(**given)
+
+
+def layers(task: Task, trace: Trace, no_maps: str | None) -> list[str]:
+    """Those of ``LAYERS`` that the scene of a trace has."""
+    there = {
+        "replay": task.replay is not None and trace.episode.qpos.shape[1] > 0,
+        "objects": task.ghost is not None,
+        "estimates": True,
+        "contours": trace.has_covariance,
+        "particles": trace.particles is not None and trace.log_weights is not None,
+        "force": trace.episode.observations.keys() >= set(SENSORS),
+        "map": no_maps is None,
+        "camera": task.camera is not None and pictures(trace) is not None,
+    }
+    return [layer for layer in LAYERS if there[layer]]
 
 
 def cursor(message: dict[str, Any]) -> Cursor:

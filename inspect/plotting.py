@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -180,3 +181,10 @@ def colour_of(layer: str, layers: Sequence[str]) -> str:
     """The layer's colour; black for a curve that belongs to none."""
     named = list(dict.fromkeys(one for one in layers if one))
     return colour(layer, named) if layer else "#333333"
+
+
+@cache
+def colour_table(name: str) -> NDArray[np.uint8]:
+    """(256, 3) RGB of a colour map of matplotlib's, from its low end to its high one."""
+    shades = np.asarray(colormaps[name](np.linspace(0.0, 1.0, 256)))
+    return np.rint(255.0 * shades[:, :3]).astype(np.uint8)
