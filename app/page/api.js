@@ -160,5 +160,11 @@ export const startFinetune = async (selection, settings) => (await post(finetune
 /** A run, how far it is, and what it found. */
 export const tuned = async (run, signal) => (await ask(`/api/tuned/${encodeURIComponent(run)}`, { signal })).json();
 
+/** What studies found. @returns {Promise<{studies: object[], problems: string[]}>} */
+export const studies = async () => (await ask('/api/studies')).json();
+
+/** Puts a checkpoint that a study measured on the shelf. @returns {Promise<{filter: string}>} its name there */
+export const openMeasured = async (...parts) => (await ask(`/api/studies/${parts.map(encodeURIComponent).join('/')}`, { method: 'POST' })).json();
+
 /** What becomes of a child. @param {'accept' | 'keep' | 'roll-back'} act @returns {Promise<Run>} */
 export const decide = async (run, act) => (await ask(`/api/tuned/${encodeURIComponent(run)}/${act}`, { method: 'POST' })).json();

@@ -35,6 +35,7 @@ export class Failures {
   #rows = []; // of the moments, as they were listed last: {moment, row, button}
   #last = -1; // place of the moment that was gone to last
   #listed = ''; // what the rows are of
+  #sought = ''; // the key of what the worst moment is waited for
 
   /**
    * @param {HTMLElement} host @param {import('./state.js').Store} store @param {import('./jobs.js').Jobs} jobs
@@ -76,6 +77,7 @@ export class Failures {
     const { signal } = (this.#loading = new AbortController());
     const key = this.#key;
     this.#last = -1;
+    if (this.#sought !== key) this.#sought = '';
     if (!this.#results.has(key)) this.#keep(key, { state: 'loading' });
     this.draw();
     if (this.#results.get(key).state === 'ready') return;
@@ -86,6 +88,7 @@ export class Failures {
       this.#keep(key, { state: 'error', error: error.message });
     }
     this.draw();
+    this.#seek();
   }
 
   /** Goes to the next moment of the list, or the one before. @param {1 | -1} by */
@@ -96,6 +99,21 @@ export class Failures {
     this.#open(moments[this.#last], inputTime);
     const table = this.#part('.moments');
     if (table.checkVisibility()) stopAt(this.#rows[this.#last].row, table.contains(document.activeElement));
+  }
+
+  /** Goes to the worst moment of all as soon as it is known; has it looked for where nobody did. */
+  worst() {
+    this.#sought = this.#key;
+    this.#seek();
+  }
+
+  #seek() {
+    if (this.#sought !== this.#key) return;
+    const { state } = this.#known;
+    if (state === 'unasked') this.#look();
+    if (state !== 'ready') return;
+    [this.#sought, this.#last] = ['', -1];
+    this.go(1);
   }
 
   /** Writes all that is known, by the chosen measure; only marks it on the time line while another tab is shown. */

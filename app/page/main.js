@@ -22,6 +22,7 @@ import { Rerun } from './rerun.js';
 import { Slice } from './slice.js';
 import { ViewSocket } from './socket.js';
 import { Store, resolve } from './state.js';
+import { Study } from './study.js';
 import { TimeLine } from './timeline.js';
 import { Undo } from './undo.js';
 import { fixed, sentence, spoken } from './units.js';
@@ -83,6 +84,7 @@ class Page {
     this.failures = new Failures($('#failures'), store, this.jobs, this.timeline, catalog);
     this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.#overlay(other, name));
     this.finetune = new Finetune($('#finetune'), catalog, store, this.jobs, sheet);
+    this.study = new Study($('#study'), catalog, store, this.failures);
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
     this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
@@ -246,6 +248,7 @@ class Page {
     this.failures.draw();
     this.compare.open = tab === 'compare';
     this.finetune.open = tab === 'finetune';
+    this.study.open = tab === 'study';
     if (this.#trace) this.rerun.move(this.#store.state.step, false);
   }
 
@@ -308,6 +311,7 @@ class Page {
       n: (event) => this.failures.go(1, event.timeStamp),
       b: (event) => this.failures.go(-1, event.timeStamp),
       t: () => this.#store.set({ tab: 'finetune' }),
+      u: () => this.#store.set({ tab: 'study' }),
       j: () => this.jobs.toggle(),
       c: () => this.#nextComponent(),
       e: () => this.#goWorst(),

@@ -10,7 +10,7 @@ import { spoken } from './units.js';
  * @property {string} recipe how the sensors are broken, as text (docs/data.md); empty where they are not
  * @property {string} against what differs in the other run that this one is compared with (docs/api.md); empty without one
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
- * @property {'scene' | 'rerun' | 'diagnostics' | 'failures' | 'compare' | 'finetune'} tab
+ * @property {'scene' | 'rerun' | 'diagnostics' | 'failures' | 'compare' | 'finetune' | 'study'} tab
  * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
  * @property {string} track the lowest chart: a name of `KINDS` (tracks.js)
  * @property {string} window steps that the time line shows, as 20-60; empty for all of them
@@ -21,13 +21,14 @@ import { spoken } from './units.js';
  * @property {string} by measure that ranks failures @property {string} group the only one that is listed, empty for all
  * @property {string} scale of the maps, `range`, `axes`, `colours`, `regions`, `cloud`, `zoom`: see `MAPS`
  * @property {string} run of fine-tuning that is open, empty for a new one
+ * @property {string} study that is shown @property {string} quantity of it; empty for the first of each
  * @property {boolean} playing @property {number} speed
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 /** How likelihood maps are shown: the colours' scale, whether all share its range, the axes, what lies on top, what they gain on the other run. */
 const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], zoom: ['1', '4'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
-const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
+const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
 const WORST = 'error'; // the measure that ranks failures where none is chosen
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
@@ -88,7 +89,7 @@ export function address(state) {
   if (diagnostic) kept.diagnostic = diagnostic;
   if (options) kept.options = options;
   if (over !== CHOICES.over[0]) kept.over = over;
-  if (state.run) kept.run = state.run;
+  for (const key of ['run', 'study', 'quantity']) if (state[key]) kept[key] = state[key];
   if (by !== WORST) kept.by = by;
   if (group) kept.group = group;
   for (const key of ['list', 'among', ...Object.keys(MAPS)]) if (state[key] !== CHOICES[key][0]) kept[key] = state[key];
@@ -129,6 +130,8 @@ export function resolve(search, catalog) {
     by: asked.get('by') ?? WORST,
     group: asked.get('group') ?? '',
     run: asked.get('run') ?? '',
+    study: asked.get('study') ?? '',
+    quantity: asked.get('quantity') ?? '',
     playing: false,
     speed: 1,
   };

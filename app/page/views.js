@@ -1,8 +1,8 @@
-/** The left of the page: tabs for the 3D scene, for Rerun's viewer, for the diagnostics, for failures, for comparisons and for fine-tuning. */
+/** The left of the page: tabs for the 3D scene, for Rerun's viewer, for the diagnostics, for failures, for comparisons, for fine-tuning and for studies. */
 
 import { say } from './panel.js';
 
-const TABS = ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune'];
+const TABS = ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study'];
 
 /** The scene's frame: another page of the server's, which follows the cursor by itself. */
 export class Scene {

@@ -1,0 +1,122 @@
+"""Screenshots of every view of the page, at several sizes, light and dark, to be looked at: what ships, under long names.
+
+python bench/screens.py FOLDER
+python bench/screens.py FOLDER --view study --view keys --size 1024x768 --theme dark
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Page, sync_playwright
+from served import serving
+
+from beliefscope.datasets.store import sample_path
+from beliefscope.filters.checkpoint import shipped
+
+SIZES = ("1024x768", "1440x900", "3840x2160")
+THEMES = ("light", "dark")
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+LONG = "a-filter-trained-on-the-third-floor-with-the-new-camera-v12b"
+PATIENCE = 120_000  # ms
+REST = 1200  # ms until what moves has come to rest
+
+BAD = "?task=door&episode=4711&recipe=blakout%3D0.4&filter=crossmodal-fp"
+"""A link that asks for what is not there."""
+
+
+def tab(name: str, ready: str = "true", press: str = "") -> Callable[[Page], None]:
+    """Shows a tab, presses the button of that name where it is there, and waits."""
+
+    def show(page: Page) -> None:
+        page.evaluate(f"document.querySelector('#tab-{name}').click()")
+        page.wait_for_timeout(REST)
+        button = page.locator(f"#{name}").get_by_role("button", name=press, exact=True)
+        if press and button.count() and button.first.is_visible():
+            button.first.click()
+        page.wait_for_function(f"() => {ready}", timeout=PATIENCE)
+
+    return show
+
+
+def click(selector: str) -> Callable[[Page], None]:
+    return lambda page: page.evaluate(f"document.querySelector({selector!r}).click()")
+
+
+def state(panel: str) -> str:
+    return f"document.querySelector('{panel}').dataset.state === 'ready'"
+
+
+VIEWS: dict[str, Callable[[Page], None]] = {
+    "failures": tab("failures", state("#failures"), "Look for failures"),
+    "compare": tab("compare", state("#compare .result"), "Run beside"),
+    "study": tab("study", state("#study")),
+    "rerun": tab("rerun", state("#rerun")),
+    "maps-options": click("#maps-view"),
+    "keys": click("#help"),
+    "jobs": click("#jobs-button"),
+}
+"""How a view is come to, beyond its tab; every tab is a view."""
+
+
+def close(page: Page) -> None:
+    """Puts away what lies over the page."""
+    page.evaluate(
+        "() => { document.querySelector('dialog[open]')?.close(); document.querySelector('[popover]:popover-open')?.hidePopover();"
+        " if (!document.querySelector('#jobs').hidden) document.querySelector('#jobs-button').click(); }"
+    )
+
+
+def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, wanted: list[str]) -> None:
+    width, height = map(int, size.split("x"))
+    page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=theme)
+    page.goto(f"{url}?step=40", timeout=PATIENCE)
+    page.wait_for_function("() => window.beliefscope?.stats.maps?.size === 135", timeout=PATIENCE)
+    tabs = [one.removeprefix("tab-") for one in page.eval_on_selector_all("[role=tab]", "all => all.map((t) => t.id)")]
+    for name in [*tabs, *(name for name in VIEWS if name not in tabs)]:
+        if wanted and name not in wanted:
+            continue
+        VIEWS.get(name, tab(name))(page)
+        page.wait_for_timeout(REST)
+        page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=PATIENCE)
+        close(page)
+    if not wanted or "bad-link" in wanted:
+        page.goto(url + BAD, timeout=PATIENCE)
+        page.wait_for_timeout(2 * REST)
+        page.screenshot(path=folder / f"bad-link-{size}-{theme}.png", timeout=PATIENCE)
+    page.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--view", action="append", default=[], help="a tab or one of " + ", ".join(VIEWS))
+    parser.add_argument("--size", action="append", choices=SIZES)
+    parser.add_argument("--theme", action="append", choices=THEMES)
+    parser.add_argument("--url", help="of a server that runs already")
+    asked = parser.parse_args()
+    asked.folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as given, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+
+        def all_of(url: str) -> None:
+            for size in asked.size or SIZES:
+                for theme in asked.theme or THEMES:
+                    shoot(browser, url, asked.folder, size, theme, asked.view)
+
+        if asked.url:
+            all_of(asked.url)
+            return
+        filter_ = shutil.copy(shipped("door", "crossmodal-pf"), Path(given) / f"{LONG}.safetensors")
+        data = shutil.copy(sample_path("door"), Path(given) / f"{LONG.replace('filter', 'set-of-doors')}.h5")
+        with serving("--filter", str(filter_), "--data", str(data)) as server:
+            all_of(server.url)
+
+
+if __name__ == "__main__":
+    main()
