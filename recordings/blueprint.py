@@ -15,7 +15,7 @@ from beliefscope.inspect.diagnostic import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.diagnostics import diagnostic_tab
-from beliefscope.recordings.drawing import SHOWN_SCALE, SHOWN_UNIT, SIGMAS, angles, plane_height
+from beliefscope.recordings.drawing import SHOWN_SCALE, SHOWN_UNIT, SIGMAS, angles, plane_height, positions
 from beliefscope.recordings.schema import STEP
 
 TRAIL_STEPS = 100
@@ -31,11 +31,13 @@ def blueprint(
     task: Task,
     first: LikelihoodMap | None = None,
     diagnostics: Mapping[str, Diagnostic] = MappingProxyType({}),
+    growing: bool = False,
 ) -> rrb.Blueprint:
     """The layout for a trace.
 
     Args:
         first: of its maps; where there is none, they have no views. diagnostics: by name, a tab each beside the story.
+        growing: whether this is the beginning of a run that goes on: the cursor follows it, and so do the axes.
     """
     sensed = [_picture(key) for key, shape in task.observations.items() if len(shape) == 2]
     if first is not None:
@@ -45,12 +47,12 @@ def blueprint(
         rrb.Horizontal(*sensed) if sensed else rrb.TextDocumentView(origin="about"),
         row_shares=[3, 2] if len(sensed) < 4 else [5, 2],
     )
-    story = _story(trace, task)
+    story = _story(trace, task, growing)
     if diagnostics:
         story = rrb.Tabs(story, *(diagnostic_tab(one, name) for name, one in diagnostics.items()), active_tab=0)
     return rrb.Blueprint(
         rrb.Horizontal(scene, story, column_shares=[1, 1]),
-        rrb.TimePanel(state="collapsed", timeline=STEP, play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline=STEP, play_state="following" if growing else "paused"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         auto_layout=False,
@@ -61,7 +63,7 @@ def blueprint(
 def _scene(trace: Trace, task: Task) -> rrb.Container:
     """The whole scene from behind the robot, and the belief from straight above, as the maps show it."""
     x, y = task.map_indices
-    anchor = np.array([*trace.episode.states[:, [x, y]].mean(axis=0), plane_height(trace, task)])
+    anchor = np.array([*positions(trace)[:, [x, y]].mean(axis=0), plane_height(trace, task)])
     effector = trace.episode.observations.get("effector_position")
     middle = anchor if effector is None else 0.5 * (anchor + effector.mean(axis=0))
     trail = rr.VisibleTimeRange(
@@ -103,7 +105,7 @@ def _map(layer: str, side: int) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=f"maps/{layer}", name=layer, visual_bounds=bounds)
 
 
-def _story(trace: Trace, task: Task) -> rrb.Container:
+def _story(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     rows: list[rrb.View | rrb.Container] = []
     rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=LINKED))
     shares = [1.6]
@@ -113,7 +115,7 @@ def _story(trace: Trace, task: Task) -> rrb.Container:
         rows.append(rrb.Tabs(*fusion, active_tab=0))
         shares.append(2.5)
     for component in task.components:
-        rows.append(_estimate(trace, task, component))
+        rows.append(_estimate(trace, task, component, growing))
         shares.append(2.5)
     errors = [_plot("errors/position", "Position error (cm)")]
     errors += [_plot(f"errors/{c.name}", f"Error of {c.name} (deg)") for c in angles(task)]
@@ -125,17 +127,20 @@ def _story(trace: Trace, task: Task) -> rrb.Container:
     return rrb.Vertical(*rows, row_shares=shares, name="Run")
 
 
-def _estimate(trace: Trace, task: Task, component: Component) -> rrb.TimeSeriesView:
+def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> rrb.TimeSeriesView:
     i, scale = task.index(component.name), SHOWN_SCALE[component.unit]
-    # The axis fits the truth and the fused band; a modality that runs away may leave it.
-    sigma = SIGMAS * np.sqrt(trace.estimate_covariance[:, i, i])
-    mean = trace.estimate_mean[:, i]
-    values = np.concatenate([trace.episode.states[:, i], mean - sigma, mean + sigma])
-    low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
-    margin = 0.1 * (high - low)
+    limits = None
+    if not growing:
+        # The axis fits the truth and the fused band; a modality that runs away may leave it.
+        sigma = SIGMAS * np.sqrt(trace.estimate_covariance[:, i, i])
+        mean = trace.estimate_mean[:, i]
+        values = np.concatenate([trace.episode.states[:, i], mean - sigma, mean + sigma])
+        low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
+        margin = 0.1 * (high - low)
+        limits = (low - margin, high + margin)
     name = f"{component.name} ({SHOWN_UNIT[component.unit]}): truth green, fused red"
     name += ", thin lines 2 sigma" if trace.has_covariance else ""
-    return _plot(f"states/{component.name}", name, (low - margin, high + margin), legend=False)
+    return _plot(f"states/{component.name}", name, limits, legend=False)
 
 
 def _plot(origin: str, name: str, limits: tuple[float, float] | None = None, legend: bool = True) -> rrb.TimeSeriesView:

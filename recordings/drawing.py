@@ -48,10 +48,20 @@ def angles(task: Task) -> tuple[Component, ...]:
     return tuple(component for component in task.components if component.unit == "rad")
 
 
+def positions(trace: Trace) -> Array:
+    """(T, n) true states, or where they are not known the estimated ones: where things are, for a layout."""
+    return trace.episode.states if knows_truth(trace) else trace.estimate_mean
+
+
+def knows_truth(trace: Trace, steps: slice = slice(None)) -> bool:
+    """Whether the true state is known at each of the steps: on a robot it may not be."""
+    return not np.isnan(trace.episode.states[steps]).any()
+
+
 def plane_height(trace: Trace, task: Task) -> float:
     """World height (m) of the plane on which the belief is drawn: of the object's anchor, else of the end effector."""
     if task.ghost is not None:
-        return float(task.ghost(trace.episode.states[0]).anchor[2])
+        return float(task.ghost(positions(trace)[0]).anchor[2])
     effector = trace.episode.observations.get("effector_position")
     return 0.0 if effector is None else float(effector[0, 2])
 
@@ -89,8 +99,8 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     yield "world/effector", _marker(COLOUR_OF_ROBOT, 3.0)
     yield "world/plane/truth", _marker(_hex("truth", trace), 4.0)
     if task.ghost is not None:
-        half = np.array([task.ghost(trace.episode.states[0]).size]) / 2.0
-        for name in ("truth", "fused"):
+        half = np.array([task.ghost(positions(trace)[0]).size]) / 2.0
+        for name in ("truth", "fused") if knows_truth(trace) else ("fused",):
             yield f"world/object/{name}", _box(_hex(name, trace), half, filled=name == "truth")
     yield (
         "contact",
@@ -134,17 +144,18 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
         yield "diagnostics/effective_sample_size", line(_hex("fused", trace), 1.5, "effective particles")
 
 
-def contact_changes(trace: Trace) -> tuple[NDArray[np.int64], Any]:
-    """The steps at which the contact begins or ends, step 0 first, and its columns there."""
+def contact_changes(trace: Trace, span: slice) -> tuple[NDArray[np.int64], Any]:
+    """Those of the steps at which the contact begins or ends, the trace's first among them, and its columns there."""
     contact = trace.episode.contact
-    steps = np.flatnonzero(np.concatenate([[True], contact[1:] != contact[:-1]]))
+    steps = span.start + np.flatnonzero(np.concatenate([[True], contact[1:] != contact[:-1]])[span])
     return steps, rr.StateChange.columns(state=[CONTACT_NAMES[int(contact[step])] for step in steps])
 
 
 def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
     plane = list(task.map_indices)
-    truth = trace.episode.states[steps][:, plane]
-    yield "world/plane/truth", rr.Points3D.columns(positions=_lift(truth))
+    known = knows_truth(trace, steps)
+    if known:
+        yield "world/plane/truth", rr.Points3D.columns(positions=_lift(trace.episode.states[steps][:, plane]))
     effector = trace.episode.observations.get("effector_position")
     if effector is not None:
         yield "world/effector", rr.Points3D.columns(positions=effector[steps])
@@ -158,7 +169,8 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
                 rr.Ellipsoids3D.columns(centers=_lift(centre), half_sizes=_lift(axes), quaternions=turn),
             )
     if task.ghost is not None:
-        for name, states in (("truth", trace.episode.states), ("fused", trace.estimate_mean)):
+        drawn = {"fused": trace.estimate_mean} | ({"truth": trace.episode.states} if known else {})
+        for name, states in drawn.items():
             ghost = task.ghost(states[steps])
             wxyz = ghost.wxyz
             yield (
@@ -256,18 +268,23 @@ def _marker(hue: str, points: float) -> rr.Points3D:
     return rr.Points3D.from_fields(colors=rgba(hue), radii=rr.Radius.ui_points(points))
 
 
-def about(trace: Trace, task: Task) -> rr.TextDocument:
-    """What is shown, in words: a recording is read by people who have nothing else at hand."""
+def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
+    """What is shown, in words: a recording is read by people who have nothing else at hand.
+
+    Args: trace: some steps of the run. steps: all of them, below 0 while that is not known.
+    """
     senses = " and ".join(task.modalities if not trace.modalities else trace.modalities).replace("+", " with ")
-    weighs = " and weighs its modalities anew at every step" if trace.weights is not None else ""
+    weighs = ". It weighs its modalities anew at every step" if trace.weights is not None else ""
     components = ", ".join(component.name for component in task.components)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
+    length = f"{steps} steps" if steps >= 0 else "a live run, in steps"
+    begins = "It starts at the true state" if knows_truth(trace) else "The true state is not known"
     broken = f"\nIts sensors are broken: `{trace.recipe}`.\n" if trace.recipe else ""
     text = f"""# {task.name}, episode {trace.episode_index}, {trace.filter}
 
-{KINDS[trace.kind]} estimates {components} from {senses}: {len(trace)} steps of
-{trace.episode.dt:g} s. It starts at the true state{weighs}.
+{KINDS[trace.kind]} estimates {components} from {senses}: {length} of
+{trace.episode.dt:g} s. {begins}{weighs}.
 {broken}
 | name | colour | what it is |
 | --- | --- | --- |
@@ -281,8 +298,8 @@ def about(trace: Trace, task: Task) -> rr.TextDocument:
   frame the truth (large) and the estimate (small).
 * **Plots**: centimetres and degrees. Thin lines beside the fused estimate are 2 sigma away from it.
 
-* checkpoint `{trace.checkpoint_hash}`
-* data `{trace.data_hash}`
+* checkpoint `{trace.checkpoint_hash or "unknown"}`
+* data `{trace.data_hash or "unknown"}`
 * seed {trace.seed}
 """
     return rr.TextDocument(text, media_type="text/markdown")

@@ -13,6 +13,9 @@ APPLICATION = "beliefscope"
 FORMAT_VERSION = 1
 """Raised when a path changes its meaning or goes. A new path or property alone does not raise it."""
 
+GROWING = -1
+"""The property ``steps`` of a recording whose run goes on, or was killed."""
+
 HEADER = "__properties/beliefscope"
 """Where Rerun keeps the recording property ``beliefscope``."""
 
@@ -171,7 +174,7 @@ PROPERTIES: dict[str, str] = {
     "kind": "`ekf`, `ukf`, `pf`, `lstm`, or `foreign` for a filter from outside",
     "modalities": "JSON list: the K modalities in order",
     "episode_index": "index in its data set",
-    "steps": "T, rows of every path under `trace/` and `observations/` that is not static",
+    "steps": "T, rows of every path under `trace/` and `observations/` that is not static; -1 while a live run goes on",
     "dt": "seconds a step",
     "seed": "seed of the filter's randomness",
     "checkpoint_hash": "SHA-256 of the checkpoint's file",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 import os
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun.any_batch_value import AnyBatchValue
 from rerun.chunk import RrdReader
@@ -27,16 +29,18 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnostic import Diagnostic
+from beliefscope.inspect.growing import STATIC
 from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_of
 from beliefscope.recordings import drawing
 from beliefscope.recordings.blueprint import blueprint
 from beliefscope.recordings.diagnostics import log_diagnostic
 from beliefscope.recordings.maps import map_columns, map_style
-from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, SCHEMA, TRACE_COMPONENT
+from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
 
 STEPS_PER_CHUNK = 100
 MAPS_PER_CHUNK = 16
+LAYOUT_STEPS = 1000
 
 
 def write_recording(
@@ -64,22 +68,17 @@ def write_recording(
         BadInput: the folder does not exist or cannot be written; maps of different sizes or unknown steps; a diagnostic
             with curves of another number of steps.
     """
-    rr.set_strict_mode(True)  # or Rerun turns its errors into warnings and leaves gaps
     task = find_task(trace.episode.task)
     report = progress or (lambda share: None)
     blocks = _blocks(maps or (), MAPS_PER_CHUNK)
     first = next(blocks, [])
     layers = first[0].layers if first else ()
-    with _complete_or_absent(Path(path)) as unfinished:
-        stream = rr.RecordingStream(APPLICATION)
-        layout = blueprint(trace, task, first[0] if first else None, diagnostics)
-        stream.save(unfinished, default_blueprint=layout)
-        _send_header(stream, trace)
-        _send_static(stream, trace, task)
-        stream.flush()  # so that even a file cut off later says what it is
+    sample = thinned(trace)
+    layout = blueprint(sample, task, first[0] if first else None, diagnostics)
+    with new_recording(Path(path), sample, len(trace), layout) as stream:
         for start in range(0, len(trace), STEPS_PER_CHUNK):
             steps = slice(start, min(start + STEPS_PER_CHUNK, len(trace)))
-            _send_steps(stream, trace, task, steps)
+            send_steps(stream, trace, task, steps)
             report(0.5 * steps.stop / len(trace))
         for name, diagnostic in diagnostics.items():
             log_diagnostic(stream, diagnostic, name, trace)
@@ -90,9 +89,38 @@ def write_recording(
             _send_maps(stream, first, trace, task, layers)
             report(0.5 + 0.5 * (first[-1].step + 1) / len(trace))
             first = next(blocks, [])
-        _finish(stream, unfinished)
     report(1.0)
     return Path(path)
+
+
+@contextmanager
+def new_recording(path: Path, sample: Trace, steps: int, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """A stream into a file that is complete at the end, or not there; its header and what is static are sent.
+
+    Args:
+        sample: of the trace's steps, spread over all of them (``thinned``). steps: that the whole trace has.
+
+    Raises BadInput where the folder does not exist or cannot be written.
+    """
+    rr.set_strict_mode(True)  # or Rerun turns its errors into warnings and leaves gaps
+    with _complete_or_absent(path) as unfinished:
+        stream = rr.RecordingStream(APPLICATION)
+        stream.save(unfinished, default_blueprint=layout)
+        send_header(stream, sample, steps)
+        stream.flush()  # so that even a file cut off later says what it is
+        yield stream
+        _finish(stream, unfinished)
+
+
+def thinned(trace: Trace) -> Trace:
+    """Every so many-th of its steps: what the layout and all else that is static is made from, however long it is."""
+    stride = thinning(len(trace))
+    return trace_of(header_of(trace), {n: a if n in STATIC else a[::stride] for n, a in arrays_of(trace).items()})
+
+
+def thinning(steps: int) -> int:
+    """The stride at which a thousand steps or fewer are left."""
+    return max(1, math.ceil(steps / LAYOUT_STEPS))
 
 
 def stored_arrays(trace: Trace) -> Iterator[tuple[str, bool, NDArray[Any]]]:
@@ -111,7 +139,17 @@ def is_picture(array: NDArray[Any]) -> bool:
     return array.ndim == 3 and array.dtype == np.uint8
 
 
-def _send_header(stream: rr.RecordingStream, trace: Trace) -> None:
+def send_header(stream: rr.RecordingStream, trace: Trace, steps: int = GROWING) -> None:
+    """The recording's properties, and all else that is not over steps, of a run that these steps are of.
+
+    Args:
+        trace: some of its steps. steps: all of them; ``GROWING`` while that is not known.
+    """
+    _send_properties(stream, trace, steps)
+    _send_static(stream, trace, find_task(trace.episode.task), steps)
+
+
+def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> None:
     episode = trace.episode
     arrays = {path: (array if static else array[:1], static) for path, static, array in stored_arrays(trace)}
     shapes = {p: [list(a.shape if static else a.shape[1:]), a.dtype.str] for p, (a, static) in arrays.items()}
@@ -135,7 +173,7 @@ def _send_header(stream: rr.RecordingStream, trace: Trace) -> None:
             kind=trace.kind,
             modalities=text(trace.modalities),
             episode_index=trace.episode_index,
-            steps=len(trace),
+            steps=steps,
             dt=float(episode.dt),
             seed=trace.seed,
             checkpoint_hash=trace.checkpoint_hash,
@@ -149,7 +187,7 @@ def _send_header(stream: rr.RecordingStream, trace: Trace) -> None:
     stream.send_recording_name(f"{episode.task} {trace.episode_index}, {trace.filter}")
 
 
-def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task) -> None:
+def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task, steps: int) -> None:
     for path, static, array in stored_arrays(trace):
         if static:
             stream.log(path, [_values(array)], static=True)
@@ -160,13 +198,17 @@ def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task) -> None:
             stream.log(f"observations/{key}", rr.Image.from_fields(format=gray), static=True)
     for path, what in drawing.style(trace, task):
         stream.log(path, what, static=True)
-    stream.log("about", drawing.about(trace, task), static=True)
-    steps, states = drawing.contact_changes(trace)
-    stream.send_columns("contact", drawing.time_columns(steps, trace.episode.dt), states)
+    stream.log("about", drawing.about(trace, task, steps), static=True)
 
 
-def _send_steps(stream: rr.RecordingStream, trace: Trace, task: Task, steps: slice) -> None:
-    times = drawing.time_columns(np.arange(steps.start, steps.stop), trace.episode.dt)
+def send_steps(stream: rr.RecordingStream, trace: Trace, task: Task, steps: slice, offset: int = 0) -> None:
+    """Some steps of a trace, stored and drawn.
+
+    Args:
+        steps: of the trace, from and to. offset: which step of the run the trace's first is, where it is only a part.
+            A part that is not the run's beginning begins at least one step before ``steps``: what changed is told.
+    """
+    times = drawing.time_columns(np.arange(steps.start, steps.stop) + offset, trace.episode.dt)
     for path, static, array in stored_arrays(trace):
         if not static:
             rows = array[steps]
@@ -180,6 +222,9 @@ def _send_steps(stream: rr.RecordingStream, trace: Trace, task: Task, steps: sli
         stream.send_columns(f"observations/{key}", times, columns)
     for path, columns in drawing.columns(trace, task, steps):
         stream.send_columns(path, times, columns)
+    changes, states = drawing.contact_changes(trace, steps)
+    if len(changes):
+        stream.send_columns("contact", drawing.time_columns(changes + offset, trace.episode.dt), states)
 
 
 def _send_maps(
