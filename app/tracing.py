@@ -17,7 +17,7 @@ from concurrent.futures import wait
 from pathlib import Path
 from typing import Any
 
-from beliefscope.app.work import PAUSE, how_it_ended, own_output
+from beliefscope.app.work import NICENESS, PAUSE, how_it_ended, own_output
 from beliefscope.datasets.errors import BadInput
 
 
@@ -96,6 +96,7 @@ def main() -> None:
     from beliefscope.app.library import Library, Selection, Settings
     from beliefscope.inspect.trace import save_trace
 
+    os.nice(NICENESS)
     told = own_output()
     library, shown = None, None
     for line in sys.stdin:
