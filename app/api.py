@@ -7,7 +7,6 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import TimeoutError as NotYet
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +20,7 @@ from beliefscope import __version__
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.proxy import client_page
 from beliefscope.app.session import Views
-from beliefscope.app.wire import header, layers, pictures
+from beliefscope.app.wire import pictures
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.corrupt import Recipe, described
 from beliefscope.inspect.catalog import quick
@@ -86,14 +85,9 @@ def routes(library: Library, views: Views) -> APIRouter:
     @router.get("/api/trace/{task}/{filter}/{episode}")
     def trace_header(asked: OfTwo) -> Response:
         traced = library.traced(asked)
-        try:
-            trace = traced.done.result(timeout=PATIENCE)
-        except NotYet:
+        if not traced.ready(PATIENCE):
             return JSONResponse({"progress": traced.progress}, status_code=202)
-        task, why = traced.checkpoint.task, no_maps(traced.checkpoint, trace)
-        components = [{"name": c.name, "unit": c.unit} for c in task.components]
-        described = header(trace, traced.columns[0], components, why)
-        return JSONResponse(described | {"filter": asked.filter, "scene": layers(task, trace, why)})
+        return JSONResponse(traced.header() | {"filter": asked.filter})
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
     def trace_columns(asked: OfTwo, request: Request) -> Response:

@@ -25,7 +25,7 @@ def routes(library: Library) -> APIRouter:
         other = asked.against(against)
         both = [library.traced(selection) for selection in (asked, other)]
         try:
-            this, that = (traced.done.result(timeout=PATIENCE) for traced in both)
+            this, that = (traced.result(PATIENCE) for traced in both)
         except NotYet:
             return JSONResponse({"progress": sum(traced.progress for traced in both) / 2}, status_code=202)
         names = _names(asked, other)

@@ -149,7 +149,7 @@ class _Made:
 def _there(traced: Traced) -> Trace | None:
     """The trace; None where it takes longer than a moment. Raises what computing it raised."""
     try:
-        return traced.done.result(timeout=PATIENCE)
+        return traced.result(PATIENCE)
     except NotYet:
         return None
 

@@ -49,11 +49,12 @@ OUTLINES = {
 class Drawing:
     """The nodes of one trace in viser's scene, and where they are at each step."""
 
-    def __init__(self, server: ViserServer, traced: Traced, look: Look) -> None:
-        self._trace = trace = traced.trace
+    def __init__(self, server: ViserServer, traced: Traced, trace: Trace, look: Look) -> None:
+        """Trace: of the traced run, or of a part of it, whose steps ``move`` counts then."""
         self._server = server
         self._task = task = traced.checkpoint.task
-        self._replay = replay(task, trace.episode)
+        self._plane = list(task.map_indices)
+        self._take(trace)
         there = layers(task, trace, no_maps(traced.checkpoint, trace))
         scene = server.scene
         scene.set_up_direction("+z")
@@ -74,12 +75,6 @@ class Drawing:
             self._roots["replay"].append(self._robot.fixed_bodies_frame)
         else:
             add_plane(server, task, trace)
-        self._plane = list(task.map_indices)
-        self._believed = list(_believed(trace))
-        states = np.stack([mean for _, mean, _ in self._believed], axis=1)  # (T, S, n)
-        self._ghost = None if task.ghost is None else task.ghost(states)
-        flat = np.concatenate([states[..., self._plane], np.zeros_like(states[..., :1])], axis=-1)
-        self._anchors = flat if self._ghost is None else self._ghost.anchor  # (T, S, 3)
         self._above = BELIEF_ABOVE if self._ghost is not None else 0.0
         self._level = float(self._anchors[0, 0, 2]) + self._above
         self._markers = [self._add_marker(i, name) for i, (name, _, _) in enumerate(self._believed)]
@@ -100,8 +95,28 @@ class Drawing:
             self._ground = Ground(server, trace, level)
         if "camera" in there:
             self._sight = Sight(server, task, trace)
+        if np.isnan(trace.episode.states).any():  # nobody knows the truth: it would hide behind the estimate
+            for node in (*self._markers[0], *([self._outlines[0]] if self._outlines else [])):
+                node.visible = False
         self.look(look)
         self._place_camera()
+
+    def turn_to(self, trace: Trace) -> None:
+        """Another part of the run that is drawn: its steps are those of ``move`` from now on."""
+        self._take(trace)
+        for part in (self._force, self._sight):
+            if part is not None:
+                part.take(trace)
+
+    def _take(self, trace: Trace) -> None:
+        """Where everything is at each step of a trace."""
+        self._trace = trace
+        self._replay = replay(self._task, trace.episode)
+        self._believed = list(_believed(trace))
+        states = np.stack([mean for _, mean, _ in self._believed], axis=1)  # (T, S, n)
+        self._ghost = None if self._task.ghost is None else self._task.ghost(states)
+        flat = np.concatenate([states[..., self._plane], np.zeros_like(states[..., :1])], axis=-1)
+        self._anchors = flat if self._ghost is None else self._ghost.anchor  # (T, S, 3)
 
     def look(self, look: Look) -> None:
         """Show and hide, from the next ``move`` on."""
@@ -244,7 +259,7 @@ class Drawing:
 
 def _believed(trace: Trace) -> Iterator[tuple[str, Array, Array]]:
     """(name, states (T, n), covariances (T, n, n)): the truth, the fused estimate, each modality's if it is another."""
-    yield "truth", trace.episode.states, np.zeros_like(trace.estimate_covariance)
+    yield "truth", trace.anchors, np.zeros_like(trace.estimate_covariance)
     yield "fused", trace.estimate_mean, trace.estimate_covariance
     if len(trace.alone) > 1:
         for k, name in enumerate(trace.alone):

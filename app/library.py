@@ -5,31 +5,30 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl
 
+from beliefscope.app.liveruns import PREFIX, LiveRuns
+from beliefscope.app.selection import Selection, Traced
 from beliefscope.app.shelf import Shelf, shelves
 from beliefscope.app.tracing import Tracer
-from beliefscope.app.wire import MAP_SIZES, columns
 from beliefscope.datasets.catalog import load_task
-from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.foreign import Foreign, load_foreign
-from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
 from beliefscope.inspect.replay import Edit, Replay
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 
+__all__ = ["Library", "Selection", "Settings", "Traced"]
+
 TRACES_IN_MEMORY = 8
-FINE = max(MAP_SIZES)
 
 
 @dataclass(frozen=True)
@@ -82,96 +81,13 @@ class Settings:
         )
 
 
-@dataclass(frozen=True)
-class Selection:
-    """What is being looked at: names of a task and a filter, an episode's index, how its sensors are broken.
-
-    Data: name of the data set; empty for the task's first. Edit: what is changed over some steps of the run.
-    """
-
-    task: str
-    filter: str
-    episode: int
-    recipe: Recipe = WHOLE
-    data: str = ""
-    edit: Edit | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """As JSON values, for another process."""
-        edit = None if self.edit is None else self.edit.to_json()
-        return {**vars(self), "recipe": self.recipe.to_json(), "edit": edit}
-
-    @classmethod
-    def of_json(cls, shown: Mapping[str, Any]) -> Selection:
-        """What ``to_json`` gave."""
-        edit = None if shown["edit"] is None else Edit.of(shown["edit"])
-        return cls(**{**shown, "recipe": Recipe.of(shown["recipe"]), "edit": edit})
-
-    def against(self, text: str) -> Selection:
-        """The other run that this one is compared with, from what is different about it.
-
-        ``filter=NAME``, ``recipe=FAULTS`` (none where empty) or both; or an edit over some steps, ``from=20&to=40``
-        with ``recipe=FAULTS``, ``weights=MODALITY=BETA`` or both. Raises BadInput for anything else, and the same run.
-        """
-        given = dict(parse_qsl(text, keep_blank_values=True))
-        if given.keys() & {"from", "to", "weights"}:
-            return replace(self, edit=Edit.parse(text))
-        for key in given:
-            if key not in ("filter", "recipe"):
-                raise one_of("part of the other run", key, ("filter", "recipe", "from", "to", "weights"))
-        recipe = Recipe.parse(given["recipe"]) if "recipe" in given else self.recipe
-        other = replace(self, filter=given.get("filter", self.filter), recipe=recipe)
-        if other == self:
-            raise BadInput(f"{text!r} is the run that is shown, not another")
-        return other
-
-
-class Traced:
-    """A trace that is being computed, or is there; and what is derived from it.
-
-    Attributes:
-        key: hash of everything the trace depends on: checkpoint, episode, seed, particles, recipe.
-        done: the trace, or the error that computing it ended in. progress: 0..1.
-    """
-
-    def __init__(self, key: str, checkpoint: Checkpoint) -> None:
-        self.key = key
-        self.checkpoint = checkpoint
-        self.done: Future[Trace] = Future()
-        self.done.set_running_or_notify_cancel()  # so that who stops waiting for it cannot cancel it
-        self.progress = 0.0
-        self._maps = threading.Lock()
-
-    @property
-    def trace(self) -> Trace:
-        """Waits for it. Raises what computing it raised."""
-        return self.done.result()
-
-    @cached_property
-    def columns(self) -> tuple[list[dict[str, Any]], bytes]:
-        """The trace's numbers as the page wants them: descriptions and one buffer."""
-        return columns(self.trace)
-
-    def map(self, step: int, angle: float | None, size: int) -> LikelihoodMap:
-        """One likelihood map; one at a time a trace, because its engine keeps caches."""
-        with self._maps:
-            return self._engine.map(step, angle=angle, size=size)
-
-    def maps(self, steps: Iterable[int]) -> Iterator[LikelihoodMap]:
-        """The fine maps at several steps; other askers get theirs in between."""
-        return (self.map(step, None, FINE) for step in steps)
-
-    @cached_property
-    def _engine(self) -> MapEngine:
-        return MapEngine(self.checkpoint, self.trace)
-
-
 class Library:
     """Everything a server can show. Methods may be called from any thread; they block, so not from the event loop."""
 
     def __init__(self, settings: Settings, tracer: Tracer | None = None) -> None:
         """Tracer: runs the filters in another process; without it a thread does."""
         self.settings = settings
+        self.live = LiveRuns(settings.workspace / "live")
         self._tracer = tracer
         self._lock = threading.RLock()
         self._keys: dict[Selection, str] = {}
@@ -198,6 +114,11 @@ class Library:
             tasks = [shelf.describe() for shelf in found.values() if not shelf.missing]
             return {"tasks": tasks, "problems": problems}
 
+    def described(self, task: str) -> dict[str, Any]:
+        """A task as the catalog has it, whether or not there is anything of it to show."""
+        with self._lock:
+            return self._shelf(task).describe()
+
     def default(self) -> Selection:
         """What a page shows first: the first of everything. Raises BadInput where there is nothing to show."""
         with self._lock:
@@ -210,6 +131,8 @@ class Library:
 
     def traced(self, selection: Selection) -> Traced:
         """The selection's trace, computed from now on if it is not there. Raises BadInput for what does not exist."""
+        if (live := self._live(selection)) is not None:
+            return live
         with self._lock:
             known = self._traced.get(self._keys.get(selection, ""))
             if known is None or (known.done.done() and known.done.exception() is not None):
@@ -224,6 +147,8 @@ class Library:
 
     def there(self, selection: Selection) -> Traced | None:
         """The selection's trace if it is in memory and done. Nothing is computed for it."""
+        if (live := self._live(selection)) is not None:
+            return live
         with self._lock:
             known = self._traced.get(self._keys.get(selection, ""))
             if known is None or not known.done.done() or known.done.exception() is not None:
@@ -233,6 +158,8 @@ class Library:
 
     def key(self, selection: Selection) -> str:
         """Hash of everything its trace depends on; the trace need not be there. Raises BadInput as ``traced``."""
+        if (live := self._live(selection)) is not None:
+            return live.key
         with self._lock:
             if selection not in self._keys:
                 checkpoint, episode = self._found(selection)
@@ -246,8 +173,13 @@ class Library:
     def held_out(self, selection: Selection) -> list[Selection]:
         """The same of each episode that its data set holds out. Raises BadInput for an unknown task or data set."""
         with self._lock:
-            episodes = self._shelf(selection.task).dataset(selection.data).held_out()
+            episodes = self.dataset(selection.task, selection.data)[1].held_out()
             return [replace(selection, episode=episode) for episode in episodes]
+
+    def filters(self, task: str) -> dict[str, Checkpoint]:
+        """By name, all that there are of a task. Raises BadInput for an unknown one."""
+        with self._lock:
+            return self._shelf(task).filters
 
     def checkpoint(self, task: str, filter_: str) -> Checkpoint:
         """Raises BadInput for a name that is not here."""
@@ -256,6 +188,8 @@ class Library:
 
     def dataset(self, task: str, name: str) -> tuple[str, Dataset]:
         """Name and data set; the task's first for an empty name. Raises BadInput for a name that is not here."""
+        if name.startswith(PREFIX):
+            raise BadInput(f"{name!r} is a live run: one episode, not a set of them")
         with self._lock:
             shelf = self._shelf(task)
             found = shelf.dataset(name)
@@ -284,11 +218,18 @@ class Library:
     def _found(self, selection: Selection) -> tuple[Checkpoint, Episode]:
         shelf = self._shelf(selection.task)
         checkpoint = shelf.filter(selection.filter)
-        episode = shelf.episode(selection.data, selection.episode)
+        live = selection.data.startswith(PREFIX)
+        episode = self.live.episode(selection.data) if live else shelf.episode(selection.data, selection.episode)
         selection.recipe.check(checkpoint.task)
         if selection.edit is not None:
             selection.edit.recipe.check(checkpoint.task)
         return checkpoint, episode
+
+    def _live(self, selection: Selection) -> Traced | None:
+        """The live run itself, where it is that which is asked for."""
+        if not selection.data.startswith(PREFIX):
+            return None
+        return self.live.traced(selection, self.filters(selection.task))
 
     def _shelf(self, task: str) -> Shelf:
         found, _ = self._stock
@@ -372,6 +313,7 @@ class Library:
         if self._tracer is not None:
             self._tracer.close()
         self._tracing.shutdown(wait=True, cancel_futures=True)
+        self.live.close()
         with self._lock:
             if "_stock" in vars(self):
                 for shelf in self._stock[0].values():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,15 +35,17 @@ NUMBERS = (
 )
 
 
-def maps_message(serial: int, task: Task, trace: Trace, maps: LikelihoodMap, other: bool = False) -> bytes:
+def maps_message(serial: int, task: Task, trace: Trace, index: int, maps: LikelihoodMap, other: bool = False) -> bytes:
     """Header's length, JSON header, padding to a multiple of 4, float32 particles, then the layers as uint16.
 
-    Other: whether they are of the other run.
+    Index: of the maps' step in the trace, which may be a part of a run. Other: whether they are of the other run.
     """
     effector = trace.episode.observations.get("effector_position")
     cells, log_max, log_range = quantised(maps.log_likelihood)
-    cloud = particles(trace, maps.step, task)
-    measured = measure_maps([maps], trace)
+    cloud = particles(trace, index, task)
+    measured = measure_maps([replace(maps, step=index)], trace)
+    # Without a truth the maps are laid around the estimate: what is likely there is not what is likely at the truth.
+    unknown = {"truth": [None] * len(maps.layers)} if np.isnan(trace.episode.states[index]).any() else {}
     description = {
         "type": "maps",
         "serial": serial,
@@ -53,13 +56,13 @@ def maps_message(serial: int, task: Task, trace: Trace, maps: LikelihoodMap, oth
         "layers": list(maps.layers),
         "half_width": float(-maps.offsets_x[0] + 0.5 * (maps.offsets_x[1] - maps.offsets_x[0])),
         "centre": maps.centre.tolist(),
-        "truth": _json(trace.episode.states[maps.step]),
-        "estimate": _json(trace.estimate_mean[maps.step]),
+        "truth": _json(trace.episode.states[index]),
+        "estimate": _json(trace.estimate_mean[index]),
         "log_max": _json(log_max),
         "log_range": _json(log_range),
         "peak": maps.peaks().tolist(),
-        "effector": None if effector is None else effector[maps.step, :2].tolist(),
-        "numbers": {name: _json(getattr(measured, name)[0]) for name in NUMBERS},
+        "effector": None if effector is None else effector[index, :2].tolist(),
+        "numbers": {name: _json(getattr(measured, name)[0]) for name in NUMBERS} | unknown,
         "particles": 0 if cloud is None else len(cloud[0]),
     }
     text = json.dumps(description).encode()

@@ -71,12 +71,17 @@ class Scene:
         with self._lock:
             if self._closed:
                 return
-            if self._key != traced.key:
-                self._build(traced)
+            trace, index = traced.at(step)
+            if self._key != traced.shown:
+                self._build(traced, trace)
             assert self._drawing is not None
             with self._server.atomic():
-                self._shown = step, maps
-                self._drawing.move(step, maps)
+                if traced.grows:
+                    assert self._slider is not None
+                    self._drawing.turn_to(trace)
+                    self._slider.max = max(1, len(traced) - 1)
+                self._shown = index, maps
+                self._drawing.move(index, maps)
                 if other is not self._other:
                     self._shade(traced, other)
                 if self._shadow is not None:
@@ -91,16 +96,16 @@ class Scene:
             self._closed = True
         self.viser.close()
 
-    def _build(self, traced: Traced) -> None:
+    def _build(self, traced: Traced, trace: Trace) -> None:
         server = self._server
         with server.atomic():
             server.scene.reset()
             server.gui.reset()
-            self._drawing, self._shadow, self._other = Drawing(server, traced, self._look), None, None
-            self._slider = server.gui.add_slider("step", 0, max(1, len(traced.trace) - 1), 1, 0)
+            self._drawing, self._shadow, self._other = Drawing(server, traced, trace, self._look), None, None
+            self._slider = server.gui.add_slider("step", 0, max(1, len(traced) - 1), 1, 0)
             self._slider.on_update(self._on_slider)
             self._fold_panel()
-        self._key = traced.key
+        self._key = traced.shown
 
     def _shade(self, traced: Traced, other: Trace | None) -> None:
         if self._shadow is not None:

@@ -95,10 +95,10 @@ class Sight:
     """The camera that took the pictures, and the picture as the filter saw it."""
 
     def __init__(self, server: ViserServer, task: Task, trace: Trace) -> None:
-        camera, seen = task.camera, pictures(trace)
+        camera = task.camera
         assert camera is not None
-        assert seen is not None
-        self._seen = seen
+        self.take(trace)
+        seen = self._seen
         forward, up = np.array(camera.forward), np.array(camera.up)
         turn = np.stack([np.cross(forward, up), -up, forward], axis=1)
         self._frustum: Any = server.scene.add_camera_frustum(
@@ -119,6 +119,12 @@ class Sight:
         far = camera.position[2] / -forward[2] if forward[2] < -0.1 else 1.0
         self._frustum.scale = SIGHT * far / self._frustum.compute_canonical_frustum_size()[2]
 
+    def take(self, trace: Trace) -> None:
+        """The steps that ``show`` counts."""
+        seen = pictures(trace)
+        assert seen is not None
+        self._seen = seen
+
     def show(self, step: int, look: Look) -> None:
         """The picture of a step."""
         self._frustum.visible = "camera" not in look.hidden
@@ -134,9 +140,7 @@ class Force:
     """What the hand feels where it touches, as an arrow of 4 cm for 10 N, with its newtons."""
 
     def __init__(self, server: ViserServer, trace: Trace) -> None:
-        episode = trace.episode
-        self._contact = episode.contact.astype(bool)
-        self._at, self._force = episode.observations["effector_position"], episode.observations["force"]
+        self.take(trace)
         self._arrow: Any = server.scene.add_arrows(
             "/force/arrow",
             np.zeros((1, 2, 3), np.float32),
@@ -147,6 +151,12 @@ class Force:
             visible=False,
         )
         self._label: Any = server.scene.add_label("/force/label", "", anchor="bottom-center", visible=False, **SMALL)
+
+    def take(self, trace: Trace) -> None:
+        """The steps that ``show`` counts."""
+        episode = trace.episode
+        self._contact = episode.contact.astype(bool)
+        self._at, self._force = episode.observations["effector_position"], episode.observations["force"]
 
     def show(self, step: int) -> None:
         """The force of a step: none but in contact."""
@@ -194,7 +204,7 @@ def add_plane(server: ViserServer, task: Task, trace: Trace) -> None:
 
 def extent(task: Task, trace: Trace) -> tuple[Array, Array, float]:
     """Lower and upper corner (2,), m, of the whole cells in which the truth and its maps lie, and a cell's side, m."""
-    truth = trace.episode.states[:, list(task.map_indices)]
+    truth = trace.anchors[:, list(task.map_indices)]
     low, high = truth.min(axis=0) - task.map_half_width, truth.max(axis=0) + task.map_half_width
     cell = next((side for side in CELLS if (high - low).max() <= MOST_CELLS * side), CELLS[-1])
     return np.floor(low / cell) * cell, np.ceil(high / cell) * cell, cell

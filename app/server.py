@@ -19,7 +19,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
-from beliefscope.app import compare, diagnostics, failures, finetune, jobs, reports, study
+from beliefscope.app import compare, diagnostics, failures, finetune, jobs, live, reports, study
 from beliefscope.app.api import routes
 from beliefscope.app.children import with_children
 from beliefscope.app.library import Library, Settings
@@ -76,6 +76,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> Fa
         compare.routes(library),
         failures.routes(library, work),
         finetune.routes(library, work),
+        live.routes(library),
         reports.routes(library, work),
         study.routes(library),
     ):

@@ -17,7 +17,7 @@ from beliefscope.app.mapwire import maps_message
 from beliefscope.app.scene import Scene
 from beliefscope.app.wire import Cursor, cursor, look
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.likelihood import LikelihoodMap, no_maps
+from beliefscope.inspect.likelihood import LikelihoodMap
 
 log = logging.getLogger("beliefscope.app")
 
@@ -105,17 +105,16 @@ class View:
     async def _answer_one(self, websocket: WebSocket, wanted: Cursor) -> None:
         selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.recipe, wanted.data)
         traced = await asyncio.to_thread(self._library.traced, selection)
-        if not await self._ready_before_newer(traced):
+        if not traced.grows and not await self._ready_before_newer(traced):
             return
-        trace = traced.trace
-        if wanted.step >= len(trace):
-            raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(trace) - 1}.")
-        other = self._other(selection, wanted.against, len(trace))
+        if wanted.step >= len(traced):
+            raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(traced) - 1}.")
+        other = self._other(selection, wanted.against, len(traced))
         maps = None
-        if no_maps(traced.checkpoint, trace):
+        if traced.no_maps:
             await websocket.send_json({"type": "no_maps", "serial": wanted.serial, "step": wanted.step})
         else:
-            if wanted.beside and other is not None and not no_maps(other.checkpoint, other.trace):
+            if wanted.beside and other is not None and not other.no_maps:
                 _, beside = await asyncio.to_thread(_maps, wanted, other, True)
                 await websocket.send_bytes(beside)
             maps, message = await asyncio.to_thread(_maps, wanted, traced)
@@ -205,7 +204,7 @@ class Views:
 def _maps(wanted: Cursor, traced: Traced, other: bool = False) -> tuple[LikelihoodMap, bytes]:
     """The maps of a cursor, and as they are sent. Other: of the other run."""
     maps = traced.map(wanted.step, wanted.angle, wanted.size)
-    return maps, maps_message(wanted.serial, traced.checkpoint.task, traced.trace, maps, other=other)
+    return maps, maps_message(wanted.serial, traced.checkpoint.task, *traced.at(wanted.step), maps, other=other)
 
 
 async def _quietly(sending: Any) -> None:

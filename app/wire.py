@@ -185,11 +185,10 @@ def pictures(trace: Trace) -> NDArray[np.uint8] | None:
     return next((array for array in seen if array.ndim == 3 and array.dtype == np.uint8), None)
 
 
-def header(
-    trace: Trace, described: list[dict[str, Any]], components: list[dict[str, str]], no_maps: str | None
-) -> dict[str, Any]:
+def header(trace: Trace, described: list[dict[str, Any]], task: Task, no_maps: str | None) -> dict[str, Any]:
     """What the page must know of a trace before it reads its columns. No_maps: why there are none, where so."""
     shown = pictures(trace)
+    components = [{"name": c.name, "unit": c.unit} for c in task.components]
     return {
         "steps": len(trace),
         "dt": trace.episode.dt,
@@ -208,6 +207,7 @@ def header(
         "no_maps": no_maps,
         "pictures": None if shown is None else list(shown.shape[1:]),
         "columns": described,
+        "scene": layers(task, trace, no_maps),
     }
 
 

@@ -41,7 +41,7 @@ class LikelihoodMap:
         step: of the trace. angle: value of the one component that is held fixed (rad), NaN where there is none.
         layers: names: the trace's modalities, then ``fused``; L of them.
         offsets_x, offsets_y: (S,) m, cell centres, increasing, relative to ``centre``. centre: (2,) m, the true
-            position.
+            position, or where it is not known the fused estimate.
         log_likelihood: (L, S, S) natural log, not normalised; [l, iy, ix] belongs to offsets_y[iy], offsets_x[ix].
     """
 
@@ -120,6 +120,7 @@ class MapEngine:
         rest = [i for i in range(len(self.task.components)) if i not in self.task.map_indices]
         self.fixed = rest[0] if rest else None
         self._cells = self._networks()
+        self._anchors = trace.anchors
 
     @torch.no_grad()
     def _encode(self) -> Evidence | None:
@@ -153,8 +154,8 @@ class MapEngine:
             raise BadInput(f"a map has 2 to {LARGEST} cells along a side, not {size}")
         if angle is not None and not math.isfinite(angle):
             raise BadInput(f"angle must be a finite number of rad, not {angle}")
-        middle = trace.episode.states[step].astype(np.float64)
-        centre = trace.episode.states[step][list(self.task.map_indices)]
+        about = self._anchors[step]
+        middle, centre = about.astype(np.float64), about[list(self.task.map_indices)]
         if self.fixed is not None and angle is not None:
             middle[self.fixed] = angle
         with one_thread():

@@ -107,6 +107,12 @@ class Trace:
         return () if np.isnan(self.modality_mean).all() else self.modalities
 
     @property
+    def anchors(self) -> Array:
+        """(T, n) what likelihood maps and drawings are laid around: the truth; the estimate where it is not known."""
+        truth = self.episode.states
+        return np.where(np.isnan(truth), self.estimate_mean, truth)
+
+    @property
     def effective_sample_size(self) -> Array | None:
         """(T,) ``1 / sum w_i^2`` of the posterior weights, between 1 and M; None for a filter without particles."""
         return None if self.log_weights is None else effective_sample_size(torch.from_numpy(self.log_weights)).numpy()
