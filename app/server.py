@@ -19,13 +19,15 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
-from beliefscope.app import compare, diagnostics, failures, finetune, jobs, live, reports, study
+from beliefscope.app import compare, diagnostics, failures, finetune, jobs, recordings, reports, study
 from beliefscope.app.api import routes
 from beliefscope.app.children import with_children
 from beliefscope.app.library import Library, Settings
+from beliefscope.app.rrdfiles import RrdFiles
 from beliefscope.app.security import Guard
 from beliefscope.app.session import Views
 from beliefscope.app.tracing import Tracer
+from beliefscope.app.trash import Gone, Taken
 from beliefscope.app.vendor import UPLOT_FILES, RerunViewer, cached_file, installed
 from beliefscope.app.wire import MAP_SIZES
 from beliefscope.datasets.errors import BadInput
@@ -49,6 +51,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> Fa
     views = Views(library)
     work = jobs.Jobs(settings.workspace / "jobs")
     rerun = RerunViewer(settings.workspace / "cache")
+    rrds = RrdFiles(settings.workspace / "recordings")
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -62,6 +65,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> Fa
         tidying.cancel()
         await views.close()
         await asyncio.to_thread(work.close)
+        await asyncio.to_thread(rrds.close)
         await asyncio.to_thread(library.close)
         # A thread that is inside C++ when Python ends takes the whole process down with an abort.
         if warm:
@@ -76,7 +80,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> Fa
         compare.routes(library),
         failures.routes(library, work),
         finetune.routes(library, work),
-        live.routes(library),
+        recordings.routes(library, rrds),
         reports.routes(library, work),
         study.routes(library),
     ):
@@ -85,6 +89,8 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> Fa
     app.add_middleware(Guard, hosts=settings.hosts)
     app.add_exception_handler(BadInput, _say(400))
     app.add_exception_handler(jobs.QueueFull, _say(429))
+    app.add_exception_handler(Gone, _say(404))
+    app.add_exception_handler(Taken, _say(409))
     app.add_exception_handler(RequestValidationError, _say(422))
     app.add_exception_handler(HTTPException, _say(None))
     app.add_exception_handler(Exception, _say(500))

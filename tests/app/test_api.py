@@ -16,7 +16,6 @@ from beliefscope import __version__
 from beliefscope.app.server import Settings
 from beliefscope.datasets.corrupt import Recipe
 from beliefscope.inspect.trace import load_trace
-from beliefscope.recordings.read import read_recording
 
 OpenClient = Callable[..., TestClient]
 
@@ -165,38 +164,6 @@ def test_a_trace_is_fetched_once(client: TestClient, traced: str) -> None:
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str, settings: Settings) -> None:
-    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "recipe": "", "maps": 20}
-    answer = client.post("/api/recordings", json=wanted)
-    assert answer.status_code == 201, answer.text
-    made = answer.json()
-    assert made["name"].startswith("door-crossmodal-pf-episode1-")
-    (listed,) = client.get("/api/recordings").json()
-    assert (listed["name"], listed["bytes"]) == (made["name"], made["bytes"])
-    assert (listed["task"], listed["filter"], listed["episode"]) == ("door", "crossmodal-pf", 1)
-    content = client.get(made["url"]).content
-    assert content == (settings.workspace / "recordings" / made["name"]).read_bytes()
-    part = client.get(made["url"], headers={"Range": "bytes=4-11"})
-    assert (part.status_code, part.content) == (206, content[4:12])
-    np.testing.assert_array_equal(
-        read_recording(settings.workspace / "recordings" / made["name"]).estimate_mean,
-        columns(client, traced)["estimate_mean"],
-    )
-
-
-def test_a_recording_that_is_there_is_not_written_again(client: TestClient, traced: str, settings: Settings) -> None:
-    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
-    first = client.post("/api/recordings", json=wanted).json()
-    path = settings.workspace / "recordings" / first["name"]
-    before = path.stat().st_mtime_ns
-    again = client.post("/api/recordings", json=wanted)
-    assert (again.status_code, again.json()) == (200, first | {"seconds": None})
-    assert path.stat().st_mtime_ns == before
-    other = client.post("/api/recordings", json=wanted | {"recipe": "blackout=0.5"})
-    assert other.status_code == 201
-    assert other.json()["name"] != first["name"]
-
-
 def test_data_sets_are_told_apart(client: TestClient, traced: str) -> None:
     mine = columns(client, traced)["truth"]
     url = "/api/trace/door/crossmodal-pf/1?data="
@@ -208,36 +175,6 @@ def test_data_sets_are_told_apart(client: TestClient, traced: str) -> None:
     answer = client.get(f"{url}yours")
     assert answer.status_code == 400
     assert answer.json()["error"] == "data 'yours' does not exist. Available: mine, sample."
-
-
-@pytest.mark.parametrize(
-    "name", ["../traces/x", "..%2ftraces%2fx", "..%5cx", "%2fetc%2fpasswd", ".hidden", "door-crossmodal-pf-episode1-zz"]
-)
-def test_a_recordings_name_leads_nowhere_else(client: TestClient, settings: Settings, name: str) -> None:
-    (settings.workspace / "traces").mkdir(parents=True)
-    (settings.workspace / "traces" / "x.rrd").write_bytes(b"secret")
-    answer = client.get(f"/api/recordings/{name}.rrd")
-    assert answer.status_code == 404
-    assert b"secret" not in answer.content
-
-
-@pytest.mark.parametrize(
-    ("body", "status", "said"),
-    [
-        (b"not json", 422, "JSON"),
-        (b"{}", 422, "Field required"),
-        (b'{"task": "door", "filter": "crossmodal-pf", "episode": "1"}', 422, "body.episode"),
-        (b'{"task": "door", "filter": "crossmodal-pf", "episode": 1, "maps": -1}', 422, "body.maps"),
-        (b'{"task": "door", "filter": "none", "episode": 1}', 400, "filter 'none' does not exist"),
-    ],
-)
-def test_a_bad_request_for_a_recording_writes_nothing(
-    client: TestClient, settings: Settings, body: bytes, status: int, said: str
-) -> None:
-    answer = client.post("/api/recordings", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code == status
-    assert said in answer.json()["error"]
-    assert not (settings.workspace / "recordings").exists()
 
 
 @pytest.mark.parametrize("broken", ["data", "checkpoint"])

@@ -1,0 +1,243 @@
+"""Recordings over HTTP (docs/api.md): of the runs that are shown, and from elsewhere; listed and looked after."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import Annotated, Any
+from urllib.parse import quote
+
+from fastapi import APIRouter, HTTPException, Request
+from fastapi.responses import FileResponse, Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.requests import ClientDisconnect
+
+from beliefscope import __version__
+from beliefscope.app.api import tagged
+from beliefscope.app.library import Library, Selection
+from beliefscope.app.rrdabout import About
+from beliefscope.app.rrdfiles import ENDING, Recording, RrdFiles, disk
+from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.catalog import quick
+from beliefscope.inspect.likelihood import no_maps
+from beliefscope.recordings.describe import describe
+from beliefscope.recordings.write import write_recording
+
+LARGEST = 2 * 10**9  # bytes of a file that is added
+SPARED = 2 * 10**8  # bytes of the disk that adding files leaves free
+MAGIC = b"RRF"  # what Rerun's files begin with, of any version
+FREE_IN = 10**7  # bytes to which the free space is told, so that a list does not change all the time
+
+
+class RecordingRequest(BaseModel):
+    """Body of ``POST /api/recordings``; maps at every ``maps``-th step, none for 0."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    task: str
+    filter: str
+    episode: int
+    recipe: str = ""
+    data: str = ""
+    maps: Annotated[int, Field(ge=0)] = 0
+
+
+class ChangeRequest(BaseModel):
+    """Body of ``PATCH /api/recordings/{name}.rrd``: what is to be another."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    name: str | None = None
+    tags: list[str] | None = None
+
+
+def routes(library: Library, files: RrdFiles) -> APIRouter:
+    """Every route under ``/api/recordings``."""
+    router = APIRouter()
+    writing = threading.Lock()
+    runs = Runs(library)
+
+    @router.get("/api/recordings")
+    def list_recordings(request: Request) -> Response:
+        found, trash = files.all(), files.deleted()
+        tasks = runs.tasks()
+        free = disk(files.folder) // FREE_IN * FREE_IN
+        shown = {
+            "recordings": [_shown(one, *runs.of(one.about, tasks)) for one in found],
+            "deleted": [asdict(one) for one in trash],
+            "bytes": sum(one.bytes for one in found),
+            "free": free,
+            "largest": max(0, min(LARGEST, free - SPARED)),
+        }
+        body = json.dumps(shown).encode()
+        return tagged(request, hashlib.sha256(body).hexdigest()[:24], lambda: body, "application/json")
+
+    @router.post("/api/recordings", status_code=201)
+    def record(wanted: RecordingRequest, response: Response) -> dict[str, Any]:
+        started = time.perf_counter()
+        of = Selection(wanted.task, wanted.filter, wanted.episode, Recipe.parse(wanted.recipe), wanted.data)
+        traced = library.traced(of)
+        trace = traced.trace
+        # The name says all that the file depends on, so one that was made under it is this one.
+        depends = f"{traced.key} maps {wanted.maps} diagnostics version {__version__}"
+        parts = hashlib.sha256(depends.encode()).hexdigest()[:8]
+        made_as = f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}{ENDING}"
+        steps = range(0, len(trace), wanted.maps) if wanted.maps and not no_maps(traced.checkpoint, trace) else ()
+        with writing:
+            there = files.made_as(made_as)
+            path = there or files.unused(made_as)
+            if there is None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                maps = traced.maps(steps) if steps else None
+                write_recording(trace, path, maps, diagnostics=quick(trace, traced.checkpoint))
+                files.learn(path, About.of(describe(path), path), made_as)
+        if there:
+            response.status_code = 200
+        return {
+            "name": path.name,
+            "url": _url(path.name),
+            "bytes": path.stat().st_size,
+            "seconds": None if there else time.perf_counter() - started,
+        }
+
+    @router.get("/api/recordings/{name}.rrd")
+    def recording(name: str) -> Response:
+        path = files.path(name)
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    @router.put("/api/recordings/{name}.rrd", status_code=201)
+    async def add(name: str, request: Request) -> dict[str, Any]:
+        await asyncio.to_thread(files.free, name)
+        most = max(0, min(LARGEST, await asyncio.to_thread(disk, files.folder) - SPARED))
+        _fits(int(request.headers.get("content-length", 0)), most)
+        part = await asyncio.to_thread(files.part)
+        try:
+            await _receive(request, part, most)
+            about = await asyncio.to_thread(files.examine, part)
+            added = await asyncio.to_thread(files.add, part, name, about)
+            return await asyncio.to_thread(shown, added)
+        finally:
+            part.unlink(missing_ok=True)
+
+    @router.patch("/api/recordings/{name}.rrd")
+    def change(name: str, wanted: ChangeRequest) -> dict[str, Any]:
+        changed = files.one(name)
+        if wanted.tags is not None:
+            changed = files.tag(name, wanted.tags)
+        if wanted.name is not None:
+            changed = files.rename(name, wanted.name)
+        return shown(changed)
+
+    @router.delete("/api/recordings/{name}.rrd")
+    def delete(name: str) -> dict[str, str]:
+        return {"deleted": files.delete(name)}
+
+    @router.post("/api/recordings/deleted/{id}")
+    def restore(id: str) -> dict[str, Any]:
+        return shown(files.restore(id))
+
+    @router.delete("/api/recordings/deleted")
+    def empty() -> dict[str, int]:
+        freed = sum(one.bytes for one in files.deleted())
+        files.empty()
+        return {"freed": freed}
+
+    def shown(one: Recording) -> dict[str, Any]:
+        return _shown(one, *runs.of(one.about, runs.tasks()))
+
+    return router
+
+
+class Runs:
+    """Which of a server's own runs its recordings are of."""
+
+    def __init__(self, library: Library) -> None:
+        self._library = library
+        self._data: dict[tuple[str, int, str], str | None] = {}
+
+    def tasks(self) -> dict[str, Any]:
+        """Those of the catalog by name."""
+        return {task["name"]: task for task in self._library.catalog()["tasks"]}
+
+    def of(self, about: About | None, tasks: Mapping[str, Any]) -> tuple[dict[str, str] | None, str]:
+        """Names of filter and data set whose run this is, and why there is none. Tasks: as ``tasks`` gives them."""
+        if about is None or about.problem:
+            return None, "" if about is None else about.problem
+        assert about.task is not None
+        assert about.episode is not None
+        filters = tasks[about.task]["filters"] if about.task in tasks else ()
+        filter_ = next((one["name"] for one in filters if one["checkpoint_hash"] == about.checkpoint_hash), None)
+        settings = self._library.settings
+        if filter_ is None:
+            short = about.checkpoint_hash[:8]
+            why = f"Its filter, {about.filter} of {about.task} with checkpoint {short}, is not one of this server's."
+        elif about.edited:
+            why = "Some of its steps were edited by hand: the tab Compare runs it again."
+        elif about.seed != settings.seed:
+            why = f"It was run with seed {about.seed}; this server runs filters with seed {settings.seed}."
+        elif about.particles not in (None, settings.particles):
+            why = f"It was run with {about.particles} particles; this server's filters have {settings.particles}."
+        elif (data := self._data_set(tasks[about.task], about.episode, about.data_hash)) is None:
+            why = f"No data set of this server has its episode {about.episode}, {about.data_hash[:8]}."
+        else:
+            return {"filter": filter_, "data": data}, ""
+        return None, why
+
+    def _data_set(self, task: Mapping[str, Any], index: int, digest: str) -> str | None:
+        """Name of the one whose episode this is; looked for once, since data sets stay what they are."""
+        key = task["name"], index, digest
+        if key not in self._data:
+            self._data[key] = None
+            for data in task["data"]:
+                with suppress(BadInput):  # an episode that cannot be read is not this one
+                    _, episodes = self._library.dataset(task["name"], data["name"])
+                    if 0 <= index < len(episodes) and episodes[index].digest() == digest:
+                        self._data[key] = data["name"]
+                        break
+        return self._data[key]
+
+
+def _shown(one: Recording, run: dict[str, str] | None, why_not: str) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "url": _url(one.name),
+        "bytes": one.bytes,
+        "modified": datetime.fromtimestamp(one.modified, UTC).isoformat(timespec="seconds"),
+        "tags": one.tags,
+        "reading": one.about is None,
+        **asdict(one.about or About()),
+        "run": run,
+        "why_not": why_not,
+    }
+
+
+def _url(name: str) -> str:
+    return f"/api/recordings/{quote(name)}"
+
+
+def _fits(size: int, most: int) -> None:
+    if size > most:
+        raise HTTPException(413, f"The file has more than {most / 1e6:,.0f} MB, which is all that is taken here.")
+
+
+async def _receive(request: Request, part: Any, most: int) -> None:
+    """Writes a body to a file as it comes, and no more of it than may be."""
+    size, start = 0, b""
+    with part.open("xb") as file:
+        try:
+            async for chunk in request.stream():
+                size += len(chunk)
+                _fits(size, most)
+                if len(start) < len(MAGIC):
+                    start += chunk[: len(MAGIC)]
+                    if not MAGIC.startswith(start[: len(MAGIC)]):
+                        raise BadInput("This is not a Rerun recording: an .rrd file begins with RRF and a digit.")
+                await asyncio.to_thread(file.write, chunk)
+        except ClientDisconnect:
+            raise HTTPException(400, f"The file ended after {size} bytes.") from None
