@@ -3,31 +3,106 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
+import threading
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fastapi import APIRouter, HTTPException, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, Response
 
-from beliefscope.app.api import Asked
+from beliefscope.app.api import Asked, tagged
 from beliefscope.app.commands.given import serving
 from beliefscope.app.commands.report import trace_command
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.app.link import moment_link
+from beliefscope.app.trash import Deleted, Gone, Trash, size
 from beliefscope.app.work import Report
 from beliefscope.datasets.corrupt import Recipe
 from beliefscope.recordings.report import compose, write_report
 
 NAME = re.compile(r"[\w.+-]+-episode\d+-[0-9a-f]{8}")
 
+PAGE_POLICY = (
+    "sandbox allow-popups; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
+)
+"""What a report may do that is opened here: show itself, and have its links followed."""
+
+
+class Reports:
+    """The reports of a workspace. Methods may be called from any thread, and block."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._trash = Trash(folder)
+        self._lock = threading.Lock()
+        self._known: dict[str, tuple[int, dict[str, Any]]] = {}  # name -> (ns at which it was made, what it is)
+
+    def all(self) -> list[dict[str, Any]]:
+        """The newest first."""
+        with self._lock:
+            found = [
+                self._shown(path) for path in self.folder.glob("*/manifest.json") if NAME.fullmatch(path.parent.name)
+            ]
+        return sorted((one for one in found if one), key=lambda one: one["made"], reverse=True)
+
+    def page(self, name: str) -> Path:
+        """Raises Gone where there is no such report."""
+        path = self.folder / name / "report.html"
+        if not NAME.fullmatch(name) or path.parent.is_symlink() or not path.is_file():
+            raise Gone(f"Report {name!r} is not there, or no longer.")
+        return path
+
+    def delete(self, name: str) -> str:
+        """Into the trash; gives the id by which it is had back. Raises Gone."""
+        with self._lock:
+            return self._trash.put(self.page(name).parent)
+
+    def restore(self, id: str) -> str:
+        """Gives its name. Raises Gone, and Taken where it has been made again."""
+        with self._lock:
+            return self._trash.restore(id, self.folder).name
+
+    def deleted(self) -> list[Deleted]:
+        """The last first."""
+        with self._lock:
+            return self._trash.all()
+
+    def empty(self) -> None:
+        """Deletes for good what is in the trash."""
+        with self._lock:
+            self._trash.empty()
+
+    def _shown(self, manifest: Path) -> dict[str, Any] | None:
+        """What its manifest says, read once; None where that cannot be read."""
+        name = manifest.parent.name
+        with suppress(OSError, ValueError, LookupError, TypeError):
+            made = manifest.stat().st_mtime_ns
+            if name not in self._known or self._known[name][0] != made:
+                said = json.loads(manifest.read_bytes())
+                (run,) = said["traces"]
+                shown = {key: said[key] for key in ("title", "made", "task", "filter")}
+                shown |= {"episode": run["episode"], "recipe": str(Recipe.of(run["recipe"]))}
+                shown |= {"name": name, "url": f"/api/reports/{name}.html", "bytes": size(manifest.parent)}
+                self._known[name] = made, shown
+            return self._known[name][1]
+        return None
+
 
 def routes(library: Library, jobs: Jobs) -> APIRouter:
     """Every route under ``/api/reports``."""
     router = APIRouter()
-    reports = library.settings.workspace / "reports"
+    reports = Reports(library.settings.workspace / "reports")
+
+    @router.get("/api/reports")
+    def list_reports(request: Request) -> Response:
+        body = json.dumps({"reports": reports.all(), "deleted": [asdict(one) for one in reports.deleted()]}).encode()
+        return tagged(request, hashlib.sha256(body).hexdigest()[:24], lambda: body, "application/json")
 
     @router.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
     def make(asked: Asked, request: Request) -> dict[str, Job]:
@@ -43,18 +118,38 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
             "recipe": str(asked.recipe),
             "episode": asked.episode,
             "url": url,
-            "folder": str(reports / name),
+            "folder": str(reports.folder / name),
         }
         title = f"Report of {asked.filter}, {asked.task} episode {asked.episode}"
         title += f", {asked.recipe}" if asked.recipe else ""
+        before = jobs.find("report", key)
+        if before is not None and before.state == "done" and not (reports.folder / name).is_dir():
+            jobs.cancel(before.id)  # what it made was deleted: forget it, and make it again
         return {"job": jobs.submit("report", title, arguments, key, f"api/reports/{name}.html")}
 
     @router.get("/api/reports/{name}.html")
-    def page(name: str) -> Response:
-        path = reports / name / "report.html"
-        if not NAME.fullmatch(name) or not path.is_file():
-            raise HTTPException(404, f"Report {name!r} does not exist.")
-        return FileResponse(path, media_type="text/html; charset=utf-8", filename=f"{name}.html")
+    def page(name: str, shown: bool = False) -> Response:
+        path = reports.page(name)
+        way = "inline" if shown else "attachment"
+        answer = FileResponse(
+            path, media_type="text/html; charset=utf-8", filename=f"{name}.html", content_disposition_type=way
+        )
+        answer.headers["content-security-policy"] = PAGE_POLICY
+        return answer
+
+    @router.delete("/api/reports/{name}.html")
+    def delete(name: str) -> dict[str, str]:
+        return {"deleted": reports.delete(name)}
+
+    @router.post("/api/reports/deleted/{id}")
+    def restore(id: str) -> dict[str, str]:
+        return {"name": reports.restore(id)}
+
+    @router.delete("/api/reports/deleted")
+    def empty() -> dict[str, int]:
+        freed = sum(one.bytes for one in reports.deleted())
+        reports.empty()
+        return {"freed": freed}
 
     return router
 

@@ -33,5 +33,22 @@ def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
         assert "recipe=blackout%3D0.4" in page.text
         again = client.post("/api/reports/door/crossmodal-ekf/9", params={"data": "sample", "recipe": "blackout=0.4"})
         assert again.json()["job"]["state"] == "done", "what is there is not made again"
+        (listed,) = client.get("/api/reports").json()["reports"]
+        assert f"/{job['link']}" == listed["url"]
+        said = tuple(listed[key] for key in ("task", "filter", "episode", "recipe"))
+        assert said == ("door", "crossmodal-ekf", 9, "blackout=0.4")
+        shown = client.get(listed["url"], params={"shown": "true"})
+        assert shown.headers["content-disposition"].startswith("inline")
+        assert shown.headers["content-security-policy"].startswith("sandbox")
+        id = client.delete(listed["url"]).json()["deleted"]
+        assert client.get("/api/reports").json()["reports"] == []
+        assert client.get(listed["url"]).status_code == 404
+        restored = client.post(f"/api/reports/deleted/{id}").json()
+        assert restored == {"name": listed["name"]}
+        assert client.get("/api/reports").json() == {"reports": [listed], "deleted": []}
+        client.delete(listed["url"])
+        assert client.delete("/api/reports/deleted").json() == {"freed": listed["bytes"]}
+        again = client.post("/api/reports/door/crossmodal-ekf/9", params={"data": "sample", "recipe": "blackout=0.4"})
+        assert again.json()["job"]["state"] in ("waiting", "running"), "what was deleted is made again"
         assert client.get("/api/reports/door-nosuch-episode9-00000000.html").status_code == 404
         assert client.post("/api/reports/door/nosuch/9").status_code in (400, 404)
