@@ -166,17 +166,29 @@ class Foreign(Checkpoint):
             raise BadInput(f"{self.source} fails at {where}: {type(error).__name__}: {what}") from error
 
     def _names(self, values: Values, models: tuple[int, ...]) -> tuple[str, ...]:
-        """Of the measurement models: as given, after the task's modalities where there are as many, or numbered."""
-        counts = [values[name].shape[2] for name, shape in SHAPES.items() if shape[0] == "K" and name in values]
-        count, given, task = max(counts, default=0), tuple(self.adapter.modalities), tuple(self._task.modalities)
-        for names in (given, task):
-            if count and len(names) > count == len(models):
-                return tuple(names[k] for k in models)
-            if count and len(names) == count:
-                return names
-        if given and count:
-            raise BadInput(f"{self.source} names {len(given)} modalities, {', '.join(given)}, but has {count}")
-        return ("+".join(task),) if count == 1 else tuple(f"model-{k + 1}" for k in range(count))
+        return model_names(values, 2, self.adapter.modalities, self._task, models, self.source)
+
+
+def model_names(
+    values: Values, axis: int, given: Sequence[str], task: Task, models: Sequence[int] = (), who: str = "the filter"
+) -> tuple[str, ...]:
+    """Of the measurement models: as given, after the task's modalities where there are as many, or numbered.
+
+    Args:
+        axis: of the values along which they lie. models: which of all took part, where not all did.
+
+    Raises BadInput where there are others than the given.
+    """
+    counts = [values[name].shape[axis] for name, shape in SHAPES.items() if shape[0] == "K" and name in values]
+    count, given, known = max(counts, default=0), tuple(given), tuple(task.modalities)
+    for names in (given, known):
+        if count and len(names) > count == len(models):
+            return tuple(names[k] for k in models)
+        if count and len(names) == count:
+            return names
+    if given and count:
+        raise BadInput(f"{who} names {len(given)} modalities, {', '.join(given)}, but has {count}")
+    return ("+".join(known),) if count == 1 else tuple(f"model-{k + 1}" for k in range(count))
 
 
 def load_foreign(source: str, task: str = "", unsaid: str = "") -> Foreign:

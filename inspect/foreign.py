@@ -56,15 +56,16 @@ def trace_foreign(
         seed=seed,
         recipe=recipe,
         settings=settings,
-        **(_unknown(len(episode), len(modalities), len(foreign.task.components), arrays) | arrays),
+        **with_unknown(arrays, len(modalities)),
     )
 
 
-def _unknown(steps: int, k: int, n: int, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """NaN for what every trace has."""
+def with_unknown(arrays: Mapping[str, NDArray[Any]], k: int) -> dict[str, NDArray[Any]]:
+    """The arrays by name, and NaN for what every trace has of K models and is not among them."""
+    steps, n = arrays["estimate_mean"].shape
     shapes = {
         "estimate_covariance": (steps, n, n),
         "modality_mean": (steps, k, n),
         "modality_covariance": (steps, k, n, n),
     }
-    return {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items() if name not in arrays}
+    return {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items()} | dict(arrays)

@@ -198,14 +198,21 @@ class GrowingReader:
             first, self._given = self._given, self.poll()
             return self.part(first, self._given)
 
-    def part(self, first: int, last: int | None = None) -> Trace:
-        """Steps ``first`` to ``last - 1`` of those that are known; nothing is kept. Raises BadInput for others."""
+    def part(self, first: int, last: int | None = None, stride: int = 1) -> Trace:
+        """Steps ``first`` to ``last - 1`` of those that are known, or every so many-th of them; nothing is kept.
+
+        Raises BadInput for others.
+        """
         with self._lock:
             last = self.steps if last is None else last
             if not 0 <= first <= last <= self.steps:
                 raise BadInput(f"steps {first} to {last} are not in {self._name}: it has {self.steps}")
-            arrays = {name: np.empty((last - first, *shape), kind) for name, (shape, kind) in self._shapes.items()}
-            self._fill(arrays, first, last)
+            steps = range(first, last, stride)
+            arrays = {name: np.empty((len(steps), *shape), kind) for name, (shape, kind) in self._shapes.items()}
+            if stride == 1:
+                self._fill(arrays, first, last)
+            for at, step in enumerate(steps if stride > 1 else ()):
+                self._fill({name: array[at : at + 1] for name, array in arrays.items()}, step, step + 1)
             return self._trace(arrays)
 
     def trace(self) -> Trace:

@@ -16,6 +16,7 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from beliefscope.datasets.corrupt import WHOLE, Recipe
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
@@ -26,6 +27,7 @@ from beliefscope.filters.foreign import Foreign
 from beliefscope.filters.pf import ParticleFilter
 from beliefscope.filters.resample import effective_sample_size
 from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.inspect.intact import check_intact
 
 Array = NDArray[np.float32]
 FORMAT = 1
@@ -148,6 +150,37 @@ def trace(
         from beliefscope.inspect.foreign import trace_foreign  # which builds upon this module
 
         return trace_foreign(checkpoint, episode, episode_index, seed, recipe, progress)
+    run = begin(checkpoint, episode, episode_index, seed, particles, recipe)
+    result = rollout(
+        checkpoint.filter, run.evidence, run.start, run.generator(), particles, keep=True, progress=progress
+    )
+    return assemble(checkpoint, run.episode, run.start, run.evidence, result.steps, **run.given)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of one of our filters over an episode, before its first step.
+
+    Attributes:
+        episode: as the filter is given it. start: its belief before step 0, N = 1. evidence: of all steps.
+        given: fields of the trace that say where it comes from.
+    """
+
+    episode: Episode
+    start: Gaussian
+    evidence: Evidence
+    given: Mapping[str, Any]
+
+    def generator(self) -> torch.Generator:
+        """Of all its random numbers."""
+        return torch.Generator().manual_seed(self.given["seed"])
+
+
+@torch.no_grad()
+def begin(
+    checkpoint: Checkpoint, episode: Episode, episode_index: int, seed: int, particles: int, recipe: Recipe
+) -> Run:
+    """Args and errors: as ``trace``."""
     if particles < 1:
         raise BadInput(f"particles must be at least 1, not {particles}")
     if episode.task != checkpoint.task.name:
@@ -155,26 +188,11 @@ def trace(
             f"filter {checkpoint.name!r} is for task {checkpoint.task.name!r}, the episode is of {episode.task!r}"
         )
     filter_ = checkpoint.filter
-    data_hash = episode.digest()
+    given = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "recipe": recipe}
     episode = recipe.apply(episode, seed)
     batch = Steps.of(filter_.task, [episode]).episode(0)
-    evidence = filter_.encode(batch)
-    start = start_at_truth(filter_, batch)
-    result = rollout(
-        filter_, evidence, start, torch.Generator().manual_seed(seed), particles, keep=True, progress=progress
-    )
-    return assemble(
-        checkpoint,
-        episode,
-        start,
-        evidence,
-        result.steps,
-        data_hash=data_hash,
-        episode_index=episode_index,
-        seed=seed,
-        recipe=recipe,
-        settings={"particles": particles, "torch": torch.__version__},
-    )
+    settings = {"particles": particles, "torch": torch.__version__}
+    return Run(episode, start_at_truth(filter_, batch), filter_.encode(batch), given | {"settings": settings})
 
 
 def assemble(
@@ -321,8 +339,8 @@ def load_trace(path: Path) -> Trace:
         with safe_open(path, framework="np") as file:
             metadata = file.metadata() or {}
             arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-        header = json.loads(metadata.get("beliefscope-trace", "null"))
-    except (SafetensorError, OSError, ValueError) as error:
+        header = read_json(metadata.get("beliefscope-trace", "null"))
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise BadInput(f"{str(path)!r} is not a readable trace: {error}") from None
     if not isinstance(header, dict):
         raise BadInput(f"{str(path)!r} is a safetensors file, but not a trace of Beliefscope")
@@ -330,12 +348,15 @@ def load_trace(path: Path) -> Trace:
         raise BadInput(f"{str(path)!r} is a trace of another format; this version reads format {FORMAT}")
     try:
         return trace_of(header, arrays)
-    except (KeyError, TypeError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise BadInput(f"{str(path)!r} is not a whole trace: {error}") from None
 
 
 def trace_of(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> Trace:
-    """What ``header_of`` and ``arrays_of`` were made of. Raises KeyError or TypeError where that does not fit."""
+    """What ``header_of`` and ``arrays_of`` were made of.
+
+    Raises AttributeError, KeyError, TypeError or ValueError, BadInput among them, where that does not fit.
+    """
     of_episode: dict[str, Any] = {
         name.removeprefix("episode/"): a for name, a in arrays.items() if name.startswith("episode/")
     }
@@ -347,7 +368,9 @@ def trace_of(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> Trace:
     )
     said = {name: value for name, value in header.items() if name not in ("format", "episode")}
     said |= {"modalities": tuple(said["modalities"]), "recipe": stored_recipe(said.get("recipe"), said["settings"])}
-    return Trace(**said, episode=episode, **{n: a for n, a in arrays.items() if not n.startswith("episode/")})
+    found = Trace(**said, episode=episode, **{n: a for n, a in arrays.items() if not n.startswith("episode/")})
+    check_intact(found)
+    return found
 
 
 def stored_recipe(recipe: Any, settings: Mapping[str, Any]) -> Recipe:
