@@ -56,8 +56,9 @@ def routes(library: Library, views: Views) -> APIRouter:
         return {"status": "ok", "version": __version__}
 
     @router.get("/api/catalog")
-    def catalog() -> dict[str, Any]:
-        return {"version": __version__, "faults": described(), **library.catalog()}
+    def catalog(request: Request) -> dict[str, Any]:
+        about = {"version": __version__, "read_only": request.app.state.read_only, "faults": described()}
+        return {**about, **library.catalog()}
 
     @router.get("/api/trace/{task}/{filter}/{episode}")
     def trace_header(asked: OfTwo) -> Response:

@@ -19,10 +19,14 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
+from beliefscope import __version__
 from beliefscope.app import compare, diagnostics, failures, finetune, jobs, recordings, reports, study
+from beliefscope.app.access import LOOPBACK, OPEN, VARIABLE, Access, names_of
 from beliefscope.app.api import routes
 from beliefscope.app.children import with_children
 from beliefscope.app.library import Library, Settings
+from beliefscope.app.logs import no_false_alarm
+from beliefscope.app.patience import CONNECTIONS, HEAD, PatientProtocol
 from beliefscope.app.rrdfiles import RrdFiles
 from beliefscope.app.security import Guard
 from beliefscope.app.session import Views
@@ -38,14 +42,17 @@ PAGE = Path(__file__).parent / "page"
 log = logging.getLogger("beliefscope.app")
 
 
-def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> FastAPI:
+def create_app(settings: Settings, warm: bool = True, apart: bool = False, access: Access = OPEN) -> FastAPI:
     """The application; it starts no thread before its lifespan begins and leaves none behind when that ends.
 
     Args:
         settings: what to show and where to keep things.
         warm: prepare the first page's trace and Rerun's viewer in the background at the start.
         apart: run the filters in a process of their own; else a thread does.
+        access: what whoever asks has to bring, and whether they may change anything.
     """
+    with contextlib.suppress(FileExistsError):  # what is wrong with it is said by who needs it
+        settings.workspace.mkdir(mode=0o700, parents=True)
     tracer = Tracer() if apart else None
     library = Library(with_children(settings), tracer)
     views = Views(library)
@@ -73,6 +80,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> Fa
 
     app = FastAPI(title="Beliefscope", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     app.state.library, app.state.views, app.state.jobs = library, views, work
+    app.state.read_only = access.read_only
     for router in (
         routes(library, views),
         jobs.routes(work),
@@ -86,14 +94,13 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False) -> Fa
     ):
         app.include_router(router)
     _add_files(app, rerun)
-    app.add_middleware(Guard, hosts=settings.hosts)
+    app.add_middleware(Guard, hosts=settings.hosts, access=access)
     app.add_exception_handler(BadInput, _say(400))
     app.add_exception_handler(jobs.QueueFull, _say(429))
     app.add_exception_handler(Gone, _say(404))
     app.add_exception_handler(Taken, _say(409))
     app.add_exception_handler(RequestValidationError, _say(422))
     app.add_exception_handler(HTTPException, _say(None))
-    app.add_exception_handler(Exception, _say(500))
     return app
 
 
@@ -102,36 +109,58 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8000,
     listening: Callable[[str], None] | None = None,
+    access: Access = OPEN,
 ) -> None:
     """Serve until SIGINT or SIGTERM, on one port.
 
     Args:
         settings: see ``create_app``.
         host, port: address to listen on; port 0 takes any free one.
-        listening: called with the URL once connections are accepted; the default prints it.
+        listening: called with the URL that opens the page, token included, once connections are accepted; the default
+            prints it.
+        access: see ``create_app``; a host that others can reach demands a token.
 
-    Raises BadInput when the address cannot be had, or something given cannot be shown.
+    Raises BadInput when the address cannot be had or may not be listened on, or something given cannot be shown.
     """
     if listening is None:
         listening = _print_url
+    if host not in LOOPBACK and not access.token:
+        raise BadInput(f"Others can reach {host}: a server there needs a token, in Access or in {VARIABLE}.")
     with _bound(host, port) as listener:  # first of all: without an address nothing is to be made
-        app = create_app(settings, apart=True)
+        app = create_app(settings, apart=True, access=access)
         problems = app.state.library.problems()
         if problems:
             raise BadInput("; ".join(problems))
-        shown = f"[{host}]" if ":" in host else host
-        url = f"http://{shown}:{listener.getsockname()[1]}/"
-        logging.getLogger("uvicorn.error").addFilter(_no_false_alarm)
+        shown = names_of(host)[0]
+        url = f"http://{f'[{shown}]' if ':' in shown else shown}:{listener.getsockname()[1]}/"
+        logging.getLogger("uvicorn.error").addFilter(no_false_alarm)
         config = uvicorn.Config(
             app,
+            http=PatientProtocol,
+            limit_concurrency=CONNECTIONS,
+            h11_max_incomplete_event_size=HEAD,
+            proxy_headers=False,  # anyone on this machine could write them
+            log_config=None,
             log_level="warning",
             access_log=False,
             server_header=False,
             ws_per_message_deflate=False,  # deflate takes binary messages from 300 to 12 MB/s
             timeout_graceful_shutdown=3,
         )
+
+        def started() -> None:
+            about = {
+                "url": url,
+                "version": __version__,
+                "asks_for_token": bool(access.token),
+                "read_only": access.read_only,
+            }
+            log.info("started", extra={"event": about})
+            listening(access.link(url))
+
         with _signals_end_in_peace():
-            _Server(config, lambda: listening(url)).run(sockets=[listener])
+            _Server(config, started).run(sockets=[listener])
+        log.info("stopped", extra={"event": {"url": url}})
 
 
 class _Server(uvicorn.Server):
@@ -228,11 +257,6 @@ def _signals_end_in_peace() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _no_false_alarm(record: logging.LogRecord) -> bool:
-    """uvicorn calls a WebSocket that was refused with an answer one that was not answered."""
-    return record.getMessage() != "ASGI callable returned without completing handshake."
 
 
 def _print_url(url: str) -> None:

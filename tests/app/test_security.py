@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
+import re
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
+from starlette.exceptions import HTTPException
 from starlette.testclient import TestClient, WebSocketDenialResponse
-from starlette.types import Scope
+from starlette.types import Receive, Scope, Send
 
-from beliefscope.app.security import Guard
+from beliefscope.app import security
+from beliefscope.app.security import MAX_BODY, Guard
 from beliefscope.app.server import Settings, create_app
+
+JSON = {"content-type": "application/json"}
 
 
 async def _nothing(*_: object) -> None:
@@ -22,11 +29,17 @@ def scope(host: str, origin: str | None = None, method: str | None = "GET") -> S
     return kind | {"headers": headers, "path": "/"}
 
 
+def problem(guard: Guard, asked: Scope) -> str:
+    """Why it is not passed on; empty where it is."""
+    reply = guard.reply(asked)
+    return "" if reply is None else reply.reason
+
+
 @pytest.mark.parametrize(
     "host", ["localhost", "localhost:8000", "LOCALHOST:1", "127.0.0.1:9", "[::1]:8000", "lab:8000"]
 )
 def test_a_known_name_at_any_port_may_read(host: str) -> None:
-    assert Guard(_nothing, ["lab"]).problem(scope(host)) is None
+    assert problem(Guard(_nothing, ["lab"]), scope(host)) == ""
 
 
 @pytest.mark.parametrize(
@@ -34,7 +47,7 @@ def test_a_known_name_at_any_port_may_read(host: str) -> None:
     ["evil.example", "evil.example:8000", "localhost.evil.example", "127.0.0.1.evil.example", "[::2]", "", "lab"],
 )
 def test_another_name_may_not_even_read(host: str) -> None:
-    assert "is not answered here" in (Guard(_nothing).problem(scope(host)) or "")
+    assert "is not answered here" in problem(Guard(_nothing), scope(host))
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", None])
@@ -44,17 +57,17 @@ def test_another_name_may_not_even_read(host: str) -> None:
 )
 def test_what_changes_something_comes_from_our_own_page(method: str | None, origin: str | None) -> None:
     guard = Guard(_nothing)
-    assert "Origin" in (guard.problem(scope("localhost:8000", origin, method)) or "")
-    assert guard.problem(scope("localhost:8000", "http://localhost:8000", method)) is None
+    assert "Origin" in problem(guard, scope("localhost:8000", origin, method))
+    assert problem(guard, scope("localhost:8000", "http://localhost:8000", method)) == ""
 
 
 def test_two_hosts_are_none() -> None:
     both = scope("localhost") | {"headers": [(b"host", b"localhost"), (b"host", b"evil.example")]}
-    assert Guard(_nothing).problem(both) is not None
+    assert "one Host" in problem(Guard(_nothing), both)
 
 
 def test_an_ipv6_name_is_known_by_its_brackets() -> None:
-    assert Guard(_nothing, ["fe80::1"]).problem(scope("[fe80::1]:8000")) is None
+    assert problem(Guard(_nothing, ["fe80::1"]), scope("[fe80::1]:8000")) == ""
 
 
 def test_a_refusal_says_why(client: TestClient) -> None:
@@ -79,22 +92,105 @@ def test_sockets_are_guarded_too(client: TestClient, path: str) -> None:
         assert refused.value.json()["error"]
 
 
-def test_every_answer_has_the_security_headers(client: TestClient) -> None:
-    for path in ("/healthz", "/api/catalog", "/nowhere", "/api/trace/door/none/0"):
+ALWAYS = {
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "origin-agent-cluster": "?1",
+}
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/healthz", "/api/catalog", "/nowhere", "/api/trace/door/none/0", "/static/main.js"]
+)
+def test_every_answer_has_the_security_headers(client: TestClient, path: str) -> None:
+    headers = client.get(path).headers
+    assert {name: headers.get(name) for name in ALWAYS} == ALWAYS
+    assert "camera=()" in headers["permissions-policy"]
+    assert "microphone=()" in headers["permissions-policy"]
+    assert "server" not in headers
+    policy = headers["content-security-policy"]
+    assert "http" not in policy, "nothing comes from other hosts"
+    assert "'unsafe-eval'" not in policy
+
+
+def test_a_refusal_has_them_too(client: TestClient) -> None:
+    headers = client.get("/healthz", headers={"Host": "evil.example"}).headers
+    assert {name: headers.get(name) for name in ALWAYS} == ALWAYS
+
+
+def test_nobody_frames_the_page_and_only_the_page_the_scene(client: TestClient) -> None:
+    scene = client.post("/api/views").json()["scene"]
+    for path, ancestors, framed in (
+        ("/", "'none'", "DENY"),
+        ("/api/jobs", "'none'", "DENY"),
+        (scene, "'self'", "SAMEORIGIN"),
+    ):
         headers = client.get(path).headers
-        assert headers["x-content-type-options"] == "nosniff"
-        assert headers["cross-origin-resource-policy"] == "same-origin"
-        policy = headers["content-security-policy"]
-        assert "connect-src 'self';" in policy
-        assert "frame-ancestors 'self'" in policy
-        assert "script-src 'self' 'wasm-unsafe-eval';" in policy
+        assert f"frame-ancestors {ancestors};" in headers["content-security-policy"]
+        assert headers["x-frame-options"] == framed
 
 
 def test_only_the_scene_may_run_inline_scripts(client: TestClient) -> None:
     scene = client.post("/api/views").json()["scene"]
-    policy = client.get(scene).headers["content-security-policy"]
-    assert "script-src 'self' 'unsafe-inline'" in policy
-    assert "frame-ancestors 'self'" in policy
+    assert "script-src 'self' 'unsafe-inline'" in client.get(scene).headers["content-security-policy"]
+    assert "script-src 'self' 'wasm-unsafe-eval';" in client.get("/").headers["content-security-policy"]
+
+
+def test_numbers_and_files_are_inert_as_pages(client: TestClient) -> None:
+    for path in ("/api/catalog", "/static/icon.svg", "/vendor/rerun/viewer.js"):
+        policy = client.get(path).headers["content-security-policy"]
+        assert policy.startswith("default-src 'none';")
+        assert policy.endswith("sandbox")
+
+
+def test_a_body_is_no_larger_than_it_need_be(client: TestClient) -> None:
+    def chunks() -> Iterator[bytes]:
+        for _ in range(20):
+            yield b" " * (MAX_BODY // 10)
+
+    for body in (b" " * (MAX_BODY + 1), chunks()):
+        answer = client.post("/api/recordings", content=body, headers={"content-type": "application/json"})
+        assert answer.status_code == 413
+        assert str(MAX_BODY) in answer.json()["error"]
+    assert client.post("/api/views", content=b" " * 1000 + b'{"dark": true}', headers=JSON).status_code == 201
+
+
+def test_a_body_that_never_ends_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(security, "PATIENCE", 0.01)
+
+    async def body() -> dict[str, object]:
+        await asyncio.sleep(10.0)
+        return {}
+
+    async def reads(scope: Scope, receive: Receive, send: Send) -> None:
+        with pytest.raises(HTTPException) as error:
+            await receive()
+        assert error.value.status_code == 408
+
+    sent: list[object] = []
+
+    async def send(message: object) -> None:
+        sent.append(message)
+
+    asked = scope("localhost", "http://localhost", "POST")
+    asyncio.run(Guard(reads)(asked, body, send))  # type: ignore[arg-type]
+    assert not sent
+
+
+def test_what_fails_is_told_with_a_mark_that_the_log_has_too(caplog: pytest.LogCaptureFixture) -> None:
+    async def fails(scope: Scope, receive: Receive, send: Send) -> None:
+        raise ZeroDivisionError("at the wrong moment")
+
+    answer = TestClient(Guard(fails), base_url="http://localhost").get("/")
+    assert answer.status_code == 500
+    mark = re.fullmatch(r"at the wrong moment \(error ([0-9a-f]{8})\)", answer.json()["error"])
+    assert mark
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    (record,) = caplog.records
+    assert record.event["error"] == mark[1]  # type: ignore[attr-defined]
+    assert record.exc_info
 
 
 def test_a_given_name_is_answered(settings: Settings) -> None:

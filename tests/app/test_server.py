@@ -15,6 +15,7 @@ import pytest
 from starlette.requests import Request
 from starlette.testclient import TestClient
 
+from beliefscope.app.access import Access
 from beliefscope.app.server import Settings, _bound, serve
 from beliefscope.app.vendor import RerunViewer, installed, without_names
 from beliefscope.datasets.errors import BadInput
@@ -102,7 +103,7 @@ def test_small_messages_are_not_held_back() -> None:
 @pytest.mark.parametrize(("host", "port"), [("nowhere.invalid", 8000), ("127.0.0.1", 70000)])
 def test_an_impossible_address_is_one_clear_line(settings: Settings, host: str, port: int) -> None:
     with pytest.raises(BadInput, match=f"Cannot listen on {host} port {port}: "):
-        serve(settings, host=host, port=port)
+        serve(settings, host=host, port=port, access=Access("a token of this test"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
