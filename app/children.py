@@ -8,7 +8,10 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from beliefscope.app.library import Library, Settings
+from beliefscope.datasets.document import read_json
 from beliefscope.filters.checkpoint import load_checkpoint, write_atomically
 
 FILE = "kept.json"
@@ -24,10 +27,13 @@ class Child:
     default: bool
 
 
+RECORDS = TypeAdapter(list[Child])
+
+
 def read(workspace: Path) -> list[Child]:
     """Those whose files are still there; of a file that cannot be read, none."""
     with suppress(OSError, ValueError, TypeError):
-        found = [Child(**one) for one in json.loads((workspace / FILE).read_bytes())]
+        found = RECORDS.validate_python(read_json((workspace / FILE).read_bytes()))
         return [one for one in found if Path(one.path).is_file()]
     return []
 

@@ -7,12 +7,13 @@ import json
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Body, HTTPException
+from pydantic import TypeAdapter
 
 from beliefscope.app import children
 from beliefscope.app.children import Child
@@ -21,6 +22,7 @@ from beliefscope.app.jobs import UNDER_WAY, Job, Jobs
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.link import beside, moment_link
 from beliefscope.app.work import Report
+from beliefscope.datasets.document import read_json
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
 from beliefscope.filters.finetune import FineTune, finetune
 from beliefscope.filters.foreign import Foreign
@@ -36,6 +38,21 @@ TUNING = 0.8
 """Share of a job that is training; the rest is holding the child against its parent."""
 
 PAUSE = 0.3  # s between two writings of how a run goes
+
+
+@dataclass(frozen=True)
+class Run:
+    """What was asked for, as ``run.json`` has it. run: its name and its folder's. asked: s since 1970."""
+
+    run: str
+    task: str
+    filter: str
+    data: str
+    settings: dict[str, Any]
+    asked: float
+
+
+RUN = TypeAdapter(Run)
 
 Act = Literal["accept", "keep", "roll-back"]
 
@@ -227,8 +244,13 @@ def _folder(library: Library, run: str) -> Path:
 
 def _runs(library: Library) -> list[dict[str, Any]]:
     """All that were asked for in this workspace, the newest first."""
-    found = map(_read, (library.settings.workspace / "finetune").glob("*/run.json"))
-    return sorted(filter(None, found), key=lambda run: -run["asked"])
+    found = []
+    for path in (library.settings.workspace / "finetune").glob("*/run.json"):
+        with suppress(ValueError):  # no run of ours
+            run = RUN.validate_python(_read(path))
+            if run.run == path.parent.name:
+                found.append(asdict(run))
+    return sorted(found, key=lambda run: -run["asked"])
 
 
 def _known(library: Library, run: str) -> dict[str, Any]:
@@ -252,8 +274,8 @@ def _shown(library: Library, jobs: Jobs, about: Mapping[str, Any]) -> dict[str, 
 def _read(path: Path) -> dict[str, Any] | None:
     """JSON; None where it is not there."""
     with suppress(OSError, ValueError):
-        found: dict[str, Any] = json.loads(path.read_bytes())
-        return found
+        found: dict[str, Any] = read_json(path.read_bytes())
+        return found if isinstance(found, dict) else None
     return None
 
 

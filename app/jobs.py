@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import shutil
 import signal
@@ -24,9 +25,11 @@ from typing import Any, Literal
 
 from fastapi import APIRouter, HTTPException
 from fastapi.responses import FileResponse, JSONResponse, Response
+from pydantic import TypeAdapter
 
 from beliefscope import __version__
 from beliefscope.app.work import how_it_ended
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import write_atomically
 
@@ -44,6 +47,7 @@ LOG_TAIL = 8000  # bytes
 
 State = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
 UNDER_WAY = ("waiting", "running")
+log = logging.getLogger("beliefscope.app")
 
 
 class QueueFull(BadInput):
@@ -73,6 +77,9 @@ class Job:
     ended: float | None = None
     server: int = 0
     link: str = ""
+
+
+RECORD = TypeAdapter(Job)
 
 
 class Jobs:
@@ -148,7 +155,10 @@ class Jobs:
                 raise QueueFull(f"{len(self._queue)} jobs wait already, no more are taken: cancel one, or wait")
             folder = self._folder / id
             shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(parents=True)
+            try:
+                folder.mkdir(parents=True)
+            except OSError as error:
+                raise BadInput(f"cannot write {str(folder)!r}: {error.strerror}") from None
             write_atomically(folder / "arguments.json", json.dumps(arguments).encode())
             self._put(Job(id, kind, title, asked=time.time(), server=os.getpid(), link=link))
             self._queue.append(id)
@@ -189,7 +199,10 @@ class Jobs:
     def _put(self, job: Job, write: bool = True) -> None:
         self._jobs[job.id] = job
         if write:
-            write_atomically(self._folder / job.id / "job.json", json.dumps(asdict(job)).encode())
+            try:
+                write_atomically(self._folder / job.id / "job.json", json.dumps(asdict(job)).encode())
+            except BadInput as error:  # a full disk, or a folder that is gone: only a later server misses it
+                log.warning("Job %s is not kept: %s", job.id, error)
 
     def _forget(self, id: str) -> None:
         del self._jobs[id]
@@ -204,12 +217,12 @@ class Jobs:
             id = self._queue.popleft()
             job = self._jobs[id]
             # A session of its own: Ctrl-C in the terminal is for the server, and what a job starts ends with it.
-            with (self._folder / id / "log.txt").open("wb") as log:
+            with (self._folder / id / "log.txt").open("wb") as said:
                 process = subprocess.Popen(
                     [sys.executable, "-P", "-m", "beliefscope.app.work", self._kinds[job.kind], self._folder / id],
                     stdin=subprocess.PIPE,  # when it closes, its server is gone
                     stdout=subprocess.PIPE,
-                    stderr=log,
+                    stderr=said,
                     start_new_session=True,
                     env=os.environ | {"OMP_NUM_THREADS": "1"},
                 )
@@ -313,18 +326,18 @@ def _read_all(folder: Path) -> list[Job]:
     for path in folder.glob("*/job.json"):
         # A file that cannot be read, or is of another version, is no job of ours.
         with suppress(OSError, ValueError, TypeError):
-            job = Job(**json.loads(path.read_bytes()))
+            job = RECORD.validate_python(read_json(path.read_bytes()))
             if job.id == path.parent.name and not (job.state in UNDER_WAY and _lives_elsewhere(job.server)):
                 found.append(job)
     return found
 
 
 def _lives_elsewhere(pid: int) -> bool:
-    if pid in (0, os.getpid()):
+    if pid <= 0 or pid == os.getpid():
         return False
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True

@@ -25,6 +25,7 @@ from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.push_real import RATE, observed
 from beliefscope.datasets.simulate import hand_controls
+from beliefscope.datasets.stored import numbers
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -244,7 +245,10 @@ class AuthorsFiles(Dataset):
     def _array(self, source: _Source, key: str, steps: int | None) -> NDArray[Any]:
         """(T, ...) float32, checked; ``steps`` None takes any T of at least 1."""
         shape = self._layout.keys[key]
-        stored = source.group.get(key) if isinstance(source.group, h5py.Group) else None
+        try:
+            stored = source.group.get(key) if isinstance(source.group, h5py.Group) else None
+        except DAMAGE as error:
+            raise BadInput(f"{source.place}: {key!r} cannot be read: {reason(error)}.") from None
         if not isinstance(stored, h5py.Dataset):
             expected = ", ".join(self._layout.keys)
             raise BadInput(f"{source.place} has no {key!r}; expected the keys {expected}.")
@@ -256,7 +260,9 @@ class AuthorsFiles(Dataset):
             first = next(iter(self._layout.keys))
             raise BadInput(f"{place} has {len(stored)} steps, {first!r} has {steps}; expected as many.")
         try:
-            array = np.asarray(stored[()], np.float32)
+            array = np.asarray(numbers(stored, place), np.float32)
+        except BadInput:
+            raise
         except DAMAGE as error:
             raise BadInput(f"{place} cannot be read: {reason(error)}.") from None
         if not np.isfinite(array).all():
@@ -280,13 +286,17 @@ def _picture(source: _Source, image: NDArray[Any]) -> NDArray[np.uint8]:
 
 def _gray(path: Path, group: h5py.Group) -> tuple[float, float]:
     """Values of black and white by the range of one trajectory's pictures: -1 to 1, 0 to 1, or 0 to 255."""
-    stored = group.get("image")
-    if not isinstance(stored, h5py.Dataset) or not stored.size:
-        return 0.0, 255.0
+    place = f"{path}: 'image' of {group.name[1:]}"
     try:
-        low, high = float(np.nanmin(stored[()])), float(np.nanmax(stored[()]))
+        stored = group.get("image")
+        if not isinstance(stored, h5py.Dataset) or not stored.size:
+            return 0.0, 255.0
+        values = numbers(stored, place)
+    except BadInput:
+        raise
     except DAMAGE as error:
-        raise BadInput(f"{path}: 'image' of {group.name[1:]} cannot be read: {reason(error)}.") from None
+        raise BadInput(f"{place} cannot be read: {reason(error)}.") from None
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if low < 0:
         return -1.0, 1.0
     return (0.0, 1.0) if high <= 1 else (0.0, 255.0)

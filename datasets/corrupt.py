@@ -7,7 +7,6 @@ first parameter's, the others are named; commas divide faults.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.faults import FAULTS, Fault, Readings, parameters
@@ -47,9 +47,10 @@ class Recipe:
         """From its text, ``blackout=0.4,delay=image:steps=3``, or from JSON as text. Raises BadInput as ``of`` does."""
         if text.lstrip().startswith(("{", "[")):
             try:
-                return cls.of(json.loads(text))
-            except (json.JSONDecodeError, RecursionError) as error:
+                document = read_json(text)
+            except ValueError as error:
                 raise BadInput(f"recipe is not JSON: {error}") from None
+            return cls.of(document)
         return cls(tuple(_read(part.strip()) for part in text.split(",")) if text.strip() else ())
 
     def to_json(self) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from beliefscope.datasets.task import Task
 
 SPLITS = ("train", "val", "test")
 
-DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
+DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
 """What h5py raises on meeting a damaged file. BadInput is a ValueError too."""
 
 

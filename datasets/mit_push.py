@@ -29,6 +29,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.push_real import CENTRE, OUTLINES, TOUCHING, gap, observed, pictures
 from beliefscope.datasets.simulate import hand_controls
+from beliefscope.datasets.stored import numbers
 from beliefscope.datasets.task import Task
 
 Array = NDArray[np.float64]
@@ -170,9 +171,16 @@ def _content(path: Path) -> dict[str, object]:
             read = json.loads(path.read_bytes())
         else:
             with h5py.File(path) as file:
-                read = {key: file[key][()] for key in KEYS if isinstance(file.get(key), h5py.Dataset)}
+                found = {key: file.get(key) for key in KEYS}
+                read = {
+                    key: numbers(stored, f"{path}: {key!r}")
+                    for key, stored in found.items()
+                    if isinstance(stored, h5py.Dataset)
+                }
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise BadInput(f"{path} is not JSON or cut short: {error}.") from None
+    except BadInput:
+        raise
     except DAMAGE as error:
         raise damaged(path, error) from None
     if not isinstance(read, Mapping):
@@ -188,7 +196,7 @@ def _stream(path: Path, key: str, rows: object) -> Array:
     place = f"{path}: {key!r}"
     try:
         stream = np.asarray(rows, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         stream = np.zeros(0)
     if stream.ndim != 2 or stream.shape[1] != 4:
         raise BadInput(f"{place} is not a list of rows of 4 numbers, all as long as each other: time, x, y, angle.")

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from beliefscope.datasets.authors import AuthorsFiles, is_authors
 from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.dataset import DAMAGE, SPLITS, Dataset, EpisodeSummary, damaged, reason
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.mit_push import MitPushes, is_mit
 from beliefscope.datasets.push_real import PUSH_REAL, PUSH_REAL_TASKS
+from beliefscope.datasets.stored import check_claim
 from beliefscope.datasets.task import Task
 
 FORMAT = "beliefscope-episodes"
@@ -170,13 +172,16 @@ class EpisodeFile(Dataset):
         split = self._attribute(group, "split", str)
         if split not in SPLITS:
             raise BadInput(f"{self._place(group, 'split')} is {split!r}. Available: {', '.join(SPLITS)}.")
+        contact = self._attribute(group, "contact_fraction", float)
+        if not 0.0 <= contact <= 1.0:
+            raise BadInput(f"{self._place(group, 'contact_fraction')} is {contact}, expected a share from 0 to 1.")
         return EpisodeSummary(
             index=index,
             steps=int(states.shape[0]),
             policy=str(self._provenance(group).get("policy", "")),
             split=split,
             seed=self._attribute(group, "seed", int),
-            contact_fraction=self._attribute(group, "contact_fraction", float),
+            contact_fraction=contact,
         )
 
     def _read(self, group: h5py.Group) -> Episode:
@@ -208,8 +213,10 @@ class EpisodeFile(Dataset):
 
     def _provenance(self, group: h5py.Group) -> dict[str, Any]:
         try:
-            value = json.loads(self._attribute(group, "provenance", str))
-        except json.JSONDecodeError:
+            value = read_json(self._attribute(group, "provenance", str))
+        except ValueError as error:
+            if isinstance(error, BadInput):
+                raise
             value = None
         if not isinstance(value, dict):
             raise BadInput(f"{self._place(group, 'provenance')} is not a JSON object.")
@@ -223,7 +230,7 @@ class EpisodeFile(Dataset):
         value = group.attrs[key]
         try:
             return kind(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             name = getattr(kind, "__name__", "another type")
             raise BadInput(f"{self._place(group, key)} is {value!r}, expected {name}.") from None
 
@@ -231,6 +238,7 @@ class EpisodeFile(Dataset):
         stored = group.get(key)
         if not isinstance(stored, h5py.Dataset):
             raise BadInput(f"{self.path}: {group.name[1:]} has no {key!r}. It has: {', '.join(group) or 'nothing'}.")
+        check_claim(stored, self._place(group, key))
         return stored
 
     def _array(

@@ -15,10 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import build, filters_of
@@ -74,12 +76,12 @@ def load_checkpoint(path: Path) -> Checkpoint:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise BadInput(f"{str(path)!r} is not a readable safetensors file: {error}") from None
     header = _header(path, metadata)
     architecture = Architecture.from_json(header["architecture"])
-    filter_ = build(architecture)
-    expected = {key: tuple(value.shape) for key, value in filter_.state_dict().items()}
+    with torch.device("meta"):  # takes no memory, whatever sizes the header names
+        expected = {key: tuple(value.shape) for key, value in build(architecture).state_dict().items()}
     found = {key: tuple(value.shape) for key, value in tensors.items()}
     if expected != found:
         key = min(expected.items() ^ found.items())[0]
@@ -87,6 +89,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
             f"{str(path)!r}: tensor {key!r} is {found.get(key, 'missing')}, but this architecture has "
             f"{expected.get(key, 'no such tensor')}"
         )
+    for key, value in tensors.items():
+        if not (value.is_floating_point() and bool(torch.isfinite(value).all())):
+            raise BadInput(f"{str(path)!r}: tensor {key!r} holds what are no finite numbers ({value.dtype})")
+    filter_ = build(architecture)
     filter_.load_state_dict(tensors)
     filter_.eval().requires_grad_(False)
     return Checkpoint(filter_, header["name"], hashlib.sha256(path.read_bytes()).hexdigest(), header["record"])
@@ -96,8 +102,8 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     if "beliefscope" not in metadata:
         raise BadInput(f"{str(path)!r} is a safetensors file, but not a checkpoint of Beliefscope")
     try:
-        header = json.loads(metadata["beliefscope"])
-    except json.JSONDecodeError as error:
+        header = read_json(metadata["beliefscope"])
+    except ValueError as error:
         raise BadInput(f"{str(path)!r} has a damaged header: {error}") from None
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         found = header.get("format") if isinstance(header, dict) else header
@@ -105,6 +111,13 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     missing = {"name", "architecture", "record"} - header.keys()
     if missing:
         raise BadInput(f"{str(path)!r} lacks {', '.join(sorted(missing))} in its header")
+    for name, kind, meant in (
+        ("name", str, "text"),
+        ("architecture", dict, "an object"),
+        ("record", dict, "an object"),
+    ):
+        if not isinstance(header[name], kind):
+            raise BadInput(f"{str(path)!r} has the {name} {header[name]!r:.200} in its header, expected {meant}")
     return header
 
 
@@ -122,18 +135,21 @@ def shipped(task: str, name: str) -> Path:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """The old file or the new one, never half of it. Raises BadInput when the folder does not exist."""
+    """The old file or the new one, never half of it. Raises BadInput where it cannot be written: no folder, no room."""
     path = Path(path)
     if not path.parent.is_dir():
         raise BadInput(f"folder {str(path.parent)!r} does not exist")
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    temporary = None
     try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:100]}.", dir=path.parent)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    except OSError as error:
+        raise BadInput(f"cannot write {str(path)!r}: {error.strerror}") from None
+    finally:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)

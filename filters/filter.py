@@ -23,6 +23,9 @@ from beliefscope.filters.resample import Resampling
 Kind = Literal["ekf", "ukf", "pf", "lstm"]
 Fusion = Literal["crossmodal", "unimodal", "none"]
 
+WIDEST = 4096
+"""Of a layer, and what else counts in a filter: far beyond what a step has time for."""
+
 
 @dataclass(frozen=True)
 class Architecture:
@@ -63,6 +66,10 @@ class Architecture:
             value = getattr(self, name)
             if get_origin(kind) is Literal and value not in get_args(kind):
                 raise one_of(f"{name} of a filter", value, get_args(kind))
+            if kind is int and not (type(value) is int and 1 <= value <= WIDEST):
+                raise BadInput(f"{name} of a filter is {value!r}, not a whole number from 1 to {WIDEST}")
+        if not self.models or not all(isinstance(model, str) for model in self.models):
+            raise BadInput(f"models of a filter are {self.models!r}, not names of modalities")
         if not 0.0 < self.soft_share <= 1.0:
             raise BadInput(f"soft_share must be above 0 and at most 1, not {self.soft_share}")
 

@@ -23,6 +23,8 @@ def key_of(**what: Any) -> str:
 class Partial:
     """How far one training has come, tensors and JSON, in one file beside its checkpoint.
 
+    A file that is damaged anywhere is as good as none.
+
     Args:
         path: of the file. key: of the training; a file with another key is of no use to this one.
     """
@@ -59,14 +61,26 @@ class Parts:
 def _read(path: Path, key: str) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
     try:
         with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("kept", "{}"))
-            if header.get("key") != key:
-                return None
-            return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError):
+            said = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        # Nobody could tell wrong weights from right ones later on.
+        if said.get("digest") != _digest(said["kept"], tensors):
+            return None
+        header = json.loads(said["kept"])
+        return (tensors, header) if header["key"] == key else None
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def _digest(header: str, tensors: Mapping[str, Tensor]) -> str:
+    total = hashlib.sha256(header.encode())
+    for name, tensor in sorted(tensors.items()):
+        total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        total.update(tensor.numpy().tobytes())
+    return total.hexdigest()
 
 
 def _write(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    write_atomically(path, save(contiguous, metadata={"kept": json.dumps(header)}))
+    said = json.dumps(header)
+    write_atomically(path, save(contiguous, metadata={"kept": said, "digest": _digest(said, contiguous)}))

@@ -203,7 +203,7 @@ BAD = [
         r"'contact-obs' of trajectory1 has shape \(7, 1\), expected \(7,\)",
     ),
     (replaced("object-state", lambda a: a[:0]), r"'object-state' of trajectory1 has shape \(0, 5\), expected \(T, 5\)"),
-    (replaced("eef_pos", lambda a: np.full(a.shape, b"x")), r"'eef_pos' of trajectory1 cannot be read"),
+    (replaced("eef_pos", lambda a: np.full(a.shape, b"x")), r"'eef_pos' of trajectory1 is .S1, expected numbers"),
 ]
 
 

@@ -77,8 +77,10 @@ def small(whole: Trace) -> Trace:
     few: dict[str, np.ndarray] = {
         name: array[..., :2].copy()
         for name, array in arrays_of(made).items()
-        if name in ("particles", "log_weights", "prior_log_weights", "log_likelihood", "ancestors")
+        if name in ("log_weights", "prior_log_weights", "log_likelihood")
     }
+    if made.particles is not None and made.ancestors is not None:
+        few |= {"particles": made.particles[:, :2].copy(), "ancestors": made.ancestors[:, :2] % 2}
     return replace(made, episode=replace(made.episode, observations=keep), **few)
 
 
