@@ -39,8 +39,8 @@ async function ask(url, options) {
   throw new ServerError(body.error ?? `The server answered ${response.status} ${response.statusText}.`);
 }
 
-const post = (url, body) =>
-  ask(url, { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify(body) });
+const post = (url, body, method = 'POST') =>
+  ask(url, { method, headers: { 'content-type': 'application/json' }, body: JSON.stringify(body) });
 
 /** @returns {Promise<Catalog>} */
 export const catalog = async () => (await ask('/api/catalog')).json();
@@ -124,6 +124,22 @@ export const failures = async (asked, signal) => (await ask(failuresUrl(asked), 
 
 /** Has it looked for as a job. @returns {Promise<{job: Job}>} */
 export const lookForFailures = async (asked) => (await ask(failuresUrl(asked), { method: 'POST' })).json();
+
+/** What the workspace keeps of recordings, and of reports (docs/api.md). */
+export const recordings = async () => (await ask('/api/recordings')).json();
+export const reports = async () => (await ask('/api/reports')).json();
+
+/** Gives a recording another name, or other tags. @param {{url: string}} file @param {{name?: string, tags?: string[]}} change */
+export const changeRecording = async ({ url }, change) => (await post(url, change, 'PATCH')).json();
+
+/** Puts a recording or a report into the trash. @returns {Promise<{deleted: string}>} by which it is had back */
+export const discard = async ({ url }) => (await ask(url, { method: 'DELETE' })).json();
+
+/** Has it back. @param {'recordings' | 'reports'} of */
+export const restore = async (of, id) => (await ask(`/api/${of}/deleted/${encodeURIComponent(id)}`, { method: 'POST' })).json();
+
+/** Deletes for good what is in the trash. @returns {Promise<{freed: number}>} bytes */
+export const emptyTrash = async (of) => (await ask(`/api/${of}/deleted`, { method: 'DELETE' })).json();
 
 /** @returns {Promise<Job[]>} the newest first. */
 export const jobs = async () => (await ask('/api/jobs')).json();

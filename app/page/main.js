@@ -10,6 +10,7 @@ import { Finetune } from './finetune.js';
 import { Heatmaps } from './heatmap.js';
 import { Jobs } from './jobs.js';
 import { keys } from './keys.js';
+import { Library } from './library.js';
 import { mapTools } from './maptools.js';
 import { Numbers } from './numbers.js';
 import { Theme, swatch, tellApart } from './palette.js';
@@ -85,9 +86,10 @@ class Page {
     this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.#overlay(other, name));
     this.finetune = new Finetune($('#finetune'), catalog, store, this.jobs, sheet);
     this.study = new Study($('#study'), catalog, store, this.failures);
+    this.library = new Library($('#recordings'), catalog, store, this.jobs, this.rerun);
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
-    this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }));
+    this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }), (name) => (store.set({ tab: 'recordings' }), this.library.point(name)));
     $('#report').addEventListener('click', () => this.#report());
     store.listen((state, changed) => this.#follow(state, changed));
     this.#takeKeys();
@@ -247,6 +249,7 @@ class Page {
     this.diagnostics.open = tab === 'diagnostics';
     this.failures.draw();
     this.compare.open = tab === 'compare';
+    this.library.open = tab === 'recordings';
     this.finetune.open = tab === 'finetune';
     this.study.open = tab === 'study';
     if (this.#trace) this.rerun.move(this.#store.state.step, false);
@@ -312,6 +315,7 @@ class Page {
       b: (event) => this.failures.go(-1, event.timeStamp),
       t: () => this.#store.set({ tab: 'finetune' }),
       u: () => this.#store.set({ tab: 'study' }),
+      r: () => this.#store.set({ tab: 'recordings' }),
       j: () => this.jobs.toggle(),
       c: () => this.#nextComponent(),
       e: () => this.#goWorst(),

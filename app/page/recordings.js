@@ -5,9 +5,10 @@ import { bytes, fixed } from './units.js';
 /**
  * @param {HTMLButtonElement} button @param {HTMLElement} host where the result is told
  * @param {() => Promise<import('./api.js').Recording>} write @param {() => void} open shows it in the Rerun tab.
+ * @param {(name: string) => void} keep shows where it is among the others
  * @returns {() => Promise<void>} what the button does
  */
-export function saving(button, host, write, open) {
+export function saving(button, host, write, open, keep) {
   const tell = (...children) => {
     const close = document.createElement('button');
     [close.type, close.textContent] = ['button', '×'];
@@ -25,11 +26,13 @@ export function saving(button, host, write, open) {
       const recording = await write();
       const link = document.createElement('a');
       [link.href, link.download, link.textContent] = [recording.url, recording.name, `Download ${recording.name}`];
-      const view = document.createElement('button');
-      [view.type, view.className, view.textContent] = ['button', 'text', 'Open in Rerun tab'];
-      view.addEventListener('click', open);
+      const [view, place] = [['Open in Rerun tab', open], ['Recordings', () => keep(recording.name)]].map(([textContent, act]) => {
+        const made = Object.assign(document.createElement('button'), { type: 'button', className: 'text', textContent });
+        made.addEventListener('click', act);
+        return made;
+      });
       const when = recording.seconds === null ? 'written before' : `written in ${fixed(recording.seconds)} s`;
-      tell(link, ` ${bytes(recording.bytes)}, ${when} `, view);
+      tell(link, ` ${bytes(recording.bytes)}, ${when} `, view, place);
     } catch (error) {
       tell(`The recording was not written: ${error.message}`);
     } finally {

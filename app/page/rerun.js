@@ -1,4 +1,5 @@
-/** Rerun's viewer in the page, loaded when its tab is first opened; its time and the page's step follow each other. */
+/** Rerun's viewer in the page, loaded when its tab is first opened; its time and the page's step follow each other. It shows
+ *  the page's run, or files in its place, which keep their own time. */
 
 import { record } from './api.js';
 import { say } from './panel.js';
@@ -11,8 +12,10 @@ export class Rerun {
   #moved;
   #viewer = null;
   #starting = null;
-  #shown = null; // the trace whose recording is open
+  #shown = null; // the trace whose recording is open, or the files
   #trace = null;
+  #files = null; // that are to be shown in place of the trace
+  #bar = document.createElement('p');
   #step = 0;
   #pending = null;
   #busy = false;
@@ -22,18 +25,30 @@ export class Rerun {
   /** @param {HTMLElement} host @param {(step: number) => void} moved called when the time was moved in the viewer. */
   constructor(host, moved) {
     [this.#host, this.#moved] = [host, moved];
+    [this.#bar.className, this.#bar.hidden] = ['files', true];
+    this.#bar.innerHTML = '<span></span><button type="button" class="text">Back to the run</button>';
+    this.#bar.querySelector('button').addEventListener('click', () => this.files(null));
+    host.append(this.#bar);
   }
 
   /** @param {import('./trace.js').Trace} trace */
   show(trace) {
     this.#trace = trace;
-    if (this.#open) this.#load();
+    this.files(null);
+  }
+
+  /** Shows files in place of the run, until another run is shown; null for the run again. @param {{name: string, url: string}[] | null} files */
+  files(files) {
+    this.#files = files;
+    this.#bar.hidden = !files;
+    this.#bar.firstElementChild.textContent = files ? files.map(({ name }) => name).join(' and ') : '';
+    if (this.#open && (files || this.#trace)) this.#load();
   }
 
   /** The tab is in front, or no longer. */
   set open(open) {
     this.#open = open;
-    if (open && this.#trace) this.#load();
+    if (open && (this.#files || this.#trace)) this.#load();
   }
 
   /** @param {number} step @param {boolean} fromRerun whether it was moved in the viewer itself. */
@@ -48,21 +63,25 @@ export class Rerun {
   }
 
   async #load() {
-    const trace = this.#trace;
-    if (this.#shown === trace) {
+    const [trace, files, before] = [this.#trace, this.#files, this.#shown];
+    if (before === (files ?? trace)) {
       this.#seek(this.#step);
       return;
     }
-    this.#shown = trace;
+    const shown = (this.#shown = files ?? trace);
     try {
-      say(this.#host, 'loading', 'Writing the recording …');
-      const [recording] = await Promise.all([record(trace), this.#start()]);
-      if (this.#shown !== trace) return;
+      say(this.#host, 'loading', files ? 'Starting Rerun …' : 'Writing the recording …');
+      const [recordings] = await Promise.all([files ?? Promise.all([record(trace)]), this.#start()]);
+      if (this.#shown !== shown) return;
       say(this.#host, 'loading', 'Opening the recording …');
-      const before = (await this.#viewer.get_state()).recordings ?? [];
-      await this.#viewer.open(new URL(recording.url, location.href).href);
-      await Promise.all(before.map((r) => this.#viewer.close(r.store_id).catch(() => null)));
-      await this.#settle();
+      const old = (await this.#viewer.get_state()).recordings ?? [];
+      const close = () => Promise.all(old.map((r) => this.#viewer.close(r.store_id).catch(() => null)));
+      const first = files || Array.isArray(before); // a file may be that of a run that is open: it has the same id
+      if (first) await close();
+      for (const { url } of recordings) await this.#viewer.open(new URL(url, location.href).href);
+      if (!first) await close();
+      this.#viewer.override_panel_state('blueprint', recordings.length > 1 ? 'expanded' : undefined);
+      if (!files) await this.#settle();
       say(this.#host, 'ready');
       this.#seek(this.#step);
     } catch (error) {
@@ -109,7 +128,7 @@ export class Rerun {
   /** Moves the viewer's time, one request at a time: the newest wins. */
   async #seek(step) {
     this.#pending = step;
-    if (this.#busy || !this.#viewer || !this.#open || this.#host.dataset.state !== 'ready') return;
+    if (this.#busy || this.#files || !this.#viewer || !this.#open || this.#host.dataset.state !== 'ready') return;
     this.#busy = true;
     while (this.#pending !== null) {
       const started = performance.now();
@@ -132,7 +151,7 @@ export class Rerun {
     const step = Math.round(time);
     const ours = this.#echo !== null || this.#pending !== null; // on its way: whatever comes is older
     if (step === this.#echo) this.#echo = null;
-    if (ours || !this.#open || this.#host.dataset.state !== 'ready' || step === this.#step) return;
+    if (ours || this.#files || !this.#open || this.#host.dataset.state !== 'ready' || step === this.#step) return;
     if (step >= 0 && step < this.#trace.steps) this.#moved(step);
   }
 }

@@ -15,7 +15,7 @@ export function walk(body) {
 
 /** Makes a row the one where the tab key stops, and brings it into sight. @param {HTMLTableRowElement} row @param {boolean} focus */
 export function stopAt(row, focus) {
-  for (const button of row.parentElement.querySelectorAll('button')) button.tabIndex = row.contains(button) ? 0 : -1;
+  for (const button of row.parentElement.querySelectorAll('button, input')) button.tabIndex = row.contains(button) ? 0 : -1;
   if (focus) row.querySelector('button').focus({ preventScroll: true });
   const box = row.closest('.scroll');
   const [seen, at] = [box.getBoundingClientRect(), row.getBoundingClientRect()];

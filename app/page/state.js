@@ -10,7 +10,7 @@ import { spoken } from './units.js';
  * @property {string} recipe how the sensors are broken, as text (docs/data.md); empty where they are not
  * @property {string} against what differs in the other run that this one is compared with (docs/api.md); empty without one
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
- * @property {'scene' | 'rerun' | 'diagnostics' | 'failures' | 'compare' | 'finetune' | 'study'} tab
+ * @property {'scene' | 'rerun' | 'diagnostics' | 'failures' | 'compare' | 'finetune' | 'study' | 'recordings'} tab
  * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
  * @property {string} track the lowest chart: a name of `KINDS` (tracks.js)
  * @property {string} window steps that the time line shows, as 20-60; empty for all of them
@@ -28,7 +28,7 @@ import { spoken } from './units.js';
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 /** How likelihood maps are shown: the colours' scale, whether all share its range, the axes, what lies on top, what they gain on the other run. */
 const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], zoom: ['1', '4'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
-const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
+const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study', 'recordings'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
 const WORST = 'error'; // the measure that ranks failures where none is chosen
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 

@@ -33,5 +33,6 @@ export const percent = (share) => (Number.isFinite(share) ? `${Math.round(100 * 
 export const wrapped = (degrees) => degrees - 360 * Math.round(degrees / 360);
 
 export function bytes(count) {
-  return count < 1e6 ? `${Math.round(count / 1e3)} kB` : `${(count / 1e6).toFixed(1)} MB`;
+  const [size, unit] = [[1e9, 'GB'], [1e6, 'MB']].find(([least]) => count >= least) ?? [];
+  return size ? `${(count / size).toFixed(1)} ${unit}` : `${Math.round(count / 1e3)} kB`;
 }

@@ -2,7 +2,7 @@
 
 import { say } from './panel.js';
 
-const TABS = ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study'];
+const TABS = ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study', 'recordings'];
 
 /** The scene's frame: another page of the server's, which follows the cursor by itself. */
 export class Scene {
