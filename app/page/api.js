@@ -1,5 +1,6 @@
 /** What the page asks of its server over HTTP (docs/api.md). */
 
+import { begun } from './stream.js';
 import { Trace } from './trace.js';
 
 /**
@@ -8,8 +9,8 @@ import { Trace } from './trace.js';
  * @typedef {object} Task
  * @property {string} name @property {Component[]} components @property {string[]} modalities @property {number} dt s
  * @property {{x: string, y: string, half_width: number}} map
- * @property {{name: string, kind: string, checkpoint_hash: string}[]} filters
- * @property {{name: string, first: number, episodes: Summary[]}[]} data sets of episodes; the index to begin with
+ * @property {{name: string, kind: string, checkpoint_hash: string, live?: string}[]} filters `live`: known only by the live run of that name
+ * @property {{name: string, first: number, episodes: Summary[], live?: import('./live.js').Run}[]} data sets of episodes; the index to begin with
  * @property {{name: string, recipe: string}[]} recipes that are ready to be picked
  * @typedef {{name: string, default: number | string | null, unit: string, meaning: string}} Parameter
  * @typedef {{fault: string, meaning: string, parameters: Parameter[]}} Fault
@@ -45,6 +46,9 @@ const post = (url, body, method = 'POST') =>
 /** @returns {Promise<Catalog>} */
 export const catalog = async () => (await ask('/api/catalog')).json();
 
+/** @returns {Promise<{runs: import('./live.js').Run[], tasks: Task[]}>} live runs, the newest first; the tasks that they are of. */
+export const liveRuns = async () => (await ask('/api/live')).json();
+
 /** @param {boolean} dark @returns {Promise<{view: string, scene: string, socket: string}>} */
 export const openView = async (dark) => (await post('/api/views', { dark })).json();
 
@@ -72,6 +76,7 @@ export async function loadTrace(task, selection, progress, signal) {
     response = await ask(traceUrl(selection), { signal });
   }
   const header = await response.json();
+  if (header.live) return begun(task, selection, header, signal);
   const buffer = async (part) => (await ask(traceUrl(selection, part), { signal })).arrayBuffer();
   const [columns, pictures] = await Promise.all([buffer('/columns'), header.pictures && buffer('/images')]);
   return new Trace(task, selection, header, columns, pictures);
@@ -120,7 +125,10 @@ const failuresUrl = ({ task, filter, data, recipe, among }) =>
   `/api/failures/${encodeURIComponent(task)}/${encodeURIComponent(filter)}?${new URLSearchParams({ data, recipe, among })}`;
 
 /** Where a filter fails; or the job that looks for it, null where nobody asked for it. @returns {Promise<Failures | {job: Job | null}>} */
-export const failures = async (asked, signal) => (await ask(failuresUrl(asked), { signal })).json();
+export async function failures(asked, signal) {
+  if (asked.data.startsWith('live:')) throw new ServerError('A live run is one episode: failures are looked for in whole data sets.');
+  return (await ask(failuresUrl(asked), { signal })).json();
+}
 
 /** Has it looked for as a job. @returns {Promise<{job: Job}>} */
 export const lookForFailures = async (asked) => (await ask(failuresUrl(asked), { method: 'POST' })).json();

@@ -40,22 +40,16 @@ export function style({ name, other = false }, compared) {
  */
 export function chart(parent, track, shading, frame) {
   const ink = { stroke: colour('muted'), grid: { stroke: colour('grid'), width: 1, show: !track.note }, ticks: { stroke: colour('grid'), size: 4, width: 1 }, font: FONT };
-  const steps = Float64Array.from({ length: frame.steps }, (_, t) => t);
-  const data = [steps];
   const series = [{}];
   const bands = [];
-  for (const { name, values, sigma } of track.series) {
+  for (const { name, sigma } of track.series) {
     if (!sigma) continue;
     const edge = { points: { show: false }, width: 0, stroke: 'transparent' };
-    data.push(values.map((v, t) => v + 2 * sigma[t]), values.map((v, t) => v - 2 * sigma[t]));
     series.push({ ...edge }, { ...edge });
-    bands.push({ series: [data.length - 2, data.length - 1], fill: translucent(line(name).stroke, name === 'fused' ? 0.2 : 0.08) });
+    bands.push({ series: [series.length - 2, series.length - 1], fill: translucent(line(name).stroke, name === 'fused' ? 0.2 : 0.08) });
   }
-  for (const one of track.series) {
-    data.push(one.values);
-    series.push({ ...style(one, frame.compared), points: { show: false } });
-  }
-  if (!track.series.length) [data[1], series[1]] = [new Array(frame.steps).fill(null), {}]; // an axis needs a line
+  for (const one of track.series) series.push({ ...style(one, frame.compared), points: { show: false } });
+  if (!track.series.length) series[1] = {}; // an axis needs a line
   return new uPlot(
     {
       width: frame.width,
@@ -76,9 +70,16 @@ export function chart(parent, track, shading, frame) {
       bands,
       hooks: { drawClear: [(plot) => shade(plot, shading)], drawAxes: [(plot) => track.bounds && between(plot, track.bounds)] },
     },
-    data,
+    plotted(track, frame.steps),
     parent,
   );
+}
+
+/** What uPlot draws of a track: the steps, the edges of each band, the lines. @param {Track} track */
+export function plotted({ series }, steps) {
+  const edges = series.filter(({ sigma }) => sigma).flatMap(({ values, sigma }) => [2, -2].map((by) => values.map((v, t) => v + by * sigma[t])));
+  const lines = series.map(({ values }) => values);
+  return [Float64Array.from({ length: steps }, (_, t) => t), ...edges, ...(lines.length ? lines : [new Array(steps).fill(null)])];
 }
 
 /** The y axis of a logarithmic chart has powers of ten alone, that of none names nothing. */

@@ -78,6 +78,7 @@ export class Diagnostics {
     this.#loading.abort();
     this.#loading = new AbortController();
     const trace = this.#trace;
+    if (trace.live?.state === 'running') return say(this.#host, 'empty', 'The run goes on. Diagnostics are made of all its steps once it has ended.');
     try {
       this.#entries = await api.diagnostics(trace.selection, this.#loading.signal);
     } catch (error) {

@@ -11,6 +11,7 @@ import { Heatmaps } from './heatmap.js';
 import { Jobs } from './jobs.js';
 import { keys } from './keys.js';
 import { Library } from './library.js';
+import { Live, shelve } from './live.js';
 import { mapTools } from './maptools.js';
 import { Numbers } from './numbers.js';
 import { Theme, swatch, tellApart } from './palette.js';
@@ -44,7 +45,8 @@ start().catch((error) => {
 });
 
 async function start() {
-  const catalog = await api.catalog();
+  const [catalog, live] = await Promise.all([api.catalog(), api.liveRuns().catch(() => ({ runs: [], tasks: [] }))]);
+  shelve(catalog, live);
   messages.say('catalog', catalog.problems?.join(' '));
   if (!catalog.tasks.length) {
     throw new api.ServerError('There is nothing to show: no task has both episodes and a trained filter.');
@@ -55,7 +57,7 @@ async function start() {
     state.recipe = '';
   });
   messages.say('link', problems.join(' '));
-  new Page(catalog, new Store(state));
+  new Page(catalog, new Store(state), live);
 }
 
 /** Everything on the page, and what makes it move. */
@@ -65,10 +67,10 @@ class Page {
   #trace = null;
   #loading = new AbortController();
 
-  constructor(catalog, store) {
+  constructor(catalog, store, live) {
     [this.#catalog, this.#store] = [catalog, store];
     const sheet = new FaultSheet($('#faults'), catalog.faults);
-    pickers(catalog, store, sheet);
+    const listed = pickers(catalog, store, sheet);
     this.undo = new Undo(store);
     this.theme = new Theme((dark) => this.#recolour(dark));
     this.clock = new Clock(store);
@@ -86,6 +88,12 @@ class Page {
     this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.#overlay(other, name));
     this.finetune = new Finetune($('#finetune'), catalog, store, this.jobs, sheet);
     this.study = new Study($('#study'), catalog, store, this.failures);
+    this.live = new Live(document, catalog, store, {
+      grown: (trace, fresh) => this.#grow(trace, fresh),
+      ended: (trace) => (this.timeline.grow(), this.diagnostics.show(trace)),
+      listed,
+      say: (line) => messages.say('live', line),
+    }, live);
     this.library = new Library($('#recordings'), catalog, store, this.jobs, this.rerun);
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
@@ -96,7 +104,7 @@ class Page {
     this.#takeButtons();
     this.#showTab(store.state.tab);
     this.#load();
-    window.beliefscope = { state: () => ({ ...store.state }), stats, timeline: this.timeline, rerun: { getState: () => this.rerun.getState() } };
+    window.beliefscope = { state: () => ({ ...store.state }), stats, timeline: this.timeline, live: this.live, rerun: { getState: () => this.rerun.getState() } };
   }
 
   /** Has a report written; its job becomes the link to it. */
@@ -174,6 +182,7 @@ class Page {
 
   #show(trace) {
     this.#trace = trace;
+    this.live.show(trace);
     const { step } = this.#store.state;
     if (step >= trace.steps) {
       messages.say('step', `Step ${step} does not exist: this episode has steps 0 to ${trace.steps - 1}.`);
@@ -195,6 +204,15 @@ class Page {
     this.compare.show(trace);
     this.#choose();
     this.#move();
+  }
+
+  /** A live run has more steps. Fresh: they tell of what was not known before. */
+  #grow(trace, fresh) {
+    if (fresh) return this.#show(trace);
+    for (const panel of [this.clock, this.slice]) panel.show(trace);
+    this.timeline.grow();
+    $('#black-key').hidden = !trace.black.some(Boolean);
+    this.#count();
   }
 
   /** The other run has come or gone: it is drawn over the time line, and in the scene. */
@@ -223,9 +241,14 @@ class Page {
     this.rerun.move(step, origin === 'rerun');
     this.socket.move({ ...trace.selection, step, angle, against: state.against, beside: state.beside === 'gain' }, inputTime);
     this.#read(state);
+    this.#count();
+  }
+
+  #count() {
+    const [{ steps, dt }, { step }] = [this.#trace, this.#store.state];
     const [count, time] = $('#readout').children;
-    count.textContent = `${step} / ${trace.steps - 1}`;
-    time.textContent = `${fixed(step * trace.dt)} s`;
+    count.textContent = `${step} / ${steps - 1}`;
+    time.textContent = `${fixed(step * dt)} s`;
   }
 
   #read({ step, component }) {
@@ -319,6 +342,7 @@ class Page {
       j: () => this.jobs.toggle(),
       c: () => this.#nextComponent(),
       e: () => this.#goWorst(),
+      l: () => this.live.newest(),
       m: () => this.heatmaps.pin(),
       s: () => this.save(),
       d: () => this.theme.toggle(),

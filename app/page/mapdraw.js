@@ -120,7 +120,7 @@ function drawMarks(pen, drawn, side, { cloud, zoom, hover }) {
   }
   if (cloud) drawCloud(pen, drawn, place);
   // Open in the middle: a sharp peak is no larger than a mark.
-  outlined(pen, [['rgb(0 0 0 / 0.6)', 3.5], ['#fff', 1.5]], () => {
+  if (maps.truth[0] !== null) outlined(pen, [['rgb(0 0 0 / 0.6)', 3.5], ['#fff', 1.5]], () => {
     for (const [dx, dy] of [[1, 0], [0, 1], [-1, 0], [0, -1]]) {
       pen.moveTo(tx + 4 * dx, ty + 4 * dy);
       pen.lineTo(tx + 10 * dx, ty + 10 * dy);

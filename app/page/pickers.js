@@ -1,18 +1,23 @@
 /** What is shown: task, filter, episode, speed; and the small choices above the time line. */
 
 import { check } from './api.js';
+import { showing } from './live.js';
 import { recipePicker } from './recipes.js';
 import { SPEEDS } from './state.js';
 import { percent } from './units.js';
 
-/** @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store @param {import('./recipes.js').FaultSheet} sheet */
+/**
+ * @param {import('./api.js').Catalog} catalog @param {import('./state.js').Store} store @param {import('./recipes.js').FaultSheet} sheet
+ * @returns {() => void} to be called when the catalog has changed
+ */
 export function pickers(catalog, store, sheet) {
   const ids = ['task', 'filter', 'data', 'episode', 'speed'];
   const [task, filter, data, episode, speed] = ids.map((id) => document.getElementById(id));
   const named = (list, name) => list.find((one) => one.name === name);
   const current = () => named(catalog.tasks, store.state.task);
   const names = (list) => list.map(({ name }) => [name, name]);
-  fill(task, names(catalog.tasks));
+  /** The filters of this task that a data set can be shown with: one known by its live run alone, with no other. */
+  const usable = (set) => current().filters.filter(({ live }) => !live || live === set);
   // Who chooses what this run is compared with sees the two change places.
   const swapped = (key, value) => (store.state.against === `${key}=${value}` ? { against: `${key}=${store.state[key]}` } : {});
   const showRecipe = recipePicker(document.getElementById('recipe'), sheet, {
@@ -23,9 +28,10 @@ export function pickers(catalog, store, sheet) {
   });
   fill(speed, SPEEDS.map((s) => [s, `${s}×`]));
   const refill = () => {
-    fill(filter, names(current().filters));
+    fill(task, names(catalog.tasks));
+    fill(filter, names(usable(store.state.data)));
     fill(data, names(current().data));
-    fill(episode, named(current().data, store.state.data).episodes.map((e) => [e.index, described(e)]));
+    fill(episode, (named(current().data, store.state.data)?.episodes ?? []).map((e) => [e.index, described(e)]));
     // A choice of one is none.
     for (const select of [task, data]) select.parentElement.hidden = select.length < 2;
   };
@@ -36,7 +42,9 @@ export function pickers(catalog, store, sheet) {
     store.set({ task: name, filter, data, episode: first, recipe, against: '', step: 0, angle: null, component: map.x, playing: false });
   });
   data.addEventListener('change', () => {
-    store.set({ data: data.value, episode: named(current().data, data.value).first, step: 0, playing: false });
+    const { live, first } = named(current().data, data.value);
+    const { name } = named(usable(data.value), filter.value) ?? current().filters[0];
+    store.set(live ? showing(catalog, live, store.state) : { data: data.value, filter: name, episode: first, step: 0, playing: false });
   });
   filter.addEventListener('change', () => store.set({ filter: filter.value, ...swapped('filter', filter.value) }));
   episode.addEventListener('change', () => store.set({ episode: Number(episode.value), step: 0, playing: false }));
@@ -48,10 +56,11 @@ export function pickers(catalog, store, sheet) {
   };
   show(store.state);
   store.listen(show);
+  return () => show(store.state);
 }
 
-function described({ index, policy, split, steps, contact_fraction }) {
-  return [index, policy, split, `${steps} steps`, `contact ${percent(contact_fraction)}`].filter((part) => part !== '').join(' · ');
+function described({ index, policy, split, steps, contact_fraction, label }) {
+  return label ?? [index, policy, split, `${steps} steps`, `contact ${percent(contact_fraction)}`].filter((part) => part !== '').join(' · ');
 }
 
 function fill(select, options) {

@@ -13,8 +13,8 @@ const FEW = 0.05; // of the particles
  */
 export function reading(trace, step, component) {
   const error = trace.error('fused', 'position')[step];
-  const [tone, judged] = judge(trace, step);
-  const said = [`${trace.fuses ? 'Fused belief' : 'The estimate'} is ${fixed(error, 1)} cm off; ${judged}.`];
+  const [tone, judged] = trace.knows(step) ? judge(trace, step) : ['none'];
+  const said = [judged ? `${trace.fuses ? 'Fused belief' : 'The estimate'} is ${fixed(error, 1)} cm off; ${judged}.` : 'The true state is not known.'];
 
   const [best, leader] = [closest(trace, step), leading(trace, step, component)];
   const blind = (leader?.name === 'image' && trace.black[step] && 'the picture is black') || (leader?.name === 'haptics' && !trace.contact[step] && 'there is no contact to feel');

@@ -71,7 +71,7 @@ export class Rerun {
     const shown = (this.#shown = files ?? trace);
     try {
       say(this.#host, 'loading', files ? 'Starting Rerun …' : 'Writing the recording …');
-      const [recordings] = await Promise.all([files ?? Promise.all([record(trace)]), this.#start()]);
+      const [recordings] = await Promise.all([files ?? Promise.all([trace.stream ? growing(trace) : record(trace)]), this.#start()]);
       if (this.#shown !== shown) return;
       say(this.#host, 'loading', 'Opening the recording …');
       const old = (await this.#viewer.get_state()).recordings ?? [];
@@ -155,5 +155,8 @@ export class Rerun {
     if (step >= 0 && step < this.#trace.steps) this.#moved(step);
   }
 }
+
+/** The recording that a live run writes itself: it is sent on as it grows. */
+const growing = (trace) => ({ url: `/api/live/${encodeURIComponent(trace.live.name)}.rrd` });
 
 const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));

@@ -28,14 +28,20 @@ export class Slice {
     return this.#trace.shown(this.#angle).scale;
   }
 
+  /** (T,) where the maps are cut by themselves: at the truth, or where that is not known at the estimate. */
+  get #around() {
+    const estimate = this.#trace.mean('fused', this.#angle);
+    return this.#trace.truth(this.#angle).map((v, t) => (Number.isFinite(v) ? v : estimate[t]));
+  }
+
   /** @param {import('./trace.js').Trace} trace */
   show(trace) {
     this.#trace = trace;
     this.#angle = trace.components.findIndex((_, i) => !trace.position.includes(i));
     this.#label.hidden = this.#button.hidden = this.#angle < 0;
     if (this.#angle < 0) return;
-    const truth = trace.truth(this.#angle);
-    const [low, high] = [Math.min(...truth), Math.max(...truth)];
+    const around = this.#around.filter(Number.isFinite);
+    const [low, high] = around.reduce(([least, most], v) => [Math.min(least, v), Math.max(most, v)], [Infinity, -Infinity]);
     this.#input.min = String(Math.floor(low - REACH));
     this.#input.max = String(Math.ceil(high + REACH));
     this.#input.disabled = false;
@@ -44,14 +50,15 @@ export class Slice {
 
   move(step) {
     if (!this.#trace || this.#angle < 0) return;
-    const truth = this.#trace.truth(this.#angle)[step];
+    const truth = this.#around[step];
+    const known = Number.isFinite(this.#trace.truth(this.#angle)[step]);
     const { angle } = this.#store.state;
     const shown = angle === null ? truth : angle * this.#scale;
     if (document.activeElement !== this.#input || angle === null) this.#input.value = String(shown);
     const { unit } = this.#trace.shown(this.#angle);
     const off = wrapped(shown - truth);
-    this.#label.querySelector('output').textContent = angle === null ? `${fixed(shown)}${unit} true` : `${fixed(shown)}${unit}`;
-    this.#label.title = angle === null ? 'The maps are cut at the true value' : `${signed(off)}${unit} from the true value`;
+    this.#label.querySelector('output').textContent = angle === null ? `${fixed(shown)}${unit} ${known ? 'true' : 'est.'}` : `${fixed(shown)}${unit}`;
+    this.#label.title = angle === null ? `The maps are cut at the ${known ? 'true' : 'estimated'} value` : `${signed(off)}${unit} from the ${known ? 'true' : 'estimated'} value`;
     this.#button.disabled = angle === null;
   }
 }

@@ -23,6 +23,7 @@ import { spoken } from './units.js';
  * @property {string} run of fine-tuning that is open, empty for a new one
  * @property {string} study that is shown @property {string} quantity of it; empty for the first of each
  * @property {boolean} playing @property {number} speed
+ * @property {boolean} follow whether the cursor stays at the newest step of a live run; a link without a step begins so
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
@@ -111,12 +112,12 @@ export function resolve(search, catalog) {
     problems.push(`The link asks for ${kind} “${name}”, which does not exist. Available: ${names.join(', ')}.`);
     return fallback;
   };
-  const pickOf = (key, all) => all.find(({ name }) => name === pick(key, all.map((one) => one.name), all[0].name));
+  const pickOf = (key, all, fallback = all[0].name) => all.find(({ name }) => name === pick(key, all.map((one) => one.name), fallback));
   const task = pickOf('task', catalog.tasks);
   const data = pickOf('data', task.data);
   const state = {
     task: task.name,
-    filter: pickOf('filter', task.filters).name,
+    filter: pickOf('filter', task.filters.filter(({ live }) => !live || live === data.name), data.live?.filter).name,
     data: data.name,
     episode: number(asked, 'episode', data.first, data.episodes.map((e) => e.index), problems),
     recipe: asked.get('recipe')?.trim() ?? '',
@@ -134,6 +135,7 @@ export function resolve(search, catalog) {
     quantity: asked.get('quantity') ?? '',
     playing: false,
     speed: 1,
+    follow: data.live?.state === 'running' && !asked.has('step'),
   };
   for (const [key, values] of Object.entries(CHOICES)) state[key] = pick(key, values, values[0], spoken(key));
   return { state, problems };

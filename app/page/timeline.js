@@ -1,6 +1,6 @@
 /** The time line: charts one above the other with one step axis, one cursor, and the hand that scrubs and zooms. */
 
-import { GUTTER, chart, style } from './chart.js';
+import { GUTTER, chart, plotted, style } from './chart.js';
 import { Marks } from './marks.js';
 import { sample, variable } from './palette.js';
 import { stretches } from './trace.js';
@@ -21,9 +21,10 @@ export class TimeLine {
   #other = null;
   #otherName = '';
   #tracks = [];
+  #shading = {}; // stretches of steps
   /** @type {{plot: uPlot, track: import('./chart.js').Track, top: number, height: number}[]} px in the host */
   #charts = [];
-  /** @type {{text: Text, values: ArrayLike<number>, digits?: number}[]} the values in the legends */
+  /** @type {{text: Text, track: import('./chart.js').Track, place: number}[]} the values in the legends: of which of a track's lines */
   #cells = [];
   #window = [0, 1]; // steps
   #plot = { left: 0, width: 1 }; // px in the host
@@ -77,6 +78,21 @@ export class TimeLine {
     [key.hidden, key.title, key.lastChild.textContent] = [!this.#compared, this.#otherName, this.#otherName];
     document.querySelector('#timeline').classList.toggle('compared', Boolean(this.#compared));
     this.#build();
+  }
+
+  /** More steps have come to the trace that is shown: charts stay and get longer. */
+  grow() {
+    if (!this.#trace) return;
+    const longer = tracks(this.#trace, this.#store.state, this.#compared);
+    if (!this.#store.state.window) this.#window = this.#all;
+    if (!this.#charts.length || alike(longer) !== alike(this.#tracks)) return this.redraw();
+    this.#tracks.forEach((track, i) => Object.assign(track, longer[i]));
+    this.#shade();
+    for (const { plot, track } of this.#charts) plot.setData(plotted(track, this.#trace.steps));
+    this.#host.setAttribute('aria-valuemax', String(this.#trace.steps - 1));
+    this.#placeMarks();
+    this.move(this.#store.state.step);
+    this.#tell(this.#hover ?? this.#store.state.step);
   }
 
   /** Moves the cursor; nothing is drawn again. */
@@ -142,8 +158,10 @@ export class TimeLine {
     return this.#other?.alongside(this.#trace) ? this.#other : null;
   }
 
+  /** Those of a live run that are still to come have their place, where it is known how many there will be. */
   get #all() {
-    return [0, Math.max(1, this.#trace.steps - 1)];
+    const { steps, live } = this.#trace;
+    return [0, Math.max(1, steps - 1, live?.state === 'running' ? (live.expected ?? 0) - 1 : 0)];
   }
 
   /** The window as the state has it: empty for the whole episode. */
@@ -208,7 +226,7 @@ export class TimeLine {
     const left = legendWidth + GUTTER.left;
     this.#plot = { left, width: wide - left - GUTTER.right };
     this.#measure();
-    const shading = { contact: stretches(trace.contact), black: stretches(trace.black), edit: this.#compared?.edited };
+    this.#shade();
     const lowest = this.#tracks.length - 1;
     const heights = shares(this.#tracks, height - GUTTER.axis);
     this.#tracks.forEach((track, i) => {
@@ -227,7 +245,7 @@ export class TimeLine {
         stepName: `step (${fixed(trace.dt, 2)} s each)`,
         compared: Boolean(this.#compared),
       };
-      this.#charts.push({ plot: chart(row, track, shading, frame), track, top: row.offsetTop, height: heights[i] });
+      this.#charts.push({ plot: chart(row, track, this.#shading, frame), track, top: row.offsetTop, height: heights[i] });
     });
     this.#host.setAttribute('aria-valuemax', String(trace.steps - 1));
     this.#placeMarks();
@@ -236,7 +254,8 @@ export class TimeLine {
   }
 
   /** Names, lines and values of a track; what is cut short is said in full under the pointer. */
-  #legend({ title, unit, help, series, digits }) {
+  #legend(track) {
+    const { title, unit, help, series } = track;
     const element = document.createElement('div');
     element.className = 'legend';
     const heading = document.createElement('h3');
@@ -252,14 +271,19 @@ export class TimeLine {
       list.append(term);
       for (const other of this.#compared ? [false, true] : [false]) {
         const cell = document.createElement('dd');
-        const shown = series.find((s) => s.name === name && Boolean(s.other) === other);
+        const place = series.findIndex((s) => s.name === name && Boolean(s.other) === other);
         const text = cell.appendChild(new Text());
-        if (shown) this.#cells.push({ text, values: shown.values, digits });
+        if (place >= 0) this.#cells.push({ text, track, place });
         list.append(cell);
       }
     }
     element.append(heading, list);
     return element;
+  }
+
+  /** The charts keep hold of the one object. */
+  #shade() {
+    Object.assign(this.#shading, { contact: stretches(this.#trace.contact), black: stretches(this.#trace.black), edit: this.#compared?.edited });
   }
 
   #measure() {
@@ -277,7 +301,8 @@ export class TimeLine {
   /** Writes the values at a step into the legends. */
   #tell(step) {
     this.#told.textContent = `${this.#hover === null ? 'cursor' : 'pointer'} ${step} · ${fixed(step * this.#trace.dt)} s`;
-    for (const { text, values, digits } of this.#cells) {
+    for (const { text, track: { series, digits }, place } of this.#cells) {
+      const { values } = series[place];
       const value = digits === undefined ? significant(values[step]) : fixed(values[step], digits);
       if (text.data !== value) text.data = value;
     }
@@ -287,6 +312,7 @@ export class TimeLine {
   #spoken(step) {
     const trace = this.#trace;
     const parts = [`step ${step}`, `${fixed(step * trace.dt)} s`, `${fixed(trace.error('fused', 'position')[step])} cm off`];
+    if (!trace.knows(step)) parts.pop();
     if (trace.contact[step]) parts.push('in contact');
     if (trace.black[step]) parts.push('black picture');
     return parts.join(', ');
@@ -365,6 +391,9 @@ export class TimeLine {
     this.#tell(this.#hover ?? this.#store.state.step);
   }
 }
+
+/** What must be the same of tracks for their charts to stay. */
+const alike = (tracks) => JSON.stringify(tracks.map(({ title, note, unit, series }) => [title, note, unit, series.map(({ name, sigma, other }) => [name, Boolean(sigma), other])]));
 
 const shorter = (step) => String(Number(step.toFixed(1)));
 

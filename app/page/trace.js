@@ -5,6 +5,9 @@ import { SHOWN, wrapped } from './units.js';
 const FUSED = 'fused';
 
 export class Trace {
+  /** Whose steps are still coming: their stream (stream.js), and what is known of the run; else undefined. */
+  stream;
+  live;
   #columns = new Map();
   #cache = new Map();
 
@@ -19,8 +22,6 @@ export class Trace {
     this.dt = header.dt;
     this.components = header.components;
     this.modalities = header.modalities;
-    /** Whose estimates there are: each modality alone where it is known, and all of them; one alone is the same as all. */
-    this.sources = this.fuses && header.columns.some((c) => c.name === 'modality_mean') ? [...header.modalities, FUSED] : [FUSED];
     this.pictures = pictures && new Uint8Array(pictures);
     for (const { name, shape, offset } of header.columns) {
       const size = shape.reduce((a, b) => a * b, 1);
@@ -30,8 +31,39 @@ export class Trace {
     /** Positions in the state of the two components that span the maps. */
     this.position = [index(task.map.x), index(task.map.y)];
     this.angles = this.components.map((c, i) => (c.unit === 'rad' ? i : -1)).filter((i) => i >= 0);
-    this.contact = this.#slice('contact') ?? new Float32Array(this.steps);
-    this.black = this.#blackPictures();
+    this.#derive(0);
+  }
+
+  /**
+   * More steps at the end. A column that comes late was not known before, one that stays away is not known now.
+   * @param {import('./stream.js').Block} block @returns {boolean} whether there are columns that were not there before
+   */
+  grow({ steps, columns, buffer, pictures }) {
+    const before = this.steps;
+    const given = new Map(columns.map((column) => [column.name, column]));
+    const late = columns.filter(({ name }) => !this.has(name));
+    for (const { name, shape } of late) this.#columns.set(name, { shape: [before, ...shape.slice(1)], data: new Float32Array(before * stride(shape)).fill(NaN) });
+    for (const [name, column] of this.#columns) {
+      const [used, more] = [before, steps].map((count) => count * stride(column.shape));
+      const found = given.get(name);
+      column.data = longer(column.data, used, found ? new Float32Array(buffer, found.offset, more) : new Float32Array(more).fill(NaN));
+      column.shape = [before + steps, ...column.shape.slice(1)];
+    }
+    if (pictures) this.pictures = longer(this.pictures, (before * pictures.byteLength) / steps, new Uint8Array(pictures));
+    this.steps += steps;
+    this.#cache.clear();
+    this.#derive(before);
+    return late.length > 0;
+  }
+
+  /** Whose estimates there are: each modality alone where it is known, and all of them; one alone is the same as all. */
+  get sources() {
+    return this.fuses && this.has('modality_mean') ? [...this.modalities, FUSED] : [FUSED];
+  }
+
+  /** Whether the truth of a step is known. */
+  knows(step) {
+    return this.position.every((i) => Number.isFinite(this.truth(i)[step]));
   }
 
   /** Whether several modalities are fused, or one measurement model, or none, decides alone. */
@@ -168,9 +200,10 @@ export class Trace {
     if (!column) return undefined;
     return this.#cached(`slice ${name} ${index}`, () => {
       const [steps, ...rest] = column.shape;
-      const stride = rest.reduce((a, b) => a * b, 1);
-      const start = index.reduce((sum, i, axis) => sum * rest[axis] + i, 0);
-      return Float32Array.from({ length: steps }, (_, t) => column.data[t * stride + start]);
+      const [values, width] = [new Float32Array(steps), stride(column.shape)];
+      let at = index.reduce((sum, i, axis) => sum * rest[axis] + i, 0);
+      for (let t = 0; t < steps; t++, at += width) values[t] = column.data[at];
+      return values;
     });
   }
 
@@ -179,11 +212,29 @@ export class Trace {
     return this.#cache.get(key);
   }
 
-  #blackPictures() {
+  /** Contact, and which pictures are black; of the steps from `first` on. */
+  #derive(first) {
+    this.contact = this.#slice('contact') ?? new Float32Array(this.steps);
     const black = new Uint8Array(this.steps);
-    if (this.pictures) for (let t = 0; t < this.steps; t++) black[t] = Number(this.picture(t).every((v) => v === 0));
-    return black;
+    if (first) black.set(this.black);
+    if (this.pictures) for (let t = first; t < this.steps; t++) black[t] = Number(this.picture(t).every((v) => v === 0));
+    this.black = black;
   }
+}
+
+/** Numbers that a step has in a column of this shape. */
+const stride = ([, ...rest]) => rest.reduce((a, b) => a * b, 1);
+
+/** An array with more behind the `used` first of its values; it has room for as many again. */
+function longer(array, used, more) {
+  const all = used + more.length;
+  if (array.length < all) {
+    const before = array;
+    array = new before.constructor(2 * all);
+    array.set(before.subarray(0, used));
+  }
+  array.set(more, used);
+  return array;
 }
 
 function difference(a, b, unit) {

@@ -65,6 +65,7 @@ const LOWEST = { error, signed, nees, innovation, particles };
 
 function error(trace, component) {
   const angle = trace.angles.includes(component);
+  if (!trace.truth(component).some(Number.isFinite)) return none('Error', UNKNOWN);
   return {
     title: angle ? `${capital(spoken(trace.components[component].name))} error` : 'Position error',
     unit: angle ? '°' : 'cm',
@@ -76,6 +77,7 @@ function error(trace, component) {
 
 /** What estimates are off by, with the band of what they claim: where it leaves zero out, the filter is surprised. */
 function signed(trace, component) {
+  if (!trace.truth(component).some(Number.isFinite)) return none('Signed error', UNKNOWN);
   const sources = known(trace.sources, (source) => trace.offset(source, component), (source) => trace.sigma(source, component));
   const truth = { name: 'truth', values: new Float32Array(trace.steps) };
   return { title: 'Signed error', unit: trace.shown(component).unit, help: 'Estimate less truth, with what it claims', series: [truth, ...sources], digits: 1 };
@@ -83,7 +85,7 @@ function signed(trace, component) {
 
 function nees(trace) {
   const series = known(trace.sources, (source) => trace.nees(source));
-  if (!series.length) return none('NEES', 'None: this filter does not say how sure it is.');
+  if (!series.length) return none('NEES', trace.has('nees') ? UNKNOWN : 'None: this filter does not say how sure it is.');
   const bounds = trace.header.nees_bounds;
   const [low, high] = [fixed(bounds[0], 2), fixed(bounds[1], 1)];
   return {
@@ -128,6 +130,7 @@ function unparticular(kind) {
   return kind === 'foreign' ? 'None: this filter shows no particles.' : 'None: a Kalman filter has a Gaussian and no particles.';
 }
 
+const UNKNOWN = 'None: the true state of this run is not known.';
 const none = (title, note) => ({ title, unit: '', series: [], note });
 
 /** A line for each name whose values are known. @returns {import('./chart.js').Series[]} */
