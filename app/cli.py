@@ -24,6 +24,7 @@ from beliefscope.app.commands.figure import figure
 from beliefscope.app.commands.finetune import finetune
 from beliefscope.app.commands.inspect import inspect
 from beliefscope.app.commands.lineage import lineage
+from beliefscope.app.commands.live import live
 from beliefscope.app.commands.modules import modules
 from beliefscope.app.commands.recipes import recipes
 from beliefscope.app.commands.record import record
@@ -48,6 +49,7 @@ COMMANDS = (
     study,
     trace,
     record,
+    live,
     restore,
     export,
     inspect,

@@ -106,24 +106,45 @@ class Foreign(Checkpoint):
                 at which step.
         """
         observations, controls = _inputs(self._task, episodes, _dtype(self.adapter.module))
-        start = self.start(episodes)
+        models: tuple[int, ...] = ()
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            if hasattr(self.adapter.module, "initialize_beliefs"):
-                values, models = self._step_by_step(observations, controls, start, progress)
+            if self._steps_alone:
+                steps: list[Values] = []
+                for step, took_part in self._steps(observations, controls, self.start(episodes)):
+                    steps.append(step)
+                    models = took_part
+                    if progress is not None:
+                        progress(len(steps) / len(controls))
+                always = [name for name in steps[0] if all(name in step for step in steps)]
+                values = {name: torch.stack([step[name] for step in steps]) for name in always}
             else:
-                values, models = self._at_once(observations, controls), ()
+                values = self._at_once(observations, controls)
                 if progress is not None:
                     progress(1.0)
         return derived(self._units.to_si(values)), self._names(values, models)
 
-    def _step_by_step(
-        self,
-        observations: Mapping[str, Tensor],
-        controls: Tensor,
-        start: Gaussian,
-        progress: Callable[[float], None] | None,
-    ) -> tuple[Values, tuple[int, ...]]:
+    def live(self, episode: Episode, seed: int = 0) -> Iterator[tuple[Values, tuple[str, ...]]]:
+        """``run`` of one episode, a step at a time as it is asked for: (N, ...) with N = 1, and the models' names.
+
+        Raises BadInput as ``run``, and for a model of sequences, which takes no steps.
+        """
+        if not self._steps_alone:
+            raise BadInput(f"{self.source} has no initialize_beliefs: it takes all steps at once, and cannot run live")
+        observations, controls = _inputs(self._task, [episode], _dtype(self.adapter.module))
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            for step, models in self._steps(observations, controls, self.start([episode])):
+                yield self._units.to_si(step), self._names({n: v[None] for n, v in step.items()}, models)
+
+    @property
+    def _steps_alone(self) -> bool:
+        return hasattr(self.adapter.module, "initialize_beliefs")
+
+    def _steps(
+        self, observations: Mapping[str, Tensor], controls: Tensor, start: Gaussian
+    ) -> Iterator[tuple[Values, tuple[int, ...]]]:
+        """What each step says and shows, in the module's units, and which of its measurement models took part."""
         if start.covariance.isnan().any():
             raise BadInput(
                 f"{self.source} starts from a covariance, and no filter ships for task {self._task.name!r} to say how "
@@ -134,7 +155,6 @@ class Foreign(Checkpoint):
         with self._blamed("initialize_beliefs"):
             getattr(module, "initialize_beliefs")(mean=mean, covariance=covariance)  # noqa: B009 - mypy takes it for a Tensor
         sizes: dict[str, int] = {"n": n}
-        steps: list[Values] = []
         with Capture(module) as capture:
             for t in range(len(controls)):
                 where = f"step {t}"
@@ -142,11 +162,7 @@ class Foreign(Checkpoint):
                     seen = self.adapter.inputs({key: value[t] for key, value in observations.items()}, controls[t])
                     said = named(module(observations=seen[0], controls=seen[1]), self.source)
                     values = capture.step(said["estimate_mean"]) | said
-                steps.append(checked(values, (count,), sizes, f"{self.source} at {where}"))
-                if progress is not None:
-                    progress((t + 1) / len(controls))
-        always = [name for name in steps[0] if all(name in step for step in steps)]
-        return {name: torch.stack([step[name] for step in steps]) for name in always}, capture.models
+                yield checked(values, (count,), sizes, f"{self.source} at {where}"), capture.models
 
     def _at_once(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
         with self._blamed("all steps"):

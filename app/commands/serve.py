@@ -92,10 +92,7 @@ def serve(
     from beliefscope.filters.catalog import filters_of
     from beliefscope.filters.foreign import load_foreign
 
-    if workspace.exists() and not workspace.is_dir():
-        raise BadInput(f"workspace {str(workspace)!r} is a file, not a folder")
-    if not workspace.absolute().parent.is_dir():
-        raise BadInput(f"folder {str(workspace.parent)!r} does not exist, so {workspace.name!r} cannot be made in it")
+    check_workspace(workspace)
 
     for what, value, available in (("log level", log_level, logs.LEVELS), ("log format", log_format, logs.FORMATS)):
         if value not in available:
@@ -158,3 +155,11 @@ def _opening(workspace: Path, secret: bool) -> Iterator[Callable[[str], None]]:
         yield open_
     finally:
         page.unlink(missing_ok=True)
+
+
+def check_workspace(workspace: Path) -> None:
+    """Raises BadInput where it is no folder, and none can be made there."""
+    if workspace.exists() and not workspace.is_dir():
+        raise BadInput(f"workspace {str(workspace)!r} is a file, not a folder")
+    if not workspace.absolute().parent.is_dir():
+        raise BadInput(f"folder {str(workspace.parent)!r} does not exist, so {workspace.name!r} cannot be made in it")
