@@ -12,6 +12,7 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict
 
 from beliefscope import __version__
+from beliefscope.app.caching import tagged
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.proxy import client_page
 from beliefscope.app.session import Views
@@ -123,14 +124,6 @@ def _immutable(request: Request, traced: Traced, part: str, content: Callable[[]
     """A part of a trace: its key says all that it depends on, so it can be an ETag."""
     traced.trace  # noqa: B018 - wait for it, or raise what it raised, before anything is answered
     return tagged(request, f"{traced.key[:24]}-{part}", content, "application/octet-stream")
-
-
-def tagged(request: Request, tag: str, content: Callable[[], bytes], media_type: str) -> Response:
-    """An answer that a browser need not be sent again for as long as its tag is the same."""
-    headers = {"etag": f'"{tag}"', "cache-control": "no-cache"}
-    if headers["etag"] in request.headers.get("if-none-match", ""):
-        return Response(status_code=304, headers=headers)
-    return Response(content(), media_type=media_type, headers=headers)
 
 
 async def _no_view(websocket: WebSocket, name: str) -> None:

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import ClientDisconnect
 
 from beliefscope import __version__
-from beliefscope.app.api import tagged
+from beliefscope.app.caching import tagged
 from beliefscope.app.library import Library, Selection
 from beliefscope.app.rrdabout import About
 from beliefscope.app.rrdfiles import ENDING, Recording, RrdFiles, disk

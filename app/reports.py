@@ -15,7 +15,8 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, Response
 
-from beliefscope.app.api import Asked, tagged
+from beliefscope.app.api import Asked
+from beliefscope.app.caching import tagged
 from beliefscope.app.commands.given import serving
 from beliefscope.app.commands.report import trace_command
 from beliefscope.app.jobs import Job, Jobs

@@ -17,7 +17,6 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
-from starlette.staticfiles import StaticFiles
 
 from beliefscope import __version__
 from beliefscope.app import compare, diagnostics, failures, finetune, jobs, recordings, reports, study
@@ -26,13 +25,14 @@ from beliefscope.app.api import routes
 from beliefscope.app.children import with_children
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.logs import no_false_alarm
+from beliefscope.app.pagefiles import PageFiles
 from beliefscope.app.patience import CONNECTIONS, HEAD, PatientProtocol
 from beliefscope.app.rrdfiles import RrdFiles
 from beliefscope.app.security import Guard
 from beliefscope.app.session import Views
 from beliefscope.app.tracing import Tracer
 from beliefscope.app.trash import Gone, Taken
-from beliefscope.app.vendor import UPLOT_FILES, RerunViewer, cached_file, installed
+from beliefscope.app.vendor import UPLOT_FILES, RerunViewer, installed
 from beliefscope.app.wire import MAP_SIZES
 from beliefscope.datasets.errors import BadInput
 
@@ -175,12 +175,17 @@ class _Server(uvicorn.Server):
 
 
 def _add_files(app: FastAPI, rerun: RerunViewer) -> None:
-    app.mount("/static", StaticFiles(directory=PAGE, check_dir=False), name="static")
     uplot = installed("uplot") / "static"
+    files = PageFiles(PAGE, [uplot / name for name in UPLOT_FILES])
 
+    # From memory, in the event loop: a browser asks for all of them at once.
     @app.get("/")
-    def page(request: Request) -> Response:
-        return cached_file(request, PAGE / "index.html", "text/html; charset=utf-8", {})
+    async def page(request: Request) -> Response:
+        return files.index(request)
+
+    @app.get("/static/{path:path}")
+    async def page_file(path: str, request: Request) -> Response:
+        return files.file(request, path)
 
     @app.get("/vendor/rerun/viewer.js")
     def rerun_script() -> Response:
@@ -190,13 +195,6 @@ def _add_files(app: FastAPI, rerun: RerunViewer) -> None:
     @app.get("/vendor/rerun/re_viewer_bg.wasm")  # the name by which viewer.js asks for it
     def rerun_wasm(request: Request) -> Response:
         return rerun.wasm(request)
-
-    @app.get("/vendor/uplot/{name}")
-    def uplot_file(name: str, request: Request) -> Response:
-        if name not in UPLOT_FILES:
-            raise HTTPException(404, f"{name!r} is not served. Available: {', '.join(UPLOT_FILES)}.")
-        media_type = "text/css" if name.endswith(".css") else "text/javascript"
-        return cached_file(request, uplot / name, media_type, {})
 
 
 def _warm(library: Library, tracer: Tracer | None, rerun: RerunViewer, stopping: threading.Event) -> None:

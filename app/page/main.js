@@ -32,9 +32,13 @@ import { Scene, tabs } from './views.js';
 
 const $ = (selector) => document.querySelector(selector);
 const KEPT = 1000; // latencies
+const SCENE_WAITS = 1000; // ms at most until the scene starts, which would hold up everything else
 const bodies = ['#heatmaps', '#moment .body', '#timeline .body'].map($);
 const messages = new Messages($('#messages'));
-const stats = { scrub: [], scene: [], maps: null, drawn: null };
+const stats = { scrub: [], scene: [], maps: null, drawn: null, useful: null };
+const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+let isUseful; // the page shows what it is for: the time line, and maps where there are any
+const useful = new Promise((resolve) => (isUseful = () => requestAnimationFrame(resolve))).then(() => (stats.useful = performance.now()));
 
 bodies.forEach((body) => say(body, 'loading', 'Loading …'));
 start().catch((error) => {
@@ -119,7 +123,7 @@ class Page {
   /** The view's socket tells. */
   #handlers() {
     return {
-      view: ({ scene }) => this.scene.open(scene),
+      view: ({ scene }) => this.scene.open(scene, Promise.race([useful, pause(SCENE_WAITS)])),
       pace: (times) => this.scene.pace(times),
       maps: (maps, inputTime) => {
         if (!this.#trace) return;
@@ -127,8 +131,12 @@ class Page {
         say($('#heatmaps'), 'ready');
         stats.maps = { serial: maps.serial, step: maps.step, size: maps.size };
         if (inputTime !== null) keep(stats.scrub, performance.now() - inputTime);
+        isUseful();
       },
-      noMaps: (step, size) => (stats.maps = { step, size }),
+      noMaps: (step, size) => {
+        stats.maps = { step, size };
+        isUseful();
+      },
       drawn: (step, { inputTime }) => {
         this.scene.drawn();
         stats.drawn = { step };

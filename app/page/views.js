@@ -20,9 +20,10 @@ export class Scene {
     say(host, 'loading', 'Starting the 3D scene …');
   }
 
-  /** @param {string} url of a new view's scene. */
-  open(url) {
+  /** @param {string} url of a new view's scene @param {Promise<unknown>} when it may start: it is a whole page */
+  async open(url, when) {
     say(this.#host, 'loading', 'Starting the 3D scene …');
+    await when;
     this.#frame.src = url;
     if (!this.#frame.isConnected) this.#host.append(this.#frame);
   }

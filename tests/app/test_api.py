@@ -150,7 +150,7 @@ def test_unknown_names_get_one_readable_line(client: TestClient, path: str, part
 
 
 @pytest.mark.parametrize(
-    "path", ["/nowhere", "/scene/none/", "/static/none.js", "/vendor/uplot/none.js", "/api/recordings/x.rrd"]
+    "path", ["/nowhere", "/scene/none/", "/static/none.js", "/static/0/none.js", "/api/recordings/x.rrd"]
 )
 def test_what_is_not_there_is_said_in_json(client: TestClient, path: str) -> None:
     answer = client.get(path)

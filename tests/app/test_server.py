@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import socket
@@ -16,7 +17,8 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 
 from beliefscope.app.access import Access
-from beliefscope.app.server import Settings, _bound, serve
+from beliefscope.app.pagefiles import PageFiles
+from beliefscope.app.server import PAGE, Settings, _bound, serve
 from beliefscope.app.vendor import RerunViewer, installed, without_names
 from beliefscope.datasets.errors import BadInput
 
@@ -65,8 +67,8 @@ def test_the_installed_viewer_is_what_we_take_it_for() -> None:
     ("path", "kind", "content"),
     [
         ("/", "text/html", b"<html"),
-        ("/vendor/uplot/uPlot.iife.js", "text/javascript", b"uPlot"),
-        ("/vendor/uplot/uPlot.min.css", "text/css", b".uplot"),
+        ("/static/uPlot.iife.js", "text/javascript", b"uPlot"),
+        ("/static/uPlot.min.css", "text/css", b".uplot"),
         ("/vendor/rerun/viewer.js", "text/javascript", b"export { WebViewer };"),
     ],
 )
@@ -82,7 +84,36 @@ def test_files_come_with_their_type_and_are_revalidated(
         assert client.get(path, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
 
 
-@pytest.mark.parametrize("path", ["/static/../server.py", "/static/..%2fserver.py", "/vendor/uplot/..%2f__init__.py"])
+def test_the_page_names_its_modules_by_what_is_in_them(client: TestClient) -> None:
+    page = client.get("/").text
+    named = re.findall(r'<link rel="modulepreload" href="(/static/[0-9a-f]+/([\w.]+))">', page)
+    assert {name for _, name in named} >= {"main.js", "api.js", "mapvalues.js"}
+    assert len({name for _, name in named}) == len(named)
+    for address, name in named:
+        answer = client.get(address)
+        assert "immutable" in answer.headers["cache-control"]
+        assert answer.content == (PAGE / name).read_bytes()
+        # Whatever it imports is named too, so that none is found out late.
+        assert set(re.findall(r"^import .* from '\./([\w.]+)'", answer.text, re.MULTILINE)) <= {n for _, n in named}
+    # The name of another content is not kept: a browser with an old page does not hold on to the new file.
+    assert client.get("/static/0123456789ab/main.js").headers["cache-control"] == "no-cache"
+
+
+def test_a_file_that_is_edited_has_another_name(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text('<head><script src="/static/main.js"></script></head>')
+    (tmp_path / "main.js").write_text("import { a } from './a.js';")
+    (tmp_path / "a.js").write_text("export const a = 1;")
+    files = PageFiles(tmp_path)
+    before = bytes(files.index(request("br")).body)
+    (tmp_path / "a.js").write_text("export const a = 12;")
+    after = bytes(files.index(request("br")).body)
+    names = [set(re.findall(rb"/static/(\w+)/", page)) for page in (before, after)]
+    assert [len(each) for each in names] == [1, 1]
+    assert names[0] != names[1]
+    assert files.file(request("br"), f"{names[1].pop().decode()}/a.js").body == b"export const a = 12;"
+
+
+@pytest.mark.parametrize("path", ["/static/../server.py", "/static/..%2fserver.py", "/static/x/..%2f__init__.py"])
 def test_files_beside_the_page_are_not_served(client: TestClient, path: str) -> None:
     assert client.get(path).status_code == 404
 
