@@ -8,7 +8,7 @@ export class Camera {
   /** @param {HTMLElement} figure */
   constructor(figure) {
     this.#figure = figure;
-    this.#pen = figure.querySelector('canvas').getContext('2d');
+    this.#pen = figure.querySelector('canvas').getContext('2d', { willReadFrequently: true }); // drawn by the processor: no waiting for the scene's
   }
 
   /** @param {import('./trace.js').Trace} trace */
