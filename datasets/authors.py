@@ -192,6 +192,7 @@ class AuthorsFiles(Dataset):
             try:
                 file = self._open.enter_context(h5py.File(path))
                 layout, names = _layout(file), _trajectories(file)
+                groups = [file[name] for name in names]
             except DAMAGE as error:
                 raise damaged(path, error) from None
             if layout is None:
@@ -201,9 +202,9 @@ class AuthorsFiles(Dataset):
             if len(layouts) > 1:
                 (one, (_, first)), (other, (_, second)) = layouts.items()
                 raise BadInput(f"{first} is of task {one!r}, {second} of {other!r}: give files of one task.")
-            gray = layout.gray or _gray(path, file[names[0]])
-            used = names[:VALIDATION_USED] if path.stem == "kloss_val" else names
-            sources += [_Source(path, file[name], gray) for name in used]
+            gray = layout.gray or _gray(path, groups[0])
+            used = groups[:VALIDATION_USED] if path.stem == "kloss_val" else groups
+            sources += [_Source(path, group, gray) for group in used]
         ((layout, _),) = layouts.values()
         return layout, sources
 

@@ -40,6 +40,7 @@ LEAST = {"train": 200}  # trajectories of a split, however few pushes there are
 LEAST_HELD_OUT = 50
 AREA = 0.125  # half the side of the square around CENTRE in which the block's centre stays, m
 LONGEST_GAP = 0.5  # s without a row that is bridged by a straight line
+LATEST, LARGEST = 1e10, 1e6  # s since 1970, and m, rad, N or N m: beyond these is no robot
 LARGEST_STEP = {"object_pose": (0.05, 0.5), "tip_pose": (0.05, np.inf)}
 """Key -> what its place (m) and yaw (rad) change by from one row to the next, unless tracking was lost."""
 
@@ -200,9 +201,10 @@ def _stream(path: Path, key: str, rows: object) -> Array:
         stream = np.zeros(0)
     if stream.ndim != 2 or stream.shape[1] != 4:
         raise BadInput(f"{place} is not a list of rows of 4 numbers, all as long as each other: time, x, y, angle.")
-    if not np.isfinite(stream).all():
-        row = int(np.argwhere(~np.isfinite(stream))[0][0])
-        raise BadInput(f"{place} is {stream[row].tolist()} in row {row}, expected finite numbers.")
+    wild = ~(np.abs(stream) <= [LATEST, LARGEST, LARGEST, LARGEST])
+    if wild.any():
+        row = int(np.argwhere(wild)[0][0])
+        raise BadInput(f"{place} is {stream[row].tolist()} in row {row}, expected finite numbers below {LARGEST:g}.")
     clock = stream[:, 0]
     stream = stream[np.concatenate([[True], clock[1:] > np.maximum.accumulate(clock)[:-1]])] if len(clock) else stream
     if len(stream) < 2:

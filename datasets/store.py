@@ -252,8 +252,8 @@ class EpisodeFile(Dataset):
         if array.dtype != kind:
             raise BadInput(f"{place} is {array.dtype}, expected {np.dtype(kind)}.")
         if not np.isfinite(array).all():
-            step = int(np.argwhere(~np.isfinite(array))[0][0])
-            raise BadInput(f"{place} is {array[step]} at step {step}, expected finite numbers.")
+            at = tuple(np.argwhere(~np.isfinite(array))[0])
+            raise BadInput(f"{place} is {array[at]} at step {at[0]}, expected finite numbers.")
         return np.asarray(array)
 
     def _place(self, group: h5py.Group, key: str) -> str:

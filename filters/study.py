@@ -22,6 +22,7 @@ import torch
 from scipy.stats import chi2
 
 from beliefscope.datasets.catalog import find_task, load_task
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
@@ -80,14 +81,15 @@ class Cell:
     def document(self, folder: Path) -> Document | None:
         """The document of the finished or failed cell; None where there is none that is this cell's, and whole."""
         try:
-            found = json.loads(self.path(folder).read_bytes())
+            found = read_json(self.path(folder).read_bytes())
             if not isinstance(found, dict) or any(found.get(k) != v for k, v in self.depends_on().items()):
                 return None
             if "error" not in found:
                 checkpoint = self.path(folder, ".safetensors").read_bytes()
                 if hashlib.sha256(checkpoint).hexdigest() != found["checkpoint_hash"]:
                     return None
-        except (OSError, ValueError, KeyError):
+                to_markdown(rows_of({self: found}))  # whole is what the table can be made of
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError):
             return None
         return found
 

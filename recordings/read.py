@@ -16,11 +16,16 @@ from rerun.chunk import RrdReader
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.intact import check_intact
 from beliefscope.inspect.trace import Trace, stored_recipe
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, HEADER, PROPERTIES, STEP, TRACE_COMPONENT
 
 VALUES = (TRACE_COMPONENT, "Image:buffer", "Scalars:scalars")
 STORED = ["/trace/**", "/observations/**", f"/{HEADER}"]
+
+
+Rows = dict[str, list[tuple[NDArray[np.int64] | None, NDArray[Any]]]]
+"""Stored path -> its chunks: steps (R,), None where static, and values, flattened."""
 
 
 def read_recording(path: str | Path) -> Trace:
@@ -31,6 +36,17 @@ def read_recording(path: str | Path) -> Trace:
     """
     path = Path(path)
     header, rows = _load(path)
+    try:
+        found = _trace(path, header, rows)
+        check_intact(found)
+    except BadInput as error:
+        raise error if str(path) in str(error) else BadInput(f"{path}: {error}") from None
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, MemoryError, RecursionError) as error:
+        raise BadInput(f"{path}: not a whole recording: {' '.join(str(error).split())}") from None
+    return found
+
+
+def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
     steps = int(header["steps"])
     arrays = {
         name: _assemble(path, name, rows[name], steps, entry) for name, entry in json.loads(header["shapes"]).items()
@@ -65,10 +81,6 @@ def read_recording(path: str | Path) -> Trace:
     )
 
 
-Rows = dict[str, list[tuple[NDArray[np.int64] | None, NDArray[Any]]]]
-"""Stored path -> its chunks: steps (R,), None where static, and values, flattened."""
-
-
 def _load(path: Path) -> tuple[dict[str, Any], Rows]:
     """The header and the stored rows of a file."""
     if not path.is_file():
@@ -87,8 +99,8 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
                         header |= _properties(batch)
                     else:
                         rows[chunk.entity_path.removeprefix("/")] += _values(batch)
-    except (RuntimeError, ValueError) as error:
-        reason = str(error).splitlines()[0].split(f"{path}: ")[-1]
+    except (RuntimeError, ValueError, LookupError, TypeError) as error:
+        reason = " ".join(str(error).splitlines()[:1]).split(f"{path}: ")[-1]
         raise BadInput(f"{path}: not a whole Rerun recording ({reason}).") from None
     version = header.get("format_version")
     if version is None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import Json, check, described, title
+from beliefscope.app.commands.given import Json, check, described, title, trace_in
 
 
 def export(
@@ -28,12 +28,10 @@ def export(
       beliefscope export run.trace -o run.parquet
       beliefscope export run.rrd -o run.mcap
     """
-    from beliefscope.inspect.trace import load_trace
     from beliefscope.recordings.export import export_format, export_trace
-    from beliefscope.recordings.read import read_recording
 
     check(output, json)
     export_format(output)
-    found = read_recording(source) if source.suffix == ".rrd" else load_trace(source)
+    found = trace_in(source)
     export_trace(found, output)
     console.result(described(found, output), title(found, output), json)

@@ -139,6 +139,25 @@ def checkpoint(task: str, name_or_path: str) -> Checkpoint:
     return loaded
 
 
+def recording_in(path: Path) -> Trace:
+    """The run in a recording. A damaged file can end the process that reads it, so another one reads it before."""
+    from beliefscope.app.rrdabout import Reader
+    from beliefscope.recordings.read import read_recording
+
+    if path.is_file():
+        about = Reader()(path)
+        if about.problem and not about.application:
+            raise BadInput(f"{path}: {about.problem}")
+    return read_recording(path)
+
+
+def trace_in(path: Path) -> Trace:
+    """The run in a trace or a recording."""
+    from beliefscope.inspect.trace import load_trace
+
+    return recording_in(path) if path.suffix == ".rrd" else load_trace(path)
+
+
 def is_path(name_or_path: str) -> bool:
     """Whether a filter is named by its file."""
     return name_or_path.endswith(".safetensors") or os.sep in name_or_path

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import DataPath, Json, check, checkpoint, is_code, is_path, serving
+from beliefscope.app.commands.given import DataPath, Json, check, checkpoint, is_code, is_path, serving, trace_in
 from beliefscope.app.commands.inspect import shipped_by_hash
 from beliefscope.datasets.errors import BadInput
 
@@ -66,8 +66,6 @@ def report(
       beliefscope report run.trace --moment 35 --moment 68 --all
     """
     from beliefscope.datasets.catalog import find_task
-    from beliefscope.inspect.trace import load_trace
-    from beliefscope.recordings.read import read_recording
     from beliefscope.recordings.report import check_folder, compose, write_report
     from beliefscope.recordings.reportpdf import browser, print_page
 
@@ -79,7 +77,7 @@ def report(
     files = [file for path in paths for file in (sorted(path.glob("*.trace")) if path.is_dir() else [path])]
     if not files:
         raise BadInput(f"folder {str(paths[0])!r} holds no .trace file")
-    traces = [read_recording(file) if file.suffix == ".rrd" else load_trace(file) for file in files]
+    traces = [trace_in(file) for file in files]
     first = traces[0]
     for file, trace in zip(files, traces, strict=True):
         if trace.checkpoint_hash != first.checkpoint_hash:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import Json, check, described, title
+from beliefscope.app.commands.given import Json, check, described, recording_in, title
 
 
 def restore(
@@ -26,10 +26,9 @@ def restore(
       beliefscope import run.rrd -o run.trace
     """
     from beliefscope.inspect.trace import save_trace
-    from beliefscope.recordings.read import read_recording
 
     check(output, json)
-    found = read_recording(recording)
+    found = recording_in(recording)
     save_trace(found, output)
     console.result(described(found, output), title(found, output), json)
 

@@ -1,0 +1,283 @@
+"""Files and documents gone wrong: seeded mutations of valid ones. All draw only from the generator given."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import h5py
+import numpy as np
+
+HUGE = 10**12
+
+TEXTS = (
+    "",
+    " ",
+    "\0",
+    "é☃",
+    "\ud800",
+    "../../etc/passwd",
+    "x" * 300,
+    "nan",
+    "door",
+    "image",
+    "beliefscope-episodes",
+    "%s%n",
+    "1e999",
+    "9" * 5000,
+    "[" * 2000,
+    "file.py:TASK",
+)
+NUMBERS = (
+    0,
+    -1,
+    1,
+    2,
+    7,
+    2**31,
+    -(2**31),
+    2**63,
+    2**64,
+    HUGE,
+    10**400,
+    0.5,
+    -0.0,
+    1e308,
+    math.nan,
+    math.inf,
+    -math.inf,
+)
+RAW = (
+    b"[" * 100_000,
+    b'{"a":' * 50_000,
+    b"9" * 5000,
+    b"\xff\xfe",
+    b"\xef\xbb\xbf{}",
+    b"NaN",
+    b"null",
+    b"",
+    b'"\\ud800"',
+)
+
+
+def value(rng: Random, depth: int = 3) -> Any:
+    """A JSON value of any shape."""
+    kind = rng.randrange(8 if depth else 5)
+    if kind == 0:
+        return rng.choice((None, True, False))
+    if kind in (1, 2):
+        return rng.choice(NUMBERS)
+    if kind in (3, 4):
+        return rng.choice(TEXTS)
+    if kind == 5:
+        return [value(rng, depth - 1) for _ in range(rng.randrange(4))]
+    return {rng.choice(TEXTS): value(rng, depth - 1) for _ in range(rng.randrange(4))}
+
+
+def edited(document: Any, rng: Random) -> Any:
+    """A copy of a JSON document with one value in it replaced, left out or doubled."""
+    document = json.loads(json.dumps(document))
+    at, places = document, []
+    while isinstance(at, dict | list) and at:
+        key = rng.choice(list(at)) if isinstance(at, dict) else rng.randrange(len(at))
+        places.append((at, key))
+        if rng.random() < 0.3:
+            break
+        at = at[key]
+    if not places:
+        return value(rng)
+    parent, key = places[-1]
+    match rng.randrange(6):
+        case 0:
+            del parent[key]
+        case 1 if isinstance(parent, list):
+            parent.append(parent[key])
+        case 2 if isinstance(parent, dict):
+            parent[rng.choice(TEXTS)] = value(rng)
+        case 3 if isinstance(parent[key], int | float | str):
+            parent[key] = [parent[key]] if rng.random() < 0.5 else str(parent[key])
+        case _:
+            parent[key] = value(rng)
+    return document
+
+
+def spoiled_json(data: bytes, rng: Random) -> bytes:
+    """The text of a JSON document with something wrong in what it says, or in its bytes."""
+    match rng.randrange(8):
+        case 0:
+            return damaged(data, rng)
+        case 1:
+            return rng.choice(RAW)
+        case 2:  # a value of raw text, such as only a text can have: huge, deep, NaN
+            text = json.dumps(edited(json.loads(data), rng)).encode()
+            at = text.find(b": ")
+            return text[: at + 2] + rng.choice(RAW) + b"}" if at >= 0 else text
+        case _:
+            document = json.loads(data)
+            for _ in range(rng.randint(1, 3)):
+                document = edited(document, rng)
+            return json.dumps(document).encode()
+
+
+def damaged(data: bytes, rng: Random) -> bytes:
+    """Bytes with bits flipped, cut off, overwritten, moved or put in."""
+    changed, size = bytearray(data), len(data)
+    match rng.randrange(7):
+        case 0 | 1:
+            for _ in range(rng.choice((1, 1, 2, 8, 64))):
+                at = _place(rng, size)
+                changed[at] ^= 1 << rng.randrange(8)
+        case 2:
+            del changed[rng.randrange(size) :]
+        case 3:
+            at = _place(rng, size)
+            length = rng.choice((1, 4, 8, 64))
+            changed[at : at + length] = rng.choice((b"\0", b"\xff", b"\x7f")) * length
+        case 4:
+            at = _place(rng, size)
+            changed[at : at + 8] = struct.pack("<Q", rng.choice((0, 1, 2**31, 2**32, 2**48, 2**63 - 1, 2**64 - 1)))
+        case 5:
+            at, source = _place(rng, size), _place(rng, size)
+            changed[at : at + 32] = changed[source : source + 32]
+        case 6:
+            at = _place(rng, size)
+            changed[at:at] = rng.randbytes(rng.choice((1, 3, 16)))
+    return bytes(changed)
+
+
+def _place(rng: Random, size: int) -> int:
+    """Headers lie at the front: half of the places are there."""
+    return rng.randrange(min(size, 4096) if rng.random() < 0.5 else size)
+
+
+def spoiled_safetensors(data: bytes, rng: Random, key: str) -> bytes:
+    """A safetensors file whose bytes, header, stored document (under ``key``) or numbers are wrong."""
+    if rng.random() < 0.35:
+        return damaged(data, rng)
+    (size,) = struct.unpack("<Q", data[:8])
+    header, body = json.loads(data[8 : 8 + size]), bytearray(data[8 + size :])
+    tensors = [name for name in header if name != "__metadata__"]
+    one = header[rng.choice(tensors)]
+    match rng.randrange(10):
+        case 0 | 1 | 2 | 3:
+            document = header["__metadata__"][key]
+            header["__metadata__"][key] = spoiled_json(document.encode(), rng).decode(errors="replace")
+        case 4:
+            one["shape"] = rng.choice(
+                ([], [0], [1], [HUGE], [2**32, 2**32], [-1], one["shape"][::-1], [*one["shape"], 1])
+            )
+        case 5:
+            one["dtype"] = rng.choice(("F64", "F16", "BF16", "I64", "I8", "BOOL", "F8_E4M3", "U64", "C64", "nonsense"))
+        case 6:
+            one["data_offsets"] = rng.choice(([0, 0], [0, HUGE], [8, 4], [0, len(body)], [2**63, 2**64 - 1]))
+        case 7:
+            begin, end = one["data_offsets"]
+            number = rng.choice((math.nan, math.inf, 1e38, -1.0, 0.0))
+            count = (end - begin) // 4
+            body[begin : begin + 4 * count] = np.full(count, number, "<f4").tobytes()
+        case 8:
+            whole = header.pop(rng.choice(tensors))
+            if rng.random() < 0.5:
+                header[rng.choice(TEXTS)] = whole
+        case 9:  # its shape is taken from another, whose numbers it gets as well: the file as such is sound
+            other = rng.choice(tensors)
+            header[other], header[tensors[0]] = header[tensors[0]], header[other]
+    text = json.dumps(header).encode()
+    lie = rng.choice((0, 2**63, len(text) + 1)) if rng.random() < 0.05 else len(text)
+    return struct.pack("<Q", lie) + text + bytes(body)
+
+
+def spoil_hdf5(path: Path, rng: Random) -> None:
+    """Changes an HDF5 file in place: its bytes, or what it says, in a file that is otherwise sound."""
+    if rng.random() < 0.4:
+        path.write_bytes(damaged(path.read_bytes(), rng))
+        return
+    with h5py.File(path, "r+") as file:
+        groups = [file, *(one for one in file.values() if isinstance(one, h5py.Group))]
+        for _ in range(rng.randint(1, 2)):
+            group = rng.choice(groups[1:] or groups) if rng.random() < 0.8 else file
+            (_spoil_attribute if rng.random() < 0.4 and group.attrs else _spoil_member)(group, rng)
+
+
+def _spoil_attribute(group: h5py.Group, rng: Random) -> None:
+    name = rng.choice(list(group.attrs))
+    if rng.random() < 0.2:
+        del group.attrs[name]
+        return
+    if name == "provenance" and rng.random() < 0.7:
+        text = spoiled_json(group.attrs[name].encode(), rng)
+        group.attrs[name] = text.decode(errors="replace").replace("\0", "")[:30_000]
+        return
+    numbers = [n for n in NUMBERS if isinstance(n, float) or abs(n) < 2**63]
+    texts = [t for t in TEXTS if "\0" not in t and "\ud800" not in t]
+    drawn: Callable[[], Any] = rng.choice(
+        (
+            lambda: rng.choice(numbers),
+            lambda: rng.choice(texts),
+            lambda: np.full(rng.choice((0, 2, 3)), rng.choice((0.0, math.nan))),
+            lambda: h5py.Empty("f4"),
+            lambda: b"\xff\xfe raw",
+            lambda: np.bytes_(b"\xff"),
+            lambda: np.array([b"a", b"b"]),
+        )
+    )
+    group.attrs[name] = drawn()
+
+
+def _members(group: h5py.Group) -> list[str]:
+    found: list[str] = []
+    group.visit(found.append)
+    return found
+
+
+def _spoil_member(group: h5py.Group, rng: Random) -> None:
+    names = _members(group)
+    if not names:
+        return
+    name = rng.choice(names)
+    stored = group[name]
+    known = isinstance(stored, h5py.Dataset) and stored.dtype.kind in "biuf" and 0 < (stored.size or 0) < 10**6
+    array = stored[()] if known else np.zeros(3)
+    del group[name]
+    match rng.randrange(12):
+        case 0:
+            pass
+        case 1:
+            broken = np.array(array)
+            if broken.dtype.kind == "f" and broken.size:
+                broken.flat[rng.randrange(broken.size)] = rng.choice((math.nan, math.inf, 1e38))
+            group[name] = broken
+        case 2:
+            kind = rng.choice(("f8", "i1", "i8", "u8", "f2", ">f4", "c8", "S5", "?"))
+            group[name] = np.nan_to_num(array).astype(kind)
+        case 3:
+            group[name] = array[..., :1] if array.ndim > 1 else array[: len(array) // 2]
+        case 4:
+            group[name] = rng.choice((np.zeros(()), np.zeros((0, 3), "f4"), array[None], array[..., None]))
+        case 5:  # claims far more than it holds
+            shape = rng.choice(((HUGE,), (2**40, *array.shape[1:]), (2**20, 2**20), (2**62,)))
+            kind = array.dtype if array.dtype.kind in "fui" else "f4"
+            group.create_dataset(name, shape, kind, chunks=tuple(min(n, 4) for n in shape))
+        case 6:  # little on the disk, much in memory
+            big = np.zeros((rng.choice((2**22, 2**26)),), "u1")
+            group.create_dataset(name, data=big, chunks=(2**20,), compression="gzip", compression_opts=1)
+        case 7:
+            group[name] = rng.choice(
+                (h5py.SoftLink("/nowhere"), h5py.SoftLink("/"), h5py.ExternalLink("other.h5", "/x"))
+            )
+        case 8:
+            group.create_group(name)
+        case 9:
+            group.create_dataset(name, (2,), h5py.string_dtype())
+        case 10:
+            group.create_dataset(name, (len(array) if array.ndim else 2,), h5py.vlen_dtype(np.float32))
+        case 11:
+            kind = np.dtype([("a", "f4"), ("b", "i4")])
+            group.create_dataset(name, (3,), kind) if rng.random() < 0.5 else group.create_dataset(
+                name, (4,), "u1", external=[("/etc/hostname", 0, 4)]
+            )
