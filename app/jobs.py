@@ -28,6 +28,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response
 from pydantic import TypeAdapter
 
 from beliefscope import __version__
+from beliefscope.app.security import kept_file
 from beliefscope.app.work import how_it_ended
 from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput, one_of
@@ -228,6 +229,7 @@ class Jobs:
                 )
             self._processes[id] = process
             self._put(replace(job, state="running", started=time.time()))
+            log.info("job began", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
             self._attending[id] = threading.Thread(target=self._attend, args=(id, process), name=f"job {id}")
             self._attending[id].start()
 
@@ -251,6 +253,8 @@ class Jobs:
             else:
                 job = replace(job, state="failed", error=job.error or self._why(id, code))
             self._put(job)
+            told = {"job": id, "kind": job.kind, "state": job.state, "seconds": _seconds(job), "error": job.error}
+            log.log(logging.WARNING if job.state == "failed" else logging.INFO, "job ended", extra={"event": told})
             if not self._closing:
                 self._start()
 
@@ -304,9 +308,10 @@ def routes(jobs: Jobs) -> APIRouter:
     @router.get("/api/jobs/{id}/result")
     def result(id: str) -> Response:
         job = known(id)
-        if job.state != "done" or not jobs.result(id).is_file():
+        path = kept_file(jobs.result(id).parents[1], f"{id}/result.json")
+        if job.state != "done" or path is None:
             raise HTTPException(404, f"Job {id!r} has no result: it is {job.state}{job.error and f', {job.error}'}.")
-        return FileResponse(jobs.result(id), media_type="application/json")
+        return FileResponse(path, media_type="application/json")
 
     return router
 
@@ -314,6 +319,11 @@ def routes(jobs: Jobs) -> APIRouter:
 def under_way(job: Job | None) -> JSONResponse:
     """The answer where a job has to end first; None where nobody asked for it."""
     return JSONResponse({"job": None if job is None else asdict(job)}, status_code=202)
+
+
+def _seconds(job: Job) -> float:
+    """How long it ran."""
+    return round((job.ended or 0.0) - (job.started or 0.0), 1)
 
 
 def _id(kind: str, key: str) -> str:

@@ -18,6 +18,7 @@ from fastapi.responses import StreamingResponse
 
 from beliefscope.app.library import Library
 from beliefscope.app.liveruns import Absent, LiveRuns, Run, called, described
+from beliefscope.app.security import kept_file
 from beliefscope.app.wire import columns, pictures
 from beliefscope.datasets.errors import BadInput
 
@@ -86,8 +87,8 @@ def routes(library: Library) -> APIRouter:
     @router.get("/api/live/{name}.rrd")
     def recording(name: str) -> StreamingResponse:
         run = runs[name]
-        path = runs.folder / f"{run.name}.rrd"
-        if not path.is_file():
+        path = kept_file(runs.folder, f"{run.name}.rrd")
+        if path is None:
             raise HTTPException(404, f"Live run {name!r} has no recording.")
         return StreamingResponse(_tail(run, path), media_type="application/octet-stream")
 

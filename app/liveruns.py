@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from beliefscope.app.security import kept_file
 from beliefscope.app.selection import Selection, Traced
 from beliefscope.app.wire import header
 from beliefscope.datasets.catalog import find_task
@@ -177,7 +178,7 @@ class LiveRuns:
     def __getitem__(self, name: str) -> Run:
         """As it is now. Raises BadInput for a name that is not there, and for what is no run that can be shown."""
         path = self.folder / f"{name}{SUFFIX}"
-        if not name or "/" in name or "\0" in name or not path.is_file():
+        if not name or "/" in name or kept_file(self.folder, path.name) is None:
             raise BadInput(f"live run {name!r} does not exist in {str(self.folder)!r}")
         with self._lock:
             known = self._runs.get(name)

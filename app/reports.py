@@ -22,6 +22,7 @@ from beliefscope.app.commands.report import trace_command
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.app.link import moment_link
+from beliefscope.app.security import kept_file
 from beliefscope.app.trash import Deleted, Gone, Trash, size
 from beliefscope.app.work import Report
 from beliefscope.datasets.corrupt import Recipe
@@ -55,7 +56,8 @@ class Reports:
     def page(self, name: str) -> Path:
         """Raises Gone where there is no such report."""
         path = self.folder / name / "report.html"
-        if not NAME.fullmatch(name) or path.parent.is_symlink() or not path.is_file():
+        whole = kept_file(self.folder, f"{name}/report.html")
+        if not NAME.fullmatch(name) or path.parent.is_symlink() or whole is None:
             raise Gone(f"Report {name!r} is not there, or no longer.")
         return path
 
