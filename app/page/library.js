@@ -19,7 +19,7 @@ const BODY = `
     <button type="button" class="text add" title="An .rrd file of any application, to open it here and keep it. Or drop it anywhere on this tab">Add .rrd…</button>
     <input type="file" accept=".rrd" multiple hidden>
   </div>
-  <div class="chosen" hidden><span></span><button type="button" class="text both">Both in Rerun</button><button type="button" class="text compare">Compare the runs</button><span class="why"></span><span class="spacer"></span><button type="button" class="text quiet none">Choose none</button></div>
+  <div class="chosen" hidden><span></span><button type="button" class="text both">Both in Rerun</button><button type="button" class="text compare">Compare the runs</button><span class="apart"></span><span class="spacer"></span><button type="button" class="text quiet none">Choose none</button></div>
   <ul class="adding"></ul>
   <p class="said" role="status" hidden><span></span> <button type="button" class="text">Undo</button><button type="button" class="quiet" aria-label="Dismiss">×</button></p>
   <div class="scroll" tabindex="-1">

@@ -63,8 +63,8 @@ export class Rerun {
   }
 
   async #load() {
-    const [trace, files, before] = [this.#trace, this.#files, this.#shown];
-    if (before === (files ?? trace)) {
+    const [trace, files] = [this.#trace, this.#files];
+    if (this.#shown === (files ?? trace)) {
       this.#seek(this.#step);
       return;
     }
@@ -75,11 +75,9 @@ export class Rerun {
       if (this.#shown !== shown) return;
       say(this.#host, 'loading', 'Opening the recording …');
       const old = (await this.#viewer.get_state()).recordings ?? [];
-      const close = () => Promise.all(old.map((r) => this.#viewer.close(r.store_id).catch(() => null)));
-      const first = files || Array.isArray(before); // a file may be that of a run that is open: it has the same id
-      if (first) await close();
-      for (const { url } of recordings) await this.#viewer.open(new URL(url, location.href).href);
-      if (!first) await close();
+      const { store_ids: kept } = await this.#viewer.open(recordings.map(({ url }) => new URL(url, location.href).href));
+      const store_ids = old.map((r) => r.store_id).filter((id) => !kept.includes(id));
+      if (store_ids.length) await this.#viewer.close({ store_ids });
       this.#viewer.override_panel_state('blueprint', recordings.length > 1 ? 'expanded' : undefined);
       if (!files) await this.#settle();
       say(this.#host, 'ready');
