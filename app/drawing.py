@@ -29,6 +29,8 @@ FLOOR_MAP = 0.003  # m above the floor, and below the contours where they lie on
 PALE = 130.0  # gray of a particle without weight
 FAINT = 0.25  # of its hue that one keeps where the hue tells its modalities
 EYE = np.array([-0.28, -1.32, 1.22])  # m from what the camera looks at, for what is 1 m high
+OVER = np.array([0.0, -0.04, 3.6])  # the eye over the belief, in half widths of a map: x to the right, as on the page
+AWAY = np.array([-0.6, -1.6, 0.4])  # the eye that sees the camera, in its distances from what it looks at
 BARE_EYE = np.array([-0.5, -1.2, 1.1])  # from the middle of a bare plane, in its sides
 
 # A unit disc in the plane z = 0: its rim, then its centre; and the triangles between.
@@ -47,7 +49,11 @@ OUTLINES = {
 
 
 class Drawing:
-    """The nodes of one trace in viser's scene, and where they are at each step."""
+    """The nodes of one trace in viser's scene, and where they are at each step.
+
+    Attributes:
+        viewpoints: of ``VIEWPOINTS`` those that there are: where the eye is (3,) and what it looks at (3,), m.
+    """
 
     def __init__(self, server: ViserServer, traced: Traced, trace: Trace, look: Look) -> None:
         """Trace: of the traced run, or of a part of it, whose steps ``move`` counts then."""
@@ -90,16 +96,19 @@ class Drawing:
         if "force" in there:
             self._force = Force(server, trace)
         if "map" in there:
-            # On the floor, but below everything where the belief lies on the floor itself.
-            level = FLOOR_MAP if self._above else -2.0 * DISC_STEP * len(self._believed)
-            self._ground = Ground(server, trace, level)
+            # Below all contours; where the belief lies on the floor itself, that is below the floor.
+            below = self._level - 2.0 * DISC_STEP * len(self._believed)
+            self._ground = Ground(server, trace, {"floor": FLOOR_MAP if self._above else below, "belief": below})
         if "camera" in there:
             self._sight = Sight(server, task, trace)
         if np.isnan(trace.episode.states).any():  # nobody knows the truth: it would hide behind the estimate
             for node in (*self._markers[0], *([self._outlines[0]] if self._outlines else [])):
                 node.visible = False
         self.look(look)
-        self._place_camera()
+        self.viewpoints = self._viewpoints()
+        camera = server.initial_camera  # a browser that has moved its own keeps it
+        camera.position, camera.look_at = self.viewpoints["first"]
+        camera.fov = np.deg2rad(45.0)
 
     def turn_to(self, trace: Trace) -> None:
         """Another part of the run that is drawn: its steps are those of ``move`` from now on."""
@@ -239,8 +248,8 @@ class Drawing:
         scales = np.concatenate([SIGMAS * np.sqrt(np.maximum(values, 1e-12)), np.ones((count, 1))], axis=1)
         return np.column_stack([means, levels]), wxyz, scales
 
-    def _place_camera(self) -> None:
-        """Where robot, object and belief are seen. A browser that has moved its camera keeps it."""
+    def _viewpoints(self) -> dict[str, tuple[Array, Array]]:
+        """By their names, where the eye is (3,) and what it looks at (3,), m, world."""
         at, eye = self._anchors[:, 0].mean(axis=0), EYE
         # A robot is about a meter long; without one, all there is lies around the belief.
         if self._replay is None or np.ptp(self._replay.positions[:, 1:], axis=(0, 1)).max() < 0.5:
@@ -251,10 +260,14 @@ class Drawing:
         else:
             eye = EYE * (0.6 + 0.4 * min(1.0, at[2]))
             at = at * [0.62, 0.3, 0.68] + [0.0, 0.0, 0.2 * max(0.0, 1.0 - at[2])]
-        camera = self._server.initial_camera
-        camera.look_at = at
-        camera.position = at + eye
-        camera.fov = np.deg2rad(45.0)
+        over = np.array([*self._anchors[:, 0, :2].mean(axis=0), self._level])
+        # A trifle to the side: straight from above, which way is up would be up to chance.
+        found = {"first": (at + eye, at), "above": (over + OVER * self._task.map_half_width, over)}
+        if self._sight is not None:
+            middle = (self._sight.position + self._sight.target) / 2.0
+            away = np.linalg.norm(self._sight.position - self._sight.target)
+            found["camera"] = middle + away * AWAY, middle
+        return found
 
 
 def _believed(trace: Trace) -> Iterator[tuple[str, Array, Array]]:

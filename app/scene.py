@@ -63,6 +63,17 @@ class Scene:
                 self._drawing.move(*self._shown)
             self._server.flush()
 
+    def stand(self, at: str) -> None:
+        """Move the browser's eye to one of ``VIEWPOINTS``."""
+        with self._lock:
+            if self._closed or self._drawing is None or at not in self._drawing.viewpoints:
+                return
+            position, target = self._drawing.viewpoints[at]
+            for client in self._server.get_clients().values():
+                with client.atomic():
+                    client.camera.position, client.camera.look_at = position, target
+            self._server.flush()
+
     def show(self, traced: Traced, step: int, other: Trace | None = None, maps: LikelihoodMap | None = None) -> None:
         """Draw a step of a trace and send it to the browser.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ SMALL: dict[str, Any] = {"font_screen_scale": 0.7, "depth_test": False}
 FORCE_SCALE = 0.004  # m an N
 FORCE_LENGTH = 0.30  # m, the longest arrow
 LOG_SHOWN = 40.0  # nats below the peak at the lower end of a map's colours, as on the page
-SIGHT = 0.16  # of the way from the camera to what it looks at: where its picture hangs
+SIGHT = 0.3  # of the way from the camera to what it looks at: where its picture hangs
 ENLARGED = 4  # times, so that the browser's smoothing leaves a picture's pixels apart
 CELLS = (0.05, 0.1, 0.25, 1.0)  # m between the lines of a bare plane, of which it has MOST_CELLS along a side
 MOST_CELLS = 14
@@ -49,10 +50,10 @@ def rgb(source: str, trace: Trace) -> RGB:
 class Ground:
     """A likelihood map on the floor, about the true position; its rim has the colour of its layer."""
 
-    def __init__(self, server: ViserServer, trace: Trace, level: float) -> None:
-        """level: its height, m."""
-        self._trace, self._level = trace, level
-        self._drawn: tuple[LikelihoodMap, str, str, str, str] | None = None
+    def __init__(self, server: ViserServer, trace: Trace, levels: Mapping[str, float]) -> None:
+        """levels: m, by a look's ``height``."""
+        self._trace, self._levels = trace, levels
+        self._drawn: tuple[LikelihoodMap, Look] | None = None
         self._image: Any = server.scene.add_image(
             "/map", np.zeros((1, 1, 3), np.uint8), 0.1, 0.1, format="png", receive_shadow=False, visible=False
         )
@@ -63,10 +64,9 @@ class Ground:
         self._image.visible = wanted
         if maps is None or not wanted:
             return
-        drawn = (maps, look.ground, look.scale, look.range, look.colours)
-        if self._drawn is not None and self._drawn[0] is maps and self._drawn[1:] == drawn[1:]:
+        if self._drawn is not None and self._drawn[0] is maps and self._drawn[1] == look:
             return
-        self._drawn = drawn
+        self._drawn = maps, look
         layer = maps.layers.index(look.ground) if look.ground in maps.layers else len(maps.layers) - 1
         size = len(maps.offsets_x)
         rim = max(1, size // COARSE)
@@ -75,7 +75,7 @@ class Ground:
         # viser's pictures have their top row at the smallest y, as maps have.
         self._image.image = cells
         self._image.render_width = self._image.render_height = len(cells) * float(maps.offsets_x[1] - maps.offsets_x[0])
-        self._image.position = (*map(float, maps.centre), self._level)
+        self._image.position = (*map(float, maps.centre), self._levels[look.height])
 
 
 def paint(maps: LikelihoodMap, layer: int, look: Look) -> NDArray[np.uint8]:
@@ -92,7 +92,11 @@ def paint(maps: LikelihoodMap, layer: int, look: Look) -> NDArray[np.uint8]:
 
 
 class Sight:
-    """The camera that took the pictures, and the picture as the filter saw it."""
+    """The camera that took the pictures, and the picture as the filter saw it.
+
+    Attributes:
+        position, target: (3,) m: where it is, and what it looks at.
+    """
 
     def __init__(self, server: ViserServer, task: Task, trace: Trace) -> None:
         camera = task.camera
@@ -118,6 +122,7 @@ class Sight:
         # Down to the ground, where a camera looks down; else to what lies a meter before it.
         far = camera.position[2] / -forward[2] if forward[2] < -0.1 else 1.0
         self._frustum.scale = SIGHT * far / self._frustum.compute_canonical_frustum_size()[2]
+        self.position, self.target = np.array(camera.position), camera.position + far * forward
 
     def take(self, trace: Trace) -> None:
         """The steps that ``show`` counts."""

@@ -15,7 +15,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.mapwire import maps_message
 from beliefscope.app.scene import Scene
-from beliefscope.app.wire import Cursor, cursor, look
+from beliefscope.app.wire import Cursor, cursor, look, viewpoint
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import LikelihoodMap
 
@@ -76,8 +76,10 @@ class View:
                     await asyncio.to_thread(self.scene.set_dark, message.get("dark") is True)
                 case "look":
                     await asyncio.to_thread(self.scene.look, look(message))
+                case "stand":
+                    await asyncio.to_thread(self.scene.stand, viewpoint(message))
                 case other:
-                    raise BadInput(f"Message type {other!r} does not exist. Available: cursor, look, theme.")
+                    raise BadInput(f"Message type {other!r} does not exist. Available: cursor, look, stand, theme.")
         except json.JSONDecodeError as error:
             await _tell_error(websocket, serial, f"Not JSON: {error}.")
         except BadInput as error:

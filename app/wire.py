@@ -54,11 +54,13 @@ class Look:
     """How a 3D scene is looked at.
 
     Hidden: of ``LAYERS``. Ground: the maps' layer that lies on the floor, ``fused`` where the maps do not have it.
-    Tint: particles by their weight, or by the share of each modality in it. Scale, range, colours: as the page's maps.
+    Height: the map on the floor, or under the belief, which is drawn above the object. Tint: particles by their weight,
+    or by the share of each modality in it. Scale, range, colours: as the page's maps.
     """
 
     hidden: frozenset[str] = frozenset()
     ground: str = "fused"
+    height: Literal["floor", "belief"] = "floor"
     tint: Literal["weight", "share"] = "weight"
     scale: Literal["normalised", "log"] = "normalised"
     range: Literal["own", "same"] = "own"
@@ -84,6 +86,17 @@ def look(message: dict[str, Any]) -> Look:
             raise one_of(f"look's {key!r}", message[key], get_args(kind))
         given[key] = message[key]
     return Look(**given)
+
+
+VIEWPOINTS = ("first", "above", "camera")
+"""Where one may stand in a scene: as at first, over the belief, and where the camera that took the pictures is seen."""
+
+
+def viewpoint(message: dict[str, Any]) -> str:
+    """Reads a ``stand`` message. Raises BadInput for a place that does not exist."""
+    if message.get("at") not in VIEWPOINTS:
+        raise one_of("viewpoint", str(message.get("at")), VIEWPOINTS)
+    return str(message["at"])
 
 
 def layers(task: Task, trace: Trace, no_maps: str | None) -> list[str]:

@@ -21,6 +21,7 @@ import { reading } from './reading.js';
 import { FaultSheet } from './recipes.js';
 import { saving } from './recordings.js';
 import { Rerun } from './rerun.js';
+import { SceneLook } from './scenelook.js';
 import { Slice } from './slice.js';
 import { ViewSocket } from './socket.js';
 import { Store, resolve } from './state.js';
@@ -85,6 +86,7 @@ class Page {
     this.numbers = new Numbers($('#numbers'));
     this.slice = new Slice($('#slice-label'), $('#slice-true'), store);
     this.scene = new Scene($('#scene'));
+    this.sceneLook = new SceneLook($('#scene'), store, (look) => this.socket.look(look), (at) => this.socket.stand(at));
     this.rerun = new Rerun($('#rerun'), (step) => store.set({ step, playing: false }, { origin: 'rerun' }));
     this.jobs = new Jobs($('#jobs'), $('#jobs-button'));
     this.diagnostics = new Diagnostics($('#diagnostics'), store, this.jobs);
@@ -100,7 +102,7 @@ class Page {
     }, live);
     this.library = new Library($('#recordings'), catalog, store, this.jobs, this.rerun);
     this.showTab = tabs(store);
-    this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark);
+    this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark, () => this.sceneLook.look);
     this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }), (name) => (store.set({ tab: 'recordings' }), this.library.point(name)));
     $('#report').addEventListener('click', () => this.#report());
     store.listen((state, changed) => this.#follow(state, changed));
@@ -209,6 +211,7 @@ class Page {
     $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s) => [swatch(s), ` ${trace.called(s)}  `]));
     $('#sigma-key').hidden = !trace.has('estimate_sigma');
     this.showMapTools(trace);
+    this.sceneLook.show(trace);
     this.compare.show(trace);
     this.#choose();
     this.#move();

@@ -25,6 +25,7 @@ const RETRY = { first: 500, most: 8000 }; // ms
 export class ViewSocket {
   #handlers;
   #dark;
+  #look;
   #view = null;
   #socket = null;
   #serial = 0;
@@ -37,9 +38,9 @@ export class ViewSocket {
   #lost = 0;
   #pause = RETRY.first;
 
-  /** @param {Handlers} handlers @param {() => boolean} dark */
-  constructor(handlers, dark) {
-    [this.#handlers, this.#dark] = [handlers, dark];
+  /** @param {Handlers} handlers @param {() => boolean} dark @param {() => object} look of the scene */
+  constructor(handlers, dark, look) {
+    [this.#handlers, this.#dark, this.#look] = [handlers, dark, look];
     this.#connect();
   }
 
@@ -55,6 +56,16 @@ export class ViewSocket {
   /** The page's colours have changed. */
   theme(dark) {
     this.#send({ type: 'theme', dark });
+  }
+
+  /** The scene is to be looked at in another way. @param {object} look see scenelook.js */
+  look(look) {
+    this.#send({ type: 'look', ...look });
+  }
+
+  /** The eye in the scene is to move. @param {'first' | 'above' | 'camera'} at */
+  stand(at) {
+    this.#send({ type: 'stand', at });
   }
 
   #want(cursor, inputTime) {
@@ -104,6 +115,7 @@ export class ViewSocket {
       opened = true;
       this.#pause = RETRY.first;
       this.#handlers.connection(null);
+      this.look(this.#look());
       if (this.#last) this.move(this.#last);
     };
     socket.onmessage = (event) => this.#heard(event.data);

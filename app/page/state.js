@@ -20,6 +20,7 @@ import { spoken } from './units.js';
  * @property {'held-out' | 'all'} among which episodes failures are looked for @property {'moments' | 'episodes'} list what is listed of them
  * @property {string} by measure that ranks failures @property {string} group the only one that is listed, empty for all
  * @property {string} scale of the maps, `range`, `axes`, `colours`, `regions`, `cloud`, `zoom`: see `MAPS`
+ * @property {string} hide layers of the 3D scene that are hidden, with commas @property {string} ground map on its floor @property {string} height it lies at @property {string} tint of particles
  * @property {string} run of fine-tuning that is open, empty for a new one
  * @property {string} study that is shown @property {string} quantity of it; empty for the first of each
  * @property {boolean} playing @property {number} speed
@@ -29,7 +30,8 @@ import { spoken } from './units.js';
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 /** How likelihood maps are shown: the colours' scale, whether all share its range, the axes, what lies on top, what they gain on the other run. */
 const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], zoom: ['1', '4'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
-const CHOICES = { tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study', 'recordings'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
+const CHOICES = { height: ['floor', 'belief'], tint: ['weight', 'share'], tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study', 'recordings'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
+const FLOOR = 'fused'; // the map on the scene's floor where none is chosen
 const WORST = 'error'; // the measure that ranks failures where none is chosen
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
@@ -93,7 +95,9 @@ export function address(state) {
   for (const key of ['run', 'study', 'quantity']) if (state[key]) kept[key] = state[key];
   if (by !== WORST) kept.by = by;
   if (group) kept.group = group;
-  for (const key of ['list', 'among', ...Object.keys(MAPS)]) if (state[key] !== CHOICES[key][0]) kept[key] = state[key];
+  if (state.hide) kept.hide = state.hide;
+  if (state.ground !== FLOOR) kept.ground = state.ground;
+  for (const key of ['list', 'among', 'height', 'tint', ...Object.keys(MAPS)]) if (state[key] !== CHOICES[key][0]) kept[key] = state[key];
   if (angle !== null) kept.angle = Number(angle.toFixed(4));
   return `?${new URLSearchParams(kept)}`;
 }
@@ -130,6 +134,8 @@ export function resolve(search, catalog) {
     options: asked.get('options') ?? '',
     by: asked.get('by') ?? WORST,
     group: asked.get('group') ?? '',
+    hide: asked.get('hide') ?? '',
+    ground: asked.get('ground') ?? FLOOR,
     run: asked.get('run') ?? '',
     study: asked.get('study') ?? '',
     quantity: asked.get('quantity') ?? '',

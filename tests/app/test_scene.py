@@ -14,6 +14,7 @@ from urllib.request import Request, urlopen
 import pytest
 import viser
 import websockets.asyncio.server
+import zstandard
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
@@ -69,8 +70,20 @@ def received(socket: ClientConnection, enough: int) -> int:
     return count
 
 
-def draw(socket: ClientConnection, step: int) -> None:
-    selection: dict[str, Any] = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "step": step}
+def told(socket: ClientConnection, quiet: float = 0.5) -> bytes:
+    """What a scene's client is told until nothing comes for so many seconds: the messages, without their arrays."""
+    found = b""
+    with contextlib.suppress(TimeoutError):
+        while True:
+            message = socket.recv(timeout=quiet)
+            assert isinstance(message, bytes)
+            packed = int.from_bytes(message[8:16], "little")
+            found += zstandard.ZstdDecompressor().decompress(message[16 : 16 + packed])
+    return found
+
+
+def draw(socket: ClientConnection, step: int, filter_: str = "crossmodal-pf") -> None:
+    selection: dict[str, Any] = {"task": "door", "filter": filter_, "episode": 1, "step": step}
     socket.send(json.dumps({"type": "cursor", "serial": step, "angle": None, "size": 41, **selection}))
     assert isinstance(socket.recv(timeout=30.0), bytes)
     assert json.loads(socket.recv(timeout=30.0)) == {"type": "drawn", "serial": step, "step": step}
@@ -94,6 +107,46 @@ def test_the_scene_comes_through_our_own_port(address: str) -> None:
         draw(page_socket, 4)
         received(scene, 1)
         assert listening() == before
+
+
+def test_two_people_look_at_two_moments_of_two_filters(address: str) -> None:
+    with contextlib.ExitStack() as stack:
+        views = [open_view(address) for _ in range(2)]
+        pages = [stack.enter_context(joined(address, view["socket"])) for view in views]
+        scenes = [stack.enter_context(joined(address, v["scene"].rstrip("/"), PROTOCOL)) for v in views]
+        draw(pages[0], 3)
+        draw(pages[1], 30, "crossmodal-ekf")
+        particles, gaussians = map(told, scenes)
+        assert b"/particles" in particles
+        assert b"/particles" not in gaussians
+        assert b"/map" in gaussians
+        for mine, other in ((0, 1), (1, 0)):
+            pages[mine].send(json.dumps({"type": "look", "hidden": ["estimates"], "ground": "image", "tint": "share"}))
+            draw(pages[mine], 20 + mine, ("crossmodal-pf", "crossmodal-ekf")[mine])
+            assert b"/map" in told(scenes[mine])
+            assert told(scenes[other], quiet=0.2) == b""
+            with pytest.raises(TimeoutError):
+                pages[other].recv(timeout=0.1)
+
+
+def test_what_is_hidden_costs_nothing_and_comes_back(address: str) -> None:
+    view = open_view(address)
+    with joined(address, view["socket"]) as page, joined(address, view["scene"].rstrip("/"), PROTOCOL) as scene:
+        draw(page, 3)
+        told(scene)
+        page.send(json.dumps({"type": "look", "hidden": ["map", "camera"]}))
+        assert b"/map" in told(scene)
+        draw(page, 4)
+        moved = told(scene)
+        assert b"/particles" in moved
+        assert b"/map" not in moved
+        assert b"/camera" not in moved
+        page.send(json.dumps({"type": "look", "ground": "haptics"}))
+        shown = told(scene)
+        assert b"/map" in shown
+        assert b"/camera" in shown
+        page.send(json.dumps({"type": "look", "hidden": ["moon"]}))
+        assert "'moon' does not exist" in json.loads(page.recv(timeout=5.0))["error"]
 
 
 def test_another_version_of_the_client_is_turned_away(address: str) -> None:

@@ -129,7 +129,7 @@ def test_the_newest_cursor_wins(
     [
         ("not json", "Not JSON"),
         ("[1]", "JSON object"),
-        ("{}", "Message type None does not exist. Available: cursor, look, theme."),
+        ("{}", "Message type None does not exist. Available: cursor, look, stand, theme."),
         (json.dumps(cursor(task="nothing")), "task 'nothing' does not exist"),
         (json.dumps(cursor(filter="nothing")), "filter 'nothing' does not exist"),
         (json.dumps(cursor(filter=3)), "cursor needs 'filter', a name; got 3."),
