@@ -22,6 +22,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun.any_batch_value import AnyBatchValue
 from rerun.chunk import RrdReader
+from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
 import beliefscope
 from beliefscope.datasets.catalog import find_task
@@ -103,13 +104,33 @@ def new_recording(path: Path, sample: Trace, steps: int, layout: rrb.Blueprint) 
     Raises BadInput where the folder does not exist or cannot be written.
     """
     rr.set_strict_mode(True)  # or Rerun turns its errors into warnings and leaves gaps
+    flush_and_cleanup_orphaned_recordings()  # Rerun keeps each stream there was, with two threads, until it is told
     with _complete_or_absent(path) as unfinished:
         stream = rr.RecordingStream(APPLICATION)
-        stream.save(unfinished, default_blueprint=layout)
+        with _let_go(layout):
+            stream.save(unfinished, default_blueprint=layout)
         send_header(stream, sample, steps)
         stream.flush()  # so that even a file cut off later says what it is
         yield stream
         _finish(stream, unfinished)
+
+
+@contextmanager
+def _let_go(layout: rrb.Blueprint) -> Iterator[None]:
+    """Ends the stream that Rerun makes for a layout and forgets: it holds itself, two threads and what was sent."""
+    made, log = [], layout._log_to_stream
+
+    def remembered(stream: rr.RecordingStream) -> None:
+        made.append(stream)
+        log(stream)
+
+    layout._log_to_stream = remembered  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        layout._log_to_stream = log  # type: ignore[method-assign]
+        for stream in made:
+            stream.disconnect()
 
 
 def thinned(trace: Trace) -> Trace:

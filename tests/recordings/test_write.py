@@ -234,3 +234,16 @@ def test_a_full_disk_is_noticed(new_trace: Callable[..., Trace], tmp_path: Path)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_rerun_lets_go_of_a_recording_that_is_written(trace: Trace, tmp_path: Path) -> None:
+    def threads() -> int:
+        return len(os.listdir("/proc/self/task"))
+
+    if not Path("/proc/self/task").is_dir():
+        pytest.skip("needs /proc to see Rerun's threads")
+    counts = []
+    for number in range(4):
+        write_recording(trace, tmp_path / f"{number}.rrd")
+        counts.append(threads())
+    assert counts[3] <= counts[0]
