@@ -146,8 +146,9 @@ export class FileTable {
       const cell = row.insertCell();
       cell.className = c ? `${number ? 'number ' : ''}of-${name}` : 'name';
       cell.title = hint?.(file) ?? '';
-      if (c) cell.append(shown(file));
-      else cell.append(this.#opener(file, acts[0]), ...[shown(file)].filter(Boolean));
+      const place = c ? cell : cell.appendChild(document.createElement('div'));
+      if (!c) place.append(this.#opener(file, acts[0]));
+      place.append(shown(file));
     }
     const more = part('button', 'more', { type: 'button', className: 'quiet more', textContent: '⋯', ariaHasPopup: 'menu', title: 'What can be done with it' });
     more.setAttribute('aria-label', `Menu of ${file.name}`);

@@ -9,13 +9,13 @@ import { bytes, sentence } from './units.js';
 const AGAIN = 4000; // ms until the list is asked for again: another browser may have changed it
 const SOON = 700; // while a file is being looked into
 const READ_ONLY = 'This server only shows: nothing can be changed here';
-const WHEN = new Intl.DateTimeFormat('en-GB', { day: 'numeric', month: 'short', hour: '2-digit', minute: '2-digit' });
+const TIME = new Intl.DateTimeFormat('en-GB', { hour: '2-digit', minute: '2-digit' });
+const DAY = new Intl.DateTimeFormat('en-GB', { day: 'numeric', month: 'short' });
 
 const BODY = `
   <div class="top">
     <input type="search" placeholder="Search name, task, filter, tag" aria-label="Search recordings and reports" autocomplete="off" spellcheck="false">
     <span class="told" aria-live="polite"></span>
-    <span class="spacer"></span>
     <button type="button" class="text add" title="An .rrd file of any application, to open it here and keep it. Or drop it anywhere on this tab">Add .rrd…</button>
     <input type="file" accept=".rrd" multiple hidden>
   </div>
@@ -39,7 +39,7 @@ const OF_A_RUN = [
   { ...words('recipe', 'sensors', 'How they were broken', ({ task, recipe }) => (task === null ? null : recipe || 'as recorded')), hint: ({ recipe }) => recipe },
 ];
 const size = { name: 'bytes', title: 'size', help: 'On the disk', value: (file) => file.bytes, shown: (file) => bytes(file.bytes), number: true };
-const when = (name) => ({ name: 'when', title: 'when', help: 'It was written', value: (file) => Date.parse(file[name]), shown: (file) => WHEN.format(new Date(file[name])), hint: (file) => new Date(file[name]).toLocaleString('en-GB'), number: true });
+const when = (name) => ({ name: 'when', title: 'when', help: 'It was written', value: (file) => Date.parse(file[name]), shown: (file) => moment(new Date(file[name])), hint: (file) => new Date(file[name]).toLocaleString('en-GB'), number: true });
 const data = { ...words('data', 'data', 'Data set, as it is named here', (file) => file.run?.data ?? null), hint: (file) => file.data_hash && `Episode ${file.data_hash.slice(0, 12)}` };
 
 export class Library {
@@ -320,7 +320,7 @@ export class Library {
         const line = document.createElement('li');
         const back = Object.assign(document.createElement('button'), { type: 'button', className: 'text quiet', textContent: 'Restore', ariaLabel: `Restore ${one.name}`, disabled: Boolean(this.#readOnly) });
         back.addEventListener('click', () => this.#restore(one));
-        line.append(back, one.name, note(`${bytes(one.bytes)}, deleted ${WHEN.format(new Date(1000 * one.deleted))}`));
+        line.append(back, one.name, note(`${bytes(one.bytes)}, deleted ${moment(new Date(1000 * one.deleted))}`));
         return line;
       }),
     );
@@ -396,6 +396,13 @@ function against(one, other) {
   if (one.run.filter !== other.run.filter) differs.filter = other.run.filter;
   if (one.recipe !== other.recipe) differs.recipe = other.recipe;
   return String(new URLSearchParams(differs));
+}
+
+/** The time of today, the day of any other. */
+function moment(date) {
+  const now = new Date();
+  if (date.toDateString() === now.toDateString()) return TIME.format(date);
+  return `${DAY.format(date)}${date.getFullYear() === now.getFullYear() ? '' : ` ${date.getFullYear()}`}`;
 }
 
 function note(text, kind = '') {

@@ -28,7 +28,7 @@ export function saving(button, host, write, open, keep) {
       [link.href, link.download, link.textContent] = [recording.url, recording.name, `Download ${recording.name}`];
       const [view, place] = [['Open in Rerun tab', open], ['Recordings', () => keep(recording.name)]].map(([textContent, act]) => {
         const made = Object.assign(document.createElement('button'), { type: 'button', className: 'text', textContent });
-        made.addEventListener('click', act);
+        made.addEventListener('click', () => (host.replaceChildren(), act()));
         return made;
       });
       const when = recording.seconds === null ? 'written before' : `written in ${fixed(recording.seconds)} s`;
