@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 import secrets
 import time
@@ -16,6 +15,7 @@ from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.mapwire import maps_message
 from beliefscope.app.scene import Scene
 from beliefscope.app.wire import Cursor, cursor, look, viewpoint
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import LikelihoodMap
 
@@ -64,7 +64,7 @@ class View:
     async def _heard(self, websocket: WebSocket, text: str) -> None:
         serial = None
         try:
-            message = json.loads(text)
+            message = read_json(text)
             if not isinstance(message, dict):
                 raise BadInput("A message is a JSON object.")
             serial = message.get("serial")
@@ -80,10 +80,10 @@ class View:
                     await asyncio.to_thread(self.scene.stand, viewpoint(message))
                 case other:
                     raise BadInput(f"Message type {other!r} does not exist. Available: cursor, look, stand, theme.")
-        except json.JSONDecodeError as error:
-            await _tell_error(websocket, serial, f"Not JSON: {error}.")
         except BadInput as error:
             await _tell_error(websocket, serial, str(error))
+        except ValueError as error:
+            await _tell_error(websocket, serial, f"Not JSON: {error}.")
 
     async def _answer(self, websocket: WebSocket) -> None:
         while True:

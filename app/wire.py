@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_type_hints
 
@@ -17,6 +16,7 @@ from beliefscope.inspect import measures
 from beliefscope.inspect.consistency import innovations
 from beliefscope.inspect.trace import Trace
 
+LARGEST_ANGLE = 1e3  # rad: no door turns farther
 MAP_SIZES = (41, 135)  # cells a side: what a drag shows, and the fine one that follows
 SENSORS = ("effector_position", "force")
 
@@ -128,7 +128,7 @@ def cursor(message: dict[str, Any]) -> Cursor:
         if not isinstance(text, str):
             raise BadInput(f"cursor's {key!r} is text; got {text!r}.")
     size = message.get("size", MAP_SIZES[0])
-    if size not in MAP_SIZES:
+    if type(size) is not int or size not in MAP_SIZES:
         raise BadInput(f"cursor's 'size' is {' or '.join(map(str, MAP_SIZES))}; got {size!r}.")
     scene, beside = message.get("scene", True), message.get("beside", False)
     for key, flag in (("scene", scene), ("beside", beside)):
@@ -149,7 +149,7 @@ def cursor(message: dict[str, Any]) -> Cursor:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_ANGLE
 
 
 def _integer(message: dict[str, Any], key: str) -> int:

@@ -2,7 +2,7 @@
 
     python bench/fuzz.py [part ...] --inputs 10000 --seed 0 --keep DIR
 
-Parts are ``api``, ``socket`` and the readers in tests/fuzz/readers.py; all by default. Files are read in processes of
+Parts are ``http``, ``socket`` and the readers in tests/fuzz/readers.py; all by default. Files are read in processes of
 their own, whose memory is bounded and which are ended when one input takes too long: what kills such a process is a
 failure, and the rest goes on. Inputs that fail are kept in DIR, with what came of them. Exit code 1 where any did.
 """
@@ -115,6 +115,36 @@ def _read_all(name: str, seed: int, first: int, inputs: int, folder: str, shared
         shared[8:24] = counts["read"].to_bytes(8, "little") + counts["refused"].to_bytes(8, "little")
 
 
+def fuzz_server(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
+    """All inputs of the HTTP routes, or of a view's socket; then what they left behind."""
+    import threading
+
+    import asked
+    import readers
+
+    began, before = time.monotonic(), threading.active_count()
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        given = readers.server(Path(folder))
+        with asked.served(given) as (client, heard):
+            ask = asked.ask_http if name == "http" else asked.ask_socket
+            tally = ask(client, heard, inputs, seed)
+        for left in asked.left_over(given.workspace):
+            tally.failures[f"left over: {left}"] = ""
+        if more := asked.threads_after(before):
+            tally.failures[f"{more} threads are left"] = ""
+    place = keep / name
+    for number, (why, sent) in enumerate(tally.failures.items()):
+        place.mkdir(parents=True, exist_ok=True)
+        (place / f"{number}.txt").write_text(f"{why}\n{sent}\n", errors="replace")
+    print(f"    {name}: {dict(tally.answers)}", file=sys.stderr)
+    good = tally.answers["2xx"] + tally.answers["maps"] + tally.answers["drawn"]
+    failures = Counter(dict.fromkeys((why[:160] for why in tally.failures), 1))
+    return Outcome(tally.inputs, good, tally.inputs - good, time.monotonic() - began, failures)
+
+
+SERVER = ("http", "socket")
+
+
 def _in_a_process(work: Callable[[], None]) -> int:
     """Its exit code; minus the signal that ended it."""
     pid = os.fork()
@@ -135,7 +165,7 @@ def main() -> None:
     import readers
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = [*readers.READERS]
+    parts = [*readers.READERS, *SERVER]
     parser.add_argument("parts", nargs="*", metavar="part", help=f"some of: {', '.join(parts)}")
     parser.add_argument("--inputs", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
@@ -146,7 +176,8 @@ def main() -> None:
     print("| part | inputs | refused | read | failures | seconds |\n| --- | ---: | ---: | ---: | ---: | ---: |")
     failed = False
     for name in given.parts or parts:
-        outcome = fuzz_reader(name, given.inputs, given.seed, given.keep)
+        fuzz = fuzz_server if name in SERVER else fuzz_reader
+        outcome = fuzz(name, given.inputs, given.seed, given.keep)
         print(outcome.row(name), flush=True)
         for why, count in outcome.failures.most_common():
             print(f"    {count} x {why}", file=sys.stderr, flush=True)

@@ -26,6 +26,9 @@ from beliefscope.filters.slices import NOMINAL, Slice
 from beliefscope.filters.train import versions
 from beliefscope.filters.tuning import Look, Tuning, look
 
+MOST = {"length": 10**4, "windows": 1024, "steps": 10**7, "check": 10**7, "patience": 10**7, "particles": 10**4}
+"""Of what counts the memory that a step takes, and the time of a run."""
+
 
 @dataclass(frozen=True)
 class FineTune:
@@ -63,9 +66,12 @@ class FineTune:
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of its range."""
-        for name in ("length", "windows", "steps", "check", "patience", "particles"):
-            if getattr(self, name) < 1:
-                raise BadInput(f"{name} of a fine-tuning is {getattr(self, name)}, not a whole number of at least 1")
+        for name, most in MOST.items():
+            value = getattr(self, name)
+            if not 1 <= value <= most:
+                raise BadInput(f"{name} of a fine-tuning is {value}, not a whole number from 1 to {most}")
+        if not 0 <= self.seed < 2**63:
+            raise BadInput(f"seed of a fine-tuning is {self.seed}, not a whole number from 0 to 2^63 - 1")
         for name in ("rate", "pull", "likelihood_weight"):
             value = getattr(self, name)
             if not (0.0 < value < math.inf or (value == 0.0 and name != "rate")):
@@ -113,7 +119,7 @@ class FineTune:
                 raise one_of("setting of a fine-tuning", str(key), known)
             try:
                 given[key] = _READ[known[key].type](one)
-            except (TypeError, ValueError, KeyError, AttributeError) as error:
+            except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
                 if isinstance(error, BadInput):
                     raise
                 raise BadInput(f"setting {key!r} of a fine-tuning is {one!r}, which does not fit") from None

@@ -118,7 +118,7 @@ def betas(text: str) -> dict[str, float]:
 
 def _step(text: str, given: Mapping[str, str], key: str) -> int:
     value = given.get(key, "")
-    if not (value.isascii() and value.isdigit()):
+    if not (value.isascii() and value.isdigit() and len(value) < 10):
         raise BadInput(f"{key!r} of the edit {text!r} is a step, an integer from 0; got {value!r}")
     return int(value)
 

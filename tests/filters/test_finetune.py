@@ -314,7 +314,7 @@ def test_settings_travel_and_wrong_ones_are_refused(episodes: list[Episode]) -> 
     for values, words in (
         ({"step": 3}, "setting of a fine-tuning 'step' does not exist"),
         ({"steps": "3"}, "setting 'steps' of a fine-tuning is '3'"),
-        ({"steps": 0}, "not a whole number of at least 1"),
+        ({"steps": 0}, "not a whole number from 1 to"),
         ({"train": "all"}, "setting 'train'"),
         ({"nominal": 1.5}, "not from 0 to 1"),
         ({"rate": 0}, "rate of a fine-tuning"),

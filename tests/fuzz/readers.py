@@ -304,6 +304,14 @@ def read_run(path: Path) -> None:
         raise BadInput(error.detail) from None
 
 
+def server(folder: Path) -> Settings:
+    """What a server is given that shall be quick: few steps, few particles, small networks."""
+    make_episodes(folder / "mine.h5")
+    make_checkpoint(folder / "small.safetensors")
+    data, checkpoints = {"mine": folder / "mine.h5"}, {"small": folder / "small.safetensors"}
+    return Settings(folder / "workspace", data, checkpoints, particles=7)
+
+
 # Recipes: text and JSON.
 
 
