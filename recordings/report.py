@@ -10,6 +10,8 @@ date aside.
 from __future__ import annotations
 
 import csv
+import fcntl
+import glob
 import hashlib
 import io
 import json
@@ -18,7 +20,7 @@ import platform
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -323,7 +325,11 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """A hidden folder beside it, which takes its name when all went well, and is gone when not."""
     folder = Path(folder).absolute()
     check_folder(folder)
-    made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    with _held(folder.parent):  # so that nobody clears away what is not held yet
+        _clear(folder)
+        made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        holding = ExitStack()
+        holding.enter_context(_held(made))
     old = made.with_name(f"{made.name}.old")
     try:
         yield made
@@ -338,8 +344,33 @@ def new_folder(folder: Path) -> Iterator[Path]:
                 old.rename(folder)
             raise
     finally:
+        holding.close()
         shutil.rmtree(made, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _clear(folder: Path) -> None:
+    """Removes what reports left there that were killed; one killed between its two renames leaves the older report."""
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}.????????"):
+        with suppress(OSError), _held(left, wait=False):  # one that is being written is held
+            shutil.rmtree(left)
+    for old in folder.parent.glob(f".{glob.escape(folder.name)}.????????.old"):
+        with suppress(OSError):
+            if folder.exists():
+                shutil.rmtree(old)
+            else:
+                old.rename(folder)
+
+
+@contextmanager
+def _held(folder: Path, wait: bool = True) -> Iterator[None]:
+    """Holds a folder among all who ask so; a process that ends lets go. Raises OSError for one that is held."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)
 
 
 def _json(document: Mapping[str, Any]) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -25,9 +25,6 @@ from beliefscope.app.commands.given import (
     serving,
     whole,
 )
-
-if TYPE_CHECKING:
-    from beliefscope.inspect.diagnostic import Table
 
 
 def failures(
@@ -99,31 +96,10 @@ def failures(
         "moments": [as_json(m) | {"link": link} for m, link in zip(moments, links, strict=True)],
         "serve": serving(files, data, seed),
     }
-    lines = [found.verdict, *map(text, (found.table_of_groups(), found.table_of(moments)))]
+    tables = (found.table_of_groups(), found.table_of(moments))
+    lines = [found.verdict, *(console.grid(table.title, table.columns, table.rows) for table in tables)]
     if url is not None:
         lines += [f"Links, for {document['serve']}", *links]
     if particles != 300 and found.particles:
         console.say("note: the page filters with 300 particles, so its numbers at these moments are others")
     console.result(document, "\n\n".join(lines[:3]) + "".join(f"\n{line}" for line in lines[3:]), json)
-
-
-def text(table: Table) -> str:
-    """A table, as wide as it needs."""
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table as Grid
-
-    grid = Grid(title=table.title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for i, name in enumerate(table.columns):
-        words = any(isinstance(row[i], str) for row in table.rows)
-        grid.add_column(name, justify="left" if words else "right", no_wrap=True)
-    for row in table.rows:
-        grid.add_row(*(_shown(value) for value in row))
-    view = Console(width=1000, color_system=None)
-    with view.capture() as capture:
-        view.print(grid)
-    return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
-
-
-def _shown(value: str | int | float | None) -> str:
-    return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -137,6 +137,24 @@ def test_a_report_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     assert json.loads((folder / "manifest.json").read_text())["title"] == "new"
 
 
+def test_what_killed_reports_left_is_cleared_but_not_what_others_write(tmp_path: Path) -> None:
+    folder = tmp_path / "report"
+    manifest = json.dumps({"format": FORMAT})
+    (tmp_path / ".report.k1lled__").mkdir()
+    (tmp_path / ".report.k1lled__" / "half").write_text("x")
+    (tmp_path / ".report.between_.old").mkdir()  # a kill after the older report was moved away
+    (tmp_path / ".report.between_.old" / "manifest.json").write_text(manifest)
+    (tmp_path / ".other.k1lled__").mkdir()
+    with new_folder(folder) as mine:
+        assert sorted(path.name for path in tmp_path.iterdir()) == sorted([".other.k1lled__", mine.name, "report"])
+        assert (folder / "manifest.json").read_text() == manifest
+        with new_folder(folder) as theirs:
+            assert mine.is_dir(), "another process may be writing there"
+            (theirs / "manifest.json").write_text(manifest)
+        (mine / "manifest.json").write_text(manifest)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other.k1lled__", "report"]
+
+
 def test_only_a_report_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "manifest.json").write_text('{"format": "chapters"}')
