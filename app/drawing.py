@@ -254,9 +254,10 @@ class Drawing:
         # A robot is about a meter long; without one, all there is lies around the belief.
         if self._replay is None or np.ptp(self._replay.positions[:, 1:], axis=(0, 1)).max() < 0.5:
             low, high, _ = extent(self._task, self._trace)
-            at = np.array([*(low + high) / 2.0, 0.0])
+            tall = 0.0 if self._ghost is None or self._replay is not None else float(max(self._ghost.size))
+            at = np.array([*(low + high) / 2.0, tall / 3.0])
             # Beside a replay's objects the masts of the estimates stand half a meter high.
-            eye = BARE_EYE * ((high - low).max() if self._replay is None else 0.5)
+            eye = BARE_EYE * (max((high - low).max(), 1.2 * tall) if self._replay is None else 0.5)
         else:
             eye = EYE * (0.6 + 0.4 * min(1.0, at[2]))
             at = at * [0.62, 0.3, 0.68] + [0.0, 0.0, 0.2 * max(0.0, 1.0 - at[2])]
