@@ -1,4 +1,4 @@
-"""Screenshots of every view of the page, at several sizes, light and dark, to be looked at: what ships, under long names.
+"""Screenshots of every view of the page, to be looked at: several sizes, light and dark, what ships under long names.
 
 python bench/screens.py FOLDER
 python bench/screens.py FOLDER --view study --view keys --size 1024x768 --theme dark
@@ -56,7 +56,7 @@ VIEWS: dict[str, Callable[[Page], None]] = {
     "failures": tab("failures", state("#failures"), "Look for failures"),
     "compare": tab("compare", state("#compare .result"), "Run beside"),
     "study": tab("study", state("#study")),
-    "rerun": tab("rerun", state("#rerun")),
+    "rerun": tab("rerun", "['ready', 'error'].includes(document.querySelector('#rerun').dataset.state)"),
     "maps-options": click("#maps-view"),
     "keys": click("#help"),
     "jobs": click("#jobs-button"),
@@ -67,7 +67,8 @@ VIEWS: dict[str, Callable[[Page], None]] = {
 def close(page: Page) -> None:
     """Puts away what lies over the page."""
     page.evaluate(
-        "() => { document.querySelector('dialog[open]')?.close(); document.querySelector('[popover]:popover-open')?.hidePopover();"
+        "() => { document.querySelector('dialog[open]')?.close();"
+        " document.querySelector('[popover]:popover-open')?.hidePopover();"
         " if (!document.querySelector('#jobs').hidden) document.querySelector('#jobs-button').click(); }"
     )
 

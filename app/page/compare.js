@@ -36,6 +36,7 @@ export class Compare {
     this.#figures = new Figures(host.querySelector('.figures'), store);
     this.#form = new Edit(host.querySelector('form'), catalog, store, sheet, (against) => api.check({ ...store.state, against }));
     say(this.#result, 'loading', 'Loading …');
+    this.#showGain();
   }
 
   /** Whether the panel can be seen. */
@@ -106,6 +107,7 @@ export class Compare {
   #showGain() {
     const [box, text] = this.#gain.children;
     const none = this.#other && whyNoGain(this.#trace, this.#other);
+    this.#gain.hidden = !this.#other;
     [box.checked, box.disabled] = [this.#store.state.beside === 'gain' && !none, Boolean(none)];
     text.textContent = none ?? `In the maps, show what this run gains on ${this.name}`;
   }

@@ -18,16 +18,22 @@ export class Heatmaps {
   #maps = null;
   #trace = null;
   #pinned = null; // {maps, selection}
+  #fetch;
+  #fetched = ''; // the moment whose maps were asked for, to be pinned
   #besideName = '';
   #hover = null; // [dx, dy] m
   #side = 0;
 
-  /** @param {HTMLElement} panel with `#heatmaps` inside @param {import('./state.js').Store} store */
-  constructor(panel, store) {
-    [this.#panel, this.#store] = [panel, store];
+  /**
+   * @param {HTMLElement} panel with `#heatmaps` inside @param {import('./state.js').Store} store
+   * @param {(moment: object) => Promise<import('./mapvalues.js').Maps>} fetch the fine maps of another moment
+   */
+  constructor(panel, store, fetch) {
+    [this.#panel, this.#store, this.#fetch] = [panel, store, fetch];
     this.#host = panel.querySelector('#heatmaps');
     new ResizeObserver(() => this.#resize()).observe(this.#host);
     store.listen((_, changed) => LOOKS.some((look) => changed.has(look)) && this.#shade());
+    store.listen((_, changed) => changed.has('pin') && this.#takePin());
   }
 
   /**
@@ -42,14 +48,36 @@ export class Heatmaps {
     if (first) this.#figures = this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
     const kept = this.#pinned;
     if (kept && (kept.selection.task !== trace.selection.task || !comparable(kept.maps, maps))) this.pin(); // lets them go
+    this.#takePin();
     this.#shade();
   }
 
   /** Keeps these maps, to show what others gain or lose against them; or lets those go. */
   pin() {
-    this.#pinned = this.#pinned || !this.#maps ? null : { maps: this.#maps, selection: this.#trace.selection };
-    if (this.#maps) this.#shade();
+    if (!this.#maps) return;
+    this.#keep(this.#pinned ? null : { maps: this.#maps, selection: this.#trace.selection });
+    const { angle } = this.#store.state;
+    this.#store.set({ pin: this.#pinned ? moment(this.#trace.selection, this.#maps.step, angle) : '' });
+  }
+
+  #keep(pinned) {
+    this.#pinned = pinned;
+    this.#shade();
     this.changed();
+  }
+
+  /** The state names a moment whose maps are not here, as a link does: asks for them. Or it names none any more. */
+  async #takePin() {
+    const { pin, task } = this.#store.state;
+    if (!pin && this.#pinned) this.#keep(null);
+    if (!pin || !this.#trace || this.#pinned || this.#fetched === pin) return;
+    this.#fetched = pin;
+    const { step, angle = null, episode, ...named } = Object.fromEntries(new URLSearchParams(pin));
+    const selection = { recipe: '', ...named, task, episode: Number(episode) };
+    const maps = await this.#fetch({ ...selection, step: Number(step), angle: angle && Number(angle) });
+    if (this.#store.state.pin !== pin || this.#pinned) return;
+    if (comparable(maps, this.#maps)) this.#keep({ maps, selection });
+    else this.#store.set({ pin: '' });
   }
 
   /** The maps that the shown ones are set against: those pinned, or the other run's at this step; null without any. */
@@ -282,6 +310,13 @@ export class Heatmaps {
 }
 
 const comparable = (a, b) => a.layers.join() === b.layers.join() && Math.abs(a.half_width - b.half_width) < 1e-6;
+
+/** A moment of the page's task in words of an address. */
+function moment({ filter, data, episode, recipe }, step, angle) {
+  const told = { filter, data, episode, step, ...(recipe && { recipe }), ...(angle !== null && { angle: angle.toFixed(4) }) };
+  return String(new URLSearchParams(told));
+}
+
 const degrees = (radians) => (radians === null ? null : (radians * 180) / Math.PI);
 
 /** Few digits: of areas and divergences, whose size says more than their digits. */

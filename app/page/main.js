@@ -80,7 +80,7 @@ class Page {
     this.theme = new Theme((dark) => this.#recolour(dark));
     this.clock = new Clock(store);
     this.timeline = new TimeLine($('#timeline .body'), store);
-    this.heatmaps = new Heatmaps($('#maps'), store);
+    this.heatmaps = new Heatmaps($('#maps'), store, (moment) => this.socket.ask(moment));
     this.showMapTools = mapTools($('#maps-options'), $('#maps-view'), store, this.heatmaps);
     this.camera = new Camera($('#camera'));
     this.numbers = new Numbers($('#numbers'));

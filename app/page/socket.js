@@ -30,6 +30,8 @@ export class ViewSocket {
   #socket = null;
   #serial = 0;
   #wanted = null;
+  #asked = null; // {cursor, done, serial}: maps of another moment, between two cursors
+  #newest = 0; // serial of the newest cursor
   #inFlight = null;
   #sent = new Map();
   #last = null;
@@ -51,6 +53,14 @@ export class ViewSocket {
     this.#want({ ...cursor, size: COARSE, scene }, inputTime);
     clearTimeout(this.#rest);
     this.#rest = setTimeout(() => this.#want({ ...cursor, size: FINE, scene: true }, null), REST);
+  }
+
+  /** The fine maps of another moment; the cursor stays where it is. @param {object} cursor without its size. @returns {Promise<Maps>} */
+  ask(cursor) {
+    return new Promise((done) => {
+      this.#asked = { cursor: { against: '', ...cursor, size: FINE, scene: false }, done, serial: 0 };
+      this.#pump();
+    });
   }
 
   /** The page's colours have changed. */
@@ -76,11 +86,17 @@ export class ViewSocket {
   }
 
   #pump() {
-    if (this.#inFlight !== null || !this.#wanted || this.#socket?.readyState !== WebSocket.OPEN) return;
-    const { cursor, inputTime } = this.#wanted;
-    this.#wanted = null;
+    if (this.#inFlight !== null || this.#socket?.readyState !== WebSocket.OPEN) return;
+    const asked = this.#asked && !this.#asked.serial;
+    if (!asked && !this.#wanted) return;
+    const { cursor, inputTime } = asked ? this.#asked : this.#wanted;
     this.#inFlight = ++this.#serial;
-    this.#sent.set(this.#serial, { ...cursor, inputTime });
+    if (asked) this.#asked.serial = this.#serial;
+    else {
+      this.#wanted = null;
+      this.#newest = this.#serial;
+      this.#sent.set(this.#serial, { ...cursor, inputTime });
+    }
     this.#send({ type: 'cursor', serial: this.#serial, ...cursor });
     this.#lost = setTimeout(() => this.#answered(this.#inFlight), PATIENCE);
   }
@@ -125,6 +141,7 @@ export class ViewSocket {
       if (!opened) this.#view = null;
       clearTimeout(this.#lost);
       this.#inFlight = null;
+      if (this.#asked) this.#asked.serial = 0;
       this.#sent.clear();
       this.#handlers.pace(PAUSE.rest);
       this.#retry('The server has gone.');
@@ -142,6 +159,12 @@ export class ViewSocket {
   #heard(data) {
     if (data instanceof ArrayBuffer) {
       const maps = readMaps(data);
+      if (maps.serial === this.#asked?.serial) {
+        this.#asked.done(maps);
+        this.#asked = null;
+        this.#answered(maps.serial);
+        return;
+      }
       if (maps.other) {
         this.#beside = maps;
         return;
@@ -160,7 +183,7 @@ export class ViewSocket {
     }
     if (message.type === 'drawn') {
       const sent = this.#sent.get(message.serial) ?? {};
-      if (sent.size === FINE && message.serial === this.#serial) this.#handlers.pace(PAUSE.rest);
+      if (sent.size === FINE && message.serial === this.#newest) this.#handlers.pace(PAUSE.rest);
       this.#handlers.drawn(message.step, sent);
       for (const serial of this.#sent.keys()) if (serial <= message.serial) this.#sent.delete(serial);
     }

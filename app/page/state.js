@@ -23,6 +23,7 @@ import { spoken } from './units.js';
  * @property {string} hide layers of the 3D scene that are hidden, with commas @property {string} ground map on its floor @property {string} height it lies at @property {string} tint of particles
  * @property {string} run of fine-tuning that is open, empty for a new one
  * @property {string} study that is shown @property {string} quantity of it; empty for the first of each
+ * @property {string} pin moment whose maps the shown ones are set against, as in an address; empty for none
  * @property {boolean} playing @property {number} speed
  * @property {boolean} follow whether the cursor stays at the newest step of a live run; a link without a step begins so
  */
@@ -92,7 +93,7 @@ export function address(state) {
   if (diagnostic) kept.diagnostic = diagnostic;
   if (options) kept.options = options;
   if (over !== CHOICES.over[0]) kept.over = over;
-  for (const key of ['run', 'study', 'quantity']) if (state[key]) kept[key] = state[key];
+  for (const key of ['run', 'study', 'quantity', 'pin']) if (state[key]) kept[key] = state[key];
   if (by !== WORST) kept.by = by;
   if (group) kept.group = group;
   if (state.hide) kept.hide = state.hide;
@@ -139,6 +140,7 @@ export function resolve(search, catalog) {
     run: asked.get('run') ?? '',
     study: asked.get('study') ?? '',
     quantity: asked.get('quantity') ?? '',
+    pin: asked.get('pin') ?? '',
     playing: false,
     speed: 1,
     follow: data.live?.state === 'running' && !asked.has('step'),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sysconfig
 import time
@@ -14,7 +15,6 @@ import pytest
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: pip install -e '.[dev]'")
 
-SCREENSHOTS = Path(__file__).resolve().parents[2] / "out" / "screenshots"
 FLAGS = [
     "--headless",
     "--no-sandbox",
@@ -88,9 +88,10 @@ def browser(chromium: str) -> Iterator[Any]:
 class Watched:
     """A page, and everything about it that must not be."""
 
-    def __init__(self, page: Any, url: str) -> None:
+    def __init__(self, page: Any, url: str, screenshots: Path) -> None:
         self.page = page
         self.url = url
+        self._screenshots = screenshots
         self.wrong: list[str] = []
         page.add_init_script(
             "document.addEventListener('securitypolicyviolation', (event) => {"
@@ -139,9 +140,9 @@ class Watched:
         )
 
     def picture(self, name: str) -> None:
-        """Keeps a screenshot."""
-        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-        self.page.screenshot(path=SCREENSHOTS / f"{name}.png", timeout=1000 * PATIENCE)
+        """Keeps a screenshot, where ``BELIEFSCOPE_SCREENSHOTS`` says or among the tests' own files."""
+        self._screenshots.mkdir(parents=True, exist_ok=True)
+        self.page.screenshot(path=self._screenshots / f"{name}.png", timeout=1000 * PATIENCE)
 
 
 STATE = (
@@ -152,13 +153,15 @@ OpenPage = Callable[..., Watched]
 
 
 @pytest.fixture
-def open_page(browser: Any, served: Served) -> Iterator[OpenPage]:
+def open_page(browser: Any, served: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpenPage]:
     """Opens pages, and checks at the end that nothing went wrong on any of them."""
     opened: list[Watched] = []
+    kept = os.environ.get("BELIEFSCOPE_SCREENSHOTS")
+    screenshots = Path(kept) if kept else tmp_path_factory.getbasetemp() / "screenshots"
 
     def open_(link: str = "", url: str = "", **options: Any) -> Watched:
         options = {"viewport": {"width": 1024, "height": 768}, "color_scheme": "light"} | options
-        watched = Watched(browser.new_page(**options), url or served.url)
+        watched = Watched(browser.new_page(**options), url or served.url, screenshots)
         opened.append(watched)
         return watched.open(link)
 

@@ -1,0 +1,75 @@
+"""The whole page's craft: every tab accessible in light and dark, a focus that is seen and comes round, no jumps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.browser
+
+axe = pytest.importorskip("axe_playwright_python", reason="axe is not installed: pip install -e '.[dev]'")
+AXE = (Path(axe.__file__).parent / "axe.min.js").read_text()
+
+TABS = "(all) => all.map((tab) => tab.id.replace('tab-', ''))"
+
+VIOLATIONS = """async () => {
+  // Other people's pages are not ours to judge: viser's scene, Rerun's canvas.
+  const { violations } = await axe.run({ exclude: ['iframe', '.viewer'] }, { resultTypes: ['violations'] });
+  const serious = violations.filter(({ impact }) => impact === 'serious' || impact === 'critical');
+  const told = ({ target, failureSummary }) => `${target} ${failureSummary.split('\\n')[1].trim()}`;
+  return serious.flatMap(({ id, nodes }) => nodes.map((node) => `${id}: ${told(node)}`));
+}"""
+
+FOCUSED = """() => {
+  const at = document.activeElement;
+  const { width, height } = at.getBoundingClientRect();
+  const name = at.ariaLabel || at.title || at.labels?.length || at.textContent.trim();
+  const left = at === document.body || at.tagName === 'IFRAME';
+  return [left, at.id || at.outerHTML.slice(0, 90), width * height > 0, Boolean(name)];
+}"""
+
+JUMPS = """() => new Promise((done) => {
+  const observer = new PerformanceObserver((list) => sum += list.getEntries().reduce((all, one) => all + one.value, 0));
+  let sum = 0;
+  observer.observe({ type: 'layout-shift', buffered: true });
+  setTimeout(() => done(sum), 300);
+})"""
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_every_tab_and_sheet_is_accessible(open_page: Any, theme: str) -> None:
+    page = open_page(color_scheme=theme)
+    page.page.evaluate(AXE)
+    found: dict[str, list[str]] = {}
+    tabs = page.page.locator("[role=tab]").evaluate_all(TABS)
+    for tab in tabs:
+        if tab == "rerun":
+            continue  # a canvas; test_page opens it
+        page.page.locator(f"#tab-{tab}").click()
+        page.until(f"() => !document.querySelector('#{tab}').matches('[aria-busy=true], :has([aria-busy=true])')")
+        found[tab] = page.page.evaluate(VIOLATIONS)
+    for sheet, button in (("keys", "#help"), ("maps-options", "#maps-view"), ("jobs", "#jobs-button")):
+        page.page.locator(button).click()
+        found[sheet] = page.page.evaluate(VIOLATIONS)
+        page.page.keyboard.press("Escape")
+    assert {name: lines for name, lines in found.items() if lines} == {}
+
+
+def test_the_tab_key_goes_once_through_all_that_can_be_used(open_page: Any) -> None:
+    page = open_page("?tab=failures")
+    assert page.page.evaluate(JUMPS) < 0.05
+    stops: list[str] = []
+    for _ in range(80):
+        page.page.keyboard.press("Tab")
+        left, what, seen, named = page.page.evaluate(FOCUSED)
+        if left:
+            break
+        assert seen, f"{what} has the focus and cannot be seen"
+        assert named, f"{what} has no name"
+        stops.append(what)
+    assert len(stops) < 80, "the focus never comes back"
+    assert len(stops) == len(set(stops)), stops
+    order = ["filter", "play", "save", "tab-failures", "maps-view", "tracks"]
+    assert [stop for stop in stops if stop in order] == order
