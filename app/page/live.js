@@ -207,7 +207,7 @@ const identity = (runs) => JSON.stringify(runs.map(({ name, state, started, filt
 function said({ state, told: line, steps, expected, here }) {
   if (line) return line;
   const count = expected ? `${steps} of ${expected} steps` : `${steps} steps`;
-  const absent = here ? '' : ' · its filter is not served here: --filter';
+  const absent = here ? '' : ' · its checkpoint is not served here (--filter)';
   return `${state === 'running' ? 'goes on' : 'ended'}, ${count}${absent}`;
 }
 

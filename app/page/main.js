@@ -207,7 +207,7 @@ class Page {
     $('#maps').classList.toggle('none', Boolean(trace.header.no_maps));
     if (trace.header.no_maps) say($('#heatmaps'), 'empty', sentence(trace.header.no_maps));
     $('#black-key').hidden = !trace.black.some(Boolean);
-    $('#worst').disabled = false;
+    $('#worst').disabled = !trace.truth(0).some(Number.isFinite);
     $('#swatches').replaceChildren(...['truth', ...trace.sources].flatMap((s) => [swatch(s), ` ${trace.called(s)}  `]));
     $('#sigma-key').hidden = !trace.has('estimate_sigma');
     this.showMapTools(trace);
