@@ -304,6 +304,17 @@ class GrowingReader:
         return b"".join(parts)
 
 
+def load_live(path: Path) -> Trace:
+    """The steps that are there. Raises BadInput as ``GrowingReader``, where the file is damaged, and without a step."""
+    reader = GrowingReader(path)
+    try:
+        if not reader.poll():
+            raise BadInput(f"{str(path)!r} has no step yet")
+        return reader.trace()
+    finally:
+        reader.close()
+
+
 def _checksum(mark: bytes, number: int, content: bytes) -> int:
     return crc32(content, crc32(struct.pack("<4sI", mark, number)))
 

@@ -132,11 +132,11 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
     limits = None
     if not growing:
         # The axis fits the truth and the fused band; a modality that runs away may leave it.
-        sigma = SIGMAS * np.sqrt(trace.estimate_covariance[:, i, i])
+        sigma = np.nan_to_num(SIGMAS * np.sqrt(trace.estimate_covariance[:, i, i]))
         mean = trace.estimate_mean[:, i]
         values = np.concatenate([trace.episode.states[:, i], mean - sigma, mean + sigma])
         low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
-        margin = 0.1 * (high - low)
+        margin = 0.1 * (high - low) or 1.0
         limits = (low - margin, high + margin)
     name = f"{component.name} ({SHOWN_UNIT[component.unit]}): truth green, fused red"
     name += ", thin lines 2 sigma" if trace.has_covariance else ""

@@ -18,7 +18,15 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.intact import check_intact
 from beliefscope.inspect.trace import Trace, stored_recipe
-from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, HEADER, PROPERTIES, STEP, TRACE_COMPONENT
+from beliefscope.recordings.schema import (
+    APPLICATION,
+    FORMAT_VERSION,
+    GROWING,
+    HEADER,
+    PROPERTIES,
+    STEP,
+    TRACE_COMPONENT,
+)
 
 VALUES = (TRACE_COMPONENT, "Image:buffer", "Scalars:scalars")
 STORED = ["/trace/**", "/observations/**", f"/{HEADER}"]
@@ -30,6 +38,9 @@ Rows = dict[str, list[tuple[NDArray[np.int64] | None, NDArray[Any]]]]
 
 def read_recording(path: str | Path) -> Trace:
     """The trace that a recording was written from: equal numbers, in their own types.
+
+    Of a live run that goes on, or was killed, its complete steps. Rerun cannot read a file whose last message is cut in
+    two; the ``.live`` file beside it can be read then.
 
     Raises:
         BadInput: no such file, not a recording of this project, of a newer format version, or cut off.
@@ -47,10 +58,10 @@ def read_recording(path: str | Path) -> Trace:
 
 
 def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
-    steps = int(header["steps"])
-    arrays = {
-        name: _assemble(path, name, rows[name], steps, entry) for name, entry in json.loads(header["shapes"]).items()
-    }
+    steps, shapes = int(header["steps"]), json.loads(header["shapes"])
+    if steps == GROWING:
+        steps = _complete(path, shapes, rows)
+    arrays = {name: _assemble(path, name, rows[name], steps, entry) for name, entry in shapes.items()}
     made, settings = json.loads(header["episode"]), json.loads(header["settings"])
     observations = {
         name.removeprefix("observations/"): array for name, array in arrays.items() if name.startswith("observations/")
@@ -106,7 +117,8 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
     if version is None:
         raise BadInput(f"{path}: a Rerun recording, but not one that {APPLICATION} wrote.")
     if version != FORMAT_VERSION:
-        raise BadInput(f"{path}: recording format {version}; this version reads format {FORMAT_VERSION}.")
+        by = " ".join(str(header.get("versions", "an unknown version")).split())
+        raise BadInput(f"{path}: recording format {version}, by {by}; this version reads format {FORMAT_VERSION}.")
     if missing := PROPERTIES.keys() - header.keys() - {"recipe"}:
         raise BadInput(f"{path}: the recording lacks the properties {', '.join(sorted(missing))}.")
     return header, rows
@@ -128,6 +140,19 @@ def _values(batch: pa.RecordBatch) -> list[tuple[NDArray[np.int64] | None, NDArr
                 values = values.flatten()
             chunks.append((steps, values.to_numpy(zero_copy_only=False)))
     return chunks
+
+
+def _complete(path: Path, shapes: dict[str, Any], rows: Rows) -> int:
+    """Of a live run that goes on, or was killed: the steps that each path has. Drops those that only some have."""
+    over_steps = [name for name, (shape, _) in shapes.items() if 0 not in shape]
+    over_steps = [name for name in over_steps if not rows[name] or any(index is not None for index, _ in rows[name])]
+    steps = min(sum(len(index) for index, _ in rows[name] if index is not None) for name in over_steps)
+    if not steps:
+        raise BadInput(f"{path}: no step is complete.")
+    for name in over_steps:
+        whole = [(index, value.reshape(len(index), -1)) for index, value in rows[name] if index is not None]
+        rows[name] = [(index[index < steps], value[index < steps].ravel()) for index, value in whole]
+    return steps
 
 
 def _assemble(

@@ -184,27 +184,26 @@ def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> No
         shapes.setdefault(f"trace/{name}", [list(array.shape[1:]), array.dtype.str])
     versions = {name: importlib.metadata.version(name) for name in ("rerun-sdk", "numpy")}
     text = json.dumps
-    stream.send_property(
-        "beliefscope",
-        rr.AnyValues(
-            format_version=FORMAT_VERSION,
-            versions=text({"beliefscope": beliefscope.__version__} | versions),
-            task=episode.task,
-            filter=trace.filter,
-            kind=trace.kind,
-            modalities=text(trace.modalities),
-            episode_index=trace.episode_index,
-            steps=steps,
-            dt=float(episode.dt),
-            seed=trace.seed,
-            checkpoint_hash=trace.checkpoint_hash,
-            data_hash=trace.data_hash,
-            recipe=text(trace.recipe.to_json()),
-            settings=text(dict(trace.settings)),
-            episode=text({"seed": episode.seed, "split": episode.split, "provenance": dict(episode.provenance)}),
-            shapes=text(shapes),
-        ),
-    )
+    said = {
+        "format_version": FORMAT_VERSION,
+        "versions": text({"beliefscope": beliefscope.__version__} | versions),
+        "task": episode.task,
+        "filter": trace.filter,
+        "kind": trace.kind,
+        "modalities": text(trace.modalities),
+        "episode_index": trace.episode_index,
+        "steps": steps,
+        "dt": float(episode.dt),
+        "seed": trace.seed,
+        "checkpoint_hash": trace.checkpoint_hash,
+        "data_hash": trace.data_hash,
+        "recipe": text(trace.recipe.to_json()),
+        "settings": text(dict(trace.settings)),
+        "episode": text({"seed": episode.seed, "split": episode.split, "provenance": dict(episode.provenance)}),
+        "shapes": text(shapes),
+    }
+    # As arrays: an empty text of a name that Rerun has not met before would be left out.
+    stream.send_property("beliefscope", rr.AnyValues(**{name: pa.array([value]) for name, value in said.items()}))
     stream.send_recording_name(f"{episode.task} {trace.episode_index}, {trace.filter}")
 
 

@@ -140,10 +140,16 @@ def checkpoint(task: str, name_or_path: str) -> Checkpoint:
 
 
 def recording_in(path: Path) -> Trace:
-    """The run in a recording. A damaged file can end the process that reads it, so another one reads it before."""
+    """The run in a recording, or what there is of a live one.
+
+    A damaged recording can end the process that reads it, so another one reads it before.
+    """
     from beliefscope.app.rrdabout import Reader
+    from beliefscope.inspect.growing import SUFFIX, load_live
     from beliefscope.recordings.read import read_recording
 
+    if path.suffix == SUFFIX:
+        return load_live(path)
     if path.is_file():
         about = Reader()(path)
         if about.problem and not about.application:
@@ -152,10 +158,10 @@ def recording_in(path: Path) -> Trace:
 
 
 def trace_in(path: Path) -> Trace:
-    """The run in a trace or a recording."""
+    """The run in a trace, a recording, or what there is of a live one."""
     from beliefscope.inspect.trace import load_trace
 
-    return recording_in(path) if path.suffix == ".rrd" else load_trace(path)
+    return recording_in(path) if path.suffix in (".rrd", ".live") else load_trace(path)
 
 
 def is_path(name_or_path: str) -> bool:

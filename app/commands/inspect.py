@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from beliefscope.app import console
-from beliefscope.app.commands.given import Json, check, checkpoint
+from beliefscope.app.commands.given import Json, check, checkpoint, trace_in
 from beliefscope.datasets.errors import BadInput, one_of
 
 if TYPE_CHECKING:
@@ -59,7 +59,6 @@ def inspect(
     from beliefscope.datasets.catalog import find_task
     from beliefscope.inspect.catalog import DIAGNOSTICS
     from beliefscope.inspect.plotting import FORMATS, write_figure
-    from beliefscope.inspect.trace import load_trace
 
     check(None, json)
     for name in only or ():
@@ -75,7 +74,7 @@ def inspect(
         raise one_of("format of a figure", format_, FORMATS)
     if figures is not None and figures.exists() and not figures.is_dir():
         raise BadInput(f"--figures {str(figures)!r} is a file; give the name of a folder")
-    traces = [load_trace(path) for path in paths]
+    traces = [trace_in(path) for path in paths]
     for path, trace in zip(paths, traces, strict=True):
         if trace.checkpoint_hash != traces[0].checkpoint_hash:
             raise BadInput(f"{path} is of another checkpoint than {paths[0]}: inspect the traces of one filter")

@@ -12,18 +12,22 @@ from beliefscope.app.commands.given import Json, check, described, recording_in,
 
 
 def restore(
-    recording: Annotated[Path, typer.Argument(metavar="RUN.rrd", help="File of beliefscope record, or of the page.")],
+    recording: Annotated[
+        Path, typer.Argument(metavar="RUN.rrd|RUN.live", help="File of beliefscope record or live, or of the page.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="TRACE", help="Where to write the trace.")],
     json: Json = None,
 ) -> None:
     """Get the trace out of a recording.
 
     The very numbers of the trace that the recording was made from, in their own types, so that all that is computed
-    from it is the same: beliefscope inspect says the same of both.
+    from it is the same: beliefscope inspect says the same of both. Of a live run that goes on, or was killed: the steps
+    that there are.
 
     \b
-    Example:
+    Examples:
       beliefscope import run.rrd -o run.trace
+      beliefscope import workspace/live/run.live -o run.trace
     """
     from beliefscope.inspect.trace import save_trace
 

@@ -64,7 +64,13 @@ def test_another_format_version(
 ) -> None:
     monkeypatch.setattr(write, "FORMAT_VERSION", 2)
     path = write.write_recording(new_trace("ekf"), tmp_path / "newer.rrd")
-    assert "recording format 2; this version reads format 1" in message(path)
+    assert "recording format 2, by " in (said := message(path))
+    assert "this version reads format 1" in said in message(path)
+
+
+def test_a_recording_of_an_older_format(new_trace: Callable[..., Trace], assert_same: Callable[..., None]) -> None:
+    """Written when format 1 was new. Each further format keeps one of its own beside it."""
+    assert_same(read_recording(Path(__file__).with_name("format1.rrd")), new_trace("pf", steps=5, particles=4))
 
 
 @pytest.mark.parametrize(("chance", "recipe"), [(0.0, ""), (0.4, "blackout=0.4")])
