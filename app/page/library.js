@@ -225,8 +225,9 @@ export class Library {
     this.#drawChosen();
   }
 
+  /** The files that are ticked, the first that was first. */
   get #two() {
-    return this.#kept.recordings.filter(({ name }) => this.#chosen.has(name));
+    return [...this.#chosen].map((name) => this.#kept.recordings.find((file) => file.name === name)).filter(Boolean);
   }
 
   /** What two files that are ticked can be compared by. */
