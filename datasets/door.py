@@ -16,6 +16,7 @@ from beliefscope.datasets.camera import Camera
 from beliefscope.datasets.control import FORWARD, Impedance, add_controller
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.looks import dress
 from beliefscope.datasets.robot import ROBOT_BIT, STIFF, WORLD_BIT, add_panda, new_spec
 from beliefscope.datasets.sensors import add_touch
 from beliefscope.datasets.simulate import DT, POSITION_BITS, Scene, episode_rng, quantise, simulate
@@ -72,14 +73,19 @@ def panel_ghost(states: ArrayLike) -> Ghost:
     )
 
 
-def door_model(physics: DoorPhysics) -> mujoco.MjModel:
-    """Robot, door, frame and floor. Joint ``door`` comes last in qpos; bodies are named after what they are."""
+def door_model(physics: DoorPhysics, looks: bool = False) -> mujoco.MjModel:
+    """Robot, door, frame and floor. Joint ``door`` comes last in qpos; bodies are named after what they are.
+
+    Looks: with the robot's meshes, where they are installed.
+    """
     spec = new_spec()
     add_panda(spec)
     add_controller(spec, IMPEDANCE)
     _add_surroundings(spec, physics.hinge)
     _add_door(spec, physics)
     add_touch(spec, "door")
+    if looks:
+        dress(spec)
     return spec.compile()
 
 
@@ -163,7 +169,7 @@ def _replay(episode: Episode) -> mujoco.MjModel:
         raise BadInput(
             "The episode's provenance does not describe its door: expected 'hinge': [x, y] and 'bar_height', in m."
         ) from None
-    return door_model(DoorPhysics((x, y), height))
+    return door_model(DoorPhysics((x, y), height), looks=True)
 
 
 def policy_of(index: int) -> str:

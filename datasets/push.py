@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from beliefscope.datasets.camera import Camera
 from beliefscope.datasets.control import DOWN, Impedance, add_controller
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.looks import dress
 from beliefscope.datasets.robot import ROBOT_BIT, WORLD_BIT, add_panda, new_spec
 from beliefscope.datasets.sensors import add_touch
 from beliefscope.datasets.simulate import (
@@ -143,8 +144,11 @@ def puck_ghost(states: ArrayLike) -> Ghost:
     )
 
 
-def push_model() -> mujoco.MjModel:
-    """Robot, puck and ground. The puck's free joint comes last in qpos; bodies are named after what they are."""
+def push_model(looks: bool = False) -> mujoco.MjModel:
+    """Robot, puck and ground. The puck's free joint comes last in qpos; bodies are named after what they are.
+
+    Looks: with the robot's meshes, where they are installed.
+    """
     spec = new_spec()
     add_panda(spec)
     add_controller(spec, IMPEDANCE)
@@ -173,6 +177,8 @@ def push_model() -> mujoco.MjModel:
         conaffinity=ROBOT_BIT | WORLD_BIT,  # the ground carries it
     )
     add_touch(spec, "puck")
+    if looks:
+        dress(spec)
     return spec.compile()
 
 
@@ -200,7 +206,7 @@ PUSH = Task(
     map_components=("x", "y"),
     map_half_width=0.135,
     positions={"effector_position": (0, 1), "control": (0, 1)},
-    replay=lambda _: push_model(),
+    replay=lambda _: push_model(looks=True),
     ghost=puck_ghost,
     camera=CAMERA,
     simulate=simulate_push,
