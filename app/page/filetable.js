@@ -176,7 +176,7 @@ export class FileTable {
   #press(event) {
     const file = this.#files.find(({ name }) => name === event.target.closest('tr')?.dataset.name);
     if (!file || event.target.closest('form')) return;
-    if (!this.#acts(file).some(({ key }) => key === event.key)) return;
+    if (event.key === 'Enter' || !this.#acts(file).some(({ key }) => key === event.key)) return; // its button has Enter
     event.preventDefault();
     event.stopPropagation();
     this.#do(file, ({ key }) => key === event.key);
