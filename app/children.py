@@ -33,7 +33,7 @@ RECORDS = TypeAdapter(list[Child])
 def read(workspace: Path) -> list[Child]:
     """Those whose files are still there; of a file that cannot be read, none."""
     with suppress(OSError, ValueError, TypeError):
-        found = RECORDS.validate_python(read_json((workspace / FILE).read_bytes()), strict=True)
+        found = RECORDS.validate_python(read_json((workspace / FILE).read_bytes()))
         return [one for one in found if Path(one.path).is_file()]
     return []
 

@@ -247,7 +247,7 @@ def _runs(library: Library) -> list[dict[str, Any]]:
     found = []
     for path in (library.settings.workspace / "finetune").glob("*/run.json"):
         with suppress(ValueError):  # no run of ours
-            run = RUN.validate_python(_read(path), strict=True)
+            run = RUN.validate_python(_read(path))
             if run.run == path.parent.name:
                 found.append(asdict(run))
     return sorted(found, key=lambda run: -run["asked"])
