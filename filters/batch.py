@@ -116,6 +116,26 @@ class Steps:
         return self.windows(self.first[number : number + 1], int(self.length[number]))
 
 
+def sensed(task: Task, observations: Mapping[str, np.ndarray], control: np.ndarray) -> Batch:
+    """One step of one trajectory, T = N = 1, as it comes from a robot: of the truth nothing is known, it is NaN.
+
+    Args: observations: by the task's keys, each of one step. control: (c,).
+
+    Raises BadInput for what has not the task's shape.
+    """
+    row = Episode(
+        task=task.name,
+        states=np.full((1, len(task.components)), np.nan, np.float32),
+        controls=np.asarray(control, np.float32)[None],
+        observations={key: np.asarray(value)[None] for key, value in observations.items()},
+        contact=np.zeros(1, bool),
+        qpos=np.zeros((1, 0), np.float32),
+        dt=task.dt,
+        seed=-1,
+    )
+    return Steps.of(task, [row]).episode(0)
+
+
 def check_shapes(task: Task, episode: Episode, where: str) -> None:
     """Raises BadInput, naming the array, where an episode does not fit its task."""
     expected: dict[str, tuple[int, ...]] = {"states": (len(task.components),), "controls": (task.control_size,)}

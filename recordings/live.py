@@ -93,7 +93,7 @@ class LiveRecorder:
         *,
         task: str = "",
         modalities: Sequence[str] = (),
-        folder: Path = FOLDER,
+        folder: str | Path = FOLDER,
         start: Gaussian | None = None,
         like: Episode | None = None,
         expected: int | None = None,

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from beliefscope.app.cli import main
@@ -19,9 +20,11 @@ from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.datasets import catalog
 from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.store import open_dataset
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.trace import load_trace
+from beliefscope.inspect.growing import load_live
+from beliefscope.inspect.trace import load_trace, trace
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_task.py"
 SPEC = f"{EXAMPLE}:TASK"
@@ -91,6 +94,18 @@ def test_counterfactual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert black[0] == trusted[0], "each is compared with the same run"
     assert float(black[1]) < float(trusted[1]), "trusting a black picture is worse than not"
     assert (tmp_path / "what.svg").read_text().startswith("<?xml")
+
+
+def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    said = example("05_live.py", tmp_path, capsys)
+    assert said == f"{tmp_path}/live/example.live: 100 steps, the hinge is at (81.0, -19.8) cm\n"
+    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    with open_dataset(sample_path("door")) as data:
+        whole = trace(checkpoint, data[9])
+    found = load_live(tmp_path / "live" / "example.live")
+    # Each picture on its own adds up in another order than all at once.
+    np.testing.assert_allclose(found.estimate_mean, whole.estimate_mean, atol=1e-5)
 
 
 def test_example_is_short() -> None:
