@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 from beliefscope.app.liveruns import PREFIX, LiveRuns
 from beliefscope.app.selection import Selection, Traced
@@ -29,6 +30,13 @@ from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 __all__ = ["Library", "Selection", "Settings", "Traced"]
 
 TRACES_IN_MEMORY = 8
+"""The newest ones that are kept though nobody shows them."""
+
+BYTES_IN_MEMORY = 256 << 20
+"""What they may take; one is kept however large it is."""
+
+KEYS_KEPT = 4096
+"""Selections whose key is remembered: a few hundred bytes each."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Settings:
         data: name as shown -> file or folder of episodes, before the sample sets that ship.
         checkpoints: filter's name as shown -> file, or a filter from outside; before (or in place of) those that ship.
         hosts: names the server answers to beside the loopback's.
-        particles: of particle filters. seed: of the filters' randomness.
+        particles: of particle filters. seed: of the filters' randomness. views: most pages that are open at a time.
         tasks: the user's own, as ``load_task`` knows them. studies: name as shown -> folder of a study.
     """
 
@@ -50,6 +58,7 @@ class Settings:
     hosts: tuple[str, ...] = ()
     particles: int = 300
     seed: int = 0
+    views: int = 32
     tasks: tuple[str, ...] = ()
     studies: Mapping[str, Path] = field(default_factory=dict)
 
@@ -90,10 +99,11 @@ class Library:
         self.live = LiveRuns(settings.workspace / "live")
         self._tracer = tracer
         self._lock = threading.RLock()
-        self._keys: dict[Selection, str] = {}
+        self._keys: OrderedDict[Selection, str] = OrderedDict()
         self._hashing = threading.Lock()
         self._hashes: dict[tuple[str, str], str] = {}
         self._traced: OrderedDict[str, Traced] = OrderedDict()
+        self._living: WeakValueDictionary[str, Traced] = WeakValueDictionary()  # those too that only a view still shows
         self._tracing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="tracing")
         self._replay: tuple[str, Replay] | None = None  # of the run that was edited last; for the tracing thread alone
         self._closing = False
@@ -134,15 +144,12 @@ class Library:
         if (live := self._live(selection)) is not None:
             return live
         with self._lock:
-            known = self._traced.get(self._keys.get(selection, ""))
+            known = self._living.get(self.key(selection))
             if known is None or (known.done.done() and known.done.exception() is not None):
                 checkpoint, episode = self._found(selection)
-                key = self.key(selection)
-                known = self._traced[key] = Traced(key, checkpoint)
+                known = Traced(self.key(selection), checkpoint)
                 self._tracing.submit(self._compute, known, selection, episode)
-            self._traced.move_to_end(known.key)
-            while len(self._traced) > TRACES_IN_MEMORY:
-                self._traced.popitem(last=False)
+            self._keep(known)
             return known
 
     def there(self, selection: Selection) -> Traced | None:
@@ -150,11 +157,19 @@ class Library:
         if (live := self._live(selection)) is not None:
             return live
         with self._lock:
-            known = self._traced.get(self._keys.get(selection, ""))
+            known = self._living.get(self._keys.get(selection, ""))
             if known is None or not known.done.done() or known.done.exception() is not None:
                 return None
-            self._traced.move_to_end(known.key)
+            self._keep(known)
             return known
+
+    def _keep(self, traced: Traced) -> None:
+        """As the newest; the oldest ones go, unless somebody shows them."""
+        self._living[traced.key] = self._traced[traced.key] = traced
+        self._traced.move_to_end(traced.key)
+        size = sum(one.nbytes for one in self._traced.values())
+        while len(self._traced) > TRACES_IN_MEMORY or (size > BYTES_IN_MEMORY and len(self._traced) > 1):
+            size -= self._traced.popitem(last=False)[1].nbytes
 
     def key(self, selection: Selection) -> str:
         """Hash of everything its trace depends on; the trace need not be there. Raises BadInput as ``traced``."""
@@ -168,6 +183,9 @@ class Library:
                 if selection.edit is not None:
                     parts.append(selection.edit.to_json())
                 self._keys[selection] = hashlib.sha256(repr(tuple(parts)).encode()).hexdigest()
+                while len(self._keys) > KEYS_KEPT:
+                    self._keys.popitem(last=False)
+            self._keys.move_to_end(selection)
             return self._keys[selection]
 
     def held_out(self, selection: Selection) -> list[Selection]:
@@ -244,7 +262,8 @@ class Library:
             traced.progress = fraction
 
         try:
-            if self._tracer is not None:
+            # The first page waits for the first run: it is here sooner than the other process is there.
+            if self._tracer is not None and self._tracer.started:
                 result = self._run_apart(self._tracer, selection, progress)
             elif selection.edit is None:
                 result = self._run(traced.checkpoint, selection, episode, progress)
@@ -253,6 +272,9 @@ class Library:
             traced.done.set_result(result)
         except BaseException as error:
             traced.done.set_exception(error)
+        if self._tracer is not None:
+            with suppress(RuntimeError):  # the server is stopping
+                self._tracer.start()
 
     def _file(self, selection: Selection) -> Path:
         name = f"{selection.task}-{selection.filter}-episode{selection.episode}-{self.key(selection)[:16]}.trace"

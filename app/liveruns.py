@@ -152,7 +152,7 @@ class Growing(Traced):
     def at(self, step: int) -> tuple[Trace, int]:
         return self._part(step, step + 1), 0
 
-    @property
+    @cached_property
     def no_maps(self) -> str | None:
         return no_maps(self.checkpoint, self._last)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,10 +36,33 @@ NUMBERS = (
 )
 
 
-def maps_message(serial: int, task: Task, trace: Trace, index: int, maps: LikelihoodMap, other: bool = False) -> bytes:
-    """Header's length, JSON header, padding to a multiple of 4, float32 particles, then the layers as uint16.
+@dataclass(frozen=True)
+class WiredMaps:
+    """Maps of one step, and all of their message but for whose cursor it answers.
 
-    Index: of the maps' step in the trace, which may be a part of a run. Other: whether they are of the other run.
+    Attributes:
+        description: the message's JSON header. content: what follows it.
+    """
+
+    maps: LikelihoodMap
+    description: Mapping[str, Any]
+    content: bytes
+
+    @property
+    def nbytes(self) -> int:
+        """In memory, about."""
+        return self.maps.log_likelihood.nbytes + len(self.content)
+
+    def message(self, serial: int, other: bool = False) -> bytes:
+        """Header's length, JSON header, padding to a multiple of 4, content. Other: whether of the other run."""
+        text = json.dumps({"type": "maps", "serial": serial, "other": other, **self.description}).encode()
+        return len(text).to_bytes(4, "little") + text + b"\0" * (-len(text) % 4) + self.content
+
+
+def wire_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> WiredMaps:
+    """The content is float32 particles, then the layers as uint16.
+
+    Index: of the maps' step in the trace, which may be a part of a run.
     """
     effector = trace.episode.observations.get("effector_position")
     cells, log_max, log_range = quantised(maps.log_likelihood)
@@ -47,9 +71,6 @@ def maps_message(serial: int, task: Task, trace: Trace, index: int, maps: Likeli
     # Without a truth the maps are laid around the estimate: what is likely there is not what is likely at the truth.
     unknown = {"truth": [None] * len(maps.layers)} if np.isnan(trace.episode.states[index]).any() else {}
     description = {
-        "type": "maps",
-        "serial": serial,
-        "other": other,
         "step": maps.step,
         "size": len(maps.offsets_x),
         "angle": None if math.isnan(maps.angle) else float(maps.angle),
@@ -65,10 +86,8 @@ def maps_message(serial: int, task: Task, trace: Trace, index: int, maps: Likeli
         "numbers": {name: _json(getattr(measured, name)[0]) for name in NUMBERS} | unknown,
         "particles": 0 if cloud is None else len(cloud[0]),
     }
-    text = json.dumps(description).encode()
-    head = len(text).to_bytes(4, "little") + text + b"\0" * (-len(text) % 4)
     floats = [] if cloud is None else [np.ascontiguousarray(part, dtype="<f4").tobytes() for part in cloud]
-    return b"".join([head, *floats, cells.astype("<u2").tobytes()])
+    return WiredMaps(maps, description, b"".join([*floats, cells.astype("<u2").tobytes()]))
 
 
 def quantised(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
@@ -11,15 +12,17 @@ from functools import cached_property
 from typing import Any
 from urllib.parse import parse_qsl
 
+from beliefscope.app.mapwire import WiredMaps, wire_maps
 from beliefscope.app.wire import MAP_SIZES, columns, header
 from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, no_maps
 from beliefscope.inspect.replay import Edit
-from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.trace import Trace, arrays_of
 
 FINE = max(MAP_SIZES)
+MAPS_IN_MEMORY = 12 << 20  # bytes a trace: 300 coarse ones
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,9 @@ class Traced:
         self.done.set_running_or_notify_cancel()  # so that who stops waiting for it cannot cancel it
         self.progress = 0.0
         self._maps = threading.Lock()
+        self._keeping = threading.Lock()
+        self._kept: OrderedDict[tuple[int, float | None, int], WiredMaps] = OrderedDict()
+        self._kept_bytes = 0
 
     def result(self, timeout: float | None = None) -> Trace:
         """Waits for it. Raises what computing it raised; TimeoutError (of ``concurrent.futures``) after so many s."""
@@ -111,7 +117,7 @@ class Traced:
         """A trace in which the step is, and its index there."""
         return self.trace, step
 
-    @property
+    @cached_property
     def no_maps(self) -> str | None:
         """Why there are no likelihood maps, in one line; None where there are."""
         return no_maps(self.checkpoint, self.trace)
@@ -129,6 +135,33 @@ class Traced:
         """One likelihood map; one at a time a trace, because its engine keeps caches."""
         with self._maps:
             return self._engine.map(step, angle=angle, size=size)
+
+    def wired(self, step: int, angle: float | None, size: int) -> WiredMaps:
+        """The same as it is sent; the last ones are kept, for others who look there and for a hand that goes back."""
+        key = step, angle, size
+        with self._keeping:
+            known = self._kept.get(key)
+            if known is not None:
+                self._kept.move_to_end(key)
+                return known
+        made = wire_maps(self.checkpoint.task, *self.at(step), self.map(step, angle, size))
+        with self._keeping:
+            if key not in self._kept:
+                self._kept[key] = made
+                self._kept_bytes += made.nbytes
+            while self._kept_bytes > MAPS_IN_MEMORY:
+                self._kept_bytes -= self._kept.popitem(last=False)[1].nbytes
+        return made
+
+    @property
+    def nbytes(self) -> int:
+        """In memory, of the trace and its maps, about; none while it is computed."""
+        there = self.done.done() and self.done.exception() is None
+        return self._kept_bytes + (self._trace_bytes if there else 0)
+
+    @cached_property
+    def _trace_bytes(self) -> int:
+        return sum(array.nbytes for array in arrays_of(self.trace).values())
 
     def maps(self, steps: Iterable[int]) -> Iterator[LikelihoodMap]:
         """The fine maps at several steps; other askers get theirs in between."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 import signal
 import socket
+import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import CancelledError
@@ -55,7 +57,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False, acces
         settings.workspace.mkdir(mode=0o700, parents=True)
     tracer = Tracer() if apart else None
     library = Library(with_children(settings), tracer)
-    views = Views(library)
+    views = Views(library, settings.views)
     work = jobs.Jobs(settings.workspace / "jobs")
     rerun = RerunViewer(settings.workspace / "cache")
     rrds = RrdFiles(settings.workspace / "recordings")
@@ -64,7 +66,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False, acces
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         tidying = asyncio.create_task(views.tidy())
         stopping = threading.Event()
-        warming = threading.Thread(target=_warm, args=(library, tracer, rerun, stopping), name="warming")
+        warming = threading.Thread(target=_warm, args=(library, rerun, stopping), name="warming")
         if warm:
             warming.start()
         yield
@@ -158,6 +160,8 @@ def serve(
             log.info("started", extra={"event": about})
             listening(access.link(url))
 
+        # An answer passes through several threads, and each hand-over may wait this long for Python's lock: 5 ms else.
+        sys.setswitchinterval(0.001)
         with _signals_end_in_peace():
             _Server(config, started).run(sockets=[listener])
         log.info("stopped", extra={"event": {"url": url}})
@@ -197,12 +201,14 @@ def _add_files(app: FastAPI, rerun: RerunViewer) -> None:
         return rerun.wasm(request)
 
 
-def _warm(library: Library, tracer: Tracer | None, rerun: RerunViewer, stopping: threading.Event) -> None:
+def _warm(library: Library, rerun: RerunViewer, stopping: threading.Event) -> None:
     """Have ready what the first page asks for, maps before Rerun. What fails is told to the page that asks for it."""
     for prepare in (
-        lambda: library.traced(library.default()).map(0, None, MAP_SIZES[0]),
-        tracer.start if tracer is not None else lambda: None,
+        lambda: library.traced(library.default()),  # begun, by another thread
+        library.catalog,
+        lambda: library.traced(library.default()).wired(0, None, MAP_SIZES[0]),
         lambda: rerun.prepare(stopping.is_set),
+        _settle,
     ):
         try:
             if not stopping.is_set():
@@ -210,6 +216,12 @@ def _warm(library: Library, tracer: Tracer | None, rerun: RerunViewer, stopping:
         except (Exception, CancelledError) as error:
             if not stopping.is_set():
                 log.warning("Not prepared in advance: %s", error)
+
+
+def _settle() -> None:
+    """What is there by now stays: the collector of garbage need not look through it each time a page closes."""
+    gc.collect()
+    gc.freeze()
 
 
 def _say(status: int | None) -> Callable[[Request, Exception], JSONResponse]:

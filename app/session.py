@@ -4,42 +4,65 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 import secrets
 import time
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from beliefscope.app.desk import Desk
 from beliefscope.app.library import Library, Selection, Traced
-from beliefscope.app.mapwire import maps_message
+from beliefscope.app.mapwire import WiredMaps
 from beliefscope.app.scene import Scene
+from beliefscope.app.selection import FINE
 from beliefscope.app.wire import Cursor, cursor, look, viewpoint
 from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.trace import Trace
 
 log = logging.getLogger("beliefscope.app")
+COARSE_DUE, SCENE_DUE, FINE_DUE = 0.0, 0.05, 0.2  # s: maps under a moving hand before all else
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """What a scene is to show."""
+
+    wanted: Cursor
+    traced: Traced
+    other: Trace | None
+    maps: LikelihoodMap | None
 
 
 class View:
     """One page's scene, and the newest cursor it sent.
 
     The page owns the cursor and may move it faster than it can be drawn: a cursor waits in one place, where a newer one
-    takes its place unanswered. Each that is taken up is answered with maps first, then the scene is moved.
+    takes its place unanswered. Each that is taken up is answered with maps; then it waits for the scene, in one place
+    too, so that slow scenes hold up no maps.
 
     Attributes:
         name: unguessable; part of the view's addresses. idle_since: monotonic s when its page went, None while there.
     """
 
-    def __init__(self, library: Library, dark: bool) -> None:
+    def __init__(self, library: Library, desk: Desk, dark: bool) -> None:
         """Blocks for some 50 ms while the scene's server starts."""
         self.name = secrets.token_urlsafe(12)
         self.scene = Scene(self._moved_in_scene, dark)
         self.idle_since: float | None = time.monotonic()
         self._library = library
+        self._desk = desk
         self._waiting: Cursor | None = None
         self._arrived = asyncio.Event()
+        self._shown: tuple[Selection, Traced] | None = None  # in memory for as long as somebody looks at it
+        self._drawing: _Drawing | None = None
+        self._answered = asyncio.Event()
         self._socket: WebSocket | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -50,14 +73,15 @@ class View:
         self._loop, self.idle_since = asyncio.get_running_loop(), None
         if before is not None:
             await _quietly(before.close(4000, "The view was opened by another page."))
-        answering = asyncio.create_task(self._answer(websocket))
+        answering = [asyncio.create_task(each(websocket)) for each in (self._answer, self._draw)]
         try:
             while True:
                 await self._heard(websocket, await websocket.receive_text())
         except (WebSocketDisconnect, KeyError):  # KeyError: a binary message, which has no text
             await _quietly(websocket.close(1003))
         finally:
-            answering.cancel()
+            for task in answering:
+                task.cancel()
             if self._socket is websocket:
                 self._socket, self.idle_since = None, time.monotonic()
 
@@ -91,24 +115,15 @@ class View:
             self._arrived.clear()
             wanted = self._waiting
             assert wanted is not None
-            try:
+            async with self._told(websocket, wanted.serial):
                 await self._answer_one(websocket, wanted)
-            except BadInput as error:
-                await _tell_error(websocket, wanted.serial, str(error))
-            except (WebSocketDisconnect, RuntimeError) as error:
-                if websocket is not self._socket:
-                    return
-                log.exception("The cursor could not be drawn")
-                await _tell_error(websocket, wanted.serial, f"The server failed: {error}")
-            except Exception as error:
-                log.exception("The cursor could not be drawn")
-                await _tell_error(websocket, wanted.serial, f"The server failed: {error}")
 
     async def _answer_one(self, websocket: WebSocket, wanted: Cursor) -> None:
         selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.recipe, wanted.data)
-        traced = await asyncio.to_thread(self._library.traced, selection)
+        traced = await self._traced(selection)
         if not traced.grows and not await self._ready_before_newer(traced):
             return
+        self._shown = selection, traced
         if wanted.step >= len(traced):
             raise BadInput(f"step {wanted.step} does not exist. Available: 0 to {len(traced) - 1}.")
         other = self._other(selection, wanted.against, len(traced))
@@ -117,14 +132,52 @@ class View:
             await websocket.send_json({"type": "no_maps", "serial": wanted.serial, "step": wanted.step})
         else:
             if wanted.beside and other is not None and not other.no_maps:
-                _, beside = await asyncio.to_thread(_maps, wanted, other, True)
-                await websocket.send_bytes(beside)
-            maps, message = await asyncio.to_thread(_maps, wanted, traced)
-            await websocket.send_bytes(message)
-        if not wanted.scene:
-            return
-        await asyncio.to_thread(self.scene.show, traced, wanted.step, None if other is None else other.trace, maps)
-        await websocket.send_json({"type": "drawn", "serial": wanted.serial, "step": wanted.step})
+                beside = await self._maps(wanted, other)
+                await websocket.send_bytes(beside.message(wanted.serial, other=True))
+            wired = await self._maps(wanted, traced)
+            await websocket.send_bytes(wired.message(wanted.serial))
+            maps = wired.maps
+        if wanted.scene:
+            self._drawing = _Drawing(wanted, traced, None if other is None else other.trace, maps)
+            self._answered.set()
+
+    async def _draw(self, websocket: WebSocket) -> None:
+        """Moves the scene to the newest cursor whose maps are sent."""
+        while True:
+            await self._answered.wait()
+            self._answered.clear()
+            drawing, self._drawing = self._drawing, None
+            if drawing is None:
+                continue
+            step, serial = drawing.wanted.step, drawing.wanted.serial
+            show = partial(self.scene.show, drawing.traced, step, drawing.other, drawing.maps)
+            async with self._told(websocket, serial):
+                await self._desk.do(show, SCENE_DUE, frozenset({self}))
+                await websocket.send_json({"type": "drawn", "serial": serial, "step": step})
+
+    async def _maps(self, wanted: Cursor, traced: Traced) -> WiredMaps:
+        make = partial(traced.wired, wanted.step, wanted.angle, wanted.size)
+        if wanted.size == FINE:  # one at a time, lest nobody be left for those that are made quickly
+            return await self._desk.do(make, FINE_DUE, frozenset({traced, FINE}))
+        return await self._desk.do(make, COARSE_DUE, frozenset({traced}))
+
+    async def _traced(self, selection: Selection) -> Traced:
+        if self._shown is not None and self._shown[0] == selection and not self._shown[1].grows:
+            return self._shown[1]
+        return await asyncio.to_thread(self._library.traced, selection)
+
+    @contextlib.asynccontextmanager
+    async def _told(self, websocket: WebSocket, serial: int) -> AsyncIterator[None]:
+        """What goes wrong with a cursor is told to its page."""
+        try:
+            yield
+        except BadInput as error:
+            await _tell_error(websocket, serial, str(error))
+        except Exception as error:
+            if websocket is not self._socket and isinstance(error, WebSocketDisconnect | RuntimeError):
+                return
+            log.exception("The cursor could not be drawn")
+            await _tell_error(websocket, serial, f"The server failed: {error}")
 
     def _other(self, selection: Selection, against: str, steps: int) -> Traced | None:
         """The other run, once it is there: the page has it computed over HTTP, and is told there what is wrong."""
@@ -157,12 +210,13 @@ class Views:
     """The open views, a bounded number of them.
 
     Args:
-        limit: most views at a time: each is a thread and some MB.
+        limit: most views at a time: each is a thread, and some MB (docs/reliability.md).
         patience: s that a view outlives its page, to allow for a lost connection.
     """
 
-    def __init__(self, library: Library, limit: int = 16, patience: float = 30.0) -> None:
+    def __init__(self, library: Library, limit: int = 32, patience: float = 30.0) -> None:
         self._library = library
+        self._desk = Desk()
         self._limit = limit
         self._patience = patience
         self._views: dict[str, View] = {}
@@ -178,8 +232,11 @@ class Views:
         """A new view. Closes the one that has been idle longest if there are too many; BadInput if all are in use."""
         await self._close_idle(keep=self._limit - 1)
         if len(self._views) >= self._limit:
-            raise BadInput(f"{self._limit} pages are open already; close one and reload.")
-        view = await asyncio.to_thread(View, self._library, dark)
+            raise BadInput(
+                f"{self._limit} pages are open already, as many as this server shows at a time; close one and reload, "
+                "or serve with more --views."
+            )
+        view = await asyncio.to_thread(View, self._library, self._desk, dark)
         self._views[view.name] = view
         return view
 
@@ -196,17 +253,14 @@ class Views:
         for view in idle[: max(0, len(self._views) - keep)]:
             del self._views[view.name]
             await asyncio.to_thread(view.scene.close)
+        if idle:  # viser's handles know their server and it knows them: only the collector finds that they are dead
+            await asyncio.to_thread(gc.collect)
 
     async def close(self) -> None:
         """Close every view and its threads."""
         views, self._views = list(self._views.values()), {}
+        await asyncio.to_thread(self._desk.close)
         await asyncio.gather(*(asyncio.to_thread(view.scene.close) for view in views))
-
-
-def _maps(wanted: Cursor, traced: Traced, other: bool = False) -> tuple[LikelihoodMap, bytes]:
-    """The maps of a cursor, and as they are sent. Other: of the other run."""
-    maps = traced.map(wanted.step, wanted.angle, wanted.size)
-    return maps, maps_message(wanted.serial, traced.checkpoint.task, *traced.at(wanted.step), maps, other=other)
 
 
 async def _quietly(sending: Any) -> None:

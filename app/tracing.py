@@ -32,6 +32,11 @@ class Tracer:
         self._closed = False
         self._process: subprocess.Popen[str] | None = None
 
+    @property
+    def started(self) -> bool:
+        """Whether there is the process, or was."""
+        return self._process is not None
+
     def start(self) -> None:
         """Starts the process if there is none; it gets itself ready while others work."""
         with self._lock:
