@@ -17,6 +17,7 @@ from beliefscope.app.commands.change import change
 from beliefscope.app.commands.collect import collect
 from beliefscope.app.commands.convert import convert
 from beliefscope.app.commands.counterfactual import counterfactual
+from beliefscope.app.commands.doctor import doctor
 from beliefscope.app.commands.evaluate import evaluate
 from beliefscope.app.commands.export import export
 from beliefscope.app.commands.failures import failures
@@ -58,6 +59,7 @@ COMMANDS = (
     figure,
     failures,
     recipes,
+    doctor,
 )
 
 cli = typer.Typer(

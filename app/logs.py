@@ -72,14 +72,26 @@ class Enough(logging.Filter):
         return self._count <= REFUSED
 
 
+class _StandardError(logging.StreamHandler[TextIO]):
+    """Writes to what is standard error at the time."""
+
+    @property
+    def stream(self) -> TextIO:
+        return sys.stderr
+
+    @stream.setter
+    def stream(self, _: TextIO) -> None:
+        pass
+
+
 def begin(level: str = "warning", form: str = "text", secret: str = "", stream: TextIO | None = None) -> None:
-    """From now on the server's log goes to ``stream``, standard error if None, and only there."""
-    handler = logging.StreamHandler(stream or sys.stderr)
+    """From now on the server's log goes to ``stream``, standard error if None."""
+    handler = _StandardError() if stream is None else logging.StreamHandler(stream)
     handler.setFormatter(Lines(form == "json", secret))
     handler.addFilter(Enough())
     for name in ("beliefscope", "uvicorn.error"):
         logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = [handler], False
+        logger.handlers = [handler]
         logger.setLevel(level.upper())
     # uvicorn's own lines are of each connection, with addresses that open views.
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)

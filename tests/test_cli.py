@@ -19,7 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
 NAMES = [command.__name__ for command in COMMANDS]
 OPTIONS = {
-    "serve": "--port --host --workspace --task --data --filter --checkpoint --study --open --no-open --seed",
+    "serve": "--port --host --token --read-only --allow-host --workspace --task --data --filter --checkpoint --study "
+    "--open --no-open --log-level --log-format --seed",
     "collect": "--episodes --steps --seed --workers -o --json",
     "convert": "--data --skip-bad -o --json",
     "train": "--filter --data --skip-bad --preset --recipe --seed --log -o --json",
@@ -41,6 +42,7 @@ OPTIONS = {
     "figure": "--filter --data --skip-bad --episode --step --recipe --particles --seed -o --json",
     "failures": "--filter --data --skip-bad --recipe --by --top --group --all --url --particles --seed --json",
     "recipes": "--json",
+    "doctor": "--workspace --host --port --json",
 }
 """What scripts outside the project may rely on."""
 
@@ -212,6 +214,10 @@ BAD = [
     "serve --filter other.safetensors",
     "serve --checkpoint ./missing",
     "serve --study .",
+    "serve --log-level loud",
+    "serve --log-format xml",
+    "doctor --port 70000",
+    "doctor --json file",
     "change crossmodal-ekf crossmodal-pf",
     "change crossmodal-ekf missing.safetensors",
     "change crossmodal-ekf ekf.safetensors --slice dark",

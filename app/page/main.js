@@ -18,6 +18,7 @@ import { Theme, swatch, tellApart } from './palette.js';
 import { Messages, say } from './panel.js';
 import { choice, pickers } from './pickers.js';
 import { reading } from './reading.js';
+import { hold } from './readonly.js';
 import { FaultSheet } from './recipes.js';
 import { saving } from './recordings.js';
 import { Rerun } from './rerun.js';
@@ -53,6 +54,8 @@ async function start() {
   const [catalog, live] = await Promise.all([api.catalog(), api.liveRuns().catch(() => ({ runs: [], tasks: [] }))]);
   shelve(catalog, live);
   messages.say('catalog', catalog.problems?.join(' '));
+  $('#read-only').hidden = !catalog.read_only;
+  if (catalog.read_only) hold(document.body);
   if (!catalog.tasks.length) {
     throw new api.ServerError('There is nothing to show: no task has both episodes and a trained filter.');
   }

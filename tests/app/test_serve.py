@@ -1,28 +1,158 @@
-"""The command ``serve`` as a process of its own."""
+"""The command ``serve`` as a process of its own: what it prints, makes, logs, and how it ends."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import signal
+import socket
+import stat
 import subprocess
 import sys
+import threading
+import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from starlette.types import Receive, Scope, Send
+
+from beliefscope.app import patience
+from beliefscope.app.commands.serve import _opening
+from beliefscope.app.jobs import Jobs
+from beliefscope.app.patience import PatientProtocol
+from beliefscope.app.server import Settings, create_app
+
+PATIENCE = 60.0  # s
 
 
-def test_serve_prints_its_address_and_ends_on_interrupt(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "beliefscope", "serve", "--port", "0", "--workspace", str(tmp_path / "w")]
+@contextlib.contextmanager
+def served(workspace: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The process and its address."""
+    command = [sys.executable, "-m", "beliefscope", "serve", "--port", "0", "--workspace", str(workspace), *options]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert server.stdout is not None
         line = server.stdout.readline()
         address = re.search(r"http://127\.0\.0\.1:\d+", line)
         assert address, line
-        with urllib.request.urlopen(f"{address.group()}/healthz", timeout=30) as answer:
-            assert json.load(answer)["status"] == "ok"
-        server.send_signal(signal.SIGINT)
-        assert server.wait(30) == 0
+        yield server, address.group()
     finally:
         server.kill()
         server.communicate()
+
+
+def asked(url: str, body: Any = None) -> Any:
+    data = None if body is None else json.dumps(body).encode()
+    request = urllib.request.Request(
+        url, data, {"content-type": "application/json", "origin": url[: url.index("/", 8)]}
+    )
+    with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
+        return json.load(answer)
+
+
+def test_a_stop_saves_the_jobs_and_the_log_tells(tmp_path: Path) -> None:
+    workspace = tmp_path / "workspace"
+    with served(workspace, "--log-level", "info", "--log-format", "json") as (server, address):
+        assert asked(f"{address}/healthz")["status"] == "ok"
+        asked(f"{address}/api/finetune/push/crossmodal-ekf", {"train": ["haptics-only"], "steps": 20000})
+        end = time.monotonic() + PATIENCE
+        while asked(f"{address}/api/jobs")[0]["state"] != "running":
+            assert time.monotonic() < end
+        server.send_signal(signal.SIGTERM)
+        _, errors = server.communicate(timeout=PATIENCE)
+        assert server.returncode == 0, errors
+    said = [json.loads(line) for line in errors.splitlines()]
+    assert [line["event"] for line in said] == ["started", "job began", "job ended", "stopped"]
+    assert said[0]["url"].startswith(address)
+    assert said[2]["state"] == "interrupted"
+    (job,) = Jobs(workspace / "jobs").all()
+    assert (job.state, job.error) == ("interrupted", "the server stopped")
+
+
+def test_the_workspace_is_for_its_user_alone(settings: Settings) -> None:
+    create_app(settings, warm=False)
+    assert stat.S_IMODE(settings.workspace.stat().st_mode) == 0o700
+
+
+def test_the_browser_is_given_the_link_in_a_file_of_ours_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    link = "http://lab:8000/?token=of-this-server-alone"
+    with _opening(tmp_path, secret=True) as open_in_browser:
+        open_in_browser(link)
+        (page,) = tmp_path.iterdir()
+        assert opened == [page.as_uri()], "other users see what a browser is started with"
+        assert stat.S_IMODE(page.stat().st_mode) == 0o600
+        assert link in page.read_text()
+    assert not list(tmp_path.iterdir())
+    with _opening(tmp_path, secret=False) as open_in_browser:
+        open_in_browser("http://127.0.0.1:8000/")
+    assert opened[1:] == ["http://127.0.0.1:8000/"]
+
+
+async def _says_yes(scope: Scope, receive: Receive, send: Send) -> None:
+    assert scope["type"] == "http"
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"3")]})
+    await send({"type": "http.response.body", "body": b"yes"})
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
+    """Address of a server that waits half a second for the head of a request."""
+    monkeypatch.setattr(patience, "HEAD_PATIENCE", 0.5)
+    config = uvicorn.Config(_says_yes, port=0, log_level="error", http=PatientProtocol, lifespan="off")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    yield server.servers[0].sockets[0].getsockname()
+    server.should_exit = True
+    thread.join(10.0)
+
+
+REQUEST = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+
+
+def answered(by: socket.socket) -> None:
+    """Reads one answer."""
+    said = b""
+    while not said.endswith(b"yes"):
+        part = by.recv(4096)
+        assert part
+        said += part
+
+
+@pytest.mark.parametrize("before", [b"", REQUEST], ids=["at once", "after another"])
+@pytest.mark.parametrize("part", [b"GET / HTTP/1.1\r\nX: y", b""], ids=["half a head", "nothing"])
+def test_a_head_that_never_ends_is_given_up(patient: tuple[str, int], before: bytes, part: bytes) -> None:
+    with socket.create_connection(patient, timeout=10.0) as slow:
+        if before:
+            slow.sendall(before)
+            answered(slow)
+        slow.sendall(part)
+        started = time.monotonic()
+        if part:
+            with contextlib.suppress(OSError):  # closed while it is written to
+                for _ in range(100):
+                    slow.sendall(b"y")
+                    slow.settimeout(0.1)
+                    with contextlib.suppress(TimeoutError):
+                        if not slow.recv(1):
+                            break
+        elif not before:  # between two requests, uvicorn's own patience of 5 s holds
+            assert slow.recv(1) == b""
+        assert time.monotonic() - started < 5.0
+
+
+def test_who_asks_in_time_is_answered_again_and_again(patient: tuple[str, int]) -> None:
+    with socket.create_connection(patient, timeout=10.0) as quick:
+        for _ in range(5):
+            quick.sendall(REQUEST)
+            answered(quick)
+            time.sleep(0.2)

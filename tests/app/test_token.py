@@ -196,11 +196,11 @@ def test_the_log_never_holds_it(client: TestClient, form: str) -> None:
 def restored() -> Iterator[None]:
     """Puts the loggers back."""
     names = ("beliefscope", "uvicorn.error")
-    before = [(logger.handlers, logger.propagate, logger.level) for logger in map(logging.getLogger, names)]
+    before = [(logger.handlers, logger.level) for logger in map(logging.getLogger, names)]
     yield
-    for name, (handlers, propagate, level) in zip(names, before, strict=True):
+    for name, (handlers, level) in zip(names, before, strict=True):
         logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = handlers, propagate
+        logger.handlers = handlers
         logger.setLevel(level)
 
 
