@@ -36,6 +36,7 @@ class Served:
     """``beliefscope serve`` as a user starts it."""
 
     def __init__(self, workspace: Path, port: int = 0, *more: str) -> None:
+        self.workspace = workspace
         command = Path(sysconfig.get_path("scripts")) / "beliefscope"
         options = ["serve", "--port", str(port), "--no-open", "--workspace", str(workspace), *more]
         self.process = subprocess.Popen([str(command), *options], stdout=subprocess.PIPE, text=True)
