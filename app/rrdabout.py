@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.inspect.trace import stored_recipe
+from beliefscope.recordings.schema import GROWING
 
 PATIENCE = 300.0  # s that a file is read for at most
 
@@ -25,7 +26,7 @@ class About:
         application, title: as the file has them. entities, rows: how many.
         problem: why no run can be read out of it; empty where one can. Of a file that Rerun cannot read either,
             ``application`` is empty.
-        task ... data_hash: of the trace, where it is one of ours; ``recipe`` as text.
+        task ... data_hash: of the trace, where it is one of ours; ``recipe`` as text, ``steps`` None of a live run.
         edited: whether some steps of the run were changed by hand.
     """
 
@@ -61,7 +62,7 @@ class About:
                 task=str(properties["task"]),
                 filter=str(properties["filter"]),
                 episode=int(properties["episode_index"]),
-                steps=int(properties["steps"]),
+                steps=None if properties["steps"] == GROWING else int(properties["steps"]),
                 seed=int(properties["seed"]),
                 recipe=str(stored_recipe(json.loads(properties.get("recipe", "null")), settings)),
                 particles=settings.get("particles"),

@@ -14,6 +14,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from rerun.chunk import RrdReader
 
 from beliefscope.datasets.errors import BadInput
@@ -50,8 +51,7 @@ def describe(path: str | Path) -> dict[str, Any]:
                 entities.add(chunk.entity_path)
                 rows += chunk.num_rows
                 if chunk.entity_path == f"/{HEADER}" and ours.application_id == APPLICATION:
-                    batch = chunk.to_record_batch()
-                    properties |= {name: _first(batch, name) for name in PROPERTIES if name in batch.schema.names}
+                    properties |= properties_of(chunk.to_record_batch())
                 elif chunk.entity_path == "/__properties":
                     batch = chunk.to_record_batch()
                     if "RecordingInfo:name" in batch.schema.names:
@@ -71,7 +71,12 @@ def describe(path: str | Path) -> dict[str, Any]:
     }
 
 
-def _first(batch: Any, name: str) -> Any:
+def properties_of(batch: pa.RecordBatch) -> dict[str, Any]:
+    """Those of ours that a chunk of a recording's header holds."""
+    return {name: _first(batch, name) for name in batch.schema.names if name in PROPERTIES}
+
+
+def _first(batch: pa.RecordBatch, name: str) -> Any:
     return batch.column(name)[0].as_py()[0]
 
 

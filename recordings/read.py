@@ -18,6 +18,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.intact import check_intact
 from beliefscope.inspect.trace import Trace, stored_recipe
+from beliefscope.recordings.describe import properties_of
 from beliefscope.recordings.schema import (
     APPLICATION,
     FORMAT_VERSION,
@@ -107,7 +108,7 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
                 for chunk in reader.stream(store=stores[0]).filter(content=STORED):
                     batch = chunk.to_record_batch()
                     if chunk.entity_path == f"/{HEADER}":
-                        header |= _properties(batch)
+                        header |= properties_of(batch)
                     else:
                         rows[chunk.entity_path.removeprefix("/")] += _values(batch)
     except (RuntimeError, ValueError, LookupError, TypeError) as error:
@@ -122,10 +123,6 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
     if missing := PROPERTIES.keys() - header.keys() - {"recipe"}:
         raise BadInput(f"{path}: the recording lacks the properties {', '.join(sorted(missing))}.")
     return header, rows
-
-
-def _properties(batch: pa.RecordBatch) -> dict[str, Any]:
-    return {name: batch.column(name)[0].as_py()[0] for name in batch.schema.names if name in PROPERTIES}
 
 
 def _values(batch: pa.RecordBatch) -> list[tuple[NDArray[np.int64] | None, NDArray[Any]]]:
