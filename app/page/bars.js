@@ -1,5 +1,6 @@
 /** Grouped bars with whiskers and dots, drawn as SVG whose bars are links; the looks of filters, for the bars and their legend. */
 
+import { em } from './palette.js';
 import { fixed } from './units.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
@@ -7,7 +8,7 @@ const SVG = 'http://www.w3.org/2000/svg';
 const FAMILIES = { crossmodal: '--fused', unimodal: '--spare-2', feature: '--spare-1', lstm: '--spare-0', image: '--image', haptics: '--haptics' };
 const TEXTURES = { pf: 'M-1 5 5-1M1 7 7 1', ukf: 'M1 2h2M4 5h2', lstm: 'M0 1.5h6M0 4.5h6' };
 const PATTERN = 6; // px, side of a texture's square
-const EDGE = { left: 34, right: 6, top: 16, bottom: 22 }; // px
+const EDGE = { left: em(34), right: em(6), top: em(16), bottom: em(22) }; // px
 const TALLEST = 2.5; // times the bar in the middle: taller ones are cut off and say their value
 const SHARE = 0.86; // of a group that is bars
 const LINES = 5; // of the scale, about
@@ -63,13 +64,13 @@ export class Bars {
     const step = pleasing(top / LINES);
     for (let value = 0; value <= top; value += step) {
       svg.append(element('path', { class: value ? 'grid' : 'ground', d: `M${EDGE.left} ${y(value)}H${width - EDGE.right}` }));
-      svg.append(element('text', { x: EDGE.left - 5, y: y(value) + 4, 'text-anchor': 'end' }, fixed(value, step < 0.1 ? 2 : step < 1 ? 1 : 0)));
+      svg.append(element('text', { x: EDGE.left - 5, y: y(value) + em(4), 'text-anchor': 'end' }, fixed(value, step < 0.1 ? 2 : step < 1 ? 1 : 0)));
     }
-    svg.append(element('text', { x: 2, y: 10 }, unit));
+    svg.append(element('text', { x: 2, y: em(10) }, unit));
     groups.forEach((group, g) => {
       const left = EDGE.left + g * across + ((1 - SHARE) / 2) * across;
       const each = (SHARE * across) / group.bars.length;
-      svg.append(element('text', { x: left + (SHARE * across) / 2, y: height - 7, 'text-anchor': 'middle' }, group.name));
+      svg.append(element('text', { x: left + (SHARE * across) / 2, y: height - em(7), 'text-anchor': 'middle' }, group.name));
       group.bars.forEach((bar, i) => svg.append(this.#bar(bar, left + i * each, each, y, top)));
     });
     if (level && level.value <= top) {
@@ -94,8 +95,8 @@ export class Bars {
     link.append(element('rect', { ...face(bar.filter), x, y: y(bar.mean), width: wide, height: y(0) - y(bar.mean) }));
     if (bar.mean > top) {
       link.append(element('path', { class: 'cut', d: `M${x - 1} ${EDGE.top + 5}l${wide / 2 + 1}-4 ${wide / 2 + 1} 4` }));
-      const size = Math.min(11, each);
-      const text = { class: 'over', transform: `translate(${middle + 0.36 * size} ${EDGE.top + 10}) rotate(-90)`, 'text-anchor': 'end' };
+      const size = Math.min(em(11), each);
+      const text = { class: 'over', transform: `translate(${middle + 0.36 * size} ${EDGE.top + em(10)}) rotate(-90)`, 'text-anchor': 'end' };
       const told = element('text', text, fixed(bar.mean, 1));
       told.style.fontSize = `${size}px`;
       link.append(told);
@@ -108,7 +109,7 @@ export class Bars {
     }
     const apart = wide / (bar.dots.length + 1);
     bar.dots.forEach(({ value, here }, i) => {
-      const dot = { class: here ? 'dot here' : 'dot', cx: x + (i + 1) * apart, cy: y(value), r: Math.min(here ? 3 : 2.2, each / 5) };
+      const dot = { class: here ? 'dot here' : 'dot', cx: x + (i + 1) * apart, cy: y(value), r: Math.min(here ? em(3) : em(22) / 10, each / 5) };
       if (value <= top) link.append(element('circle', dot));
     });
     return link;

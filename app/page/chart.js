@@ -1,6 +1,6 @@
 /** One track of the time line: a uPlot chart without cursor, legend or axis of its own, with shaded stretches. */
 
-import { colour, line, translucent } from './palette.js';
+import { colour, em, line, translucent } from './palette.js';
 
 /**
  * @typedef {object} Series
@@ -18,10 +18,12 @@ import { colour, line, translucent } from './palette.js';
  */
 
 /** px beside and below a track's plot. */
-export const GUTTER = { left: 46, right: 12, axis: 33 };
-const BLACK_STRIP = 8; // px
+export const GUTTER = { left: em(46), right: em(12), axis: em(33) };
+const BLACK_STRIP = em(8); // px
 const LOWEST = 0.1; // of the lower bound: a logarithmic axis goes no further down
-export const FONT = '10px system-ui, sans-serif';
+export const FONT = `${em(10)}px system-ui, sans-serif`;
+/** An axis's name. */
+export const LABEL = { labelSize: em(14), labelGap: 0, labelFont: FONT };
 
 /** How a line is drawn. Where two traces are compared, the first's lines are whole and the other's dashed. */
 export function style({ name, other = false }, compared) {
@@ -64,7 +66,7 @@ export function chart(parent, track, shading, frame) {
       },
       axes: [
         stepAxis(ink, frame),
-        { ...ink, size: GUTTER.left, gap: 3, space: 20, ...heights(track, ink) },
+        { ...ink, size: GUTTER.left, gap: 3, space: em(20), ...heights(track, ink) },
       ],
       series,
       bands,
@@ -92,9 +94,9 @@ function heights({ log, note }, { grid, ticks }) {
 
 /** Only the lowest track names the steps; the others have the same grid. (uPlot draws no axis after one not shown.) */
 function stepAxis(ink, { withAxis, stepName }) {
-  const axis = { ...ink, gap: 2, space: 60, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] };
+  const axis = { ...ink, gap: 2, space: em(60), incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] };
   if (!withAxis) return { ...axis, size: 0, ticks: { show: false }, values: (_, splits) => splits.map(() => '') };
-  return { ...axis, size: GUTTER.axis - 14, label: stepName, labelSize: 14, labelGap: 0, labelFont: FONT };
+  return { ...axis, size: GUTTER.axis - LABEL.labelSize, label: stepName, ...LABEL };
 }
 
 /** Fits what matters: the truth and the fused belief wholly, a modality that runs away only as far as most of it. */

@@ -1,12 +1,12 @@
 /** What a diagnostic found, drawn: curves over the steps with the page's cursor, plots, pictures and tables. */
 
-import { FONT, GUTTER, between, shade } from './chart.js';
+import { FONT, GUTTER, LABEL, between, shade } from './chart.js';
 import { copied } from './clipboard.js';
-import { COLOUR_TABLE, SIGNED_TABLE, colour, line, sample, swatch, variable } from './palette.js';
+import { COLOUR_TABLE, SIGNED_TABLE, colour, em, line, sample, swatch, variable } from './palette.js';
 import { stretches } from './trace.js';
 import { significant, spoken } from './units.js';
 
-const HEIGHT = { chart: 104, axis: 30, plot: 190 }; // px
+const HEIGHT = { chart: em(104), axis: em(30), plot: em(190) }; // px
 const AGAIN = [[9, 3, 2, 3], [1.5, 3], [4, 2], [12, 4]]; // dashes of the second line of a layer, the third …
 const MARGIN = 0.06; // of a range, above and below
 const TOLD = 1500; // ms
@@ -89,8 +89,8 @@ export class Figures {
         select: { show: false },
         scales: { x: { time: false, range: () => [0, Math.max(1, steps - 1)] }, y: { range: () => limits } },
         axes: [
-          { ...ink(), gap: 2, space: 60, size: last ? HEIGHT.axis - 14 : 0, ...(last ? { label: 'step', labelSize: 14, labelGap: 0, labelFont: FONT } : { ticks: { show: false }, values: (_, splits) => splits.map(() => '') }) },
-          { ...ink(), size: GUTTER.left, gap: 3, space: 20 },
+          { ...ink(), gap: 2, space: em(60), size: last ? HEIGHT.axis - LABEL.labelSize : 0, ...(last ? { label: 'step', ...LABEL } : { ticks: { show: false }, values: (_, splits) => splits.map(() => '') }) },
+          { ...ink(), size: GUTTER.left, gap: 3, space: em(20) },
         ],
         series: [{}, ...styles.map(({ stroke, dash, width }) => ({ stroke, dash, width, points: { show: false } }))],
         hooks: { ready: [() => this.move(this.#store.state.step)], drawClear: [(self) => shade(self, shading)], drawAxes: [(self) => bounds && between(self, bounds)] },
@@ -137,7 +137,7 @@ export class Figures {
     const [left, right] = extent([...xs, ...ideal]);
     const y = padded(extent([...plot.lines.flatMap((l) => l.y), ...ideal, ...(bars ? [0] : [])]));
     const x = bars ? [left - 0.6 * wide, right + 0.6 * wide] : plot.kind === 'points' ? padded([left, right]) : [left, right];
-    const small = { label: plot.x_label, labelSize: 14, labelGap: 0, labelFont: FONT };
+    const small = { label: plot.x_label, ...LABEL };
     const made = new uPlot(
       {
         width: figure.clientWidth,
@@ -148,8 +148,8 @@ export class Figures {
         select: { show: false },
         scales: { x: { time: false, range: () => (x[1] > x[0] ? x : [x[0] - 1, x[0] + 1]) }, y: { range: () => y } },
         axes: [
-          { ...ink(), ...small, size: 16, gap: 2, space: 40, ...(bars && xs.every(Number.isInteger) ? { incrs: [1, 2, 5, 10, 20, 50, 100, 1000] } : {}), ...(plot.names?.length ? { space: 1, size: 58, rotate: 38, values: (_, at) => at.map((x) => plot.names[x] ?? '') } : {}) },
-          { ...ink(), ...small, label: plot.y_label, size: 40, gap: 3, space: 24 },
+          { ...ink(), ...small, size: em(16), gap: 2, space: em(40), ...(bars && xs.every(Number.isInteger) ? { incrs: [1, 2, 5, 10, 20, 50, 100, 1000] } : {}), ...(plot.names?.length ? { space: 1, size: em(58), rotate: 38, values: (_, at) => at.map((x) => plot.names[x] ?? '') } : {}) },
+          { ...ink(), ...small, label: plot.y_label, size: em(40), gap: 3, space: em(24) },
         ],
         series: [{}, { show: false }],
         hooks: { draw: [(self) => trace(self, plot, styles, wide)] },

@@ -64,7 +64,7 @@ async function start() {
     problems.push(`The link asks for sensors broken by “${state.recipe}”: ${error.message}`);
     state.recipe = '';
   });
-  messages.say('link', problems.join(' '));
+  messages.say('link', problems.join('\n'));
   new Page(catalog, new Store(state), live);
 }
 

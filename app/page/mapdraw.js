@@ -1,14 +1,14 @@
 /** One likelihood map on a pen: the context of a canvas, or an `SvgPen` with the same strokes. */
 
-import { TABLES, line } from './palette.js';
+import { TABLES, em, line } from './palette.js';
 import { fixed } from './units.js';
 
-export const MARGIN = { left: 38, bottom: 30, top: 1, right: 5, gap: 9 }; // px around a map's square
+export const MARGIN = { left: em(38), bottom: em(30), top: 1, right: em(5), gap: em(9) }; // px around a map's square
 const SPACINGS = [1, 2, 5, 10, 20, 50, 100]; // cm between ticks
-const APART = 26; // px between them at least
+const APART = em(26); // px between them at least
 const HALO = ['rgb(255 255 255 / 0.55)', 3.5];
-const FONT = '10px system-ui, sans-serif';
-const PARTICLE = 2.2; // px radius of one with the mean weight
+const FONT = `${em(10)}px system-ui, sans-serif`;
+const PARTICLE = em(22) / 10; // px radius of one with the mean weight
 const STRENGTHS = [0.95, 0.5]; // of the regions' borders, the smallest first
 
 /**
@@ -63,7 +63,7 @@ function drawAxes(pen, { maps }, side, { axes, zoom, text, withY }) {
   for (const [cm, at] of ticks(middle[0], half, spacing, side)) {
     pen.moveTo(at, side);
     pen.lineTo(at, side + 3);
-    pen.fillText(fixed(cm, 0), at, side + 5);
+    pen.fillText(fixed(cm, 0), at, side + em(5));
   }
   if (withY) {
     pen.textAlign = 'right';
@@ -78,7 +78,7 @@ function drawAxes(pen, { maps }, side, { axes, zoom, text, withY }) {
   pen.textAlign = 'center';
   pen.textBaseline = 'top';
   const called = axes === 'world' ? ['x (cm)', 'y (cm)'] : ['Δx (cm)', 'Δy (cm)'];
-  pen.fillText(called[0], side / 2, side + 18);
+  pen.fillText(called[0], side / 2, side + em(18));
   if (!withY) return;
   pen.save();
   pen.translate(-MARGIN.left + 1, side / 2);

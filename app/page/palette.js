@@ -12,6 +12,11 @@ const CIVIDIS = [
   0x848279, 0x948e77, 0xa59c74, 0xb7a96e, 0xc8b866, 0xdbc75a, 0xeed649, 0xfee838,
 ];
 
+const UNIT = parseFloat(getComputedStyle(document.documentElement).fontSize) / 10;
+
+/** What is so many px on most screens, on this one: as `rem` in the style sheets, a tenth of it. */
+export const em = (px) => Math.round(px * UNIT);
+
 /** One meaning has one colour and one dash everywhere, so that lines differ without colour too. */
 const DASHES = { truth: [], fused: [], image: [7, 3], haptics: [2, 2.5] };
 const WIDTHS = { truth: 1.25, fused: 2.25 };

@@ -2,14 +2,14 @@
 
 import { GUTTER, chart, plotted, style } from './chart.js';
 import { Marks } from './marks.js';
-import { sample, variable } from './palette.js';
+import { em, sample, variable } from './palette.js';
 import { stretches } from './trace.js';
 import { KINDS, shownError, tracks } from './tracks.js';
 import { fixed, significant } from './units.js';
 
 const CLOSEST = 8; // steps that the strongest zoom still shows
-const NOTE = 26; // px of a line in place of a plot
-const LINE = 14; // px of a legend's
+const NOTE = em(26); // px of a line in place of a plot
+const LINE = em(14); // px of a legend's
 const MEANT = 4; // px from which a drag is one
 
 export class TimeLine {
