@@ -184,6 +184,9 @@ export const startFinetune = async (selection, settings) => (await post(finetune
 /** A run, how far it is, and what it found. */
 export const tuned = async (run, signal) => (await ask(`/api/tuned/${encodeURIComponent(run)}`, { signal })).json();
 
+/** Which filters of a task were made from which. @returns {Promise<{members: object[]}>} */
+export const lineage = async (task, signal) => (await ask(`/api/lineage/${encodeURIComponent(task)}`, { signal })).json();
+
 /** What studies found. @returns {Promise<{studies: object[], problems: string[]}>} */
 export const studies = async () => (await ask('/api/studies')).json();
 

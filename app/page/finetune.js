@@ -1,6 +1,7 @@
 /** Fine-tuning: what of the filter is trained, on what, the run as it goes, and what it mended and broke. */
 
 import * as api from './api.js';
+import { Descent } from './descent.js';
 import { Figures } from './figures.js';
 import { told, underWay } from './jobs.js';
 import { ModuleTree } from './moduletree.js';
@@ -36,6 +37,7 @@ const FORM = `
     <div class="row"><label title="Of the slice, only these steps are learned from: episodes, and steps of them. All training episodes where it is empty.">Only at <input name="moments" placeholder="9, 31:20-60" autocomplete="off" spellcheck="false"></label></div>
     <div class="row"><button class="text start">Fine-tune</button> <label class="past" hidden>Runs so far <select name="past"></select></label></div>
     <p class="wrong" role="alert"></p>
+    <section class="descent"></section>
   </form>
   <article hidden tabindex="-1">
     <div class="row"><button type="button" class="text quiet back">‹ New run</button><h3></h3></div>
@@ -54,6 +56,7 @@ export class Finetune {
   #jobs;
   #catalog;
   #tree;
+  #descent;
   #live;
   #report;
   #showRecipes;
@@ -73,6 +76,7 @@ export class Finetune {
     [this.#host, this.#catalog, this.#store, this.#jobs] = [host, catalog, store, jobs];
     host.innerHTML = FORM;
     this.#tree = new ModuleTree(this.#part('.tree'), () => ((this.#field('preset').value = OWN), this.#count()));
+    this.#descent = new Descent(this.#part('.descent'), store);
     this.#live = new Figures(this.#part('.live'), store);
     this.#report = new Figures(this.#part('.report'), store);
     this.#part('.numbers').append(...NUMBERS.map(number));
@@ -117,6 +121,7 @@ export class Finetune {
         this.#offer = await api.finetuning(this.#store.state, signal);
         this.#loaded = key;
         this.#showOffer();
+        await this.#descent.load(signal);
       }
       this.#run = run ? await api.tuned(run, signal) : null;
       this.#show();
