@@ -14,6 +14,7 @@ import sys
 import collect
 import filters
 import finetune
+import live
 import loading
 import maps
 import page
@@ -30,6 +31,7 @@ PARTS = {
     "loading": loading.measure,
     "recordings": recordings.measure,
     "page": page.measure,
+    "live": live.measure,
 }
 
 
