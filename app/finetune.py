@@ -26,7 +26,7 @@ from beliefscope.datasets.document import read_json
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
 from beliefscope.filters.finetune import FineTune, finetune
 from beliefscope.filters.foreign import Foreign
-from beliefscope.filters.modules import chosen, presets, tree
+from beliefscope.filters.modules import chosen, moved, presets, tree, within
 from beliefscope.filters.slices import slices_of
 from beliefscope.filters.tuning import Look
 from beliefscope.inspect.change import Change, change_of
@@ -120,8 +120,10 @@ def offered(checkpoint: Checkpoint) -> dict[str, Any]:
     filter_, known = checkpoint.filter, presets(checkpoint.filter)
     trained = {name: set(chosen(filter_, [name])) for name in known}
     slices = [one for one in slices_of(checkpoint.task) if all(name in filter_.names for name in one.only)]
+    ran = checkpoint.record.get("parts", {})  # of the fine-tuning that made it
     modules = [
         {"name": n.name, "kind": n.kind, "says": n.says, "parameters": n.parameters, "depth": n.depth}
+        | (moved(n.name, ran) if any(within(key, n.name) for key in ran) else {})
         for n in tree(filter_)
         if n.name and n.parameters
     ]

@@ -103,7 +103,7 @@ def routes(library: Library) -> APIRouter:
     def open_checkpoint(name: str, task: str, filter: str, seed: int) -> dict[str, str]:
         study = next((one for one in known() if one.name == name), None)
         cell = f"{task}/{filter}/seed{seed}"
-        wanted = study and study.read().checkpoints.get(cell)
+        wanted = None if study is None else study.read().checkpoints.get(cell)
         if study is None or wanted is None:
             raise HTTPException(404, f"Study {name!r} has no checkpoint {cell!r}.")
         there = _by_hash(library).get((task, wanted))

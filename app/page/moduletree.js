@@ -1,5 +1,7 @@
 /** The modules of a filter as a tree whose parts are thawed and frozen by check boxes, one for each at any depth. */
 
+import { significant } from './units.js';
+
 export class ModuleTree {
   #host;
   #changed;
@@ -53,7 +55,7 @@ export class ModuleTree {
     const box = label.firstElementChild;
     label.querySelector('b').textContent = module.name.split('.').at(-1);
     [label.title, size.textContent] = [`${module.name} (${module.kind})`, module.parameters.toLocaleString('en')];
-    says.textContent = says.title = module.says || module.kind;
+    says.textContent = says.title = [history(module), module.says || module.kind].filter(Boolean).join(' · ');
     box.setAttribute('aria-label', `Train ${module.name}`);
     twist.style.visibility = deeper ? '' : 'hidden';
     twist.addEventListener('click', () => {
@@ -79,4 +81,9 @@ export class ModuleTree {
       twist.setAttribute('aria-expanded', String(!closed));
     }
   }
+}
+
+/** What the fine-tuning that made the filter did to a module; nothing where there was none, or it was frozen. */
+function history({ gradient, change }) {
+  return gradient === undefined ? '' : `gradient ${significant(gradient)}, changed by ${significant(100 * change)} %`;
 }

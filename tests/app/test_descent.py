@@ -9,12 +9,14 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.children import Child, keep
+from beliefscope.app.finetune import offered
 from beliefscope.app.library import Library
 from beliefscope.app.server import Settings
-from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
+from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 
 MIX = [{"slice": {"name": "haptics alone"}, "share": 1.0}]
 ERRORS = {"haptics alone": {"rmse": {"position_cm": 2.0}, "nll": 1.0}}
@@ -69,6 +71,16 @@ def test_a_child_that_was_kept_is_called_as_on_the_shelf(settings: Settings, cli
     keep(library, Child("door", "crossmodal-pf-c0ffee", str(path), default=False))
     shown = {one["hash"]: one["shelf"] for one in client.get("/api/lineage/door").json()["members"]}
     assert shown[child] == "crossmodal-pf-c0ffee"
+
+
+def test_the_tree_of_modules_tells_what_its_fine_tuning_moved() -> None:
+    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    names = [name for name, _ in checkpoint.filter.named_parameters() if name.startswith("weight_model")]
+    ran = {name: [0.5, 0.1, 2.0] for name in names}
+    told = offered(replace(checkpoint, record={**checkpoint.record, "parts": ran}))
+    moved = {one["name"]: (one["gradient"], one["change"]) for one in told["modules"] if "gradient" in one}
+    assert moved["weight_model"] == pytest.approx((0.5 * len(names) ** 0.5, 0.05))
+    assert all(name.startswith("weight_model") for name in moved), "what was frozen tells nothing"
 
 
 def test_without_any_there_is_nothing_to_tell(settings: Settings, open_client: type[TestClient]) -> None:
