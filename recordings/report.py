@@ -39,6 +39,7 @@ from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostic import Table, as_json
 from beliefscope.inspect.likelihood import FINE, MapEngine, no_maps
 from beliefscope.inspect.plotting import charts_of, write_figure
+from beliefscope.inspect.snapshot import snapshot
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.reportfigures import error_figure, moment_figure, zoom_of
 from beliefscope.recordings.reportpage import page
@@ -54,6 +55,11 @@ from beliefscope.recordings.reportparts import (
 )
 
 FORMAT = "beliefscope-report 1"
+SCENE = (
+    "The scene from above, its object as it was (line) and as the filter takes it to be (dashed). Arrow: the force on "
+    "the hand, 4 cm for 10 N. Beside it the belief, its likelihood beneath: 2 sigma contours, and particles, redder "
+    "the more they weigh."
+)
 CHARTS = 8
 """Traces whose errors are drawn, those of the largest RMSE."""
 
@@ -185,7 +191,7 @@ class Writer:
         return Section(name, title, question, result.verdict, tuple(shown))
 
     def moment(self, number: int) -> Section:
-        """One moment: pictures, maps, numbers."""
+        """One moment: the scene, pictures, maps, numbers."""
         moment = self.report.moments[number]
         trace, step = self.report.traces[moment.trace], moment.step
         name = f"moment-{number + 1}"
@@ -210,6 +216,7 @@ class Writer:
                 f"What the filter was given, and its estimates as offsets from the truth. No maps: {self.no_maps}."
             )
         shown = (
+            self.figure(f"{name}-scene", SCENE, snapshot(trace, step, drawn)),
             self.figure(name, caption, moment_figure(trace, step, drawn, zoom), *data),
             self.table(name, moment_table(trace, step, map_)),
         )
