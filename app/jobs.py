@@ -38,6 +38,7 @@ KINDS: dict[str, str] = {
     "diagnostic": "beliefscope.app.diagnostics:work",
     "failures": "beliefscope.app.failures:work",
     "finetune": "beliefscope.app.finetune:work",
+    "reading": "beliefscope.app.recordings:work",
     "report": "beliefscope.app.reports:work",
 }
 """Kind of job -> ``module:function`` of (arguments, report) -> result; ``report(share done, what it is doing)``."""

@@ -246,12 +246,18 @@ class LiveRuns:
 
 def called(run: Run, filters: Mapping[str, Checkpoint]) -> tuple[str, Checkpoint]:
     """The run's filter among those of its task, by its hash, and the name it is shown by; else what is known of it."""
-    name, hash_ = run.like.filter, run.like.checkpoint_hash
+    hash_ = run.like.checkpoint_hash
+    name = name_of(run.like.filter, hash_, filters)
+    there = filters.get(name)
+    return name, there if there is not None and there.hash == hash_ else Absent(run.like, run.task)
+
+
+def name_of(name: str, hash_: str, filters: Mapping[str, Checkpoint]) -> str:
+    """What the filter of that name and hash is called beside those of its task, of which it may be one."""
     of_hash = [shown for shown, checkpoint in filters.items() if hash_ and checkpoint.hash == hash_]
     if of_hash:
-        shown = name if name in of_hash else of_hash[0]
-        return shown, filters[shown]
-    return f"{name} (live)" if name in filters else name, Absent(run.like, run.task)
+        return name if name in of_hash else of_hash[0]
+    return f"{name} (live)" if name in filters else name
 
 
 def described(run: Run) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote
 
@@ -21,14 +22,21 @@ from starlette.requests import ClientDisconnect
 
 from beliefscope import __version__
 from beliefscope.app.caching import tagged
+from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Selection
+from beliefscope.app.link import moment_link
+from beliefscope.app.liveruns import PREFIX, name_of
 from beliefscope.app.rrdabout import About
 from beliefscope.app.rrdfiles import ENDING, Recording, RrdFiles, disk
+from beliefscope.app.work import Report
+from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.catalog import quick
+from beliefscope.inspect.growing import SUFFIX, GrowingWriter
 from beliefscope.inspect.likelihood import no_maps
 from beliefscope.recordings.describe import describe
+from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
 
 LARGEST = 2 * 10**9  # bytes of a file that is added
@@ -57,7 +65,7 @@ class ChangeRequest(BaseModel):
     tags: list[str] | None = None
 
 
-def routes(library: Library, files: RrdFiles) -> APIRouter:
+def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
     """Every route under ``/api/recordings``."""
     router = APIRouter()
     writing = threading.Lock()
@@ -138,6 +146,25 @@ def routes(library: Library, files: RrdFiles) -> APIRouter:
     def delete(name: str) -> dict[str, str]:
         return {"deleted": files.delete(name)}
 
+    @router.post("/api/recordings/{name}.rrd/run", status_code=202)
+    def open_run(name: str) -> dict[str, Job]:
+        one = files.one(name)
+        about = one.about
+        if about is None or about.problem:
+            raise BadInput(about.problem if about else f"{one.name!r} is looked into just now.")
+        assert about.filter is not None
+        filters = library.filters(str(about.task))
+        key = repr((one.name, one.bytes, one.modified))
+        run = f"{one.name.removesuffix(ENDING)} {hashlib.sha256(key.encode()).hexdigest()[:8]}"
+        shown = name_of(about.filter, about.checkpoint_hash, filters)
+        link = moment_link(find_task(str(about.task)), shown, PREFIX + run, about.episode or 0, 0)
+        made = library.live.folder / f"{run}{SUFFIX}"
+        before = jobs.find("reading", key)
+        if before is not None and before.state == "done" and not made.is_file():
+            jobs.cancel(before.id)  # what it made has gone: forget it, and make it again
+        arguments = {"recording": str(files.path(name)), "run": str(made)}
+        return {"job": jobs.submit("reading", f"The run in {one.name}", arguments, key, link)}
+
     @router.post("/api/recordings/deleted/{id}")
     def restore(id: str) -> dict[str, Any]:
         return shown(files.restore(id))
@@ -152,6 +179,25 @@ def routes(library: Library, files: RrdFiles) -> APIRouter:
         return _shown(one, *runs.of(one.about, runs.tasks()))
 
     return router
+
+
+def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """The job that makes a recording a run of the workspace, as a filter that ran live would have left it."""
+    report(0.0, "reading the recording")
+    run, path = read_recording(arguments["recording"]), Path(arguments["run"])
+    report(0.5, "writing its steps")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part")
+    part.unlink(missing_ok=True)
+    writer = GrowingWriter(part, run, len(run))
+    try:
+        writer.append(run)
+        writer.finish()
+        part.replace(path)
+    finally:
+        writer.close()
+        part.unlink(missing_ok=True)
+    return {"run": path.name.removesuffix(SUFFIX), "steps": len(run)}
 
 
 class Runs:

@@ -90,7 +90,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False, acces
         compare.routes(library),
         failures.routes(library, work),
         finetune.routes(library, work),
-        recordings.routes(library, rrds),
+        recordings.routes(library, rrds, work),
         reports.routes(library, work),
         study.routes(library),
         descent.routes(library),

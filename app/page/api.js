@@ -140,6 +140,9 @@ export const reports = async () => (await ask('/api/reports')).json();
 /** Gives a recording another name, or other tags. @param {{url: string}} file @param {{name?: string, tags?: string[]}} change */
 export const changeRecording = async ({ url }, change) => (await post(url, change, 'PATCH')).json();
 
+/** Has a recording read as a run of this workspace; the job's link opens it. @returns {Promise<{job: Job}>} */
+export const readRun = async ({ url }) => (await ask(`${url}/run`, { method: 'POST' })).json();
+
 /** Puts a recording or a report into the trash. @returns {Promise<{deleted: string}>} by which it is had back */
 export const discard = async ({ url }) => (await ask(url, { method: 'DELETE' })).json();
 

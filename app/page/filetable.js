@@ -11,7 +11,7 @@ import { stopAt, walk } from './rows.js';
  * @typedef {object} Act what can be done with a file
  * @property {string} name @property {string} [key] of the keyboard that does it in its row
  * @property {() => void} [act] @property {string} [href] a link in its place, `download` a name to save it by, `window` whether in another one
- * @property {string} [why] it cannot be done
+ * @property {string} [why] it cannot be done @property {string} [hint] what there is to know
  */
 
 export class FileTable {
@@ -198,7 +198,7 @@ export class FileTable {
     item.tabIndex = -1;
     item.append(Object.assign(document.createElement('span'), { textContent: act.name }));
     if (act.key) item.append(Object.assign(document.createElement('kbd'), { textContent: { Delete: 'del' }[act.key] ?? act.key }));
-    if (act.why) item.append(Object.assign(document.createElement('small'), { textContent: act.why }));
+    if (act.why ?? act.hint) item.append(Object.assign(document.createElement('small'), { textContent: act.why ?? act.hint }));
     item.addEventListener('click', () => {
       if (act.why) return;
       this.#menu.hidePopover();

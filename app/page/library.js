@@ -3,6 +3,7 @@
 import { Adding } from './adding.js';
 import * as api from './api.js';
 import { FileTable } from './filetable.js';
+import { told, underWay } from './jobs.js';
 import { say } from './panel.js';
 import { bytes, sentence } from './units.js';
 
@@ -46,6 +47,7 @@ export class Library {
   #host;
   #store;
   #catalog;
+  #jobs;
   #rerun;
   #recordings;
   #reports;
@@ -55,6 +57,7 @@ export class Library {
   #chosen = new Set();
   #point = '';
   #undo = null;
+  #awaited = ''; // id of the job that reads a run
   #open = false;
   #timer = 0;
 
@@ -63,7 +66,7 @@ export class Library {
    * @param {import('./rerun.js').Rerun} rerun that shows recordings
    */
   constructor(host, catalog, store, jobs, rerun) {
-    [this.#host, this.#catalog, this.#store, this.#rerun] = [host, catalog, store, rerun];
+    [this.#host, this.#catalog, this.#store, this.#jobs, this.#rerun] = [host, catalog, store, jobs, rerun];
     host.innerHTML = BODY;
     const name = { name: 'name', title: 'name', help: 'Of the file', value: (file) => file.name, shown: (file) => this.#tags(file), hint: (file) => (file.reading ? '' : file.problem) };
     this.#recordings = new FileTable(this.#part('.recordings'), [name, ...OF_A_RUN, data, size, when('modified')], {
@@ -76,7 +79,7 @@ export class Library {
       sort: { name: 'when', down: true },
     });
     this.#adding = new Adding(this.#part('.adding'), (added) => this.#added(added));
-    jobs.listen(() => this.#open && this.load());
+    jobs.listen((list) => this.#hear(list));
     this.#take();
     this.#takeDrops();
   }
@@ -181,12 +184,38 @@ export class Library {
     const unread = file.reading ? 'It is looked into just now' : file.application ? undefined : sentence(file.problem);
     return [
       { name: 'Open in Rerun', key: 'Enter', act: () => this.#show([file]), why: unread },
-      { name: 'Open the run here', act: () => this.#store.set({ ...this.#selection(file), tab: 'scene' }), why: file.run ? undefined : unread ?? file.why_not },
+      { name: 'Open the run here', ...this.#run(file, unread) },
       { name: 'Rename', key: 'F2', act: () => this.#rename(file), why: this.#readOnly },
       { name: 'Tags', act: () => this.#tag(file), why: this.#readOnly },
       { name: `Download, ${bytes(file.bytes)}`, href: file.url, download: file.name },
       { name: 'Delete', key: 'Delete', act: () => this.#delete(file, 'recordings'), why: this.#readOnly },
     ];
+  }
+
+  /** The run of a recording: this server's own, or read out of the file. */
+  #run(file, unread) {
+    if (file.run) return { act: () => this.#store.set({ ...this.#selection(file), tab: 'scene' }) };
+    const known = this.#catalog.tasks.some(({ name }) => name === file.task);
+    if (unread || file.problem || !known) return { why: unread ?? sentence(file.problem || `This server has no task ${file.task}`) };
+    return { act: () => this.#readRun(file), why: this.#readOnly, hint: `As it was recorded. ${file.why_not}` };
+  }
+
+  /** Has a run read out of its file, and opens it when that is done. */
+  #readRun(file) {
+    return this.#try(async () => {
+      const { job } = await api.readRun(file);
+      if (job.state === 'done') return location.assign(`/${job.link}`);
+      this.#awaited = job.id;
+      this.#say(`The run in ${file.name} is read; it opens in a moment.`);
+      await this.#jobs.refresh();
+    });
+  }
+
+  #hear(list) {
+    const job = list.find(({ id }) => id === this.#awaited);
+    if (job?.state === 'done') location.assign(`/${job.link}`); // its episode is new to this page
+    else if (job && !underWay(job)) [this.#awaited] = ['', this.#say(told(job), null, true)];
+    if (this.#open) this.load();
   }
 
   #actsOfReport(file) {

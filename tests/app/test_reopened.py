@@ -1,0 +1,56 @@
+"""A recording's run, opened on a page that could not run it again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import parse_qs
+
+import numpy as np
+from starlette.testclient import TestClient
+
+from beliefscope.app.library import Settings
+from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.store import open_dataset
+from beliefscope.filters.checkpoint import load_checkpoint
+from beliefscope.inspect.trace import trace
+from beliefscope.recordings.write import write_recording
+
+PATIENCE = 120.0  # s: a job imports PyTorch first
+
+
+def test_the_run_in_a_recording_is_shown_as_it_was_recorded(
+    settings: Settings, open_client: Callable[..., TestClient]
+) -> None:
+    checkpoint = load_checkpoint(Path(str(settings.checkpoints["crossmodal-pf"])))
+    with open_dataset(settings.data["mine"], DOOR) as data:
+        run = trace(checkpoint, data[1], episode_index=1, seed=5, particles=20)
+    folder = settings.workspace / "recordings"
+    folder.mkdir(parents=True)
+    write_recording(run, folder / "best run (1).rrd")
+    (folder / "no run.rrd").write_bytes(b"RRF2")
+    url = "/api/recordings/best%20run%20(1).rrd/run"
+    with open_client(replace(settings, checkpoints={}, data={})) as client:
+        end = time.monotonic() + PATIENCE
+        while any(one["reading"] for one in client.get("/api/recordings").json()["recordings"]):
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        job = client.post(url).json()["job"]
+        while (job := client.get(f"/api/jobs/{job['id']}").json())["state"] in ("waiting", "running"):
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        assert job["state"] == "done", job["error"]
+        asked = {key: value for key, (value,) in parse_qs(job["link"].removeprefix("?")).items()}
+        path = f"/api/trace/{asked['task']}/{asked['filter']}/{asked['episode']}"
+        header = client.get(path, params={"data": asked["data"]}).json()
+        assert (header["steps"], header["seed"], header["checkpoint_hash"]) == (len(run), 5, checkpoint.hash)
+        columns = client.get(f"{path}/columns", params={"data": asked["data"]}).content
+        (offset,) = (one["offset"] for one in header["columns"] if one["name"] == "estimate_mean")
+        shown = np.frombuffer(columns, "<f4", run.estimate_mean.size, offset)
+        np.testing.assert_array_equal(shown, run.estimate_mean.ravel())
+        assert client.post(url).json()["job"]["state"] == "done", "what was read is not read again"
+        refused = client.post("/api/recordings/no%20run.rrd/run")
+        assert (refused.status_code, "not a whole Rerun recording" in refused.json()["error"]) == (400, True)
+        assert client.post("/api/recordings/none.rrd/run").status_code == 404
