@@ -18,7 +18,7 @@ PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_F
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve test lint check check-all bench clean
+.PHONY: help install serve test lint check check-all bench lock licences audit clean
 
 help:
 	@echo "make serve      set up what is missing and serve the page on http://127.0.0.1:8000"
@@ -26,6 +26,9 @@ help:
 	@echo "make check      lint, formatting, types and the tests"
 	@echo "make check-all  the same with the tests that take minutes"
 	@echo "make bench      measure the filters, the maps, the recordings and the page"
+	@echo "make lock       pin every package with its hashes in requirements.lock"
+	@echo "make licences   list the licences of all packages, and fail where one is not allowed"
+	@echo "make audit      ask whether any of them has a known weakness (needs the network)"
 	@echo "make install    only set up .venv, with the tools for development"
 	@echo "make clean      remove .venv and what the tools left behind"
 
@@ -63,6 +66,24 @@ check-all: lint
 
 bench: install
 	@$(BIN)/python bench/run.py $(ARGS)
+
+# Tools that stay out of .venv: their own requirements are none of ours.
+$(VENV)/tools:
+	@"$(PYTHON)" -m venv $@
+	@$@/bin/python -m pip install -qq $(PIP_FLAGS) uv pip-audit
+
+lock: $(VENV)/tools
+	@$(VENV)/tools/bin/uv pip compile pyproject.toml --extra ray --extra export --extra meshes -c constraints.txt \
+	  --universal --python-version 3.11 --generate-hashes --no-annotate --no-header -o $(VENV)/lock -q
+	@sed '/^[^#]/,$$d' requirements.lock | cat - $(VENV)/lock > $(VENV)/lock.new
+	@mv $(VENV)/lock.new requirements.lock
+
+licences: install
+	@$(BIN)/python bench/licences.py
+
+audit: $(VENV)/tools
+	@$(VENV)/tools/bin/pip-audit -r requirements.lock --require-hashes --disable-pip || { \
+	  echo "Weaknesses are listed above; where none are, the advisory service was not reached, and nothing is known." >&2; exit 1; }
 
 clean:
 	rm -rf $(VENV) build dist src/beliefscope.egg-info .pytest_cache .mypy_cache .ruff_cache
