@@ -1,17 +1,39 @@
-"""Size of an 800-step recording and the time to write it, with maps at several strides."""
+"""Recordings: how fast they are written, how large they are, how soon they open, what a long live run costs.
+
+python bench/run.py recordings          written fast enough, small enough
+python bench/recordings.py --long       memory and bytes a step of live runs of 10^4 and 10^5 steps
+python bench/recordings.py --open       from a click to the recording in the page's Rerun viewer, in Chromium
+"""
 
 from __future__ import annotations
 
+import argparse
+import json
+import resource
+import shutil
+import subprocess
+import sys
 import tempfile
+import time
+from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
+from statistics import median
 
 import subject
+import torch
 from subject import NAMES, STEPS, Row
 
 from beliefscope.inspect.likelihood import MapEngine
+from beliefscope.inspect.trace import begin
+from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.write import write_recording
 
-STRIDES = (0, 8, 4)
+STRIDE = 4
+MAPS = 400
+"""Written where speed is measured, made before of as many steps as there are of another stride."""
+
+LONG = (10_000, 100_000)
 
 
 def measure() -> list[Row]:
@@ -21,14 +43,114 @@ def measure() -> list[Row]:
         for name in NAMES:
             traced = subject.traced(name)
             engine = MapEngine(subject.checkpoint(name), traced)
-            for stride in STRIDES:
-                took = subject.seconds(
-                    lambda s=stride, t=traced, e=engine: write_recording(
-                        t, path, maps=e.maps(range(0, STEPS, s)) if s else None
-                    )
-                )
-                size = path.stat().st_size
-                what = f"{name}, " + (f"maps of 135 x 135 every {stride} steps" if stride else "without maps")
-                figure = f"{size / 1e6:.1f} MB, {size / STEPS:.0f} B/step, {took:.1f} s"
-                rows.append((what, figure, "<= 30 MB, <= 5 s"))
+            write_recording(traced, path)
+            took = median(subject.seconds(lambda t=traced: write_recording(t, path)) for _ in range(5))
+            size = path.stat().st_size
+            what = f"{STEPS / took:.0f} steps/s, {size / 1e6:.1f} MB, {size / STEPS:.0f} B/step"
+            rows.append((f"{name}, without maps", what, ">= 2000 steps/s"))
+            maps = list(engine.maps(range(0, STEPS, STRIDE)))
+            every = [replace(one, step=step) for step, one in zip(range(MAPS), cycle(maps), strict=False)]
+            more = subject.seconds(lambda t=traced, m=every: write_recording(t, path, m)) - took
+            what = f"{MAPS / (more + took * MAPS / STEPS):.0f} steps/s"
+            rows.append(
+                (f"{name}, {len(maps[0].layers)} maps of 135 x 135 a step, made before", what, ">= 200 steps/s")
+            )
+            write_recording(traced, path, maps)
+            size = path.stat().st_size
+            rows.append((f"{name}, maps every {STRIDE} steps", f"{size / 1e6:.1f} MB", "<= 15 MB"))
     return rows
+
+
+@torch.no_grad()
+def live(name: str, steps: int, folder: Path) -> dict[str, float]:
+    """A live run of so many steps: the first 100 of the subject's over and over, so that only recording is measured."""
+    episode, checkpoint = subject.episode(), subject.checkpoint(name)
+    run = begin(checkpoint, episode, 0, 0, 300, subject.traced(name).recipe)
+    generator, filter_ = run.generator(), checkpoint.filter
+    belief, taken = filter_.start(run.start, 300, generator), []
+    for t in range(100):
+        belief, known = filter_.step(belief, run.evidence[t], generator)
+        taken.append((known, {key: array[t] for key, array in episode.observations.items()}, run.evidence[t]))
+    began = time.perf_counter()
+    with LiveRecorder("long", checkpoint, folder=folder, start=run.start, like=episode, **run.given) as recorder:
+        for t in range(steps):
+            known, seen, evidence = taken[t % 100]
+            recorder.step(known, seen, episode.controls[t % 100], truth=episode.states[t % 100], evidence=evidence)
+        stepped = time.perf_counter() - began
+    took = time.perf_counter() - began
+    return {
+        "rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "live": recorder.path.stat().st_size / steps,
+        "rrd": recorder.path.with_suffix(".rrd").stat().st_size / steps,
+        "rate": steps / took,
+        "step_rate": steps / stepped,
+        "waited": recorder.waited,
+        "behind": recorder.behind,
+    }
+
+
+def long(names: tuple[str, ...] = NAMES) -> None:
+    """Each run in a process of its own: peak memory is a process's."""
+    for name in names:
+        for steps in LONG:
+            with tempfile.TemporaryDirectory() as folder:
+                command = [sys.executable, __file__, "--one", name, str(steps), folder]
+                found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+            print(
+                f"{name}, {steps} steps: peak {found['rss_mb']:.0f} MB, {found['live']:.0f} B/step in the .live file, "
+                f"{found['rrd']:.0f} B/step in the recording; {found['step_rate']:.0f} steps/s taken, "
+                f"{found['rate']:.0f} steps/s to the end; {found['waited']:.0f} waited for the disk, "
+                f"views at most {found['behind']:.0f} steps behind",
+                flush=True,
+            )
+
+
+def opened() -> None:
+    """Prints how long the page's viewer, once started, takes to open an 800-step recording with maps."""
+    import page
+    from playwright.sync_api import sync_playwright
+
+    name = "crossmodal-pf"
+    traced = subject.traced(name)
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
+    with page.serving() as url, sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.rrd"
+        write_recording(traced, path, MapEngine(subject.checkpoint(name), traced).maps(range(0, STEPS, STRIDE)))
+        chromium = playwright.chromium.launch(executable_path=browser, args=page.FLAGS)
+        view = chromium.new_page(viewport={"width": 1440, "height": 900})
+        view.goto(url + "?data=sample&tab=rerun")
+        view.wait_for_function("() => document.querySelector('#rerun').dataset.state === 'ready'", timeout=180_000)
+        view.route("**/bench.rrd", lambda route: route.fulfill(path=path, content_type="application/octet-stream"))
+        took = [view.evaluate(OPEN, f"bench.rrd?{number}") for number in range(3)]
+        chromium.close()
+    shown = ", ".join(f"{seconds:.2f}" for seconds in took)
+    print(f"{path.name} of {name}, {STEPS} steps, maps every {STRIDE}: open after {shown} s (bar: 2 s)")
+
+
+OPEN = """async (name) => {
+  const began = performance.now();
+  beliefscope.rerun.files([{ name, url: `/${name}` }]);
+  const wanted = (state) => state.recordings?.some((one) => one.source?.includes?.(name) ?? true);
+  for (;;) {
+    const ready = document.querySelector('#rerun').dataset.state === 'ready';
+    if (ready && wanted(await beliefscope.rerun.getState())) return (performance.now() - began) / 1000;
+    await new Promise(requestAnimationFrame);
+  }
+}"""
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--long", action="store_true")
+    parser.add_argument("--open", action="store_true")
+    parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    if asked.one:
+        print(json.dumps(live(asked.one[0], int(asked.one[1]), Path(asked.one[2]))))
+    elif asked.long:
+        long()
+    elif asked.open:
+        opened()
+    else:
+        parser.print_help()

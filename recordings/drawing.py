@@ -22,6 +22,10 @@ SHOWN_UNIT = {"m": "cm", "rad": "deg"}
 SHOWN_SCALE = {"m": 100.0, "rad": 180.0 / np.pi}
 CONTACT_NAMES = ("free", "contact")
 SIGMAS = 2.0
+DRAWN, SHADES = 2.0**-13, 32
+"""Of drawn particles: an eighth of a mm, to which places are rounded, and steps of the weight's colour. Nobody sees
+either, and both pack into half the room. The particles' own numbers are under ``trace/``, exact."""
+
 COLOUR_OF_ROBOT = "#B0B0B0"
 MODALITY = "this modality alone, its weight"
 KINDS = {
@@ -178,7 +182,7 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
                 rr.Boxes3D.columns(centers=ghost.position, quaternions=np.roll(wxyz, -1, axis=-1)),
             )
     if trace.particles is not None and trace.log_weights is not None:
-        points = _lift(trace.particles[steps][:, :, plane])
+        points = _lift(np.round(trace.particles[steps][:, :, plane] / DRAWN) * DRAWN)
         rows, count = points.shape[:2]
         shades = _shades(trace.log_weights[steps], _hex("fused", trace))
         both = rr.Points3D.columns(positions=points.reshape(-1, 3), colors=shades.ravel())
@@ -234,6 +238,7 @@ def _lift(points: Array) -> Array:
 def _shades(log_weights: Array, hue: str) -> NDArray[np.uint32]:
     """(T, M) RGBA from gray (no weight) to the hue (the step's greatest weight)."""
     share = np.sqrt(np.exp(log_weights - log_weights.max(axis=1, keepdims=True)))[..., None]
+    share = np.rint(share * SHADES) / SHADES
     gray, full = np.full(3, 150.0), np.array([int(hue[i : i + 2], 16) for i in (1, 3, 5)], float)
     red, green, blue = np.moveaxis(np.rint(gray + share * (full - gray)).astype(np.uint32), -1, 0)
     return red << 24 | green << 16 | blue << 8 | np.uint32(255)

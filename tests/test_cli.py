@@ -32,7 +32,8 @@ OPTIONS = {
     "evaluate": "--filter --data --skip-bad --recipe --only --particles --seed --json",
     "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
     "trace": "--filter --data --skip-bad --episode --recipe --seed -o --json",
-    "record": "--filter --data --skip-bad --episode --maps --diagnostics --no-diagnostics --recipe --seed -o --json",
+    "record": "--filter --data --skip-bad --episode --maps --map-size --diagnostics --no-diagnostics --recipe --seed "
+    "-o --json",
     "live": "--filter --data --skip-bad --episode --recipe --particles --seed --rate --workspace --name --json",
     "import": "-o --json",
     "export": "-o --json",

@@ -26,6 +26,9 @@ def record(
             "--maps", parser=whole(0), metavar="STRIDE", help="Likelihood maps of each STRIDE-th step; 0: none."
         ),
     ] = 10,
+    map_size: Annotated[
+        int, typer.Option("--map-size", parser=whole(2, 1024), metavar="S", help="Cells along a side of each map.")
+    ] = 135,
     diagnostics: Annotated[
         bool,
         typer.Option(
@@ -42,6 +45,7 @@ def record(
     \b
     Examples:
       beliefscope record door --filter crossmodal-ekf --episode 9 --maps 5 -o run.rrd
+      beliefscope record door --filter crossmodal-pf --maps 1 --map-size 41 -o every.rrd
       beliefscope record door --filter crossmodal-pf --recipe image_frozen=20 -o frozen.rrd
     """
     from beliefscope.inspect.catalog import quick
@@ -51,8 +55,12 @@ def record(
     if maps and (why := no_maps(checkpoint, made)):
         console.say(f"without maps: {why}")
         maps = 0
-    layers = MapEngine(checkpoint, made).maps(range(0, len(made), maps)) if maps else None
+    layers = MapEngine(checkpoint, made).maps(range(0, len(made), maps), map_size) if maps else None
     found = quick(made, checkpoint) if diagnostics else {}
     with console.progress("Recording") as advance:
         write_recording(made, output, maps=layers, progress=advance, diagnostics=found)
-    console.result(described(made, output) | {"maps": maps, "diagnostics": list(found)}, title(made, output), json)
+    console.result(
+        described(made, output) | {"maps": maps, "map_size": map_size, "diagnostics": list(found)},
+        title(made, output),
+        json,
+    )
