@@ -6,7 +6,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 
+from beliefscope.app.library import Selection, Settings
 from beliefscope.app.live import PATIENCE
 from beliefscope.app.wire import columns, pictures
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.growing import GrowingWriter
+from beliefscope.inspect.growing import GrowingReader, GrowingWriter
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_of
+from beliefscope.recordings.read import read_recording
 
 STEPS = 24
 SHOWN = "/api/trace/door/{}/9?data=live:run"
@@ -42,17 +44,16 @@ def whole(request: pytest.FixtureRequest) -> Trace:
 
 
 @pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    """What ships."""
+    return Settings(tmp_path / "workspace")
+
+
+@pytest.fixture
 def folder(settings: Any) -> Path:
     made: Path = settings.workspace / "live"
     made.mkdir(parents=True)
     return made
-
-
-@pytest.fixture
-def client(settings: Any, open_client: Callable[..., TestClient]) -> Iterator[TestClient]:
-    """Of what ships: the test's own filters are not those of the runs."""
-    with open_client(replace(settings, data={}, checkpoints={})) as client:
-        yield client
 
 
 @pytest.fixture
@@ -146,8 +147,6 @@ def test_one_message_is_bounded(client: TestClient, writer: GrowingWriter, whole
 
 
 def writer_row(writer: GrowingWriter) -> int:
-    from beliefscope.inspect.growing import GrowingReader
-
     reader = GrowingReader(writer.path)
     reader.close()
     return reader.bytes_per_step
@@ -191,8 +190,6 @@ def test_maps_of_a_growing_run_are_those_of_the_whole(client: TestClient, writer
     """Made of one step alone, as the newest must be; the same once it has ended."""
     writer.append(cut(whole, 0, 12))
     library = client.app.state.library  # type: ignore[attr-defined]
-    from beliefscope.app.library import Selection
-
     asked = Selection("door", whole.filter, 9, data="live:run")
     growing = library.traced(asked)
     assert growing.grows
@@ -293,3 +290,34 @@ def test_another_filter_runs_over_a_run_that_has_ended(client: TestClient, write
     while (answer := client.get(url)).status_code == 202:
         assert time.monotonic() < deadline
     assert answer.json()["steps"] == STEPS
+
+
+def until(client: TestClient, url: str) -> dict[str, Any]:
+    deadline = time.monotonic() + 60.0
+    while (answer := client.get(url)).status_code == 202:
+        assert time.monotonic() < deadline
+    assert answer.status_code == 200, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def test_recorded_compared_and_diagnosed_as_any_run(
+    client: TestClient, writer: GrowingWriter, whole: Trace, settings: Any
+) -> None:
+    """A recording is of what there is by then; what needs the whole episode comes with its end."""
+    asked = {"task": "door", "filter": whole.filter, "episode": 9, "data": "live:run", "maps": 4}
+    written = []
+    for first, last in ((0, 10), (10, STEPS)):
+        writer.append(cut(whole, first, last))
+        answer = client.post("/api/recordings", json=asked)
+        assert answer.status_code == 201, answer.text
+        written.append(read_recording(settings.workspace / "recordings" / answer.json()["name"]))
+    assert [len(one) for one in written] == [10, STEPS]
+    np.testing.assert_array_equal(written[1].estimate_mean, whole.estimate_mean)
+    writer.finish()
+    path = f"door/{whole.filter}/9"
+    found = until(client, f"/api/compare/{path}?data=live:run&against=filter%3Dimage-ekf")
+    assert found["names"] == [whole.filter, "image-ekf"]
+    entries = {entry["name"]: entry for entry in client.get(f"/api/diagnostics/{path}?data=live:run").json()}
+    name = next(name for name, entry in entries.items() if not entry["slow"] and not entry["why_not"])
+    assert until(client, f"/api/diagnostics/{name}/{path}?data=live:run")["trajectories"] == 1
