@@ -33,6 +33,15 @@ class Replay:
 def replay(task: Task, episode: Episode) -> Replay | None:
     """The whole replay of an episode (some 10 ms for 800 steps), or None where the task or the episode has none.
 
+    Raises BadInput as ``model_of``.
+    """
+    model = model_of(task, episode)
+    return None if model is None else Replay(model, *poses(model, episode.qpos))
+
+
+def model_of(task: Task, episode: Episode) -> Any:
+    """The ``mujoco.MjModel`` of an episode, or None where the task or the episode has none.
+
     Raises BadInput where the joint positions are not those of the task's model.
     """
     if task.replay is None or episode.qpos.shape[1] == 0:
@@ -43,11 +52,16 @@ def replay(task: Task, episode: Episode) -> Replay | None:
             f"The episode's 'qpos' has {episode.qpos.shape[1]} joint positions a step; the model of task {task.name!r} "
             f"has {model.nq}."
         )
+    return model
+
+
+def poses(model: Any, qpos: NDArray[np.floating]) -> tuple[Array, Array]:
+    """Positions (T, B, 3), m, and rotations (T, B, 3, 3), body to world, of all bodies at joint positions (T, nq)."""
     data = mujoco.MjData(model)
-    positions = np.empty((len(episode), model.nbody, 3))
-    rotations = np.empty((len(episode), model.nbody, 9))
-    for step, qpos in enumerate(episode.qpos):
-        data.qpos[:] = qpos
+    positions = np.empty((len(qpos), model.nbody, 3))
+    rotations = np.empty((len(qpos), model.nbody, 9))
+    for step, joints in enumerate(qpos):
+        data.qpos[:] = joints
         mujoco.mj_kinematics(model, data)
         positions[step], rotations[step] = data.xpos, data.xmat
-    return Replay(model, positions, rotations.reshape(*rotations.shape[:2], 3, 3))
+    return positions, rotations.reshape(*rotations.shape[:2], 3, 3)

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task import Component, Ghost, Task
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import STEP, TIME
@@ -103,9 +103,9 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     yield "world/effector", _marker(COLOUR_OF_ROBOT, 3.0)
     yield "world/plane/truth", _marker(_hex("truth", trace), 4.0)
     if task.ghost is not None:
-        half = np.array([task.ghost(positions(trace)[0]).size]) / 2.0
+        ghost = task.ghost(positions(trace)[0])
         for name in ("truth", "fused") if knows_truth(trace) else ("fused",):
-            yield f"world/object/{name}", _box(_hex(name, trace), half, filled=name == "truth")
+            yield f"world/object/{name}", _object(_hex(name, trace), ghost, filled=name == "truth")
     yield (
         "contact",
         rr.StateConfiguration(
@@ -176,11 +176,9 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
         drawn = {"fused": trace.estimate_mean} | ({"truth": trace.episode.states} if known else {})
         for name, states in drawn.items():
             ghost = task.ghost(states[steps])
-            wxyz = ghost.wxyz
-            yield (
-                f"world/object/{name}",
-                rr.Boxes3D.columns(centers=ghost.position, quaternions=np.roll(wxyz, -1, axis=-1)),
-            )
+            drawn = rr.Cylinders3D if ghost.shape == "cylinder" else rr.Boxes3D
+            turned = np.roll(ghost.wxyz, -1, axis=-1)
+            yield f"world/object/{name}", drawn.columns(centers=ghost.position, quaternions=turned)
     if trace.particles is not None and trace.log_weights is not None:
         points = _lift(np.round(trace.particles[steps][:, :, plane] / DRAWN) * DRAWN)
         rows, count = points.shape[:2]
@@ -260,13 +258,15 @@ def line(hue: str, width: float, *names: str, opacity: Array | float = 1.0) -> r
     return rr.SeriesLines(colors=colours, widths=[width] * count, names=list(names))
 
 
-def _box(hue: str, half_sizes: Array, filled: bool) -> rr.Boxes3D:
-    return rr.Boxes3D.from_fields(
-        half_sizes=half_sizes,
-        colors=rgba(hue),
-        radii=rr.Radius.ui_points(1.5),
-        fill_mode="TransparentFillMajorWireframe" if filled else "MajorWireframe",
-    )
+def _object(hue: str, ghost: Ghost, filled: bool) -> rr.Boxes3D | rr.Cylinders3D:
+    look: dict[str, Any] = {
+        "colors": rgba(hue),
+        "fill_mode": "TransparentFillMajorWireframe" if filled else "MajorWireframe",
+    }
+    x, _, z = ghost.size
+    if ghost.shape == "cylinder":
+        return rr.Cylinders3D.from_fields(lengths=[z], radii=[x / 2.0], line_radii=rr.Radius.ui_points(1.5), **look)
+    return rr.Boxes3D.from_fields(half_sizes=[np.array(ghost.size) / 2.0], radii=rr.Radius.ui_points(1.5), **look)
 
 
 def _marker(hue: str, points: float) -> rr.Points3D:

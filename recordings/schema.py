@@ -23,7 +23,18 @@ STEP, TIME = "step", "time"
 """The two timelines: the trace's index t, and t * dt as a duration."""
 
 Needs = Literal[
-    "always", "modalities", "covariance", "weights", "acting", "ekf", "pf", "maps", "diagnostics", "replay", "ghost"
+    "always",
+    "modalities",
+    "covariance",
+    "weights",
+    "acting",
+    "ekf",
+    "pf",
+    "maps",
+    "diagnostics",
+    "replay",
+    "bodies",
+    "ghost",
 ]
 
 
@@ -96,7 +107,22 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("world/plane/truth", "Points3D", "(1, 3)", "m", "always", "true position"),
     Entity("world/plane/{source}/mean", "Points3D", "(1, 3)", "m", "always", "estimated position"),
     Entity("world/plane/{source}/ellipse", "Ellipsoids3D", "(1, 3)", "m", "covariance", "2 sigma contour and its axes"),
-    Entity("world/object/{state}", "Boxes3D", "(1, 3)", "m", "ghost", "the object at the state `truth` or `fused`"),
+    Entity(
+        "world/bodies/{body}",
+        "Transform3D",
+        "(3,), (3, 3)",
+        "m",
+        "bodies",
+        "where each body of robot and object was, with its shape as a static `Mesh3D`",
+    ),
+    Entity(
+        "world/object/{state}",
+        "Boxes3D or Cylinders3D",
+        "(1, 3)",
+        "m",
+        "ghost",
+        "the object at the state `truth` or `fused`",
+    ),
     Entity("world/plane/particles", "Points3D", "(M, 3)", "m", "pf", "coloured by posterior weight"),
     Entity("world/plane/map", "GridMap", "(S, S)", "u8", "maps", "fused map, laid where it belongs"),
     # The plots: degrees and centimetres.

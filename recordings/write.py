@@ -35,6 +35,7 @@ from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_of
 from beliefscope.recordings import drawing
 from beliefscope.recordings.blueprint import blueprint
+from beliefscope.recordings.bodies import Bodies
 from beliefscope.recordings.diagnostics import log_diagnostic
 from beliefscope.recordings.maps import map_columns, map_style
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
@@ -76,10 +77,16 @@ def write_recording(
     layers = first[0].layers if first else ()
     sample = thinned(trace)
     layout = blueprint(sample, task, first[0] if first else None, diagnostics)
+    bodies = Bodies(trace, task)
     with new_recording(Path(path), sample, len(trace), layout) as stream:
+        for entity, look in bodies.looks():
+            stream.log(entity, look, static=True)
         for start in range(0, len(trace), STEPS_PER_CHUNK):
             steps = slice(start, min(start + STEPS_PER_CHUNK, len(trace)))
             send_steps(stream, trace, task, steps)
+            times = drawing.time_columns(np.arange(steps.start, steps.stop), trace.episode.dt)
+            for entity, columns in bodies.columns(steps):
+                stream.send_columns(entity, times, columns)
             report(0.5 * steps.stop / len(trace))
         for name, diagnostic in diagnostics.items():
             log_diagnostic(stream, diagnostic, name, trace)

@@ -40,6 +40,7 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
         "maps": maps,
         "diagnostics": False,  # tests/recordings/test_diagnostics.py
         "replay": trace.episode.qpos.size > 0,
+        "bodies": False,  # tests/recordings/test_bodies.py
         "ghost": task.ghost is not None,
     }
     if not there[entity.needs]:
