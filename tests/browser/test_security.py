@@ -52,10 +52,9 @@ def test_a_shared_page_lets_in_by_its_link_shows_names_as_text_and_changes_nothi
     assert page.state["filter"] == EVIL
     assert page.state["data"] == EVIL
     assert EVIL in page.page.inner_text("#filter")
-    for tab in ("diagnostics", "failures", "compare", "finetune", "recordings", "rerun", "scene"):
-        page.page.click(f"#tab-{tab}")
-        page.page.wait_for_timeout(300)
-    page.page.click("#jobs-button")
+    for button in (*(f"#tab-{tab}" for tab in ("diagnostics", "compare", "recordings", "failures")), "#jobs-button"):
+        page.page.evaluate("(button) => document.querySelector(button).click()", button)
+        page.page.wait_for_timeout(500)
     assert page.page.evaluate("window.hacked") is None
     assert page.page.locator("img[src=x]").count() == 0
 
@@ -63,10 +62,9 @@ def test_a_shared_page_lets_in_by_its_link_shows_names_as_text_and_changes_nothi
     for button in ("#save", "#report"):
         assert page.page.locator(button).is_disabled()
         assert "only shows" in page.page.get_attribute(button, "title")
-    page.page.click("#tab-finetune")
+    page.page.evaluate("document.querySelector('#tab-finetune').click()")
     page.until("() => document.querySelector('#finetune .start')?.disabled")
     page.page.keyboard.press("s")
-    page.page.click("#forward")
     page.picture("security-read-only")
     assert not list((tmp_path / "workspace").glob("recordings/*.rrd"))
     assert not list((tmp_path / "workspace").glob("jobs/*"))
