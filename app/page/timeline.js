@@ -32,6 +32,7 @@ export class TimeLine {
   #at = 0; // the cursor's step
   #hover = null;
   #drag = null;
+  #fingers = new Map(); // pointer -> {clientX, step} of a finger, and the step that two of them hold
   #cursor = mark('cursor');
   #pointer = mark('hover');
   #level = mark('level');
@@ -325,6 +326,11 @@ export class TimeLine {
       if (!this.#trace || event.button > 1) return;
       const kind = event.button === 1 ? 'pan' : event.shiftKey ? 'zoom' : 'scrub';
       this.#drag = { kind, x: event.clientX, step: this.#step(event), window: this.#window };
+      if (event.pointerType === 'touch') this.#fingers.set(event.pointerId, { clientX: event.clientX });
+      if (this.#fingers.size === 2) {
+        this.#drag.kind = 'pinch';
+        for (const finger of this.#fingers.values()) finger.step = this.#step(finger);
+      }
       element.setPointerCapture(event.pointerId);
       this.#pointAt(null);
       this.#pull(event);
@@ -332,7 +338,7 @@ export class TimeLine {
     element.addEventListener('mousedown', (event) => event.button === 1 && event.preventDefault()); // the browser's own scrolling
     element.addEventListener('pointermove', (event) => this.#trace && (this.#drag ? this.#pull(event) : this.#pointAt(event)));
     element.addEventListener('pointerup', (event) => this.#release(event));
-    element.addEventListener('pointercancel', () => this.#release(null));
+    element.addEventListener('pointercancel', () => (this.#fingers.clear(), this.#release(null)));
     element.addEventListener('pointerleave', () => this.#pointAt(null));
     element.addEventListener('dblclick', () => this.whole());
     element.addEventListener('wheel', (event) => this.#turn(event), { passive: false });
@@ -341,6 +347,8 @@ export class TimeLine {
   /** The hand moves while it holds something. */
   #pull(event) {
     const { kind, x, step, window } = this.#drag;
+    if (this.#fingers.has(event.pointerId)) this.#fingers.get(event.pointerId).clientX = event.clientX;
+    if (kind === 'pinch') return this.#pinch();
     if (kind === 'scrub') return this.#store.set({ step: this.#nearest(event) }, { inputTime: event.timeStamp });
     if (kind === 'pan') {
       const shift = ((x - event.clientX) / this.#plot.width) * (window[1] - window[0]);
@@ -352,7 +360,17 @@ export class TimeLine {
     place(this.#stretch, left);
   }
 
+  /** Each of two fingers keeps the step that it took hold of. */
+  #pinch() {
+    const [one, other] = [...this.#fingers.values()].sort((a, b) => a.step - b.step);
+    if (!other || other.clientX - one.clientX < MEANT) return;
+    const scale = (other.step - one.step) / (other.clientX - one.clientX); // steps a px
+    const from = one.step - scale * (one.clientX - this.#corner.left - this.#plot.left);
+    this.#look(from, from + scale * this.#plot.width);
+  }
+
   #release(event) {
+    if (event) this.#fingers.delete(event.pointerId);
     const drag = this.#drag;
     this.#drag = null;
     this.#stretch.hidden = true;

@@ -136,6 +136,12 @@ def test_looks_are_in_the_address_and_a_pinned_moment_is_what_others_gain_on(
     said = page.page.locator("#heatmaps figcaption").all_text_contents()
     assert not any(text.endswith("gain 0.00 nats") for text in said)
     page.picture("maps-gain")
+    page.until(f"() => location.search.includes('pin=') && location.search.includes('step={STEP + 10}')")
+    again = open_page("?" + page.page.url.partition("?")[2])  # a link has the pinned moment, though nobody went there
+    again.until(f"() => document.querySelector('#maps-kind').textContent === 'Gain on step {STEP}'")
+    assert (again.state["pin"], again.state["step"]) == (page.state["pin"], STEP + 10)
+    again.page.locator("#heatmaps canvas").first.hover()
+    assert again.page.locator("#heatmaps figcaption").all_text_contents() == said
     page.page.keyboard.press("m")
     page.page.keyboard.press("Shift+ArrowLeft")
     page.settle(STEP)

@@ -101,6 +101,19 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     page.page.keyboard.press("0")
     assert page.state["window"] == ""
 
+    # Two fingers: each keeps the step that it took hold of.
+    whole = (0, len(nees) - 1)
+    touch = page.page.context.new_cdp_session(page.page)
+    for kind, steps in (("touchStart", (40, 60)), ("touchMove", (20, 80)), ("touchEnd", ())):
+        points = [{"x": at(step, whole), "y": box["y"] + 60, "id": i} for i, step in enumerate(steps)]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    page.until("() => beliefscope.state().window.startsWith('33')")
+    wanted = [40 - 20 / 3, 40 - 20 / 3 + whole[1] / 3]
+    assert [float(v) for v in page.state["window"].split("-")] == pytest.approx(wanted, abs=0.3)
+    page.page.keyboard.press("0")
+    for _ in range(4):  # the first finger took the cursor to its step
+        page.page.keyboard.press("ArrowRight")
+
     # What there is of the others, and why there is not.
     page.page.locator("#track").select_option("innovation")
     page.until("() => document.querySelector('#tracks .track:last-of-type h3').textContent.startsWith('Innovation')")
