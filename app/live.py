@@ -20,6 +20,7 @@ from beliefscope.app.library import Library
 from beliefscope.app.liveruns import Absent, LiveRuns, Run, called, described
 from beliefscope.app.security import kept_file
 from beliefscope.app.wire import columns, pictures
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput
 
 BLOCK = 1 << 22  # bytes of the file that one message is made of, at most
@@ -65,7 +66,9 @@ def routes(library: Library) -> APIRouter:
             try:
                 run = runs[name]
                 shown, checkpoint = called(run, library.filters(run.task.name))
-                here = not isinstance(checkpoint, Absent) or not run.like.checkpoint_hash  # one that has no file never is
+                here = (
+                    not isinstance(checkpoint, Absent) or not run.like.checkpoint_hash
+                )  # one that has no file never is
                 about = {"filter": shown, "here": here, "kind": run.like.kind}
                 found.append(described(run) | about)
             except BadInput as error:
@@ -81,7 +84,7 @@ def routes(library: Library) -> APIRouter:
                 first, state = _asked(await websocket.receive_text())
                 await websocket.send_bytes(await _next(runs, name, first, state))
         except BadInput as error:
-            await websocket.close(4000, str(error)[:120])
+            await websocket.close(4000, str(error).encode()[:120].decode(errors="ignore"))
         except (WebSocketDisconnect, KeyError):  # KeyError: a binary message, which has no text
             return
 
@@ -99,7 +102,7 @@ def routes(library: Library) -> APIRouter:
 def _asked(text: str) -> tuple[int, str]:
     """From which step on, and the state that the page knows."""
     try:
-        message = json.loads(text)
+        message = read_json(text)
         first, state = message["from"], message.get("state", "")
     except (ValueError, TypeError, KeyError, AttributeError):
         raise BadInput('a page asks for steps as {"from": STEP, "state": what it knows}') from None
@@ -114,7 +117,8 @@ async def _next(runs: LiveRuns, name: str, first: int, state: str) -> bytes:
     end = time.monotonic() + PATIENCE
     while run.reader.steps <= first and run.state == state and time.monotonic() < end:
         await asyncio.sleep(LOOK)
-        await asyncio.to_thread(run.look)
+        if run.stirs:
+            await asyncio.to_thread(run.look)
     return await asyncio.to_thread(block, run, first)
 
 

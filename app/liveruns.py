@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import suppress
@@ -34,6 +35,7 @@ from beliefscope.inspect.trace import Trace
 
 PREFIX = "live:"
 LISTED = 30  # runs, the newest
+SURE = 0.25  # s after which it is looked whether a filter that writes nothing lives
 WHOLE_IN_MEMORY = 4  # runs that have ended
 
 
@@ -71,6 +73,7 @@ class Run:
             raise
         self.damage = ""
         self._ended = False
+        self._looked, self._size = 0.0, -1
         self._newest: Growing | None = None
         self._lock = threading.Lock()
 
@@ -78,6 +81,7 @@ class Run:
         """Looks for new steps; how many there are. A damaged file has ended where the damage begins."""
         with self._lock:
             if not self._ended:
+                self._looked, self._size = time.monotonic(), self._bytes
                 alive = self.reader.alive  # before the last look: what it wrote until its end is to be found
                 try:
                     self.reader.poll()
@@ -85,6 +89,18 @@ class Run:
                     self.damage = str(error)
                 self._ended = bool(self.damage) or not alive
             return self.reader.steps
+
+    @property
+    def stirs(self) -> bool:
+        """Whether a look may find something: the file is longer than at the last one, or that is some time ago."""
+        return self._bytes != self._size or time.monotonic() > self._looked + SURE
+
+    @property
+    def _bytes(self) -> int:
+        try:
+            return self.reader.path.stat().st_size
+        except OSError:
+            return -1
 
     @property
     def state(self) -> str:
