@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,11 +40,11 @@ class WiredMaps:
     """Maps of one step, and all of their message but for whose cursor it answers.
 
     Attributes:
-        description: the message's JSON header. content: what follows it.
+        description: the message's JSON header but for its first three entries. content: what follows it.
     """
 
     maps: LikelihoodMap
-    description: Mapping[str, Any]
+    description: str
     content: bytes
 
     @property
@@ -55,7 +54,8 @@ class WiredMaps:
 
     def message(self, serial: int, other: bool = False) -> bytes:
         """Header's length, JSON header, padding to a multiple of 4, content. Other: whether of the other run."""
-        text = json.dumps({"type": "maps", "serial": serial, "other": other, **self.description}).encode()
+        first = json.dumps({"type": "maps", "serial": serial, "other": other})
+        text = f"{first[:-1]}, {self.description[1:]}".encode()
         return len(text).to_bytes(4, "little") + text + b"\0" * (-len(text) % 4) + self.content
 
 
@@ -87,7 +87,7 @@ def wire_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> Wire
         "particles": 0 if cloud is None else len(cloud[0]),
     }
     floats = [] if cloud is None else [np.ascontiguousarray(part, dtype="<f4").tobytes() for part in cloud]
-    return WiredMaps(maps, description, b"".join([*floats, cells.astype("<u2").tobytes()]))
+    return WiredMaps(maps, json.dumps(description), b"".join([*floats, cells.astype("<u2").tobytes()]))
 
 
 def quantised(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:

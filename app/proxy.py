@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib.util
+import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
@@ -22,7 +24,11 @@ import websockets.asyncio.server
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.exceptions import ConnectionClosedOK
 
+WAITING = 64  # messages of a browser that viser has not taken yet
 CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
+if importlib.util.find_spec("cv2") is None:
+    # viser asks for OpenCV at every picture, and looks along the whole path for it: half of what a picture takes.
+    sys.modules["cv2"] = None  # type: ignore[assignment]
 # Construction and stop both touch what the whole process shares: one at a time.
 _process_wide = threading.Lock()
 
@@ -45,11 +51,17 @@ class _Connection:
         self.subprotocol = subprotocol
         self._websocket = websocket
         self._server_loop = server_loop
-        self._incoming: asyncio.Queue[bytes | None] = asyncio.Queue()
+        self._incoming: asyncio.Queue[bytes | None] = asyncio.Queue(WAITING)
 
-    def put(self, message: bytes | None) -> None:
-        """Called in viser's loop: a message from the browser, or None when it has gone."""
-        self._incoming.put_nowait(message)
+    async def put(self, message: bytes) -> None:
+        """In viser's loop: a message from the browser, once there is room for it."""
+        await self._incoming.put(message)
+
+    def end(self) -> None:
+        """In viser's loop: the browser has gone, and what it still said is of no interest."""
+        while not self._incoming.empty():
+            self._incoming.get_nowait()
+        self._incoming.put_nowait(None)
 
     async def recv(self) -> bytes:
         message = await self._incoming.get()
@@ -117,7 +129,7 @@ class EmbeddedViser:
             await asyncio.wait({handling, receiving}, return_when=asyncio.FIRST_COMPLETED)
         finally:
             receiving.cancel()
-            self._put(connection, None)
+            self._end(connection)
             await asyncio.wait({handling}, timeout=2.0)
             self._connections.discard(connection)
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
@@ -129,16 +141,18 @@ class EmbeddedViser:
     async def _receive(self, websocket: WebSocket, connection: _Connection) -> None:
         with contextlib.suppress(WebSocketDisconnect, KeyError):
             while True:
-                self._put(connection, await websocket.receive_bytes())
+                message = await websocket.receive_bytes()
+                # Waiting for viser gives the browser its backpressure.
+                await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(connection.put(message), self._loop))
 
-    def _put(self, connection: _Connection, message: bytes | None) -> None:
+    def _end(self, connection: _Connection) -> None:
         with contextlib.suppress(RuntimeError):  # viser's loop has ended
-            self._loop.call_soon_threadsafe(connection.put, message)
+            self._loop.call_soon_threadsafe(connection.end)
 
     def close(self) -> None:
         """End every connection and viser's threads. Blocks for up to a few seconds: call it in a worker thread."""
         for connection in tuple(self._connections):
-            self._put(connection, None)
+            self._end(connection)
         with _process_wide, _silence():
             self.server.stop()
 

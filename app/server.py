@@ -147,6 +147,7 @@ def serve(
             log_level="warning",
             access_log=False,
             server_header=False,
+            ws_max_size=1 << 20,  # pages say a few KB; 32 messages wait for us at most, then the browser waits
             ws_per_message_deflate=False,  # deflate takes binary messages from 300 to 12 MB/s
             timeout_graceful_shutdown=3,
         )

@@ -27,7 +27,7 @@ from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
 log = logging.getLogger("beliefscope.app")
-COARSE_DUE, SCENE_DUE, FINE_DUE = 0.0, 0.05, 0.2  # s: maps under a moving hand before all else
+COARSE_DUE, SCENE_DUE, FINE_DUE = 0.0, 0.25, 0.5  # s: where many scrub, maps under moving hands before all else
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,8 @@ class View:
         self._shown: tuple[Selection, Traced] | None = None  # in memory for as long as somebody looks at it
         self._drawing: _Drawing | None = None
         self._answered = asyncio.Event()
+        self._moved_to: int | None = None
+        self._telling = asyncio.Lock()
         self._socket: WebSocket | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -199,11 +201,16 @@ class View:
         return ready.done()
 
     def _moved_in_scene(self, step: int) -> None:
-        """Called in a thread of viser's."""
-        socket, loop = self._socket, self._loop
-        if socket is not None and loop is not None and not loop.is_closed():
-            message = {"type": "cursor", "step": step, "origin": "scene"}
-            asyncio.run_coroutine_threadsafe(_quietly(socket.send_json(message)), loop)
+        """Called in threads of viser's. Of steps that come faster than the page takes them, it is told the newest."""
+        waiting, self._moved_to = self._moved_to is not None, step
+        if not waiting and self._loop is not None and not self._loop.is_closed():
+            asyncio.run_coroutine_threadsafe(self._tell_moved(), self._loop)
+
+    async def _tell_moved(self) -> None:
+        async with self._telling:
+            step, self._moved_to = self._moved_to, None
+            if step is not None and self._socket is not None:
+                await _quietly(self._socket.send_json({"type": "cursor", "step": step, "origin": "scene"}))
 
 
 class Views:

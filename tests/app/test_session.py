@@ -150,7 +150,7 @@ def test_the_newest_cursor_wins(
         (json.dumps(cursor(recipe="delay=touch")), "modality of task 'door' 'touch' does not exist."),
         (json.dumps(cursor(size=10**6)), "cursor's 'size' is 41 or 135; got 1000000."),
         (json.dumps(cursor(angle="wide")), "cursor's 'angle' is a number of radians or null; got 'wide'."),
-        (json.dumps(cursor(angle=float("nan"))), "cursor's 'angle' is a number of radians or null; got nan."),
+        (json.dumps(cursor(angle=float("nan"))), "Not JSON: NaN is no number of JSON."),
     ],
 )
 def test_what_cannot_be_answered_is_said_and_the_socket_stays(

@@ -1,0 +1,210 @@
+"""Many at once, and for long: work by its due time, traces that nobody shows let go, browsers that do not read."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.request import Request, urlopen
+
+import pytest
+from starlette.testclient import TestClient
+from websockets.sync.client import connect
+from websockets.typing import Origin
+
+from beliefscope.app import library as library_module
+from beliefscope.app import selection as selection_module
+from beliefscope.app.desk import Desk
+from beliefscope.app.library import TRACES_IN_MEMORY, Library, Selection
+from beliefscope.app.selection import Traced
+from beliefscope.app.server import Settings
+from beliefscope.app.session import Views
+from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.errors import BadInput
+
+PATIENCE = 30.0  # s
+
+
+@pytest.fixture
+def library(settings: Settings) -> Iterator[Library]:
+    library = Library(settings)
+    yield library
+    library.close()
+
+
+def broken(number: int, filter_: str = "crossmodal-ekf") -> Selection:
+    """One of many runs of the same episode."""
+    return Selection("door", filter_, 1, Recipe.parse(f"blackout=0.{number:02d}"))
+
+
+def opened(library: Library, count: int) -> list[weakref.ref[Traced]]:
+    found = []
+    for number in range(1, count + 1):
+        traced = library.traced(broken(number))
+        traced.result(PATIENCE)
+        found.append(weakref.ref(traced))
+    return found
+
+
+def living(refs: list[weakref.ref[Any]]) -> int:
+    gc.collect()
+    return sum(ref() is not None for ref in refs)
+
+
+def test_memory_holds_the_newest_traces_not_all_that_were_opened(library: Library) -> None:
+    refs = opened(library, TRACES_IN_MEMORY + 4)
+    # The thread that traced the last one may not have let go of it yet.
+    assert TRACES_IN_MEMORY <= living(refs) <= TRACES_IN_MEMORY + 1
+    assert refs[-1]() is not None
+    assert refs[0]() is None
+
+
+def test_large_traces_count_by_their_bytes(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library_module, "BYTES_IN_MEMORY", 1)
+    assert living(opened(library, 4)) <= 2
+    assert library.there(broken(4)) is not None
+
+
+def test_a_trace_that_somebody_shows_stays_and_is_the_others_too(library: Library) -> None:
+    shown = library.traced(broken(90))
+    shown.result(PATIENCE)
+    opened(library, TRACES_IN_MEMORY + 1)
+    assert library.traced(broken(90)) is shown
+
+
+def test_names_of_what_was_opened_are_forgotten(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library_module, "KEYS_KEPT", 3)
+    keys = [library.key(broken(number)) for number in range(1, 8)]
+    assert len(library._keys) == 3
+    assert [library.key(broken(number)) for number in range(1, 8)] == keys
+
+
+def test_maps_are_made_once_for_all_who_look(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+    traced = library.traced(broken(1, "crossmodal-pf"))
+    traced.result(PATIENCE)
+    one = traced.wired(3, None, 41)
+    assert traced.wired(3, None, 41) is one
+    assert traced.wired(3, 0.1, 41) is not one
+    assert one.message(5)[4:].startswith(b'{"type": "maps", "serial": 5, "other": false, "step": 3')
+    monkeypatch.setattr(selection_module, "MAPS_IN_MEMORY", 3 * one.nbytes)
+    for step in range(10):
+        traced.wired(step, None, 41)
+    assert len(traced._kept) == 3
+    assert traced._kept_bytes == sum(kept.nbytes for kept in traced._kept.values())
+
+
+def test_a_closed_view_leaves_nothing_behind(open_client: Callable[..., TestClient], settings: Settings) -> None:
+    with open_client(settings) as client:
+        views: Views = client.app.state.views  # type: ignore[attr-defined]
+        views._patience = 0.0
+        refs: list[weakref.ref[Any]] = []
+        before = threading.active_count()
+        for number in range(1, 4):
+            view = client.post("/api/views").json()
+            chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "recipe": f"blackout=0.{number:02d}"}
+            with client.websocket_connect(view["socket"]) as socket:
+                socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **chosen})
+                assert len(socket.receive_bytes()) > 0
+                assert socket.receive_json()["type"] == "drawn"
+            open_ = views[view["view"]]
+            refs += [weakref.ref(each) for each in (open_, open_.scene, open_.scene.viser.server)]
+            del open_
+            client.portal.call(views._close_idle, 0)  # type: ignore[union-attr]
+        assert len(views) == 0
+        assert living(refs) == 0
+        # The desk's, and those in which the event loop waits for what blocks; each is there once.
+        assert threading.active_count() <= before + 14
+
+
+def test_one_page_too_many_is_told_how_many_there_may_be(settings: Settings) -> None:
+    async def scenario() -> str:
+        views = Views(Library(settings), limit=1)
+        (await views.open(False)).idle_since = None  # its page is there
+        with pytest.raises(BadInput) as told:
+            await views.open(False)
+        await views.close()
+        return str(told.value)
+
+    assert asyncio.run(scenario()).startswith("1 pages are open already, as many as this server shows at a time")
+
+
+def test_the_desk_takes_what_is_due_first_and_never_two_that_need_the_same() -> None:
+    async def scenario() -> tuple[list[str], int]:
+        desk, go_on = Desk(threads=1), threading.Event()
+        order: list[str] = []
+        first = asyncio.ensure_future(desk.do(lambda: go_on.wait(PATIENCE), 0.0))
+        await asyncio.sleep(0)  # it is taken up, and the others queue
+        others = [
+            asyncio.ensure_future(desk.do(lambda name=name: order.append(name), within))  # type: ignore[misc]
+            for name, within in (("fine", 3.0), ("scene", 2.0), ("coarse", 1.0), ("late scene", 2.5))
+        ]
+        await asyncio.sleep(0)
+        others[3].cancel()  # whose page has gone meanwhile
+        await asyncio.sleep(0)
+        go_on.set()
+        await asyncio.gather(first, *others[:3])
+        desk.close()
+
+        desk, inside, most = Desk(threads=4), [0], [0]
+
+        def alone() -> None:
+            inside[0] += 1
+            most[0] = max(most[0], inside[0])
+            threading.Event().wait(0.002)
+            inside[0] -= 1
+
+        await asyncio.gather(*(desk.do(alone, 0.0, frozenset({"engine"})) for _ in range(20)))
+        desk.close()
+        return order, most[0]
+
+    assert asyncio.run(scenario()) == (["coarse", "scene", "fine"], 1)
+
+
+def test_the_desk_gives_back_errors_and_refuses_when_it_is_closed() -> None:
+    async def scenario() -> None:
+        desk = Desk(threads=1)
+        with pytest.raises(ZeroDivisionError):
+            await desk.do(lambda: 1 / 0, 0.0)
+        assert await desk.do(lambda: 3, 0.0) == 3
+        desk.close()
+        with pytest.raises(RuntimeError, match="stopping"):
+            await desk.do(lambda: 3, 0.0)
+
+    asyncio.run(scenario())
+
+
+def test_a_browser_that_never_reads_costs_no_more_than_what_is_on_its_way(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    real = Traced.wired
+
+    def counted(self: Traced, step: int, angle: float | None, size: int) -> Any:
+        made.append(step)
+        return real(self, step, angle, size)
+
+    monkeypatch.setattr(Traced, "wired", counted)
+    origin = Origin(f"http://{address}")
+
+    def view() -> str:
+        asked = Request(f"http://{address}/api/views", method="POST", headers={"Origin": str(origin)})
+        with urlopen(asked) as answer:
+            return f"ws://{address}{json.load(answer)['socket']}"
+
+    def cursor(serial: int) -> str:
+        chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "size": 135, "scene": False}
+        return json.dumps({"type": "cursor", "serial": serial, "step": serial % 40, "angle": None, **chosen})
+
+    # Beyond so many messages this client takes nothing more from its socket.
+    with connect(view(), origin=origin, max_queue=1, proxy=None) as deaf:
+        for serial in range(1500):
+            deaf.send(cursor(serial))
+        with connect(view(), origin=origin, max_size=None, proxy=None) as other:
+            other.send(cursor(1))
+            assert isinstance(other.recv(timeout=PATIENCE), bytes)
+        # 130 KB each: what fits the system's buffers of one connection. The other 1400 cursors were overtaken.
+        assert len(made) < 100
