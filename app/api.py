@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from concurrent.futures import TimeoutError as NotYet
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Depends, HTTPException, Request, WebSocket
@@ -16,9 +15,8 @@ from beliefscope.app.caching import tagged
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.proxy import client_page
 from beliefscope.app.session import Views
-from beliefscope.app.wire import header, layers, pictures
+from beliefscope.app.wire import pictures
 from beliefscope.datasets.corrupt import Recipe, described
-from beliefscope.inspect.likelihood import no_maps
 
 PATIENCE = 0.25  # s that a request for a trace waits before it says how far the trace is
 
@@ -64,14 +62,9 @@ def routes(library: Library, views: Views) -> APIRouter:
     @router.get("/api/trace/{task}/{filter}/{episode}")
     def trace_header(asked: OfTwo) -> Response:
         traced = library.traced(asked)
-        try:
-            trace = traced.done.result(timeout=PATIENCE)
-        except NotYet:
+        if not traced.ready(PATIENCE):
             return JSONResponse({"progress": traced.progress}, status_code=202)
-        task, why = traced.checkpoint.task, no_maps(traced.checkpoint, trace)
-        components = [{"name": c.name, "unit": c.unit} for c in task.components]
-        described = header(trace, traced.columns[0], components, why)
-        return JSONResponse(described | {"filter": asked.filter, "scene": layers(task, trace, why)})
+        return JSONResponse(traced.header() | {"filter": asked.filter})
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
     def trace_columns(asked: OfTwo, request: Request) -> Response:
