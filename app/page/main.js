@@ -232,7 +232,7 @@ class Page {
   /** The other run has come or gone: it is drawn over the time line, and in the scene. */
   #overlay(other, name) {
     this.timeline.against(other, name);
-    this.#move();
+    if (this.#trace) this.#move(); // else another one is on its way
   }
 
   /** Another component, kind of weights or lowest chart. */
