@@ -106,8 +106,8 @@ export class FileTable {
     const { activeElement: active } = document;
     const [focused, part] = this.#table.contains(active) ? [active.closest('tr')?.dataset.name, active.dataset.part] : [];
     const top = document.createElement('tr');
-    if (this.#picks) top.append(Object.assign(document.createElement('th'), { scope: 'col', ariaLabel: 'Chosen', className: 'pick' }));
-    top.append(...this.#columns.map((column) => this.#heading(column)), Object.assign(document.createElement('th'), { scope: 'col', ariaLabel: 'What can be done' }));
+    if (this.#picks) top.append(unseen('Chosen', 'pick'));
+    top.append(...this.#columns.map((column) => this.#heading(column)), unseen('Menu', 'menus'));
     this.#table.tHead.replaceChildren(top);
     const files = this.#ordered;
     this.#rows = new Map(files.map((file, i) => [file.name, this.#row(file, i)]));
@@ -217,6 +217,13 @@ export class FileTable {
     event.preventDefault();
     items.at(to % items.length).focus();
   }
+}
+
+/** The heading of a column whose cells say by themselves what they are. */
+function unseen(text, className) {
+  const cell = Object.assign(document.createElement('th'), { scope: 'col', className });
+  cell.append(Object.assign(document.createElement('span'), { className: 'visually-hidden', textContent: text }));
+  return cell;
 }
 
 function link({ href, download, window }) {

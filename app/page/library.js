@@ -26,7 +26,7 @@ const BODY = `
   <div class="scroll" tabindex="-1">
     <table class="recordings" aria-label="Recordings"><thead></thead><tbody></tbody></table>
     <p class="rest"></p>
-    <section class="reports"><h3>Reports</h3><table aria-label="Reports"><thead></thead><tbody></tbody></table></section>
+    <section class="reports"><h2>Reports</h2><table aria-label="Reports"><thead></thead><tbody></tbody></table></section>
     <details class="trash"><summary></summary><ul></ul><p><button type="button" class="text empty"></button> <span class="sure" hidden>For good? <button type="button" class="text yes">Delete for good</button> <button type="button" class="text no">Keep</button></span></p></details>
   </div>
   <div class="drop" hidden><p>Drop <b>.rrd</b> files to add them</p></div>
@@ -204,7 +204,7 @@ export class Library {
   #readRun(file) {
     return this.#try(async () => {
       const { job } = await api.readRun(file);
-      if (job.state === 'done') return location.assign(`/${job.link}`);
+      if (job.state === 'done') location.assign(`/${job.link}`);
       this.#awaited = job.id;
       this.#say(`The run in ${file.name} is read; it opens in a moment.`);
       await this.#jobs.refresh();
@@ -298,7 +298,7 @@ export class Library {
   async #delete(file, of) {
     await this.#try(async () => {
       const { deleted } = await api.discard(file);
-      this.#say(`${file.name} is in the trash.`, () => this.#restore({ id: deleted, name: file.name, of }));
+      return [`${file.name} is in the trash.`, () => this.#restore({ id: deleted, name: file.name, of })];
     });
     this.#part('.said button').focus();
   }
@@ -306,8 +306,8 @@ export class Library {
   #restore({ id, name, of }) {
     return this.#try(async () => {
       await api.restore(of, id);
-      this.#say(`${name} is back.`);
       this.#point = of === 'recordings' ? name : '';
+      return [`${name} is back.`];
     });
   }
 
@@ -315,18 +315,15 @@ export class Library {
     this.#part('.sure').hidden = true;
     await this.#try(async () => {
       const freed = (await Promise.all(['recordings', 'reports'].map(api.emptyTrash))).reduce((sum, one) => sum + one.freed, 0);
-      this.#say(`The trash is empty: ${bytes(freed)} are free again.`);
+      return [`The trash is empty: ${bytes(freed)} are free again.`];
     });
   }
 
-  /** Does it, says what went wrong, and asks what there is now. */
+  /** Does it, asks what there is now, and says what was done, with what undoes it, or what went wrong. */
   async #try(act) {
-    try {
-      await act();
-    } catch (error) {
-      this.#say(error.message, null, true);
-    }
+    const said = await act().catch((error) => [error.message, null, true]);
     await this.load();
+    if (said) this.#say(...said);
   }
 
   #say(text, undo = null, bad = false) {
