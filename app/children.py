@@ -11,7 +11,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from beliefscope.app.library import Library, Settings
-from beliefscope.datasets.document import read_json
+from beliefscope.app.record import read_record
 from beliefscope.filters.checkpoint import load_checkpoint, write_atomically
 
 FILE = "kept.json"
@@ -33,7 +33,7 @@ RECORDS = TypeAdapter(list[Child])
 def read(workspace: Path) -> list[Child]:
     """Those whose files are still there; of a file that cannot be read, none."""
     with suppress(OSError, ValueError, TypeError):
-        found = RECORDS.validate_python(read_json((workspace / FILE).read_bytes()))
+        found = read_record(RECORDS, workspace / FILE)
         return [one for one in found if Path(one.path).is_file()]
     return []
 

@@ -21,6 +21,7 @@ from beliefscope.app.commands.finetune import curves, errors, of
 from beliefscope.app.jobs import UNDER_WAY, Job, Jobs
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.link import beside, moment_link
+from beliefscope.app.record import read_record
 from beliefscope.app.work import Report
 from beliefscope.datasets.document import read_json
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
@@ -248,8 +249,8 @@ def _runs(library: Library) -> list[dict[str, Any]]:
     """All that were asked for in this workspace, the newest first."""
     found = []
     for path in (library.settings.workspace / "finetune").glob("*/run.json"):
-        with suppress(ValueError):  # no run of ours
-            run = RUN.validate_python(_read(path))
+        with suppress(OSError, ValueError):  # no run of ours
+            run = read_record(RUN, path)
             if run.run == path.parent.name:
                 found.append(asdict(run))
     return sorted(found, key=lambda run: -run["asked"])

@@ -28,9 +28,9 @@ from fastapi.responses import FileResponse, JSONResponse, Response
 from pydantic import TypeAdapter
 
 from beliefscope import __version__
+from beliefscope.app.record import read_record
 from beliefscope.app.security import kept_file
 from beliefscope.app.work import how_it_ended
-from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.filters.checkpoint import write_atomically
 
@@ -162,7 +162,9 @@ class Jobs:
             except OSError as error:
                 raise BadInput(f"cannot write {str(folder)!r}: {error.strerror}") from None
             write_atomically(folder / "arguments.json", json.dumps(arguments).encode())
-            self._put(Job(id, kind, title, asked=time.time(), server=os.getpid(), link=link))
+            # A clock that was set back must not put what is asked for now behind what was.
+            asked = max([time.time(), *(job.asked + 1e-3 for job in self._jobs.values())])
+            self._put(Job(id, kind, title, asked=asked, server=os.getpid(), link=link))
             self._queue.append(id)
             self._start()
             self._tidy()
@@ -229,7 +231,7 @@ class Jobs:
                     env=os.environ | {"OMP_NUM_THREADS": "1"},
                 )
             self._processes[id] = process
-            self._put(replace(job, state="running", started=time.time()))
+            self._put(replace(job, state="running", started=max(time.time(), job.asked)))
             log.info("job began", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
             self._attending[id] = threading.Thread(target=self._attend, args=(id, process), name=f"job {id}")
             self._attending[id].start()
@@ -244,7 +246,8 @@ class Jobs:
         process.stdin.close()
         with self._lock:
             del self._processes[id], self._attending[id]
-            job = replace(self._jobs[id], ended=time.time())
+            job = self._jobs[id]
+            job = replace(job, ended=max(time.time(), job.started or 0.0))
             stopped = self._stopped.pop(id, None)
             if code == 0 and self.result(id).is_file():
                 job = replace(job, state="done", progress=1.0, message="", error="")
@@ -337,7 +340,7 @@ def _read_all(folder: Path) -> list[Job]:
     for path in folder.glob("*/job.json"):
         # A file that cannot be read, or is of another version, is no job of ours.
         with suppress(OSError, ValueError, TypeError):
-            job = RECORD.validate_python(read_json(path.read_bytes()))
+            job = read_record(RECORD, path)
             if job.id == path.parent.name and not (job.state in UNDER_WAY and _lives_elsewhere(job.server)):
                 found.append(job)
     return found

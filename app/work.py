@@ -57,7 +57,8 @@ def main(function: str, folder: Path) -> int:
         return 1
     except Exception as error:
         traceback.print_exc()
-        tell(error=f"{type(error).__name__}: {error}")
+        wanting = isinstance(error, MemoryError) or "can't allocate memory" in str(error)  # NumPy's, PyTorch's
+        tell(error=f"{'it ran out of memory: ' if wanting else ''}{type(error).__name__}: {error}")
         return 1
     return 0
 

@@ -52,7 +52,8 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
 
     outcome = Outcome(inputs)
     began = time.monotonic()
-    readers.READERS[name].make(Path(tempfile.mkdtemp()) / f"warm{readers.READERS[name].suffix}")  # fills the caches
+    with tempfile.TemporaryDirectory() as folder:
+        readers.check_whole(name, Path(folder))  # and fills the caches
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, mmap.mmap(-1, 32) as shared:
 
         def kept(number: int, why: str) -> None:

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fuzz"))
 
 import numpy as np
 import torch
-from readers import episodes
+from valid import episodes
 
 from beliefscope.datasets.collect import collect
 from beliefscope.datasets.corrupt import WHOLE

@@ -89,4 +89,4 @@ def damaged(path: Path, error: Exception) -> BadInput:
 
 def reason(error: Exception) -> str:
     """HDF5's own words, in one line."""
-    return (getattr(error, "strerror", None) or " ".join(str(error).split())).strip(" '\".")
+    return " ".join((getattr(error, "strerror", None) or str(error)).split()).strip(" '\".")

@@ -137,10 +137,10 @@ def shipped(task: str, name: str) -> Path:
 def write_atomically(path: Path, data: bytes) -> None:
     """The old file or the new one, never half of it. Raises BadInput where it cannot be written: no folder, no room."""
     path = Path(path)
-    if not path.parent.is_dir():
-        raise BadInput(f"folder {str(path.parent)!r} does not exist")
     temporary = None
     try:
+        if not path.parent.is_dir():
+            raise BadInput(f"folder {str(path.parent)!r} does not exist")
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:100]}.", dir=path.parent)
         with os.fdopen(handle, "wb") as file:
             file.write(data)

@@ -40,7 +40,7 @@ from beliefscope.recordings.diagnostics import log_diagnostic
 from beliefscope.recordings.maps import map_columns, map_style
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
 
-STEPS_PER_CHUNK = 100
+STEPS_PER_CHUNK, CHUNKS = 100, 300
 MAPS_PER_CHUNK = 16
 LAYOUT_STEPS = 1000
 
@@ -77,17 +77,11 @@ def write_recording(
     layers = first[0].layers if first else ()
     sample = thinned(trace)
     layout = blueprint(sample, task, first[0] if first else None, diagnostics)
-    bodies = Bodies(trace, task)
-    with new_recording(Path(path), sample, len(trace), layout) as stream:
-        for entity, look in bodies.looks():
-            stream.log(entity, look, static=True)
-        for start in range(0, len(trace), STEPS_PER_CHUNK):
-            steps = slice(start, min(start + STEPS_PER_CHUNK, len(trace)))
-            send_steps(stream, trace, task, steps)
-            times = drawing.time_columns(np.arange(steps.start, steps.stop), trace.episode.dt)
-            for entity, columns in bodies.columns(steps):
-                stream.send_columns(entity, times, columns)
-            report(0.5 * steps.stop / len(trace))
+    bodies = Bodies(sample, task)
+    with new_recording(Path(path), sample, bodies, len(trace), layout) as stream:
+        for start, last in chunks(len(trace)):
+            send_steps(stream, trace, task, bodies, slice(start, last))
+            report(0.5 * last / len(trace))
         for name, diagnostic in diagnostics.items():
             log_diagnostic(stream, diagnostic, name, trace)
         if first:
@@ -102,7 +96,9 @@ def write_recording(
 
 
 @contextmanager
-def new_recording(path: Path, sample: Trace, steps: int, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+def new_recording(
+    path: Path, sample: Trace, bodies: Bodies, steps: int, layout: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
     """A stream into a file that is complete at the end, or not there; its header and what is static are sent.
 
     Args:
@@ -114,16 +110,16 @@ def new_recording(path: Path, sample: Trace, steps: int, layout: rrb.Blueprint) 
     flush_and_cleanup_orphaned_recordings()  # Rerun keeps each stream there was, with two threads, until it is told
     with _complete_or_absent(path) as unfinished:
         stream = rr.RecordingStream(APPLICATION)
-        with _let_go(layout):
+        with let_go(layout):
             stream.save(unfinished, default_blueprint=layout)
-        send_header(stream, sample, steps)
+        send_header(stream, sample, bodies, steps)
         stream.flush()  # so that even a file cut off later says what it is
         yield stream
         _finish(stream, unfinished)
 
 
 @contextmanager
-def _let_go(layout: rrb.Blueprint) -> Iterator[None]:
+def let_go(layout: rrb.Blueprint) -> Iterator[None]:
     """Ends the stream that Rerun makes for a layout and forgets: it holds itself, two threads and what was sent."""
     made, log = [], layout._log_to_stream
 
@@ -138,6 +134,13 @@ def _let_go(layout: rrb.Blueprint) -> Iterator[None]:
         layout._log_to_stream = log  # type: ignore[method-assign]
         for stream in made:
             stream.disconnect()
+
+
+def chunks(steps: int) -> Iterator[tuple[int, int]]:
+    """First step and the one after the last of each part that is sent at once: not too many for Rerun's index."""
+    size = max(STEPS_PER_CHUNK, math.ceil(steps / CHUNKS))
+    for first in range(0, steps, size):
+        yield first, min(first + size, steps)
 
 
 def thinned(trace: Trace) -> Trace:
@@ -167,7 +170,7 @@ def is_picture(array: NDArray[Any]) -> bool:
     return array.ndim == 3 and array.dtype == np.uint8
 
 
-def send_header(stream: rr.RecordingStream, trace: Trace, steps: int = GROWING) -> None:
+def send_header(stream: rr.RecordingStream, trace: Trace, bodies: Bodies, steps: int = GROWING) -> None:
     """The recording's properties, and all else that is not over steps, of a run that these steps are of.
 
     Args:
@@ -175,6 +178,8 @@ def send_header(stream: rr.RecordingStream, trace: Trace, steps: int = GROWING) 
     """
     _send_properties(stream, trace, steps)
     _send_static(stream, trace, find_task(trace.episode.task), steps)
+    for entity, look in bodies.looks():
+        stream.log(entity, look, static=True)
 
 
 def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> None:
@@ -228,7 +233,9 @@ def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task, steps: in
     stream.log("about", drawing.about(trace, task, steps), static=True)
 
 
-def send_steps(stream: rr.RecordingStream, trace: Trace, task: Task, steps: slice, offset: int = 0) -> None:
+def send_steps(
+    stream: rr.RecordingStream, trace: Trace, task: Task, bodies: Bodies, steps: slice, offset: int = 0
+) -> None:
     """Some steps of a trace, stored and drawn.
 
     Args:
@@ -248,6 +255,8 @@ def send_steps(stream: rr.RecordingStream, trace: Trace, task: Task, steps: slic
         )
         stream.send_columns(f"observations/{key}", times, columns)
     for path, columns in drawing.columns(trace, task, steps):
+        stream.send_columns(path, times, columns)
+    for path, columns in bodies.columns(trace.episode.qpos[steps]):
         stream.send_columns(path, times, columns)
     changes, states = drawing.contact_changes(trace, steps)
     if len(changes):
@@ -302,5 +311,9 @@ def _complete_or_absent(path: Path) -> Iterator[Path]:
         os.replace(unfinished, path)
     except OSError as error:
         raise BadInput(f"cannot write {path}: {error.strerror or error}.") from None
+    except RuntimeError as error:
+        if "File-writer" not in str(error):  # Rerun's thread, which ends where it cannot write
+            raise
+        raise BadInput(f"cannot write {path}: {error}; is the disk full?") from None
     finally:
         unfinished.unlink(missing_ok=True)

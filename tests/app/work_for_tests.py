@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -48,3 +49,10 @@ def refuse(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
 
 def hopeless(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
     return {"value": float("nan")}
+
+
+def hungry(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
+    """Takes more memory than it may."""
+    most = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + (64 << 20)
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    return {"bytes": len(bytearray(1 << 30))}

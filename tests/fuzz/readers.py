@@ -15,20 +15,18 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import h5py
 import mutate
 import numpy as np
 import torch
+from valid import AUTHORS, episodes, make_authors, make_episodes, make_push
 
 from beliefscope.app import children
 from beliefscope.app.finetune import routes as tuned_routes
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Settings
 from beliefscope.datasets.corrupt import READY, Recipe
-from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.mit_push import KEYS
-from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
+from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
@@ -73,25 +71,6 @@ def can_be_shown(value: Any) -> None:
 # Episodes.
 
 
-@cache
-def episodes(task: str = "door", steps: int = 6) -> tuple[Episode, ...]:
-    """The first steps of three episodes of the sample set, one of each split."""
-    with open_dataset(sample_path(task)) as data:
-        first = {summary.split: summary.index for summary in reversed(data.summaries)}
-        return tuple(_first(data[index], steps) for _, index in sorted(first.items()))
-
-
-def _first(episode: Episode, steps: int) -> Episode:
-    arrays = {name: getattr(episode, name)[:steps] for name in ("states", "controls", "contact", "qpos")}
-    return replace(episode, **arrays, observations={k: v[:steps] for k, v in episode.observations.items()})
-
-
-def make_episodes(path: Path) -> None:
-    from beliefscope.datasets.door import DOOR
-
-    write_dataset(path, DOOR, episodes())
-
-
 def read_episodes(path: Path) -> None:
     for skip_bad in (False, True):
         with open_dataset(path, skip_bad=skip_bad) as data:
@@ -100,44 +79,6 @@ def read_episodes(path: Path) -> None:
                 can_be_shown(dict(episode.provenance))
                 Steps.of(data.task, [episode])
             assert len(data.hash) == 64
-
-
-AUTHORS: tuple[dict[str, tuple[int, ...]], ...] = (
-    {
-        "object-state": (5,),
-        "eef_pos": (3,),
-        "ee-force-obs": (3,),
-        "ee-torque-obs": (3,),
-        "contact-obs": (),
-        "image": (64, 64),
-    },
-    {"Cylinder0_pos": (3,), "eef_pos": (3,), "force": (6,), "contact": (), "image": (32, 32)},
-    {"pos": (3,), "tip": (3,), "force": (3,), "contact": (), "image": (32, 32, 3)},
-)
-
-
-def make_authors(path: Path, keys: dict[str, tuple[int, ...]]) -> None:
-    rng = np.random.default_rng(0)
-    with h5py.File(path, "w") as file:
-        for index in range(2):
-            group = file.create_group(f"trajectory{index}")
-            for key, shape in keys.items():
-                group[key] = rng.random((5, *shape), np.float32)
-
-
-def make_push(path: Path) -> None:
-    clock = np.arange(40) / 100
-    still = np.zeros(len(clock))
-    rows = {
-        "object_pose": np.column_stack([clock, 0.3 + clock / 10, still, still]),
-        "tip_pose": np.column_stack([clock, 0.2 + clock / 10, still, still]),
-        "ft_wrench": np.column_stack([clock, still, still, still]),
-    }
-    if path.suffix == ".json":
-        path.write_text(json.dumps({key: rows[key].tolist() for key in KEYS}))
-    else:
-        with h5py.File(path, "w") as file:
-            file.update(rows)
 
 
 def read_push(path: Path) -> None:
@@ -212,9 +153,12 @@ def read_cell(path: Path) -> None:
     there.parent.mkdir(parents=True, exist_ok=True)
     there.write_bytes(path.read_bytes())
     cell().path(folder, ".safetensors").write_bytes(b"weights")
-    rows = rows_of({cell(): cell().document(folder)})
+    found = cell().document(folder)
+    rows = rows_of({cell(): found})
     to_csv(rows)
     to_markdown(rows)
+    if found is None:
+        raise BadInput("no cell of this study")
 
 
 def make_partial(path: Path) -> None:
@@ -225,10 +169,11 @@ def make_partial(path: Path) -> None:
 def read_partial(path: Path) -> None:
     """What is taken up must be what was put down: a training cannot tell wrong weights from right ones."""
     found = Partial(path, "key").load()
-    if found is not None:
-        assert torch.equal(found[0]["now.weight"], torch.arange(6.0).reshape(2, 3))
-        assert found[1]["done"] == ["dynamics"]
-        assert found[1]["seconds"] == 1.5
+    if found is None:
+        raise BadInput("of no use")
+    assert torch.equal(found[0]["now.weight"], torch.arange(6.0).reshape(2, 3))
+    assert found[1]["done"] == ["dynamics"]
+    assert found[1]["seconds"] == 1.5
 
 
 def make_job(path: Path) -> None:
@@ -240,7 +185,10 @@ def read_job(path: Path) -> None:
     folder = path.parent / "jobs"
     (folder / "job").mkdir(parents=True, exist_ok=True)
     shutil.copy(path, folder / "job" / "job.json")
-    can_be_shown([asdict(job) for job in Jobs(folder).all()])
+    jobs = Jobs(folder).all()
+    can_be_shown([asdict(job) for job in jobs])
+    if not jobs:
+        raise BadInput("no job of ours")
 
 
 def make_children(path: Path) -> None:
@@ -252,6 +200,8 @@ def read_children(path: Path) -> None:
     shutil.copy(path, path.parent / children.FILE)
     settings = children.with_children(Settings(path.parent))
     can_be_shown(settings.to_json())
+    if not settings.checkpoints:
+        raise BadInput("no child of ours")
 
 
 RUN_FILES = ("run", "progress", "found")
@@ -374,6 +324,13 @@ READERS: dict[str, Reader] = {
     "tuned run": Reader(make_run, spoil_run, read_run, ".json"),
 }
 """What is read -> its reader. A new one is a line here."""
+
+
+def check_whole(name: str, folder: Path) -> None:
+    """That the reader takes a valid file, or nothing would be tried here."""
+    path = folder / f"motion_surface=abs_shape=rect1_whole{READERS[name].suffix}"
+    READERS[name].make(path)
+    READERS[name].read(path)
 
 
 @contextmanager
