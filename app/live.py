@@ -89,9 +89,11 @@ def routes(library: Library) -> APIRouter:
             return
 
     @router.get("/api/live/{name}.rrd")
-    def recording(name: str) -> StreamingResponse:
-        run = runs[name]
-        path = kept_file(runs.folder, f"{run.name}.rrd")
+    async def recording(name: str) -> StreamingResponse:
+        run = await asyncio.to_thread(runs.__getitem__, name)
+        end = time.monotonic() + PATIENCE  # it begins a moment after the run
+        while (path := kept_file(runs.folder, f"{run.name}.rrd")) is None and time.monotonic() < end:
+            await asyncio.sleep(LOOK)
         if path is None:
             raise HTTPException(404, f"Live run {name!r} has no recording.")
         return StreamingResponse(_tail(run, path), media_type="application/octet-stream")

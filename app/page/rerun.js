@@ -154,7 +154,12 @@ export class Rerun {
   }
 }
 
-/** The recording that a live run writes itself: it is sent on as it grows. */
-const growing = (trace) => ({ url: `/api/live/${encodeURIComponent(trace.live.name)}.rrd` });
+/** The recording that a live run writes itself, which is sent on as it grows; of one that writes none, what there is by now. */
+async function growing(trace) {
+  const url = `/api/live/${encodeURIComponent(trace.live.name)}.rrd`;
+  const found = await fetch(url);
+  await found.body.cancel();
+  return found.ok ? { url } : record(trace);
+}
 
 const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));

@@ -321,3 +321,25 @@ def test_recorded_compared_and_diagnosed_as_any_run(
     entries = {entry["name"]: entry for entry in client.get(f"/api/diagnostics/{path}?data=live:run").json()}
     name = next(name for name, entry in entries.items() if not entry["slow"] and not entry["why_not"])
     assert until(client, f"/api/diagnostics/{name}/{path}?data=live:run")["trajectories"] == 1
+
+
+def test_its_recording_is_sent_as_it_grows(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
+    """Whole, though it grows while it is read; until the run has ended, not until the file has."""
+    writer.append(cut(whole, 0, 1))
+    recording = writer.path.with_suffix(".rrd")
+    parts = [bytes([i]) * 300_000 for i in range(3)]
+
+    def grow() -> None:
+        for part in parts:
+            time.sleep(0.15)
+            with recording.open("ab") as file:
+                file.write(part)
+        time.sleep(0.15)
+        writer.finish()
+
+    growing = threading.Thread(target=grow)
+    growing.start()
+    assert client.get("/api/live/run.rrd").content == b"".join(parts)
+    growing.join()
+    recording.unlink()
+    assert client.get("/api/live/run.rrd").status_code == 404
