@@ -57,13 +57,3 @@ def test_a_bar_leads_to_the_worst_moment(open_page: Any) -> None:
         "component": "angle",
     }
     assert page.state.items() >= {**wanted, "episode": worst["episode"]}.items()
-
-
-def test_a_study_says_what_it_is_not_of(open_page: Any) -> None:
-    page = open_page("?tab=study&task=push")
-    page.until(SHOWN)
-    assert "A click opens seed 0, on this page" in page.page.locator("#study .about").text_content()
-    page.page.locator("#task").select_option("push-real")
-    page.until("() => document.querySelector('#study').dataset.state === 'empty'")
-    told = page.page.locator("#study > .note").text_content()
-    assert told == "This study has nothing on push-real. It is of door, push: choose another task."
