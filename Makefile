@@ -82,8 +82,10 @@ licences: install
 	@$(BIN)/python bench/licences.py
 
 audit: $(VENV)/tools
-	@$(VENV)/tools/bin/pip-audit -r requirements.lock --require-hashes --disable-pip || { \
-	  echo "Weaknesses are listed above; where none are, the advisory service was not reached, and nothing is known." >&2; exit 1; }
+	@$(VENV)/tools/bin/pip-audit --progress-spinner off -r requirements.lock --require-hashes --disable-pip 2>$(VENV)/audit.log || { \
+	  if grep -q Traceback $(VENV)/audit.log; then \
+	    echo "The advisory service was not reached, so nothing is known; $(VENV)/audit.log says more." >&2; \
+	  else tail -n 1 $(VENV)/audit.log >&2; fi; exit 1; }
 
 clean:
 	rm -rf $(VENV) build dist src/beliefscope.egg-info .pytest_cache .mypy_cache .ruff_cache

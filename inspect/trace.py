@@ -344,8 +344,8 @@ def load_trace(path: Path) -> Trace:
         raise BadInput(f"{str(path)!r} is not a readable trace: {error}") from None
     if not isinstance(header, dict):
         raise BadInput(f"{str(path)!r} is a safetensors file, but not a trace of Beliefscope")
-    if header.pop("format", None) != FORMAT:
-        raise BadInput(f"{str(path)!r} is a trace of another format; this version reads format {FORMAT}")
+    if (found := header.pop("format", None)) != FORMAT:
+        raise BadInput(f"{str(path)!r} has trace format {found!r}; this version reads format {FORMAT}")
     try:
         return trace_of(header, arrays)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
