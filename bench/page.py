@@ -1,48 +1,48 @@
-"""The page in headless Chromium: how soon it is usable, how long from a key to the maps drawn, how smooth a drag is."""
+"""The page in headless Chromium: how soon it shows something, how fast it answers, whether it grows while it plays."""
 
 from __future__ import annotations
 
-import re
+import argparse
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from served import serving
 from subject import STEPS, Row, episode
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.store import write_dataset
 
 KEYS = 200
+VISITS = 5
 SWEEP = 3.0  # s that a drag over the time line takes
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 
 
 @contextmanager
-def serving() -> Iterator[str]:
-    """The installed command on a free port; yields the page's address once it listens."""
-    with tempfile.TemporaryDirectory() as workspace:
-        long = Path(workspace) / "long.h5"
-        write_dataset(long, find_task("door"), [episode()])
-        command = [sys.executable, "-m", "beliefscope", "serve", "--port", "0", "--no-open", "--workspace", workspace]
-        command += ["--data", str(long)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                found = re.search(r"http://\S+", line)
-                if found:
-                    yield found[0]
-                    return
-            raise RuntimeError("the server ended before it listened")
-        finally:
-            process.terminate()
-            process.wait(timeout=20)
+def browsing() -> Iterator[Any]:
+    """A page in a browser of its own."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=found_chromium(), args=FLAGS)
+        yield chromium.new_page(viewport={"width": 1440, "height": 900})
+        chromium.close()
+
+
+def found_chromium() -> str | None:
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+def usable(page: Any) -> float:
+    """Waits until the time line and the first maps are drawn; s from the page's start to that."""
+    page.wait_for_function("() => window.beliefscope?.stats.useful", timeout=120_000)
+    return float(page.evaluate("window.beliefscope.stats.useful")) / 1e3
 
 
 DRAG = """([seconds, from, to, y]) => new Promise((done) => {
@@ -69,45 +69,111 @@ DRAG = """([seconds, from, to, y]) => new Promise((done) => {
 
 
 def measure() -> list[Row]:
-    browser = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
-    if browser is None:
-        return [("page", "skipped: no Chromium on the path", "")]
     try:
-        from playwright.sync_api import sync_playwright
+        import playwright.sync_api  # noqa: F401
     except ImportError:
         return [("page", "skipped: playwright is not installed", "")]
-    rows: list[Row] = []
-    with serving() as url, sync_playwright() as playwright:
-        listening = time.perf_counter()
-        chromium = playwright.chromium.launch(executable_path=shutil.which(browser), args=FLAGS)
-        page = chromium.new_page(viewport={"width": 1440, "height": 900})
-        launched = time.perf_counter()
-        page.goto(url + "?data=sample")
-        page.wait_for_function("() => window.beliefscope?.stats.maps", timeout=60_000)
-        usable = time.perf_counter()
-        rows.append(("from listening to maps drawn, browser's start left out", f"{usable - launched:.2f} s", "<= 3 s"))
-        rows.append(("of this machine's browser: its start", f"{launched - listening:.2f} s", ""))
-        page.wait_for_timeout(10_000)  # until the server has prepared the Rerun viewer, once a workspace
-        page.evaluate("window.beliefscope.stats.scrub.length = 0")
-        for number in range(KEYS):
-            page.keyboard.press("ArrowRight" if number // 40 % 2 == 0 else "ArrowLeft")
-            page.wait_for_timeout(60)
-        page.wait_for_timeout(500)
-        took = np.array(page.evaluate("window.beliefscope.stats.scrub"))
-        p50, p95 = np.percentile(took, [50, 95])
-        rows.append((f"key to maps drawn, {len(took)} of {KEYS} keys, p50", f"{p50:.0f} ms", ""))
-        rows.append((f"key to maps drawn, {len(took)} of {KEYS} keys, p95", f"{p95:.0f} ms", "<= 100 ms"))
-        page.goto(url + "?data=long")
-        page.wait_for_function("() => window.beliefscope?.stats.maps", timeout=60_000)
-        page.wait_for_timeout(2000)
-        box = page.locator("#tracks").bounding_box()
-        assert box is not None
-        left, right, y = box["x"] + 0.3 * box["width"], box["x"] + 0.95 * box["width"], box["y"] + 60
-        page.mouse.move(left, y)
-        page.mouse.down()
-        apart = np.diff(page.evaluate(DRAG, [SWEEP, left, right, y]))
-        page.mouse.up()
-        rows.append((f"dragging over {STEPS} steps, time line drawn", f"{1000 / apart.mean():.0f} /s", ">= 30 /s"))
-        rows.append(("dragging, between two drawings, p95", f"{np.percentile(apart, 95):.0f} ms", ""))
-        chromium.close()
+    if found_chromium() is None:
+        return [("page", "skipped: no Chromium on the path", "")]
+    with tempfile.TemporaryDirectory() as folder:
+        long = Path(folder) / "long.h5"
+        write_dataset(long, find_task("door"), [episode()])
+        with browsing() as page, serving("--data", str(long)) as served:
+            return [*paint(page, served.url), *keys(page, served.url), *drag(page, served.url)]
+
+
+def paint(page: Any, url: str) -> list[Row]:
+    """Until the page shows what it is for: right after the server listens, and where both are warm."""
+    page.goto(url + "?data=sample", wait_until="commit")
+    rows = [("from a fresh server's listening to time line and maps", f"{usable(page):.2f} s", "<= 3 s")]
+    page.wait_for_timeout(10_000)  # until the server has prepared the Rerun viewer, once a workspace
+    again, new = [], []
+    for _ in range(VISITS):
+        page.reload(wait_until="commit")
+        again.append(usable(page))
+        with page.context.browser.new_context(viewport=page.viewport_size) as stranger:
+            other = stranger.new_page()
+            other.goto(url + "?data=sample", wait_until="commit")
+            new.append(usable(other))
+    for what, took in (("a reload", again), ("a browser's first visit", new)):
+        rows.append((f"time line and maps after {what}, median of {VISITS}", f"{np.median(took):.2f} s", "<= 1.5 s"))
     return rows
+
+
+def keys(page: Any, url: str) -> list[Row]:
+    """From a key to the maps drawn."""
+    page.goto(url + "?data=sample")
+    usable(page)
+    page.wait_for_timeout(3000)
+    page.evaluate("window.beliefscope.stats.scrub.length = 0")
+    for number in range(KEYS):
+        page.keyboard.press("ArrowRight" if number // 40 % 2 == 0 else "ArrowLeft")
+        page.wait_for_timeout(60)
+    page.wait_for_timeout(500)
+    took = np.array(page.evaluate("window.beliefscope.stats.scrub"))
+    p50, p95 = np.percentile(took, [50, 95])
+    scenes = page.evaluate("window.beliefscope.stats.scene")
+    rows = [
+        (f"key to maps drawn, {len(took)} of {KEYS} keys, p50", f"{p50:.0f} ms", ""),
+        (f"key to maps drawn, {len(took)} of {KEYS} keys, p95", f"{p95:.0f} ms", "<= 50 ms"),
+    ]
+    if scenes:
+        rows.append((f"key to scene sent, {len(scenes)} keys, p95", f"{np.percentile(scenes, 95):.0f} ms", "<= 100 ms"))
+    return rows
+
+
+def drag(page: Any, url: str) -> list[Row]:
+    """Over the whole of a long episode."""
+    page.goto(url + "?data=long")
+    usable(page)
+    page.wait_for_timeout(2000)
+    box = page.locator("#tracks").bounding_box()
+    assert box is not None
+    left, right, y = box["x"] + 0.3 * box["width"], box["x"] + 0.95 * box["width"], box["y"] + 60
+    page.mouse.move(left, y)
+    page.mouse.down()
+    apart = np.diff(page.evaluate(DRAG, [SWEEP, left, right, y]))
+    page.mouse.up()
+    return [
+        (f"dragging over {STEPS} steps, time line drawn", f"{1000 / apart.mean():.0f} /s", ">= 30 /s"),
+        ("dragging, between two drawings, p95", f"{np.percentile(apart, 95):.0f} ms", ""),
+    ]
+
+
+def play(minutes: float) -> list[Row]:
+    """What a page that plays, round and round, takes: the script's memory after a collection, nodes, listeners."""
+    with browsing() as page, serving() as served:
+        page.goto(served.url)
+        usable(page)
+        devtools = page.context.new_cdp_session(page)
+        devtools.send("Performance.enable")
+        taken: list[tuple[float, ...]] = []
+        began = time.monotonic()
+        while (passed := time.monotonic() - began) < 60 * minutes:
+            if not page.evaluate("window.beliefscope.state().playing"):
+                page.keyboard.press("Space")
+            page.wait_for_timeout(10_000)
+            devtools.send("HeapProfiler.collectGarbage")
+            metrics = {m["name"]: m["value"] for m in devtools.send("Performance.getMetrics")["metrics"]}
+            taken.append((passed / 60, metrics["JSHeapUsedSize"] / 1e6, metrics["Nodes"], metrics["JSEventListeners"]))
+    values = np.array(taken)[len(taken) // 4 :]  # what it fills at first is not what it grows by
+    rows: list[Row] = []
+    for column, what, unit in ((1, "memory of scripts", "MB"), (2, "nodes", ""), (3, "listeners", "")):
+        rise = np.polyfit(values[:, 0], values[:, column], 1)[0]
+        first, last = values[0, column], values[-1, column]
+        rows.append(
+            (f"{what} over {minutes:g} min of play", f"{first:.1f} to {last:.1f} {unit}; {rise:+.2f} a minute", "flat")
+        )
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--play", type=float, metavar="MINUTES", help="only: what a page takes that plays so long")
+    asked = parser.parse_args()
+    for what, measured, bar in measure() if asked.play is None else play(asked.play):
+        print(f"{what}: {measured}{bar and f' (bar: {bar})'}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -48,7 +48,7 @@ class Soak:
         self.slow: list[str] = []
 
     async def run(self, browsers: int, hours: float, out: Path) -> np.ndarray[Any, Any]:
-        async with httpx.AsyncClient(base_url=self.served.url) as http:
+        async with httpx.AsyncClient(base_url=self.served.url, timeout=120.0) as http:
             self.catalog = (await http.get("/api/catalog")).json()
             entries = (await http.get("/api/diagnostics")).json()
             self.quick = [entry["name"] for entry in entries if not entry["slow"]]

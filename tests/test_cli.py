@@ -20,7 +20,7 @@ GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
 NAMES = [command.__name__ for command in COMMANDS]
 OPTIONS = {
     "serve": "--port --host --token --read-only --allow-host --workspace --task --data --filter --checkpoint --study "
-    "--open --no-open --log-level --log-format --seed",
+    "--views --open --no-open --log-level --log-format --seed",
     "collect": "--episodes --steps --seed --workers -o --json",
     "convert": "--data --skip-bad -o --json",
     "train": "--filter --data --skip-bad --preset --recipe --seed --log -o --json",
@@ -206,6 +206,7 @@ BAD = [
     "export missing.trace -o new.csv",
     "export missing.trace -o missing/new.parquet",
     "serve --port 70000",
+    "serve --views 0",
     "serve --workspace notes.txt",
     "serve --workspace missing/deep",
     "serve --task dor",

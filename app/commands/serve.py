@@ -57,6 +57,10 @@ def serve(
         list[Path] | None,
         typer.Option("--study", metavar="DIR", help="Folder of a study to show; may be given again."),
     ] = None,
+    views: Annotated[
+        int,
+        typer.Option("--views", parser=whole(1, 1024), metavar="N", help="Pages that may be open at a time."),
+    ] = 32,
     open_page: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = False,
     log_level: Annotated[
         str, typer.Option("--log-level", metavar="LEVEL", help="On standard error: debug, info, warning or error.")
@@ -111,6 +115,7 @@ def serve(
         checkpoints={**short_names(paths, shipped), **{one.name: one for one in foreign}},
         hosts=(*names_of(host), *(allow_host or ())),
         seed=seed,
+        views=views,
         tasks=tuple(task or ()),
         studies=short_names(study or (), {SHIPPED}),
     )
