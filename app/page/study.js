@@ -150,7 +150,7 @@ export class Study {
   /** The bar that is looked at, in words; else what a bar is. */
   #tell(bar) {
     const rest = 'Bars: mean over the seeds, with their standard deviation; a dot is a seed, the ringed one what a click opens.';
-    this.#part('.told').textContent = bar ? sentence(bar.label) : rest;
+    this.#part('.told').textContent = bar ? `${bar.label}.` : rest;
     for (const row of this.#part('tbody').rows) row.classList.toggle('here', row.dataset.filter === bar?.filter);
   }
 
@@ -273,7 +273,7 @@ function linked(bar) {
   const text = bar.mean === null ? '–' : fixed(bar.mean, 2);
   const made = document.createElement(bar.href ? 'a' : 'span');
   [made.bar, made.textContent] = [bar, text];
-  if (bar.href) [made.href, made.title] = [bar.href, sentence(bar.label)];
+  if (bar.href) [made.href, made.title] = [bar.href, `${bar.label}.`];
   if (bar.spread !== null) made.append(Object.assign(document.createElement('small'), { textContent: ` ± ${fixed(bar.spread, 2)}` }));
   return made;
 }
