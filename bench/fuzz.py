@@ -28,7 +28,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fuzz"))
 
 MEMORY = 1 << 30  # bytes that reading may take beyond what the process has
-PATIENCE = 20  # s of processor time for one input
+PATIENCE = 5  # s of processor time for one input
 
 
 @dataclass
