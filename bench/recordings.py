@@ -31,7 +31,7 @@ from beliefscope.recordings.write import write_recording
 
 STRIDE = 4
 MAPS = 400
-"""Steps with maps where speed is measured; the others of the same recording have none, and their time counts as well."""
+"""Steps with maps where speed is measured. The others of that recording have none, but their time counts as well."""
 
 LONG = (10_000, 100_000)
 

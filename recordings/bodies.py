@@ -21,7 +21,6 @@ class Bodies:
     """The bodies of a trace's replay that have a shape; none where it cannot be replayed."""
 
     def __init__(self, trace: Trace, task: Task) -> None:
-        self._trace = trace
         self._solids: dict[tuple[int, str], list[Solid]] = {}
         try:
             self._model = model_of(task, trace.episode)
@@ -46,11 +45,11 @@ class Bodies:
                 ),
             )
 
-    def columns(self, steps: slice) -> Iterator[tuple[str, Any]]:
-        """Where each was at some steps."""
+    def columns(self, qpos: np.ndarray) -> Iterator[tuple[str, Any]]:
+        """Where each was at some steps, by their joint positions (T, nq)."""
         if self._model is None:
             return
-        positions, rotations = poses(self._model, self._trace.episode.qpos[steps])
+        positions, rotations = poses(self._model, qpos)
         for body, name in self._solids:
             at, turned = positions[:, body], rotations[:, body]
             yield f"world/bodies/{name}", rr.Transform3D.columns(translation=at, mat3x3=turned)

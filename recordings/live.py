@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -34,8 +35,17 @@ from beliefscope.inspect.foreign import with_unknown
 from beliefscope.inspect.growing import SUFFIX, GrowingReader, GrowingWriter
 from beliefscope.inspect.trace import Trace, assemble
 from beliefscope.recordings.blueprint import blueprint
+from beliefscope.recordings.bodies import Bodies
 from beliefscope.recordings.schema import APPLICATION
-from beliefscope.recordings.write import STEPS_PER_CHUNK, new_recording, send_header, send_steps, thinning
+from beliefscope.recordings.write import (
+    STEPS_PER_CHUNK,
+    chunks,
+    let_go,
+    new_recording,
+    send_header,
+    send_steps,
+    thinning,
+)
 
 FOLDER = Path("workspace/live")
 WAITING = 1000
@@ -45,8 +55,8 @@ BLOCK = 100
 """Steps at most that are written at once, where several wait."""
 
 DRAWN_AT_ONCE = 10
-LOOKS = 0.1
-"""s between two looks of the drawing thread at what is new."""
+LOOKS, PATIENCE = 0.1, 1.0
+"""s between two looks of the drawing thread at what is new; and after which fewer than DRAWN_AT_ONCE are drawn."""
 
 
 @dataclass(frozen=True)
@@ -262,25 +272,25 @@ class LiveRecorder:
         stream = rr.RecordingStream(APPLICATION)
         reader = GrowingReader(self.path)
         try:
-            drawn = 0
-            ended = False
+            drawn, ended, at = 0, False, 0.0
             while not (ended and drawn == reader.steps):
                 ended = self._ended.wait(0.0 if reader.steps > drawn + DRAWN_AT_ONCE else LOOKS)
                 waiting = reader.poll() - drawn
                 self.behind = max(self.behind, waiting)
                 if drawn == 0 and waiting:
                     first = reader.part(0, 1)
-                    stream.save(
-                        self.path.with_suffix(".rrd"), default_blueprint=blueprint(first, self._task, growing=True)
-                    )
-                    send_header(stream, first)
+                    layout, bodies = blueprint(first, self._task, growing=True), Bodies(first, self._task)
+                    with let_go(layout):
+                        # Without the index of every block, which would fill the memory of a long run.
+                        stream.save(self.path.with_suffix(".rrd"), default_blueprint=layout, write_footer=False)
+                    send_header(stream, first, bodies)
                 if ended and self._error is None:
                     return  # the whole recording is written anew from the file
-                if waiting >= DRAWN_AT_ONCE or ended:
+                if waiting >= DRAWN_AT_ONCE or (waiting and (ended or time.monotonic() > at + PATIENCE)):
                     last = min(reader.steps, drawn + STEPS_PER_CHUNK)
-                    send_part(stream, reader, drawn, last)
-                    drawn = last
+                    send_part(stream, reader, bodies, drawn, last)
                     stream.flush()
+                    drawn, at = last, time.monotonic()
         except (BadInput, RuntimeError, ValueError) as error:
             warnings.warn(f"the views of live run {str(self.path)!r} end: {error}", stacklevel=2)
         finally:
@@ -331,20 +341,22 @@ def write_live(live: Path, path: Path) -> Path:
         if not reader.poll():
             raise BadInput(f"{str(live)!r} has no step yet")
         sample = reader.part(0, stride=thinning(reader.steps))
-        layout = blueprint(sample, find_task(sample.episode.task))
-        with new_recording(path, sample, reader.steps, layout) as stream:
-            for first in range(0, reader.steps, STEPS_PER_CHUNK):
-                send_part(stream, reader, first, min(first + STEPS_PER_CHUNK, reader.steps))
+        task = find_task(sample.episode.task)
+        bodies = Bodies(sample, task)
+        with new_recording(path, sample, bodies, reader.steps, blueprint(sample, task)) as stream:
+            for first, last in chunks(reader.steps):
+                send_part(stream, reader, bodies, first, last)
+                stream.flush()  # or all of it would wait in memory for the disk
     finally:
         reader.close()
     return path
 
 
-def send_part(stream: rr.RecordingStream, reader: GrowingReader, first: int, last: int) -> None:
+def send_part(stream: rr.RecordingStream, reader: GrowingReader, bodies: Bodies, first: int, last: int) -> None:
     """Steps ``first`` to ``last - 1`` of a live run, stored and drawn."""
     before = max(0, first - 1)
     part = reader.part(before, last)
-    send_steps(stream, part, find_task(part.episode.task), slice(first - before, last - before), before)
+    send_steps(stream, part, find_task(part.episode.task), bodies, slice(first - before, last - before), before)
 
 
 def _free(folder: Path, name: str) -> Path:

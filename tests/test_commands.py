@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 from beliefscope.datasets.store import open_dataset
 from beliefscope.inspect.catalog import DIAGNOSTICS
@@ -60,11 +61,13 @@ def test_collect_to_recording(run: Run, folder: Path) -> None:
     assert json.loads(out)["data_hash"] == traced.data_hash == digest
     assert json.loads(out)["checkpoint_hash"] == traced.checkpoint_hash == evaluated["checkpoint_hash"]
 
-    code, out, _ = run(f"record {EKF} --data few.h5 --episode 1 --maps 6 -o one.rrd")
+    code, out, _ = run(f"record {EKF} --data few.h5 --episode 1 --maps 6 --map-size 11 -o one.rrd")
     assert code == 0
     assert out.startswith("one.rrd (")
     assert len(out.splitlines()) == 1
-    assert (folder / "one.rrd").stat().st_size > 10_000
+    (chunk,) = RrdReader(folder / "one.rrd").stream().filter(content="/maps/image").drop(is_static=True)
+    maps = chunk.to_record_batch().column("DepthImage:buffer")
+    assert [len(row) for (row,) in maps.to_pylist()] == [11 * 11, 11 * 11]
 
 
 def test_figures_of_the_paper(run: Run, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shlex
 import time
 from collections.abc import Iterator
@@ -72,6 +73,7 @@ def live(
       beliefscope live door --filter examples/04_own_filter.py:build --name mine
     """
     check(None, json)
+    os.environ.setdefault("RUST_LOG", "error")  # else Rerun warns that a file that grows has no index yet
     if rate is not None and not (math.isfinite(rate) and rate >= 0):
         raise BadInput(f"--rate {rate:g}: steps a second, or 0 for as fast as it can")
     check_workspace(workspace)

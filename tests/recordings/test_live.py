@@ -337,7 +337,7 @@ with LiveRecorder("run", task="door", folder=folder) as recorder:
     if sys.argv[4] == "at once":
         os.kill(os.getpid(), signal.SIGKILL)
     print("there", flush=True)
-    time.sleep(60)
+    time.sleep(600)
 """
 
 
@@ -356,7 +356,7 @@ def killed(folder: Path, last: int, pause: float, when: str) -> int:
         if when == "later":
             assert process.stdout.readline() == "there\n"
             until(lambda: GrowingReader(folder / "run.live").poll() == last)
-            until(lambda: drawn(folder / "run.rrd") >= last // live.DRAWN_AT_ONCE * live.DRAWN_AT_ONCE)
+            until(lambda: drawn(folder / "run.rrd") == last)
             process.kill()
         assert process.wait(120) == -signal.SIGKILL
     reader = GrowingReader(folder / "run.live")
@@ -371,8 +371,7 @@ def test_a_kill_leaves_every_step_that_was_handed_over(run: Run, tmp_path: Path)
     assert killed(tmp_path, 47, 0.002, "later") == 47
     recording = tmp_path / "run.rrd"
     found = read_recording(recording)
-    assert 40 <= len(found) <= 47
-    np.testing.assert_array_equal(found.estimate_mean[:, 0], np.arange(len(found)))
+    np.testing.assert_array_equal(found.estimate_mean[:, 0], np.arange(47))
     assert run(f"import {tmp_path}/run.live -o {tmp_path}/run.trace")[0] == 0
     assert len(load_trace(tmp_path / "run.trace")) == 47
     live.write_live(tmp_path / "run.live", recording)
