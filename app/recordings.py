@@ -28,6 +28,7 @@ from beliefscope.app.link import moment_link
 from beliefscope.app.liveruns import PREFIX, name_of
 from beliefscope.app.rrdabout import About
 from beliefscope.app.rrdfiles import ENDING, Recording, RrdFiles, disk
+from beliefscope.app.security import READ_ONLY
 from beliefscope.app.work import Report
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.corrupt import Recipe
@@ -87,7 +88,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         return tagged(request, hashlib.sha256(body).hexdigest()[:24], lambda: body, "application/json")
 
     @router.post("/api/recordings", status_code=201)
-    def record(wanted: RecordingRequest, response: Response) -> dict[str, Any]:
+    def record(wanted: RecordingRequest, request: Request, response: Response) -> dict[str, Any]:
         started = time.perf_counter()
         of = Selection(wanted.task, wanted.filter, wanted.episode, Recipe.parse(wanted.recipe), wanted.data)
         traced = library.traced(of)
@@ -100,6 +101,8 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         with writing:
             there = files.made_as(made_as)
             path = there or files.unused(made_as)
+            if there is None and request.app.state.read_only:
+                raise HTTPException(403, f"{READ_ONLY} No recording of this run was written before.")
             if there is None:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 maps = traced.maps(steps) if steps else None

@@ -36,8 +36,9 @@ from beliefscope.app.access import (
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 WITHOUT_TOKEN = frozenset({"/healthz"})
-VIEWING = frozenset({"/api/views"})
-"""What is posted by who only looks."""
+VIEWING = frozenset({"POST /api/views", "POST /api/recordings"})
+"""What is asked for by who only looks: a view, and the recording that the Rerun viewer shows, if it is there."""
+READ_ONLY = "This server is read-only: it shows, and nothing on it can be changed."
 
 MAX_BODY = 1 << 20  # bytes of a request that is not an upload
 UPLOAD = re.compile(r"PUT /api/recordings/.*")
@@ -142,8 +143,8 @@ class Guard:
         if origins not in ([f"http://{host}"], [f"https://{host}"]) and not by_script:
             shown = ", ".join(origins) or "none"
             return Reply(403, f"Origin must be this server's own, http://{host}; the request's is {shown}.")
-        if self.read_only and scope["type"] == "http" and scope["path"] not in VIEWING:
-            return Reply(403, "This server is read-only: it shows, and nothing on it can be changed.")
+        if self.read_only and scope["type"] == "http" and f"{scope['method']} {scope['path']}" not in VIEWING:
+            return Reply(403, READ_ONLY)
         return None
 
     def _unknown(self, sign_in: SignIn, scope: Scope, host: str, bearer: str, cookies: str) -> Reply | None:

@@ -206,14 +206,14 @@ def restored() -> Iterator[None]:
 
 def test_a_read_only_server_changes_nothing(settings: Settings, open_client: Callable[..., TestClient]) -> None:
     app = create_app(settings, warm=False, access=Access(read_only=True))
-    refused = []
+    refused, run = [], {"task": "door", "filter": "crossmodal-ekf", "episode": 1}
     with TestClient(app, base_url="http://localhost:8000", headers={"Origin": "http://localhost:8000"}) as client:
         view = client.post("/api/views").json()["view"]
         with client.websocket_connect(f"ws://localhost:8000/api/views/{view}") as socket:
             socket.send_json({"type": "theme", "dark": True})
         assert client.get("/api/catalog").json()["read_only"] is True
         for method, path in changing(app):
-            answer = client.request(method, re.sub(r"\{.*?\}", "x", path))
+            answer = client.request(method, re.sub(r"\{.*?\}", "x", path), json=run)
             assert answer.status_code == 403, (method, path)
             assert "read-only" in answer.json()["error"]
             refused.append((method, path))
@@ -222,6 +222,11 @@ def test_a_read_only_server_changes_nothing(settings: Settings, open_client: Cal
     assert not list((settings.workspace / "jobs").glob("*"))
     with open_client(settings) as client:
         assert client.get("/api/catalog").json()["read_only"] is False
+        assert client.post("/api/recordings", json=run).status_code == 201
+    app = create_app(settings, warm=False, access=Access(read_only=True))
+    with TestClient(app, base_url="http://localhost:8000", headers={"Origin": "http://localhost:8000"}) as client:
+        again = client.post("/api/recordings", json=run)
+        assert (again.status_code, again.json()["seconds"]) == (200, None), "what is there is shown"
 
 
 def changing(app: FastAPI) -> Iterator[tuple[str, str]]:
