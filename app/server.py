@@ -21,7 +21,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 
 from beliefscope import __version__
-from beliefscope.app import compare, descent, diagnostics, failures, finetune, jobs, recordings, reports, study
+from beliefscope.app import compare, descent, diagnostics, failures, finetune, jobs, live, recordings, reports, study
 from beliefscope.app.access import LOOPBACK, OPEN, VARIABLE, Access, names_of
 from beliefscope.app.api import routes
 from beliefscope.app.children import with_children
@@ -92,6 +92,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False, acces
         finetune.routes(library, work),
         recordings.routes(library, rrds, work),
         reports.routes(library, work),
+        live.routes(library),
         study.routes(library),
         descent.routes(library),
     ):
