@@ -17,9 +17,9 @@ def press(page: Any, selector: str) -> None:
 
 
 def test_layers_are_a_views_own_and_in_its_address(open_page: Any) -> None:
-    first, second = open_page("?step=40&tint=share&hide=contours"), open_page("?filter=crossmodal-ekf&step=12")
+    second = open_page("?filter=crossmodal-ekf&step=12&tab=diagnostics")  # where nothing is drawn
+    first = open_page("?step=40&tint=share&hide=contours")
     first.until(READY)
-    second.until(READY)
     press(first, "#scene-layers")
     assert not first.page.locator("#scene-options [value=contours]").is_checked()
     press(first, "#scene-options [value=replay]")
@@ -31,7 +31,8 @@ def test_layers_are_a_views_own_and_in_its_address(open_page: Any) -> None:
     first.picture("scene-layers")
     assert (second.state["hide"], second.state["ground"], second.state["step"]) == ("", "fused", 12)
     assert second.page.locator("#scene-options [value=replay]").is_checked()
-    assert not second.page.locator("#scene-options [value=particles]").is_visible()
+    rows = [page.page.locator("#scene-options > div:has([value=particles])") for page in (first, second)]
+    assert [row.evaluate("(row) => row.hidden") for row in rows] == [False, True]
     second.settle(12)
     assert first.state["step"] == 40
     assert first.page.locator("#messages").text_content() == ""
