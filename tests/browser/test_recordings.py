@@ -126,7 +126,7 @@ def test_two_browsers_see_what_either_does(open_page: Callable[..., Any], runs: 
 
 @pytest.mark.long
 def test_a_report_is_made_and_opened(open_page: Callable[..., Any]) -> None:
-    shelf = Shelf(open_page("?tab=recordings&filter=crossmodal-ekf"))
+    shelf = Shelf(open_page("?tab=recordings"))
     page = shelf.page.page
     page.get_by_role("button", name="Report", exact=True).click()
     shelf.page.until("() => document.querySelector('#recordings .reports tbody tr')", REPORT)
@@ -135,6 +135,6 @@ def test_a_report_is_made_and_opened(open_page: Callable[..., Any]) -> None:
         page.locator("#recordings .reports .title").first.click()
     report = opened.value
     report.wait_for_load_state()
-    assert report.title() == "crossmodal-ekf on door"
+    assert report.title() == "crossmodal-pf on door"
     report.get_by_role("link", name="Open this moment in the dashboard").first.click()
-    report.wait_for_url("**/?task=door&filter=crossmodal-ekf*")
+    report.wait_for_url("**/?task=door&filter=crossmodal-pf*")
