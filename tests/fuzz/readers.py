@@ -5,8 +5,10 @@ Only BadInput may come out of a reader; where none does, what was read must be o
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -18,6 +20,7 @@ from typing import Any
 import mutate
 import numpy as np
 import torch
+from fastapi import HTTPException
 from valid import AUTHORS, episodes, make_authors, make_episodes, make_push
 
 from beliefscope.app import children
@@ -138,8 +141,6 @@ def document() -> dict[str, Any]:
 
 
 def _sha(data: bytes) -> str:
-    import hashlib
-
     return hashlib.sha256(data).hexdigest()
 
 
@@ -232,14 +233,10 @@ def tuned() -> dict[str, Callable[..., Any]]:
 
 @cache
 def _workspace() -> str:
-    import tempfile
-
     return tempfile.mkdtemp(prefix="workspace-")
 
 
 def read_run(path: Path) -> None:
-    from fastapi import HTTPException
-
     folder = Path(_workspace()) / "finetune" / "run"
     folder.mkdir(parents=True, exist_ok=True)
     make_run(path.with_suffix(".whole"))
