@@ -1,4 +1,4 @@
-"""The 3D scene's layers: chosen on the page, in its address, each view's own."""
+"""The 3D scene's layers: chosen on the page, in its address, each view's own (drawn: tests/app/test_scene.py)."""
 
 from __future__ import annotations
 
@@ -8,31 +8,38 @@ import pytest
 
 pytestmark = pytest.mark.browser
 
-READY = "() => document.querySelector('#scene').dataset.state === 'ready'"
+# Each layer's checkbox, or null where the scene has no such layer.
+BOXES = """() => Object.fromEntries([...document.querySelectorAll('#scene-options > div:not(.places)')].map((row) => {
+  const box = row.querySelector('label > input[type=checkbox]');
+  return [box.value, row.hidden ? null : box.checked];
+}))"""
+CHOSEN = "() => [...document.querySelectorAll('#scene-options input[type=radio]:checked')].map((one) => one.value)"
 
 
 def press(page: Any, selector: str) -> None:
-    """Clicks at once: where 3D is drawn slowly, a pointer would wait for a still page."""
-    page.page.locator(selector).evaluate("(element) => element.click()")
+    page.page.evaluate("(selector) => document.querySelector(selector).click()", selector)
 
 
 def test_layers_are_a_views_own_and_in_its_address(open_page: Any) -> None:
-    second = open_page("?filter=crossmodal-ekf&step=12&tab=diagnostics")  # where nothing is drawn
-    first = open_page("?step=40&tint=share&hide=contours")
-    first.until(READY)
-    press(first, "#scene-layers")
-    assert not first.page.locator("#scene-options [value=contours]").is_checked()
+    # Behind another tab, where nothing is drawn: the sheet is the same.
+    second = open_page("?filter=crossmodal-ekf&step=12&tab=diagnostics")
+    first = open_page("?step=40&tint=share&hide=contours&tab=diagnostics")
+    boxes = first.page.evaluate(BOXES)
+    assert len(boxes) == 8
+    assert [name for name, shown in boxes.items() if not shown] == ["contours"]
     press(first, "#scene-options [value=replay]")
     press(first, "#scene-options [value=haptics]")
-    press(first, "#scene-options .places button:nth-of-type(2)")
     first.until("() => location.search.includes('hide=contours%2Creplay&ground=haptics&')")
-    assert first.state["tint"] == "share"
-    assert first.page.locator("#scene-tint :checked").input_value() == "share"
-    first.picture("scene-layers")
-    assert (second.state["hide"], second.state["ground"], second.state["step"]) == ("", "fused", 12)
-    assert second.page.locator("#scene-options [value=replay]").is_checked()
-    rows = [page.page.locator("#scene-options > div:has([value=particles])") for page in (first, second)]
-    assert [row.evaluate("(row) => row.hidden") for row in rows] == [False, True]
+    assert first.page.evaluate(CHOSEN) == ["share", "haptics", "floor"]
+    assert not first.page.evaluate(BOXES)["replay"]
     second.settle(12)
-    assert first.state["step"] == 40
-    assert first.page.locator("#messages").text_content() == ""
+    assert (second.state["hide"], second.state["ground"], second.state["step"]) == ("", "fused", 12)
+    others = second.page.evaluate(BOXES)
+    assert others.pop("particles") is None
+    assert all(others.values())
+    for page in (first, second):
+        assert page.page.evaluate("() => document.querySelector('#messages').textContent") == ""
+    press(first, "#tab-scene")
+    press(first, "#scene-layers")
+    press(first, "#scene-options .places button:nth-of-type(2)")
+    first.picture("scene-layers")
