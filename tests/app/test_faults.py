@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import torch
 from starlette.testclient import TestClient
@@ -271,12 +272,10 @@ def test_a_clock_that_jumps_back_neither_loses_nor_reorders_jobs(
 
 def test_a_browser_that_vanishes_leaves_nothing_open(settings: Settings, address: str) -> None:
     """Its connection is cut without a word, as when a machine sleeps or a cable is pulled and the router answers."""
-    import httpx
-
     origin = f"http://{address}"
-    client = httpx.Client(base_url=origin, headers={"Origin": origin})
+    client = httpx.Client(base_url=origin, headers={"Origin": origin}, timeout=PATIENCE)
     views = [client.post("/api/views").json() for _ in range(2)]
-    sockets = [connect(f"ws://{address}{view['socket']}", origin=origin) for view in views]  # type: ignore[arg-type]
+    sockets = [connect(f"ws://{address}{view['socket']}", origin=origin, open_timeout=PATIENCE) for view in views]  # type: ignore[arg-type]
     vanishing, staying = sockets
     vanishing.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     vanishing.send(
