@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from beliefscope.app.wire import columns, header
+from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -29,7 +30,7 @@ def read(run: Trace) -> tuple[Trace, Columns, dict[str, Any]]:
         one["name"]: np.frombuffer(buffer, "<f4", int(np.prod(one["shape"])), one["offset"]).reshape(one["shape"])
         for one in described
     }
-    return run, found, header(run, described, [{"name": "x", "unit": "m"}] * 3, None)
+    return run, found, header(run, described, find_task(run.episode.task), None)
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
