@@ -176,9 +176,9 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
         drawn = {"fused": trace.estimate_mean} | ({"truth": trace.episode.states} if known else {})
         for name, states in drawn.items():
             ghost = task.ghost(states[steps])
-            drawn = rr.Cylinders3D if ghost.shape == "cylinder" else rr.Boxes3D
+            outlined = rr.Cylinders3D if ghost.shape == "cylinder" else rr.Boxes3D
             turned = np.roll(ghost.wxyz, -1, axis=-1)
-            yield f"world/object/{name}", drawn.columns(centers=ghost.position, quaternions=turned)
+            yield f"world/object/{name}", outlined.columns(centers=ghost.position, quaternions=turned)
     if trace.particles is not None and trace.log_weights is not None:
         points = _lift(np.round(trace.particles[steps][:, :, plane] / DRAWN) * DRAWN)
         rows, count = points.shape[:2]
