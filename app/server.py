@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import logging
 import signal
 import socket
@@ -27,6 +26,7 @@ from beliefscope.app.api import routes
 from beliefscope.app.children import with_children
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.logs import no_false_alarm
+from beliefscope.app.memory import few_heaps, settle
 from beliefscope.app.pagefiles import PageFiles
 from beliefscope.app.patience import CONNECTIONS, HEAD, PatientProtocol
 from beliefscope.app.rrdfiles import RrdFiles
@@ -130,6 +130,7 @@ def serve(
         listening = _print_url
     if host not in LOOPBACK and not access.token:
         raise BadInput(f"Others can reach {host}: a server there needs a token, in Access or in {VARIABLE}.")
+    few_heaps()
     with _bound(host, port) as listener:  # first of all: without an address nothing is to be made
         app = create_app(settings, apart=True, access=access)
         problems = app.state.library.problems()
@@ -211,7 +212,7 @@ def _warm(library: Library, rerun: RerunViewer, stopping: threading.Event) -> No
         library.catalog,
         lambda: library.traced(library.default()).wired(0, None, MAP_SIZES[0]),
         lambda: rerun.prepare(stopping.is_set),
-        _settle,
+        settle,
     ):
         try:
             if not stopping.is_set():
@@ -219,12 +220,6 @@ def _warm(library: Library, rerun: RerunViewer, stopping: threading.Event) -> No
         except (Exception, CancelledError) as error:
             if not stopping.is_set():
                 log.warning("Not prepared in advance: %s", error)
-
-
-def _settle() -> None:
-    """What is there by now stays: the collector of garbage need not look through it each time a page closes."""
-    gc.collect()
-    gc.freeze()
 
 
 def _say(status: int | None) -> Callable[[Request, Exception], JSONResponse]:

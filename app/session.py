@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import logging
 import secrets
 import time
@@ -18,6 +17,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from beliefscope.app.desk import Desk
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.mapwire import WiredMaps
+from beliefscope.app.memory import give_back
 from beliefscope.app.scene import Scene
 from beliefscope.app.selection import FINE
 from beliefscope.app.wire import Cursor, cursor, look, viewpoint
@@ -260,8 +260,8 @@ class Views:
         for view in idle[: max(0, len(self._views) - keep)]:
             del self._views[view.name]
             await asyncio.to_thread(view.scene.close)
-        if idle:  # viser's handles know their server and it knows them: only the collector finds that they are dead
-            await asyncio.to_thread(gc.collect)
+        if idle:
+            await asyncio.to_thread(give_back)
 
     async def close(self) -> None:
         """Close every view and its threads."""
