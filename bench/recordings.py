@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -22,6 +21,8 @@ from statistics import median
 
 import subject
 import torch
+from page import browsing
+from served import serving
 from subject import NAMES, STEPS, Row
 
 from beliefscope.inspect.likelihood import MapEngine
@@ -106,36 +107,27 @@ def long(names: tuple[str, ...] = NAMES) -> None:
 
 def opened() -> None:
     """Prints how long the page's viewer, once started, takes to open an 800-step recording with maps."""
-    import page
-    from playwright.sync_api import sync_playwright
-
     name = "crossmodal-pf"
     traced = subject.traced(name)
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
-    with page.serving() as url, sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, serving() as served, browsing() as page:
         path = Path(folder) / "run.rrd"
         write_recording(traced, path, MapEngine(subject.checkpoint(name), traced).maps(range(0, STEPS, STRIDE)))
-        chromium = playwright.chromium.launch(executable_path=browser, args=page.FLAGS)
-        view = chromium.new_page(viewport={"width": 1440, "height": 900})
-        view.goto(url + "?data=sample&tab=rerun")
-        view.wait_for_function("() => document.querySelector('#rerun').dataset.state === 'ready'", timeout=180_000)
-        view.route("**/bench.rrd", lambda route: route.fulfill(path=path, content_type="application/octet-stream"))
-        took = [view.evaluate(OPEN, f"bench.rrd?{number}") for number in range(3)]
-        chromium.close()
-    shown = ", ".join(f"{seconds:.2f}" for seconds in took)
-    print(f"{path.name} of {name}, {STEPS} steps, maps every {STRIDE}: open after {shown} s (bar: 2 s)")
+        page.goto(f"{served.url}?data=sample&tab=rerun")
+        page.wait_for_function("() => document.querySelector('#rerun')?.dataset.state === 'ready'", timeout=300_000)
+        page.route("**/run.rrd*", lambda route: route.fulfill(path=path, content_type="application/octet-stream"))
+        shown = ", ".join(f"{page.evaluate(OPEN, number):.2f}" for number in range(3))
+        print(f"{name}, {STEPS} steps, maps every {STRIDE}, {path.stat().st_size / 1e6:.1f} MB: open after {shown} s")
 
 
-OPEN = """async (name) => {
+OPEN = """async (number) => {
   const began = performance.now();
-  beliefscope.rerun.files([{ name, url: `/${name}` }]);
-  const wanted = (state) => state.recordings?.some((one) => one.source?.includes?.(name) ?? true);
-  for (;;) {
-    const ready = document.querySelector('#rerun').dataset.state === 'ready';
-    if (ready && wanted(await beliefscope.rerun.getState())) return (performance.now() - began) / 1000;
-    await new Promise(requestAnimationFrame);
-  }
+  beliefscope.rerun.files([{ name: 'run', url: `/run.rrd?${number}` }]);
+  do await new Promise(requestAnimationFrame);
+  while (document.querySelector('#rerun').dataset.state === 'loading');
+  if (document.querySelector('#rerun').dataset.state !== 'ready') throw new Error('it does not open');
+  return (performance.now() - began) / 1000;
 }"""
+"""s until the viewer has opened the file and drawn a frame."""
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ class Page {
     this.#takeButtons();
     this.#showTab(store.state.tab);
     this.#load();
-    window.beliefscope = { state: () => ({ ...store.state }), stats, timeline: this.timeline, live: this.live, rerun: { getState: () => this.rerun.getState() } };
+    window.beliefscope = { state: () => ({ ...store.state }), stats, timeline: this.timeline, live: this.live, rerun: { getState: () => this.rerun.getState(), files: (files) => this.rerun.files(files) } };
   }
 
   /** Has a report written; its job becomes the link to it. */
