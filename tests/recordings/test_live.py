@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import subprocess
 import sys
@@ -25,9 +24,8 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.foreign import load_foreign
 from beliefscope.inspect.growing import GrowingReader
-from beliefscope.inspect.trace import Trace, arrays_of, begin, header_of, load_trace, trace
+from beliefscope.inspect.trace import Trace, begin, load_trace, trace
 from beliefscope.recordings import live, write
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.read import read_recording
@@ -390,49 +388,6 @@ def test_a_kill_at_any_moment(tmp_path: Path, moment: int) -> None:
         rerun = Path(sys.executable).with_name("rerun")
         done = subprocess.run([rerun, "rrd", "stats", recording], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
-
-
-def test_the_command_runs_what_trace_does(run: Run, assert_same: Compare, tmp_path: Path) -> None:
-    line = "door --filter crossmodal-ekf --recipe blackout=0.4 --seed 5"
-    code, out, err = run(f"live {line} --rate 0 --workspace {tmp_path} --json -")
-    said = json.loads(out)
-    assert code == 0, err
-    assert f"beliefscope serve --workspace {tmp_path}" in err
-    assert (said["steps"], said["stopped"], said["waited"]) == (100, False, 0)
-    assert run(f"trace {line} -o {tmp_path}/run.trace")[0] == 0
-    whole = load_trace(tmp_path / "run.trace")
-    reader = GrowingReader(Path(said["path"]))
-    assert reader.poll() == reader.expected == 100
-    assert_same(reader.trace(), whole)
-    assert_same(read_recording(said["recording"]), whole)
-
-
-def test_the_command_runs_a_filter_from_outside(
-    run: Run, episode: Episode, assert_same: Compare, tmp_path: Path
-) -> None:
-    code, out, err = run(f"live door --filter {EXAMPLE}:build --rate 0 --workspace {tmp_path} --json -")
-    assert code == 0, err
-    with open_dataset(sample_path("door")) as data:
-        whole = trace(load_foreign(f"{EXAMPLE}:build", "door"), data[9], 9)
-    assert_same(read_recording(json.loads(out)["recording"]), whole)
-    assert header_of(whole)["kind"] == "foreign"
-    assert arrays_of(whole)
-
-
-def test_ctrl_c_ends_a_run_and_leaves_it_whole(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "beliefscope", "live", "door", "--filter", "crossmodal-ekf", "--json", "-"]
-    with subprocess.Popen([*command, "--workspace", str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
-        until(lambda: bool(list(tmp_path.glob("live/*.live"))))
-        (path,) = tmp_path.glob("live/*.live")
-        until(lambda: GrowingReader(path).poll() > 2)
-        process.send_signal(signal.SIGINT)
-        out, _ = process.communicate(timeout=120)
-    assert process.returncode == 0
-    said = json.loads(out)
-    reader = GrowingReader(path)
-    assert (said["stopped"], reader.poll(), reader.finished) == (True, said["steps"], True)
-    assert 2 < said["steps"] < 100
-    assert len(read_recording(said["recording"])) == said["steps"]
 
 
 @pytest.fixture(autouse=True)
