@@ -76,7 +76,7 @@ def test_what_is_wrong_with_a_run_is_said_and_closing_ends_it(library: Library, 
     closing.start()
     closing.join(PATIENCE)
     assert not closing.is_alive()
-    with pytest.raises(RuntimeError, match="signal 9|the server is stopping"):  # begun before or after it was closed
+    with pytest.raises(RuntimeError, match=r"signal 9|the server is stopping"):  # begun before or after it was closed
         traced.done.result(PATIENCE)
 
 
