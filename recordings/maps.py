@@ -16,6 +16,7 @@ from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.drawing import rgba, series, sources
 
 Array = NDArray[Any]
+PLANE_CELLS = 80  # a side at most in the scene: there the map is a carpet, and seen next to it in full
 
 
 def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
@@ -29,11 +30,11 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
         )
         yield f"maps/{layer}/truth", _frame(colour("truth", trace.modalities), side / 18)
         yield f"maps/{layer}/estimate", _frame(colour(layer, trace.modalities), side / 30)
-    cell = float(first.offsets_x[1] - first.offsets_x[0])
-    gray = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8", color_model="L")
+    laid = first.offsets_x[:: _thinning(first)]
+    gray = rr.components.ImageFormat(width=len(laid), height=len(laid), channel_datatype="U8", color_model="L")
     yield (
         "world/plane/map",
-        rr.GridMap.from_fields(format=gray, cell_size=cell, opacity=0.8, colormap="Inferno"),
+        rr.GridMap.from_fields(format=gray, cell_size=float(laid[1] - laid[0]), opacity=0.8, colormap="Inferno"),
     )
 
 
@@ -41,7 +42,8 @@ def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iter
     """A block of maps of one size, rows turned so that y grows upwards as on a chart."""
     x, y = task.map_indices
     steps = [m.step for m in maps]
-    pixels = np.stack([m.normalised()[:, ::-1] for m in maps])
+    shares = np.stack([m.normalised() for m in maps])
+    pixels = shares[:, :, ::-1]
     peaks = np.stack([m.log_likelihood.max(axis=(1, 2)) for m in maps])
     means = np.concatenate([trace.estimate_mean[steps, None], trace.modality_mean[steps]], axis=1)[..., [x, y]]
     for index, layer in enumerate(maps[0].layers):
@@ -51,13 +53,18 @@ def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iter
         yield f"maps/{layer}/estimate", rr.Boxes2D.columns(centers=_cells(maps, mean))
         truth = trace.episode.states[steps][:, [x, y]]
         yield f"maps/{layer}/truth", rr.Boxes2D.columns(centers=_cells(maps, truth))
-    fused = pixels[:, maps[0].layers.index("fused")].reshape(len(maps), -1)
-    first = maps[0]
-    half_cell = (first.offsets_x[1] - first.offsets_x[0]) / 2.0
+    first, thin = maps[0], _thinning(maps[0])
+    laid = shares[:, first.layers.index("fused"), ::thin, ::thin][:, ::-1].reshape(len(maps), -1)
+    half_cell = (first.offsets_x[thin] - first.offsets_x[0]) / 2.0
     below = -0.002  # or the map and the contours drawn on it would flicker through each other
     corner = np.array([[m.centre[0] + m.offsets_x[0], m.centre[1] + m.offsets_y[0], below] for m in maps])
     corner[:, :2] -= half_cell
-    yield "world/plane/map", rr.GridMap.columns(data=list(fused), translation=corner)
+    yield "world/plane/map", rr.GridMap.columns(data=list(laid), translation=corner)
+
+
+def _thinning(one: LikelihoodMap) -> int:
+    """Of how many cells in a row one is laid in the scene."""
+    return -(-len(one.offsets_x) // PLANE_CELLS)
 
 
 def _cells(maps: Sequence[LikelihoodMap], points: Array) -> Array:

@@ -124,7 +124,9 @@ SCHEMA: tuple[Entity, ...] = (
         "the object at the state `truth` or `fused`",
     ),
     Entity("world/plane/particles", "Points3D", "(M, 3)", "m", "pf", "coloured by posterior weight"),
-    Entity("world/plane/map", "GridMap", "(S, S)", "u8", "maps", "fused map, laid where it belongs"),
+    Entity(
+        "world/plane/map", "GridMap", "(s, s)", "u8", "maps", "fused map where it belongs; s is S, or every second cell"
+    ),
     # The plots: degrees and centimetres.
     Entity("states/{component}/truth", "Scalars", "()", "cm or deg", "always", "true value"),
     Entity("states/{component}/{source}", "Scalars", "()", "cm or deg", "always", "estimated value"),
