@@ -65,7 +65,8 @@ def whole(request: pytest.FixtureRequest) -> Trace:
         none = {f.name: None for f in fields(Trace) if "None" in str(f.type)}
         mean, covariance = np.zeros((30, 0, 3), np.float32), np.zeros((30, 0, 3, 3), np.float32)
         unknown = np.full((30, 3, 3), np.nan, np.float32)
-        made = replace(made, modality_mean=mean, modality_covariance=covariance, estimate_covariance=unknown, **none)
+        none |= {"modalities": (), "modality_mean": mean, "modality_covariance": covariance}
+        made = replace(made, estimate_covariance=unknown, **none)
     return made
 
 
