@@ -18,7 +18,7 @@ const BODY = `
     <input type="search" placeholder="Search name, task, filter, tag" aria-label="Search recordings and reports" autocomplete="off" spellcheck="false">
     <span class="told" aria-live="polite"></span>
     <button type="button" class="text add" title="An .rrd file of any application, to open it here and keep it. Or drop it anywhere on this tab">Add .rrd…</button>
-    <input type="file" accept=".rrd" multiple hidden>
+    <input type="file" accept=".rrd" multiple hidden aria-label="Recordings to add">
   </div>
   <div class="chosen" hidden><span></span><button type="button" class="text both">Both in Rerun</button><button type="button" class="text compare">Compare the runs</button><span class="apart"></span><span class="spacer"></span><button type="button" class="text quiet none">Choose none</button></div>
   <ul class="adding"></ul>
@@ -27,7 +27,7 @@ const BODY = `
     <table class="recordings" aria-label="Recordings"><thead></thead><tbody></tbody></table>
     <p class="rest"></p>
     <section class="reports"><h2>Reports</h2><table aria-label="Reports"><thead></thead><tbody></tbody></table></section>
-    <details class="trash"><summary></summary><ul></ul><p><button type="button" class="text empty"></button> <span class="sure" hidden>For good? <button type="button" class="text yes">Delete for good</button> <button type="button" class="text no">Keep</button></span></p></details>
+    <details class="trash"><summary></summary><ul></ul><p><button type="button" class="text empty">Empty the trash</button> <span class="sure" hidden>For good? <button type="button" class="text yes">Delete for good</button> <button type="button" class="text no">Keep</button></span></p></details>
   </div>
   <div class="drop" hidden><p>Drop <b>.rrd</b> files to add them</p></div>
   <p class="note"></p>`;
