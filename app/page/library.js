@@ -27,7 +27,7 @@ const BODY = `
     <table class="recordings" aria-label="Recordings"><thead></thead><tbody></tbody></table>
     <p class="rest"></p>
     <section class="reports"><h2>Reports</h2><table aria-label="Reports"><thead></thead><tbody></tbody></table></section>
-    <details class="trash"><summary></summary><ul></ul><p><button type="button" class="text empty">Empty the trash</button> <span class="sure" hidden>For good? <button type="button" class="text yes">Delete for good</button> <button type="button" class="text no">Keep</button></span></p></details>
+    <details class="trash" hidden><summary>Trash</summary><ul></ul><p><button type="button" class="text empty">Empty the trash</button> <span class="sure" hidden>For good? <button type="button" class="text yes">Delete for good</button> <button type="button" class="text no">Keep</button></span></p></details>
   </div>
   <div class="drop" hidden><p>Drop <b>.rrd</b> files to add them</p></div>
   <p class="note"></p>`;

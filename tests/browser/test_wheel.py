@@ -95,4 +95,4 @@ def test_its_page_is_drawn(address: str, open_page: Any) -> None:
     page.settle(1)
     assert page.maps() != before
     page.page.evaluate("document.querySelector('#tab-recordings').click()")
-    assert page.page.locator("#recordings").is_visible()
+    page.page.locator("#recordings").wait_for()
