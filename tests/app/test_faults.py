@@ -95,6 +95,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(name: str, run: Trace
     assert list(tmp_path.iterdir()) == [path], "nothing half-written is left"
 
 
+@pytest.mark.long  # in a process that wrote other recordings before, Rerun may wait for ever
 def test_a_recording_on_a_full_disk_is_one_line_too(run: Trace, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"  # not in a fork, for which Rerun is not made
     with room_for(10_000), pytest.raises(BadInput, match=r"cannot write .*run\.rrd: .* is the disk full"):
