@@ -9,11 +9,13 @@ from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, JSONResponse, Response
 
+from beliefscope.app.api import PATIENCE
 from beliefscope.app.jobs import Jobs, under_way
-from beliefscope.app.library import Library, Settings
+from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.app.link import moment_link
+from beliefscope.app.liveruns import PREFIX
 from beliefscope.app.work import Report
 from beliefscope.datasets.corrupt import Recipe
 from beliefscope.inspect.diagnostic import as_json
@@ -52,6 +54,8 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
 
     @router.get("/api/failures/{task}/{filter}")
     def found(asked: Asked) -> Response:
+        if asked.data.startswith(PREFIX):
+            return _of_live(library, asked)
         job = jobs.find("failures", _key(library, _arguments(library, asked)))
         if job is not None and job.state == "done" and jobs.result(job.id).is_file():
             return FileResponse(jobs.result(job.id), media_type="application/json")
@@ -92,8 +96,22 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         )
     finally:
         library.close()
-    names = {name: arguments[name] for name in ("filter", "data", "recipe", "among")}
-    return names | document(survey, arguments["filter"], arguments["data"])
+    return _named(arguments) | document(survey, arguments["filter"], arguments["data"])
+
+
+def _of_live(library: Library, asked: Wanted) -> Response:
+    """Of a live run, whose one episode is not run for it again. Raises BadInput while the run goes on."""
+    run = library.live.ended(asked.data)
+    of = Selection(asked.task, asked.filter, run.like.episode_index, asked.recipe, asked.data)
+    traced = library.traced(of)
+    if not traced.ready(PATIENCE):
+        return JSONResponse({"progress": traced.progress}, status_code=202)
+    found = document(Survey.of([traced.trace]), asked.filter, asked.data)
+    return JSONResponse(_named(vars(asked) | {"recipe": str(asked.recipe)}) | found)
+
+
+def _named(asked: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: asked[name] for name in ("filter", "data", "recipe", "among")}
 
 
 def document(survey: Survey, filter_: str, data: str) -> dict[str, Any]:

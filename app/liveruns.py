@@ -242,11 +242,16 @@ class LiveRuns:
                 self._whole.popitem(last=False)
             return self._whole[key]
 
-    def episode(self, data: str) -> Episode:
-        """What a run's filter was given. Raises BadInput while it goes on, and where no filter could start on it."""
+    def ended(self, data: str) -> Run:
+        """The run of a data set's name. Raises BadInput while it goes on."""
         run = self[data.removeprefix(PREFIX)]
         if run.state == "running":
-            raise BadInput(f"live run {run.name!r} goes on: once it has ended, other filters can be run over it")
+            raise BadInput(f"live run {run.name!r} goes on: all of its steps are needed, once it has ended")
+        return run
+
+    def episode(self, data: str) -> Episode:
+        """What a run's filter was given. Raises BadInput while it goes on, and where no filter could start on it."""
+        run = self.ended(data)
         episode = run.reader.part(0).episode
         if not len(episode) or np.isnan(episode.states[0]).any():
             raise BadInput(f"the true state of live run {run.name!r} is not known, from which a filter would start")

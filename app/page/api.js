@@ -125,10 +125,7 @@ const failuresUrl = ({ task, filter, data, recipe, among }) =>
   `/api/failures/${encodeURIComponent(task)}/${encodeURIComponent(filter)}?${new URLSearchParams({ data, recipe, among })}`;
 
 /** Where a filter fails; or the job that looks for it, null where nobody asked for it. @returns {Promise<Failures | {job: Job | null}>} */
-export async function failures(asked, signal) {
-  if (asked.data.startsWith('live:')) throw new ServerError('A live run is one episode: failures are looked for in whole data sets.');
-  return (await ask(failuresUrl(asked), { signal })).json();
-}
+export const failures = (asked, signal) => whole(failuresUrl(asked), signal);
 
 /** Has it looked for as a job. @returns {Promise<{job: Job}>} */
 export const lookForFailures = async (asked) => (await ask(failuresUrl(asked), { method: 'POST' })).json();

@@ -18,7 +18,7 @@ const KEPT = 8; // results
 
 /**
  * @typedef {object} Result what is known of one filter over one data set
- * @property {'loading' | 'ready' | 'unasked' | 'working' | 'ended' | 'error'} state
+ * @property {'loading' | 'ready' | 'unasked' | 'working' | 'ended' | 'error' | 'waits'} state `waits`: for the end of a live run
  * @property {api.Failures} [found] @property {api.Job} [job] @property {string} [error]
  */
 
@@ -52,7 +52,9 @@ export class Failures {
   /** @param {import('./trace.js').Trace | null} trace that the time line shows; null while there is none. */
   show(trace) {
     this.#trace = trace;
-    this.#mark();
+    if (!this.#live) return this.#mark();
+    this.#results.delete(this.#key); // another run may have its name by now
+    this.load();
   }
 
   /** Marks the row at the cursor. */
@@ -78,6 +80,7 @@ export class Failures {
     const key = this.#key;
     this.#last = -1;
     if (this.#sought !== key) this.#sought = '';
+    if (this.#waiting) return this.draw();
     if (!this.#results.has(key)) this.#keep(key, { state: 'loading' });
     this.draw();
     if (this.#results.get(key).state === 'ready') return;
@@ -124,7 +127,7 @@ export class Failures {
     const known = this.#known;
     const set = (key) => (value) => this.#store.set({ [key]: value });
     choice(this.#part('#list'), LISTS, state.list, set('list'));
-    choice(this.#part('#among'), AMONG, state.among, set('among'));
+    choice(this.#part('#among'), this.#live ? [] : AMONG, state.among, set('among'));
     this.#part('.moments').hidden = state.list !== 'moments';
     this.#part('.episodes').hidden = state.list !== 'episodes';
     this.#host.dataset.state = known.state;
@@ -149,9 +152,21 @@ export class Failures {
     return JSON.stringify([task, filter, data, recipe, among]);
   }
 
+  /** Whether it is of a live run: one episode. */
+  get #live() {
+    return this.#store.state.data.startsWith('live:');
+  }
+
+  /** How a live run is waited for of which not all steps are there; null of anything else. @returns {Result | null} */
+  get #waiting() {
+    if (!this.#live) return null;
+    if (this.#trace?.selection.data !== this.#store.state.data) return { state: 'loading' };
+    return this.#trace.live?.state === 'running' ? { state: 'waits' } : null;
+  }
+
   /** @returns {Result} */
   get #known() {
-    return this.#results.get(this.#key) ?? { state: 'loading' };
+    return this.#waiting ?? this.#results.get(this.#key) ?? { state: 'loading' };
   }
 
   /** The chosen measure, or the first where the filter's task has no such. */
@@ -311,6 +326,7 @@ function drawn(by, trace) {
 function said({ state, job, error }) {
   if (state === 'error') return sentence(error);
   if (state === 'working' || state === 'ended') return told(job);
+  if (state === 'waits') return 'The run goes on. Its failures are looked for in all its steps once it has ended; that shows here by itself.';
   if (state === 'unasked') return 'Nobody has looked yet. The filter has to run over all these episodes, so it is done only when asked for.';
   return 'Loading …';
 }

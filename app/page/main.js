@@ -99,7 +99,7 @@ class Page {
     this.study = new Study($('#study'), catalog, store, this.failures);
     this.live = new Live(document, catalog, store, {
       grown: (trace, fresh) => this.#grow(trace, fresh),
-      ended: (trace) => (this.timeline.grow(), this.diagnostics.show(trace)),
+      ended: (trace) => (this.timeline.grow(), this.diagnostics.show(trace), this.failures.show(trace)),
       listed,
       say: (line) => messages.say('live', line),
     }, live);

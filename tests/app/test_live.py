@@ -20,7 +20,9 @@ from beliefscope.app.live import PATIENCE
 from beliefscope.app.wire import columns, pictures
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.failures import failures_of
 from beliefscope.inspect.growing import GrowingReader, GrowingWriter
+from beliefscope.inspect.survey import Survey
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_of
 from beliefscope.recordings.read import read_recording
 
@@ -264,6 +266,8 @@ def test_a_run_whose_truth_is_not_known(client: TestClient, folder: Path, whole:
             np.testing.assert_allclose(head["centre"], whole.estimate_mean[-1, :2], rtol=1e-5)
             assert socket.receive_json() == {"type": "drawn", "serial": serial, "step": STEPS - 1}
     writer.close()
+    found = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
+    assert [score["total"] for score in found["scores"] if score["name"] == "error"] == [0]
 
 
 def test_what_cannot_be_asked_of_a_live_run(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
@@ -273,7 +277,7 @@ def test_what_cannot_be_asked_of_a_live_run(client: TestClient, writer: GrowingW
         "/api/trace/push/crossmodal-ekf/9?data=live:run": "is of task 'door', episode 9",
         "/api/trace/door/crossmodal-ekf/9?data=live:none": "live run 'none' does not exist",
         "/api/trace/door/crossmodal-ekf/9?data=live:../secret": "does not exist",
-        "/api/failures/door/crossmodal-ekf?data=live:run": "one episode, not a set of them",
+        "/api/failures/door/crossmodal-ekf?data=live:run": "live run 'run' goes on",
     }.items():
         answer = client.get(url)
         assert (answer.status_code, said in answer.json()["error"]) == (400, True), answer.text
@@ -290,6 +294,22 @@ def test_another_filter_runs_over_a_run_that_has_ended(client: TestClient, write
     while (answer := client.get(url)).status_code == 202:
         assert time.monotonic() < deadline
     assert answer.json()["steps"] == STEPS
+
+
+def test_failures_of_a_run_that_has_ended_are_those_of_its_episode(
+    client: TestClient, writer: GrowingWriter, whole: Trace
+) -> None:
+    writer.append(whole)
+    writer.finish()
+    found = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
+    assert (found["data"], found["steps"], found["recipe"]) == ("live:run", STEPS, "")
+    by_error = next(score for score in found["scores"] if score["name"] == "error")
+    expected = failures_of(Survey.of([whole]), "error").moments
+    assert [(m["step"], m["value"]) for m in by_error["moments"]] == [(m.step, m.score) for m in expected]
+    assert {m["episode"] for m in by_error["moments"]} == {9}
+    assert "data=live%3Arun" in by_error["moments"][0]["link"]
+    asked = client.post(f"/api/failures/door/{whole.filter}?data=live:run")
+    assert "one episode, not a set of them" in asked.json()["error"]
 
 
 def until(client: TestClient, url: str) -> dict[str, Any]:
