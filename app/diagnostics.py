@@ -19,7 +19,6 @@ from beliefscope.app.jobs import Jobs, under_way
 from beliefscope.app.library import Library, Selection, Settings, Traced
 from beliefscope.app.options import described, parse, says_how_far
 from beliefscope.app.work import Report
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import one_of
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostic import Entry
@@ -87,11 +86,7 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
             "settings": library.settings.to_json(),
             "diagnostic": entry.name,
             "options": options,
-            "task": asked.task,
-            "filter": asked.filter,
-            "data": asked.data,
-            "recipe": str(asked.recipe),
-            "episodes": [selection.episode for selection in selections],
+            "selections": [selection.to_json() for selection in selections],
         }
         where = f"all {len(selections)} held-out episodes" if episodes else f"episode {asked.episode}"
         title = ", ".join(
@@ -106,18 +101,18 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
 def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """The job of a diagnostic: its views. What was traced before is read, not traced again."""
     entry = DIAGNOSTICS[arguments["diagnostic"]]
-    recipe, episodes = Recipe.parse(arguments["recipe"]), arguments["episodes"]
+    selections = [Selection.of_json(shown) for shown in arguments["selections"]]
     library = Library(Settings.of_json(arguments["settings"]))
     traces: list[Trace] = []
     try:
-        for i, episode in enumerate(episodes):
-            of = Selection(arguments["task"], arguments["filter"], episode, recipe, arguments["data"])
+        for i, of in enumerate(selections):
             traced = library.traced(of)
             while (trace := _there(traced)) is None:
-                report(0.5 * (i + traced.progress) / len(episodes), f"running the filter over episode {episode}")
+                report(0.5 * (i + traced.progress) / len(selections), f"running the filter over episode {of.episode}")
             traces.append(trace)
-            report(0.5 * (i + 1) / len(episodes), f"{i + 1} of {len(episodes)} episodes are filtered")
-        measuring = f"measuring {len(traces)} episodes" if len(traces) > 1 else f"measuring episode {episodes[0]}"
+            report(0.5 * (i + 1) / len(selections), f"{i + 1} of {len(selections)} episodes are filtered")
+        one = f"episode {selections[0].episode}"
+        measuring = f"measuring {len(traces)} episodes" if len(traces) > 1 else f"measuring {one}"
         report(0.5, measuring)
         more = {"progress": lambda share: report(0.5 + 0.5 * share, measuring)} if says_how_far(entry) else {}
         found = entry(traces, traced.checkpoint, **arguments["options"], **more)

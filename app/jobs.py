@@ -133,12 +133,20 @@ class Jobs:
         """Where its result is, once it is done: JSON."""
         return self._folder / id / "result.json"
 
-    def submit(self, kind: str, title: str, arguments: Mapping[str, Any], key: str, link: str = "") -> Job:
-        """Has it done; one that is under way or done already is not done again.
+    def submit(
+        self,
+        kind: str,
+        title: str,
+        arguments: Mapping[str, Any],
+        key: str,
+        link: str = "",
+        made: Path | None = None,
+    ) -> Job:
+        """Has it done; one that is under way, or done with what it made still there, is not done again.
 
         Args:
             arguments: JSON, handed to the kind's function. key: hash of all that the result depends on.
-            link: to see the result on the page, from its ``?`` on.
+            link: to see the result on the page, from its ``?`` on. made: a file or folder that is made besides.
 
         Raises BadInput for an unknown kind, and QueueFull.
         """
@@ -147,9 +155,10 @@ class Jobs:
         id = _id(kind, key)
         with self._lock:
             known = self._jobs.get(id)
-            if known is not None and (
-                known.state in UNDER_WAY or (known.state == "done" and self.result(id).is_file())
-            ):
+            if known is not None and known.state in UNDER_WAY:
+                return known
+            there = self.result(id).is_file() and (made is None or made.exists())
+            if known is not None and known.state == "done" and there:
                 return known
             if self._closing:
                 raise BadInput("the server is stopping")

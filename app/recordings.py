@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import json
 import threading
 import time
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import ClientDisconnect
 
 from beliefscope import __version__
-from beliefscope.app.caching import tagged
+from beliefscope.app.caching import tagged_json
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Selection
 from beliefscope.app.link import moment_link
@@ -35,7 +34,6 @@ from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.growing import SUFFIX, GrowingWriter
-from beliefscope.inspect.likelihood import no_maps
 from beliefscope.recordings.describe import describe
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
@@ -84,8 +82,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
             "free": free,
             "largest": max(0, min(LARGEST, free - SPARED)),
         }
-        body = json.dumps(shown).encode()
-        return tagged(request, hashlib.sha256(body).hexdigest()[:24], lambda: body, "application/json")
+        return tagged_json(request, shown)
 
     @router.post("/api/recordings", status_code=201)
     def record(wanted: RecordingRequest, request: Request, response: Response) -> dict[str, Any]:
@@ -97,7 +94,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         depends = f"{traced.key} maps {wanted.maps} diagnostics version {__version__}"
         parts = hashlib.sha256(depends.encode()).hexdigest()[:8]
         made_as = f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}{ENDING}"
-        steps = range(0, len(trace), wanted.maps) if wanted.maps and not no_maps(traced.checkpoint, trace) else ()
+        steps = range(0, len(trace), wanted.maps) if wanted.maps and not traced.no_maps else ()
         with writing:
             there = files.made_as(made_as)
             path = there or files.unused(made_as)
@@ -162,11 +159,8 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         shown = name_of(about.filter, about.checkpoint_hash, filters)
         link = moment_link(find_task(str(about.task)), shown, PREFIX + run, about.episode or 0, 0)
         made = library.live.folder / f"{run}{SUFFIX}"
-        before = jobs.find("reading", key)
-        if before is not None and before.state == "done" and not made.is_file():
-            jobs.cancel(before.id)  # what it made has gone: forget it, and make it again
         arguments = {"recording": str(files.path(name)), "run": str(made)}
-        return {"job": jobs.submit("reading", f"The run in {one.name}", arguments, key, link)}
+        return {"job": jobs.submit("reading", f"The run in {one.name}", arguments, key, link, made)}
 
     @router.post("/api/recordings/deleted/{id}")
     def restore(id: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, Response
 
 from beliefscope.app.api import Asked
-from beliefscope.app.caching import tagged
+from beliefscope.app.caching import tagged_json
 from beliefscope.app.commands.given import serving
 from beliefscope.app.commands.report import trace_command
 from beliefscope.app.jobs import Job, Jobs
@@ -104,8 +104,8 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
 
     @router.get("/api/reports")
     def list_reports(request: Request) -> Response:
-        body = json.dumps({"reports": reports.all(), "deleted": [asdict(one) for one in reports.deleted()]}).encode()
-        return tagged(request, hashlib.sha256(body).hexdigest()[:24], lambda: body, "application/json")
+        shown = {"reports": reports.all(), "deleted": [asdict(one) for one in reports.deleted()]}
+        return tagged_json(request, shown)
 
     @router.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
     def make(asked: Asked, request: Request) -> dict[str, Job]:
@@ -113,22 +113,16 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         key = repr((library.key(asked), asked.filter, asked.data, url))
         short = hashlib.sha256(key.encode()).hexdigest()[:8]
         name = f"{re.sub(r'[^A-Za-z0-9_.+-]', '-', f'{asked.task}-{asked.filter}')}-episode{asked.episode}-{short}"
+        folder = reports.folder / name
         arguments = {
             "settings": library.settings.to_json(),
-            "task": asked.task,
-            "filter": asked.filter,
-            "data": asked.data,
-            "recipe": str(asked.recipe),
-            "episode": asked.episode,
+            "selection": asked.to_json(),
             "url": url,
-            "folder": str(reports.folder / name),
+            "folder": str(folder),
         }
         title = f"Report of {asked.filter}, {asked.task} episode {asked.episode}"
         title += f", {asked.recipe}" if asked.recipe else ""
-        before = jobs.find("report", key)
-        if before is not None and before.state == "done" and not (reports.folder / name).is_dir():
-            jobs.cancel(before.id)  # what it made was deleted: forget it, and make it again
-        return {"job": jobs.submit("report", title, arguments, key, f"api/reports/{name}.html")}
+        return {"job": jobs.submit("report", title, arguments, key, f"api/reports/{name}.html", folder)}
 
     @router.get("/api/reports/{name}.html")
     def page(name: str, shown: bool = False) -> Response:
@@ -161,8 +155,7 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """The job of a report: its folder. What was traced before is read, not traced again."""
     library = Library(Settings.of_json(arguments["settings"]))
     try:
-        recipe = Recipe.parse(arguments["recipe"])
-        of = Selection(arguments["task"], arguments["filter"], arguments["episode"], recipe, arguments["data"])
+        of = Selection.of_json(arguments["selection"])
         report(0.0, "running the filter")
         traced = library.traced(of)
         trace, task = traced.trace, traced.checkpoint.task
@@ -172,7 +165,7 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         served = serving([path] if path else [], data, settings.seed)
 
         def link(index: int, step: int) -> str:
-            return arguments["url"] + moment_link(task, of.filter, of.data, of.episode, step, str(recipe))
+            return arguments["url"] + moment_link(task, of.filter, of.data, of.episode, step, str(of.recipe))
 
         composed = compose(
             [trace],

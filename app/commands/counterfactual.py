@@ -20,7 +20,7 @@ from beliefscope.app.commands.given import (
     TaskName,
     check,
     checkpoint,
-    dataset,
+    one_episode,
     recipe,
     whole,
 )
@@ -80,9 +80,9 @@ def counterfactual(
     edit = Edit(first, to, recipe(recipe_, loaded.task), betas(weights))
     if not edit.recipe and not edit.weights:
         raise BadInput("nothing is edited: give --recipe, --weights or both")
-    with dataset(loaded.task, data, skip_bad) as episodes, console.progress("Filtering") as advance:
-        index = episodes.held_out()[0] if episode is None else episode
-        made = trace(loaded, episodes[index], index, seed, particles)
+    shown, index = one_episode(loaded.task, data, skip_bad, episode)
+    with console.progress("Filtering") as advance:
+        made = trace(loaded, shown, index, seed, particles)
         replay = Replay(loaded, made, progress=advance)
         edited = replay.edited(edit)
     result = compare(replay.original, edited, edit)

@@ -18,6 +18,7 @@ from beliefscope.datasets.errors import BadInput
 if TYPE_CHECKING:
     from beliefscope.datasets.corrupt import Recipe
     from beliefscope.datasets.dataset import Dataset
+    from beliefscope.datasets.episode import Episode
     from beliefscope.datasets.task import Task
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.inspect.trace import Trace
@@ -242,9 +243,16 @@ def one_run(
 
     loaded = checkpoint(task, filter_)
     broken = recipe(recipe_, loaded.task)
-    with dataset(loaded.task, data, skip_bad) as episodes, console.progress("Filtering") as advance:
-        index = episodes.held_out()[0] if episode is None else episode
-        return loaded, trace(loaded, episodes[index], index, seed, particles, broken, advance)
+    shown, index = one_episode(loaded.task, data, skip_bad, episode)
+    with console.progress("Filtering") as advance:
+        return loaded, trace(loaded, shown, index, seed, particles, broken, advance)
+
+
+def one_episode(task: Task, data: Path | None, skip_bad: bool, index: int | None) -> tuple[Episode, int]:
+    """That episode and its index; without one, the first that is held out."""
+    with dataset(task, data, skip_bad) as episodes:
+        index = episodes.held_out()[0] if index is None else index
+        return episodes[index], index
 
 
 def described(trace: Trace, path: Path) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from beliefscope.app.commands.given import (
     TaskName,
     check,
     checkpoint,
-    dataset,
+    one_episode,
     recipe,
     size,
 )
@@ -79,9 +79,7 @@ def live(
     check_workspace(workspace)
     loaded = checkpoint(task, filter_)
     broken = recipe(recipe_, loaded.task)
-    with dataset(loaded.task, data, skip_bad) as episodes:
-        index = episodes.held_out()[0] if episode is None else episode
-        shown = episodes[index]
+    shown, index = one_episode(loaded.task, data, skip_bad, episode)
     name = name or f"{loaded.task.name}-{loaded.name}-episode{index}"
     every = 1.0 / shown.dt if rate is None else rate
     watch = shlex.join(["beliefscope", "serve", "--workspace", str(workspace)])
