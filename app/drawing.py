@@ -13,7 +13,7 @@ from viser import ViserServer
 
 from beliefscope.app.library import Traced
 from beliefscope.app.mapwire import particles
-from beliefscope.app.scenery import SMALL, UP, Array, Force, Ground, Sight, add_plane, add_replay, extent, rgb
+from beliefscope.app.scenery import SMALL, UP, Array, Force, Ground, Sight, Stage, add_plane, add_replay, extent, rgb
 from beliefscope.app.wire import Look, layers
 from beliefscope.datasets.replay import replay
 from beliefscope.datasets.task import Task
@@ -75,8 +75,9 @@ class Drawing:
                 ("force", "force"),
             )
         }
-        self._robot = None
+        self._robot = self._stage = None
         if self._replay is not None:
+            self._stage = Stage(server, self._replay.model)
             self._robot = add_replay(server, self._replay)
             self._roots["replay"].append(self._robot.fixed_bodies_frame)
         else:
@@ -133,11 +134,15 @@ class Drawing:
         for layer, roots in self._roots.items():
             for root in roots:
                 root.visible = layer not in look.hidden
+        if self._stage is not None:
+            self._stage.see_through(self._ground is not None and "map" not in look.hidden and look.height == "floor")
 
     def move(self, step: int, maps: LikelihoodMap | None) -> None:
         """Put every node where it belongs at a step. Maps: of the step, where there are any."""
-        if self._robot is not None and self._replay is not None:
-            self._robot.update_from_arrays(self._replay.positions[step][None], self._replay.rotations[step][None])
+        if self._robot is not None and self._stage is not None and self._replay is not None:
+            positions, rotations = self._replay.positions[step], self._replay.rotations[step]
+            self._robot.update_from_arrays(positions[None], rotations[None])
+            self._stage.move(positions, rotations)
         for i, (pole, label) in enumerate(self._markers):
             foot = np.array([*self._anchors[step, i, :2], 0.0])
             pole.position = foot + pole.height / 2.0 * UP

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,12 @@ from viser.transforms import SO3
 
 from beliefscope.app.wire import Look, pictures
 from beliefscope.datasets.replay import Replay
+from beliefscope.datasets.shapes import Shape, shapes
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.likelihood import COARSE, LikelihoodMap
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.plotting import colour_table
+from beliefscope.inspect.solids import solid
 from beliefscope.inspect.trace import Trace
 
 Array = NDArray[Any]
@@ -30,6 +33,7 @@ FORCE_LENGTH = 0.30  # m, the longest arrow
 LOG_SHOWN = 40.0  # nats below the peak at the lower end of a map's colours, as on the page
 SIGHT = 0.2  # of the way from the camera to what it looks at: where its picture hangs
 ENLARGED = 4  # times, so that the browser's smoothing leaves a picture's pixels apart
+GLASS = 0.3  # opacity of what the map on the floor is seen through
 CELLS = (0.05, 0.1, 0.25, 1.0)  # m between the lines of a bare plane, of which it has MOST_CELLS along a side
 MOST_CELLS = 14
 
@@ -175,8 +179,54 @@ class Force:
             self._label.text, self._label.position = f"{newtons:.0f} N", end
 
 
+class Stage:
+    """What the robot works on, below ``/bodies``: it stands where the map lies, which is seen through it."""
+
+    def __init__(self, server: ViserServer, model: Any) -> None:
+        """Model: a ``mujoco.MjModel``, in which these shapes are hidden from now on."""
+        bodies = around(model)
+        parts = sorted((shape for shape in shapes(model) if bodies[shape.body]), key=_body_and_colour)
+        self._frames = {
+            body: server.scene.add_frame(f"/bodies/{name or body}", show_axes=False)
+            for body, name in {(p.body, p.name) for p in parts}
+        }
+        self._meshes: list[Any] = []
+        for i, ((body, rgba), group) in enumerate(groupby(parts, key=_body_and_colour)):
+            solids = [solid(shape) for shape in group]
+            first = np.cumsum([0, *(len(one.vertices) for one in solids)])
+            mesh = server.scene.add_mesh_simple(
+                f"{self._frames[body].name}/{i}",
+                np.concatenate([one.vertices for one in solids]),
+                np.concatenate([one.faces + at for one, at in zip(solids, first, strict=False)]),
+                color=tuple(round(255 * share) for share in rgba[:3]),
+                cast_shadow=False,
+            )
+            self._meshes.append(mesh)
+        model.geom_rgba[bodies[model.geom_bodyid], 3] = 0.0
+
+    def move(self, positions: Array, rotations: Array) -> None:
+        """Where each body is: (B, 3) m and (B, 3, 3), as a step of ``Replay`` has them."""
+        for body, frame in self._frames.items():
+            frame.position, frame.wxyz = positions[body], SO3.from_matrix(rotations[body]).wxyz
+
+    def see_through(self, through: bool) -> None:
+        """Make glass of it, or what it was."""
+        for mesh in self._meshes:
+            mesh.opacity = GLASS if through else None
+
+
+def around(model: Any) -> NDArray[np.bool_]:
+    """(B,) which bodies of a ``mujoco.MjModel`` are not the robot's, whose tree has the most joints, nor the world."""
+    joints = np.bincount(model.body_rootid[model.jnt_bodyid], minlength=model.nbody)
+    return (model.body_rootid != joints.argmax()) & (np.arange(model.nbody) > 0)
+
+
+def _body_and_colour(shape: Shape) -> tuple[int, tuple[float, ...]]:
+    return shape.body, tuple(shape.rgba)
+
+
 def add_replay(server: ViserServer, replayed: Replay) -> ViserMujocoScene:
-    """Robot and object as they were, below ``/bodies`` and ``/fixed_bodies``."""
+    """The robot as it was, and its world, below ``/bodies`` and ``/fixed_bodies``."""
     robot = ViserMujocoScene(server, replayed.model, num_envs=1)
     robot.camera_tracking_enabled = False
     for sites in robot.site_handles_by_group.values():

@@ -108,6 +108,8 @@ export class Rerun {
       viewer.on('time_update', (event) => this.#heard(event.time));
       const place = document.createElement('div');
       place.className = 'viewer';
+      place.setAttribute('role', 'application'); // it takes the keys while it has the focus
+      place.setAttribute('aria-label', 'Rerun’s viewer');
       this.#host.append(place);
       await viewer.start(null, place, {
         width: '100%',

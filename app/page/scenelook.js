@@ -1,10 +1,10 @@
-/** What the 3D scene shows: a sheet of its layers, which is its legend too, and the places to look from (docs/api.md). */
+/** What the 3D scene shows: a sheet of its layers, with the legend, and the places to look from (docs/api.md). */
 
 import { sample, swatch } from './palette.js';
 import { choice } from './pickers.js';
 
 const LAYERS = ['replay', 'objects', 'estimates', 'contours', 'particles', 'force', 'map', 'camera'];
-const PLACES = [['first', 'As at first'], ['above', 'From above'], ['camera', 'With the camera']];
+const PLACES = [['first', 'at first'], ['above', 'from above'], ['camera', 'at camera']];
 /** Of the state: the answers to each choice, and what they are called. */
 const CHOICES = {
   tint: [['weight', 'by weight'], ['share', 'by modality']],
@@ -18,6 +18,7 @@ export class SceneLook {
   #rows = {};
   #choices = {};
   #places = {};
+  #legend = element('p', { className: 'swatches' });
   #trace = null;
 
   /**
@@ -33,7 +34,7 @@ export class SceneLook {
     button.popoverTargetElement = sheet;
     button.setAttribute('aria-haspopup', 'dialog');
     host.append(button, sheet);
-    sheet.append(...LAYERS.map((layer) => this.#row(layer)), this.#footer(stand));
+    sheet.append(...LAYERS.map((layer) => this.#row(layer)), this.#legend, this.#footer(stand));
     sheet.addEventListener('beforetoggle', ({ newState }) => {
       if (newState !== 'open') return;
       const { bottom, left } = button.getBoundingClientRect();
@@ -62,20 +63,12 @@ export class SceneLook {
     const [trace, { state }] = [this.#trace, this.#store];
     if (!trace) return;
     const there = trace.header.scene ?? LAYERS;
-    const key = (names) => names.flatMap((name) => [swatch(name), ` ${trace.called(name)}  `]);
-    const estimate = trace.sources.at(-1);
-    const keys = {
-      objects: key(['truth', estimate]),
-      estimates: key(['truth', ...trace.sources]),
-      contours: key(trace.sources),
-      force: [sample('--contact', [], 2.5), ' 4 cm for 10 N'],
-    };
     for (const layer of LAYERS) {
-      const { row, box, meaning } = this.#rows[layer];
+      const { row, box } = this.#rows[layer];
       row.hidden = !there.includes(layer);
       box.checked = !hidden(state.hide).includes(layer);
-      meaning.replaceChildren(...(keys[layer] ?? []));
     }
+    this.#legend.replaceChildren(...['truth', ...trace.sources].map((name) => keyed(swatch(name), trace.called(name))));
     for (const [at, button] of Object.entries(this.#places)) button.hidden = at === 'camera' && !there.includes('camera');
     const layers = trace.fuses ? [...trace.modalities, 'fused'] : [];
     const ground = layers.includes(state.ground) ? state.ground : 'fused';
@@ -86,22 +79,22 @@ export class SceneLook {
   }
 
   #row(layer) {
-    const [row, label, meaning] = ['div', 'label', 'span'].map((tag) => element(tag));
+    const [row, label] = ['div', 'label'].map((tag) => element(tag));
     const box = element('input', { type: 'checkbox', value: layer });
     box.addEventListener('change', () => {
       const others = hidden(this.#store.state.hide).filter((one) => one !== layer);
       this.#store.set({ hide: [...others, ...(box.checked ? [] : [layer])].join(',') });
     });
     label.append(box, NAMES[layer]);
-    meaning.className = 'meaning';
-    row.append(label, meaning);
+    row.append(label);
+    if (layer === 'force') row.append(keyed(sample('--contact', [], 2.5), '4 cm for 10 N'));
     for (const [name, question] of QUESTIONS[layer] ?? []) {
       const host = (this.#choices[name] = element('div', { id: `scene-${name}`, className: 'choice' }));
       host.setAttribute('role', 'radiogroup');
       host.setAttribute('aria-label', question);
-      meaning.before(host);
+      row.append(host);
     }
-    this.#rows[layer] = { row, box, meaning };
+    this.#rows[layer] = { row, box };
     return row;
   }
 
@@ -112,7 +105,7 @@ export class SceneLook {
       button.addEventListener('click', () => stand(at));
       row.append(button);
     }
-    row.prepend('Look');
+    row.prepend(element('span', { textContent: 'Look' }));
     return row;
   }
 }
@@ -128,6 +121,13 @@ const QUESTIONS = {
 };
 
 const element = (tag, properties = {}) => Object.assign(document.createElement(tag), properties);
+
+/** A line as it is drawn, and what it means. */
+function keyed(sample, text) {
+  const key = element('span', { className: 'key' });
+  key.append(sample, text);
+  return key;
+}
 
 /** @param {string} hide of the state @returns {string[]} the layers that are hidden */
 const hidden = (hide) => hide.split(',').filter((layer) => LAYERS.includes(layer));

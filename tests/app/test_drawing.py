@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from beliefscope.app.drawing import OUTLINES, modality_shares
-from beliefscope.app.scenery import LOG_SHOWN, paint
+from beliefscope.app.scenery import LOG_SHOWN, around, paint
 from beliefscope.app.wire import LAYERS, Look, layers, look, viewpoint
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.replay import model_of
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.likelihood import LikelihoodMap
@@ -57,6 +58,13 @@ def test_every_ghost_can_be_outlined() -> None:
     for task in TASKS.values():
         if task.ghost is not None:
             assert task.ghost(np.zeros((2, len(task.components)))).shape in OUTLINES
+
+
+@pytest.mark.parametrize(("task", "bodies"), [("door", {"frame", "door"}), ("push", {"puck"})])
+def test_the_map_is_seen_through_all_but_the_robot(task: str, bodies: set[str]) -> None:
+    with open_dataset(sample_path(task)) as data:
+        model = model_of(TASKS[task], data[0])
+    assert {model.body(body).name for body in np.flatnonzero(around(model))} == bodies
 
 
 def test_a_map_is_painted_as_the_page_does(maps: LikelihoodMap) -> None:

@@ -135,7 +135,9 @@ def test_what_is_hidden_costs_nothing_and_comes_back(address: str) -> None:
         draw(page, 3)
         told(scene)
         page.send(json.dumps({"type": "look", "hidden": ["map", "camera"]}))
-        assert b"/map" in told(scene)
+        hidden = told(scene)
+        assert b"/map" in hidden
+        assert b"/bodies/frame/" in hidden, "no map is to be seen through the door's frame"
         draw(page, 4)
         moved = told(scene)
         assert b"/particles" in moved

@@ -86,6 +86,15 @@ def browser(chromium: str) -> Iterator[Any]:
         browser.close()
 
 
+VIOLATIONS = """async () => {
+  // Other people's pages are not ours to judge: viser's scene, Rerun's canvas.
+  const { violations } = await axe.run({ exclude: ['iframe', '.viewer'] }, { resultTypes: ['violations'] });
+  const serious = violations.filter(({ impact }) => impact === 'serious' || impact === 'critical');
+  const told = ({ target, failureSummary }) => `${target} ${failureSummary.split('\\n')[1].trim()}`;
+  return serious.flatMap(({ id, nodes }) => nodes.map((node) => `${id}: ${told(node)}`));
+}"""
+
+
 class Watched:
     """A page, and everything about it that must not be."""
 
@@ -132,6 +141,13 @@ class Watched:
     def maps(self) -> list[str]:
         """What each map shows."""
         return self.page.evaluate("() => [...document.querySelectorAll('#heatmaps canvas')].map((c) => c.toDataURL())")
+
+    def violations(self) -> list[str]:
+        """What of the page as it is shown somebody cannot use or read, as axe finds it."""
+        axe = pytest.importorskip("axe_playwright_python", reason="axe is not installed: pip install -e '.[dev]'")
+        if not self.page.evaluate("() => Boolean(window.axe)"):
+            self.page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text())
+        return self.page.evaluate(VIOLATIONS)
 
     def settle(self, step: int) -> None:
         """Waits until the step's fine maps are there and the scene has followed."""

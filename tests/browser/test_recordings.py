@@ -106,6 +106,9 @@ def test_ones_own_files_are_kept_found_and_compared(open_page: Callable[..., Any
     page.get_by_role("button", name="Both in Rerun").click()
     shelf.page.until("() => document.querySelector('#rerun').dataset.state === 'ready'")
     shelf.page.until("async () => (await beliefscope.rerun.getState()).recordings.length === 2")
+    for theme in ("light", "dark"):
+        page.emulate_media(color_scheme=theme)
+        assert shelf.page.violations() == [], f"the tab of Rerun, {theme}"
     page.get_by_role("button", name="Back to the run").click()
     shelf.page.until("async () => (await beliefscope.rerun.getState()).recordings.length === 1")
 
