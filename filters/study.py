@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from beliefscope.datasets.catalog import find_task, load_task
 from beliefscope.datasets.document import read_json
@@ -266,7 +266,8 @@ def nees_bounds(n: int, trajectories: int) -> tuple[float, float]:
     Applications to Tracking and Navigation, 5.4.2.
     """
     freedom = n * trajectories
-    return float(chi2.ppf(0.025, freedom) / freedom), float(chi2.ppf(0.975, freedom) / freedom)
+    low, high = chdtri(freedom, [0.975, 0.025]) / freedom  # chdtri takes the share above
+    return float(low), float(high)
 
 
 def rows_of(documents: Mapping[Cell, Document | None]) -> list[Row]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.special import chdtr, ndtr
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ def gaussian_level(squared: Array, n: int) -> Array:
 
     Uniform between 0 and 1 where the Gaussian is right.
     """
-    return chi2.cdf(squared, n)
+    return chdtr(n, squared)
 
 
 def particle_level(deviation: Array, weights: Array, error: Array, covariance: Array) -> Array:
@@ -53,7 +53,8 @@ def gaussian_crps(error: Array, deviation: Array) -> Array:
         error: (...) mean minus truth. deviation: (...) s, above 0.
     """
     z = error / deviation
-    return deviation * (z * (2.0 * norm.cdf(z) - 1.0) + 2.0 * norm.pdf(z) - 1.0 / np.sqrt(np.pi))
+    density = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    return deviation * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
 
 
 def particle_crps(deviation: Array, weights: Array) -> Array:

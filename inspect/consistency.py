@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.filters.checkpoint import Checkpoint
@@ -362,7 +362,7 @@ def _whiteness(traces: Sequence[Trace]) -> list[Whiteness]:
     freedom = LAGS * len(found)
     pairs = [(m, c.name) for m in traces[0].modalities for c in measures.task_of(traces[0]).components]
     return [
-        Whiteness(modality, component, float(r), float(q), freedom, float(chi2.sf(q, freedom)))
+        Whiteness(modality, component, float(r), float(q), freedom, float(chdtrc(freedom, q)))
         for (modality, component), q, r in zip(pairs, statistic, correlation, strict=True)
     ]
 

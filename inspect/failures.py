@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.dataset import Dataset
@@ -338,7 +338,7 @@ def _group(name: str, inside: Mask, score: Array, moments: Sequence[Moment]) -> 
         share=share,
         failures=failures,
         lift=failures / share,
-        chance=float(binom.sf(count - 1, len(moments), share)),
+        chance=float(bdtrc(count - 1, len(moments), share)),
         inside=_mean(score[inside]),
         outside=_mean(score[~inside]),
     )
