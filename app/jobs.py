@@ -39,6 +39,7 @@ KINDS: dict[str, str] = {
     "failures": "beliefscope.app.failures:work",
     "finetune": "beliefscope.app.finetune:work",
     "reading": "beliefscope.app.recordings:work",
+    "recording": "beliefscope.app.recordings:write",
     "report": "beliefscope.app.reports:work",
 }
 """Kind of job -> ``module:function`` of (arguments, report) -> result; ``report(share done, what it is doing)``."""

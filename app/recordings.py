@@ -6,12 +6,12 @@ import asyncio
 import hashlib
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Request
@@ -22,7 +22,7 @@ from starlette.requests import ClientDisconnect
 from beliefscope import __version__
 from beliefscope.app.caching import tagged_json
 from beliefscope.app.jobs import Job, Jobs
-from beliefscope.app.library import Library, Selection
+from beliefscope.app.library import Library, Selection, Settings, Traced
 from beliefscope.app.link import moment_link
 from beliefscope.app.liveruns import PREFIX, name_of
 from beliefscope.app.rrdabout import About
@@ -34,6 +34,7 @@ from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.growing import SUFFIX, GrowingWriter
+from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.recordings.describe import describe
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
@@ -45,7 +46,7 @@ FREE_IN = 10**7  # bytes to which the free space is told, so that a list does no
 
 
 class RecordingRequest(BaseModel):
-    """Body of ``POST /api/recordings``; maps at every ``maps``-th step, none for 0."""
+    """Body of ``POST /api/recordings``; maps at every ``maps``-th step, none for 0. Automatic: only to be looked at."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     task: str
@@ -54,14 +55,16 @@ class RecordingRequest(BaseModel):
     recipe: str = ""
     data: str = ""
     maps: Annotated[int, Field(ge=0)] = 0
+    automatic: bool = False
 
 
 class ChangeRequest(BaseModel):
-    """Body of ``PATCH /api/recordings/{name}.rrd``: what is to be another."""
+    """Body of ``PATCH /api/recordings/{name}.rrd``: what is to be another. Automatic: false, it is to be kept."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     name: str | None = None
     tags: list[str] | None = None
+    automatic: Literal[False] | None = None
 
 
 def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
@@ -89,24 +92,39 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         started = time.perf_counter()
         of = Selection(wanted.task, wanted.filter, wanted.episode, Recipe.parse(wanted.recipe), wanted.data)
         traced = library.traced(of)
-        trace = traced.trace
+        # A job makes the maps. Of a run that goes on it would find more steps than were asked for.
+        maps = 0 if traced.grows or traced.no_maps else wanted.maps
         # The name says all that the file depends on, so one that was made under it is this one.
-        depends = f"{traced.key} maps {wanted.maps} diagnostics version {__version__}"
+        depends = f"{traced.key} maps {maps} diagnostics version {__version__}"
         parts = hashlib.sha256(depends.encode()).hexdigest()[:8]
         made_as = f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}{ENDING}"
-        steps = range(0, len(trace), wanted.maps) if wanted.maps and not traced.no_maps else ()
         with writing:
             there = files.made_as(made_as)
-            path = there or files.unused(made_as)
             if there is None and request.app.state.read_only:
                 raise HTTPException(403, f"{READ_ONLY} No recording of this run was written before.")
-            if there is None:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                maps = traced.maps(steps) if steps else None
-                write_recording(trace, path, maps, diagnostics=quick(trace, traced.checkpoint))
-                files.learn(path, About.of(describe(path), path), made_as)
+            path = there
+            if path is None and not maps:
+                path = _written(files, traced, made_as, wanted.automatic)
+        if path is None:
+            response.status_code = 202
+            target = files.unused(made_as)
+            arguments = {
+                "settings": library.settings.to_json(),
+                "selection": of.to_json(),
+                "folder": str(files.folder),
+                "made_as": made_as,
+                "maps": maps,
+                "automatic": wanted.automatic,
+            }
+            title = f"Recording of {of.filter}, {of.task} episode {of.episode}" + (
+                f", {of.recipe}" if of.recipe else ""
+            )
+            link = _url(target.name).lstrip("/")
+            return {"job": jobs.submit("recording", title, arguments, target.name, link, target)}
         if there:
             response.status_code = 200
+            if not (wanted.automatic or request.app.state.read_only):
+                files.keep(path.name)
         return {
             "name": path.name,
             "url": _url(path.name),
@@ -140,6 +158,8 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
             changed = files.tag(name, wanted.tags)
         if wanted.name is not None:
             changed = files.rename(name, wanted.name)
+        if wanted.automatic is not None:
+            changed = files.keep(changed.name)
         return shown(changed)
 
     @router.delete("/api/recordings/{name}.rrd")
@@ -176,6 +196,44 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         return _shown(one, *runs.of(one.about, runs.tasks()))
 
     return router
+
+
+def write(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """The job that records a run with likelihood maps. What was traced before is read, not traced again."""
+    library, files = Library(Settings.of_json(arguments["settings"])), RrdFiles(Path(arguments["folder"]))
+    try:
+        report(0.0, "running the filter")
+        traced = library.traced(Selection.of_json(arguments["selection"]))
+        path = _written(files, traced, arguments["made_as"], arguments["automatic"], arguments["maps"], report)
+        return {"name": path.name}
+    finally:
+        files.close()
+        library.close()
+
+
+def _written(
+    files: RrdFiles,
+    traced: Traced,
+    made_as: str,
+    automatic: bool,
+    stride: int = 0,
+    report: Report = lambda share, message: None,
+) -> Path:
+    """A new recording. Stride: of the steps with likelihood maps; none for 0."""
+    trace = traced.trace
+    steps = range(0, len(trace), stride) if stride else range(0)
+
+    def maps() -> Iterator[LikelihoodMap]:
+        for done, one in enumerate(traced.maps(steps), start=1):
+            report(done / len(steps), f"likelihood maps, {done} of {len(steps)}")
+            yield one
+
+    part = files.part()
+    try:
+        write_recording(trace, part, maps(), diagnostics=quick(trace, traced.checkpoint))
+        return files.put(part, About.of(describe(part), part), made_as, automatic)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -252,6 +310,7 @@ def _shown(one: Recording, run: dict[str, str] | None, why_not: str) -> dict[str
         "url": _url(one.name),
         "bytes": one.bytes,
         "modified": datetime.fromtimestamp(one.modified, UTC).isoformat(timespec="seconds"),
+        "automatic": one.automatic,
         "tags": one.tags,
         "reading": one.about is None,
         **asdict(one.about or About()),

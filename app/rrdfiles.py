@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import NoReturn
 
@@ -31,26 +32,35 @@ LONGEST = 200  # bytes of a name without its ending: a file under way has a long
 TAGS, TAG = 20, 40  # of a file, characters of one
 ABANDONED = 86400.0  # s after which a file under way is nobody's
 WAITING = 64  # files read in the background at once, the others when these are done
+AUTOMATIC, AUTOMATIC_BYTES = 50, 10**9  # of the files that were written to be looked at only
 
 
 @dataclass(frozen=True)
 class Kept:
-    """A file's lines in `.about`. modified: ns. made_as: name that the page gave it. about: None where not known."""
+    """A file's lines in `.about`. modified: ns. made_as: name that the page gave it. about: None where not known.
+
+    automatic: it was written to be looked at, and nobody has said yet that it is to be kept.
+    """
 
     bytes: int
     modified: int
     made_as: str = ""
+    automatic: bool = False
     tags: tuple[str, ...] = ()
     about: About | None = None
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One file as it is now. bytes, modified (s since 1970): of the file. about: None while it is being read."""
+    """One file as it is now. bytes, modified (s since 1970): of the file. about: None while it is being read.
+
+    automatic: it was written to be looked at, and goes when there are many of them.
+    """
 
     name: str
     bytes: int
     modified: float
+    automatic: bool
     tags: tuple[str, ...]
     about: About | None
 
@@ -82,7 +92,8 @@ class RrdFiles:
                     self._ask(name, _stamp(status))
                 tags = () if kept is None else kept.tags
                 about = None if known is None else known.about
-                found.append(Recording(name, status.st_size, status.st_mtime, tags, about))
+                automatic = known is not None and known.automatic
+                found.append(Recording(name, status.st_size, status.st_mtime, automatic, tags, about))
             return sorted(found, key=lambda one: (-one.modified, one.name))
 
     def one(self, name: str) -> Recording:
@@ -135,10 +146,28 @@ class RrdFiles:
             number += 1
         return path
 
-    def learn(self, path: Path, about: About, made_as: str = "") -> None:
-        """Keeps what a new file holds."""
+    def put(self, part: Path, about: About, made_as: str, automatic: bool) -> Path:
+        """Gives a file that the page had written its name, or that with a number behind it.
+
+        What it holds is kept first: who lists it meanwhile, also in another process, need not read it. Automatic: it
+        was written to be looked at only; the oldest of those go where they are too many or too large.
+        """
         with self._lock:
-            self._write(path.name, Kept(*_stamp(path.lstat()), made_as=made_as, about=about))
+            path = self.unused(made_as)
+            self._write(path.name, Kept(*_stamp(part.lstat()), made_as, automatic, about=about))
+            os.rename(part, path)
+            if automatic:
+                self._thin()
+            return path
+
+    def keep(self, name: str) -> Recording:
+        """A file that was written to be looked at is to be kept. Raises Gone."""
+        with self._lock:
+            path = self.path(name)
+            kept = self._kept(path.name)
+            if kept is not None and kept.automatic:
+                self._write(path.name, replace(kept, automatic=False))
+            return self.one(name)
 
     def part(self) -> Path:
         """Where a file may be written that is to be added; who asks removes it again."""
@@ -157,7 +186,7 @@ class RrdFiles:
         with self._lock:
             path = self.free(name)
             os.rename(part, path)
-            self.learn(path, about)
+            self._write(path.name, Kept(*_stamp(path.lstat()), about=about))
             return self.one(path.name)
 
     def rename(self, name: str, new: str) -> Recording:
@@ -169,7 +198,7 @@ class RrdFiles:
             target = self.free(new)
             kept = self._kept(path.name)
             if kept is not None:  # first, so that no file is ever without its tags
-                self._write(target.name, kept)
+                self._write(target.name, replace(kept, automatic=False))
             try:
                 os.rename(path, target)
             except FileNotFoundError:
@@ -184,7 +213,7 @@ class RrdFiles:
         with self._lock:
             path = self.path(name)
             kept = self._kept(path.name) or Kept(0, 0)
-            self._write(path.name, replace(kept, tags=wanted))
+            self._write(path.name, replace(kept, tags=wanted, automatic=False))
             return self.one(name)
 
     def delete(self, name: str) -> str:
@@ -201,7 +230,7 @@ class RrdFiles:
             self._about.mkdir(parents=True, exist_ok=True)
             path = self._trash.restore(id, self.folder, self._about)
             self._known.pop(path.name, None)
-            return self.one(path.name)
+            return self.keep(path.name)
 
     def empty(self) -> None:
         """Deletes for good what is in the trash."""
@@ -224,6 +253,16 @@ class RrdFiles:
                         if entry.is_file(follow_symlinks=False):
                             found.append((entry.name, entry.stat(follow_symlinks=False)))
         return found
+
+    def _thin(self) -> None:
+        """Lets go of the oldest that were written to be looked at only; the newest stays, however large."""
+        there = [(status, name) for name, status in self._files() if (kept := self._kept(name)) and kept.automatic]
+        there.sort(key=lambda one: -one[0].st_mtime_ns)
+        sizes = accumulate(status.st_size for status, _ in there)
+        for place, ((_, name), size) in enumerate(zip(there, sizes, strict=True)):
+            if place and (place >= AUTOMATIC or size > AUTOMATIC_BYTES):
+                (self.folder / name).unlink(missing_ok=True)
+                self._forget(name)
 
     def _lines(self, name: str) -> Path:
         return self._about / f"{name}.json"
@@ -263,7 +302,7 @@ class RrdFiles:
                 with self._lock:
                     if _stamp((self.folder / name).lstat()) == stamp:
                         kept = self._kept(name) or Kept(*stamp)
-                        self._write(name, replace(kept, bytes=stamp[0], modified=stamp[1], made_as="", about=about))
+                        self._write(name, Kept(*stamp, tags=kept.tags, about=about))
         finally:
             with self._lock:
                 self._asked.pop(name, None)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from io import BytesIO
 from itertools import groupby
 from typing import Any
 
 import numpy as np
 from mjviser import ViserMujocoScene
 from numpy.typing import NDArray
+from PIL import Image
 from viser import ViserServer
 from viser.transforms import SO3
 
@@ -51,6 +53,17 @@ def rgb(source: str, trace: Trace) -> RGB:
     return int(hue[1:3], 16), int(hue[3:5], 16), int(hue[5:7], 16)
 
 
+def show_png(handle: Any, prop: str, pixels: NDArray[np.uint8]) -> None:
+    """Have a handle of viser's show these pixels, (H, W) gray or (H, W, 3).
+
+    Its own ``image`` takes five times as long, and no gray: that was most of what it takes to move a scene. So this
+    sets the property, other than public, that ``image`` sets.
+    """
+    file = BytesIO()
+    Image.fromarray(pixels).save(file, "png", compress_level=1)
+    setattr(handle, prop, file.getvalue())
+
+
 class Ground:
     """A likelihood map on the floor, about the true position; its rim has the colour of its layer."""
 
@@ -77,7 +90,7 @@ class Ground:
         cells = np.full((size + 2 * rim, size + 2 * rim, 3), rgb(maps.layers[layer], self._trace), np.uint8)
         cells[rim:-rim, rim:-rim] = paint(maps, layer, look)
         # viser's pictures have their top row at the smallest y, as maps have.
-        self._image.image = cells
+        show_png(self._image, "_data", cells)
         self._image.render_width = self._image.render_height = len(cells) * float(maps.offsets_x[1] - maps.offsets_x[0])
         self._image.position = (*map(float, maps.centre), self._levels[look.height])
 
@@ -116,7 +129,7 @@ class Sight:
             thickness=1.5,
             thickness_units="screen",
             color=FLOOR_GRAY,
-            image=self._picture(0),
+            image=np.repeat(self._picture(0)[..., None], 3, axis=2),
             format="png",
             wxyz=SO3.from_matrix(turn).wxyz,
             position=camera.position,
@@ -138,11 +151,10 @@ class Sight:
         """The picture of a step."""
         self._frustum.visible = "camera" not in look.hidden
         if self._frustum.visible:
-            self._frustum.image = self._picture(step)
+            show_png(self._frustum, "_image_data", self._picture(step))
 
     def _picture(self, step: int) -> NDArray[np.uint8]:
-        gray = self._seen[step].repeat(ENLARGED, axis=0).repeat(ENLARGED, axis=1)
-        return np.repeat(gray[..., None], 3, axis=2)
+        return self._seen[step].repeat(ENLARGED, axis=0).repeat(ENLARGED, axis=1)
 
 
 class Force:
@@ -198,7 +210,7 @@ class Stage:
                 f"{self._frames[body].name}/{i}",
                 np.concatenate([one.vertices for one in solids]),
                 np.concatenate([one.faces + at for one, at in zip(solids, first, strict=False)]),
-                color=tuple(round(255 * share) for share in rgba[:3]),
+                color=np.rint(255.0 * np.array(rgba[:3])).astype(np.uint8),
                 cast_shadow=False,
             )
             self._meshes.append(mesh)

@@ -13,7 +13,7 @@ export class Jobs {
   #drawer;
   #button;
   #list = [];
-  #listeners = [];
+  #listeners = new Set();
   #rows = new Map();
   #timer = 0;
 
@@ -28,7 +28,22 @@ export class Jobs {
 
   /** @param {(jobs: api.Job[]) => void} listener called when any of them has changed. */
   listen(listener) {
-    this.#listeners.push(listener);
+    this.#listeners.add(listener);
+  }
+
+  /** Waits until one has ended. @param {(job: api.Job) => void} told of every change before @returns {Promise<api.Job | undefined>} undefined: forgotten */
+  async ended(id, told) {
+    await this.refresh();
+    return new Promise((resolve) => {
+      const hear = (list) => {
+        const job = list.find((one) => one.id === id);
+        if (job && underWay(job)) return told(job);
+        this.#listeners.delete(hear);
+        resolve(job);
+      };
+      this.#listeners.add(hear);
+      hear(this.#list);
+    });
   }
 
   /** Opens or closes the drawer. */

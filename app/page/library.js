@@ -26,6 +26,7 @@ const BODY = `
   <div class="scroll" tabindex="-1">
     <table class="recordings" aria-label="Recordings"><thead></thead><tbody></tbody></table>
     <p class="rest"></p>
+    <p class="automatic" hidden><span></span> <button type="button" class="text quiet"></button></p>
     <section class="reports"><h2>Reports</h2><table aria-label="Reports"><thead></thead><tbody></tbody></table></section>
     <details class="trash" hidden><summary>Trash</summary><ul></ul><p><button type="button" class="text empty">Empty the trash</button> <span class="sure" hidden>For good? <button type="button" class="text yes">Delete for good</button> <button type="button" class="text no">Keep</button></span></p></details>
   </div>
@@ -56,6 +57,7 @@ export class Library {
   #read = ''; // as it said it last
   #chosen = new Set();
   #point = '';
+  #automatic = false; // whether those are listed that were written for the Rerun tab
   #undo = null;
   #awaited = ''; // id of the job that reads a run
   #open = false;
@@ -135,21 +137,33 @@ export class Library {
     const { recordings, reports, trash, bytes: used, free } = this.#kept;
     const there = new Set(recordings.map(({ name }) => name));
     for (const name of this.#chosen) if (!there.has(name)) this.#chosen.delete(name);
-    const found = recordings.filter((file) => this.#sought(file));
+    const kept = recordings.filter(({ automatic }) => this.#automatic || !automatic);
+    const found = kept.filter((file) => this.#sought(file));
     this.#recordings.show(found);
     this.#reports.show(reports.filter((file) => this.#sought(file)));
     this.#part('section.reports').hidden = !reports.length;
-    const many = `${recordings.length} recording${recordings.length === 1 ? '' : 's'}`;
-    const what = found.length < recordings.length ? `${found.length} of ${many}` : many;
+    const many = `${kept.length} recording${kept.length === 1 ? '' : 's'}`;
+    const what = found.length < kept.length ? `${found.length} of ${many}` : many;
     const disk = reports.reduce((sum, one) => sum + one.bytes, used);
     this.#part('.told').textContent = `${what} · ${bytes(disk)} used, ${bytes(free)} free`;
     const none = 'None yet. “Save .rrd” above writes one of the run that is shown; “Add .rrd…” takes one from elsewhere.';
-    this.#part('.rest').textContent = recordings.length ? (found.length ? '' : 'No recording has all these words.') : none;
+    this.#part('.rest').textContent = kept.length ? (found.length ? '' : 'No recording has all these words.') : none;
+    this.#drawAutomatic(recordings.filter((file) => file.automatic && this.#sought(file)));
     this.#drawTrash(trash);
     this.#drawChosen();
     if (!there.has(this.#point)) return;
     this.#recordings.point(this.#point);
     this.#point = '';
+  }
+
+  /** Those that nobody asked to be kept. */
+  #drawAutomatic(files) {
+    const host = this.#part('.automatic');
+    host.hidden = !files.length;
+    const [text, button] = host.children;
+    const size = bytes(files.reduce((sum, one) => sum + one.bytes, 0));
+    text.textContent = `${files.length} ${files.length === 1 ? 'was' : 'were'} written for the Rerun tab, ${size}; the oldest go when there are many.`;
+    button.textContent = this.#automatic ? 'Hide' : 'Show';
   }
 
   #sought({ name, task, filter, tags = [], recipe, application = '', run }) {
@@ -164,6 +178,7 @@ export class Library {
     if (file.reading) host.append(note('is looked into …'));
     else if (!file.application) host.append(note('cannot be read', 'bad'));
     else if (file.problem) host.append(note(`of ${file.application}`));
+    else if (file.automatic) host.append(note('for the Rerun tab'));
     for (const tag of file.tags) {
       const button = Object.assign(document.createElement('button'), { type: 'button', className: 'tag', textContent: tag, title: `Search for ${tag}` });
       button.dataset.part = `tag ${tag}`;
@@ -185,6 +200,7 @@ export class Library {
     return [
       { name: 'Open in Rerun', key: 'Enter', act: () => this.#show([file]), why: unread },
       { name: 'Open the run here', ...this.#run(file, unread) },
+      ...(file.automatic ? [{ name: 'Keep', act: () => this.#keep(file), why: this.#readOnly, hint: 'It was written for the Rerun tab, and goes when there are many.' }] : []),
       { name: 'Rename', key: 'F2', act: () => this.#rename(file), why: this.#readOnly },
       { name: 'Tags', act: () => this.#tag(file), why: this.#readOnly },
       { name: `Download, ${bytes(file.bytes)}`, href: file.url, download: file.name },
@@ -222,7 +238,8 @@ export class Library {
     return [
       { name: 'Open', key: 'Enter', href: `${file.url}?shown=true`, window: true },
       { name: 'Open its run here', act: () => this.#store.set({ ...this.#selection({ ...file, run: file }), tab: 'scene' }), why: this.#lacking(file) },
-      { name: `Download the page`, href: file.url, download: `${file.name}.html` },
+      { name: 'Download the page', href: file.url, download: `${file.name}.html` },
+      ...(file.pdf ? [{ name: 'Download the PDF', href: file.pdf, download: `${file.name}.pdf` }] : []),
       { name: 'Delete', key: 'Delete', act: () => this.#delete(file, 'reports'), why: this.#readOnly },
     ];
   }
@@ -292,6 +309,14 @@ export class Library {
     this.#recordings.edit(file, `Tags of ${file.name}, divided by commas`, file.tags.join(', '), async (text) => {
       await api.changeRecording(file, { tags: text.split(',').map((tag) => tag.trim()).filter(Boolean) });
       await this.load();
+    });
+  }
+
+  #keep(file) {
+    return this.#try(async () => {
+      await api.changeRecording(file, { automatic: false });
+      this.#point = file.name;
+      return [`${file.name} is kept.`];
     });
   }
 
@@ -380,6 +405,7 @@ export class Library {
     press('.add', () => picker.click());
     press('.both', () => this.#show(this.#two));
     press('.compare', () => this.#compare());
+    press('.automatic button', () => ((this.#automatic = !this.#automatic), this.#draw()));
     press('.none', () => (this.#chosen.clear(), this.#draw()));
     press('.empty', () => ((this.#part('.sure').hidden = false), this.#part('.no').focus()));
     press('.yes', () => this.#empty());

@@ -1,14 +1,16 @@
 /** Rerun's viewer in the page, loaded when its tab is first opened; its time and the page's step follow each other. It shows
  *  the page's run, or files in its place, which keep their own time. */
 
-import { record } from './api.js';
+import { recorded } from './api.js';
 import { say } from './panel.js';
+import { written } from './recordings.js';
 
 const SETTLING = 30; // frames at most until a recording that is being opened keeps our time
 const ECHO_FRAMES = 4; // that the viewer may take to tell back a time that we set
 
 export class Rerun {
   #host;
+  #jobs;
   #moved;
   #viewer = null;
   #starting = null;
@@ -22,9 +24,9 @@ export class Rerun {
   #echo = null; // the step that we set last, until the viewer has told it back
   #open = false;
 
-  /** @param {HTMLElement} host @param {(step: number) => void} moved called when the time was moved in the viewer. */
-  constructor(host, moved) {
-    [this.#host, this.#moved] = [host, moved];
+  /** @param {HTMLElement} host @param {import('./jobs.js').Jobs} jobs @param {(step: number) => void} moved called when the time was moved in the viewer. */
+  constructor(host, jobs, moved) {
+    [this.#host, this.#jobs, this.#moved] = [host, jobs, moved];
     [this.#bar.className, this.#bar.hidden] = ['files', true];
     this.#bar.innerHTML = '<span></span><button type="button" class="text">Back to the run</button>';
     this.#bar.querySelector('button').addEventListener('click', () => this.files(null));
@@ -71,7 +73,7 @@ export class Rerun {
     const shown = (this.#shown = files ?? trace);
     try {
       say(this.#host, 'loading', files ? 'Starting Rerun …' : 'Writing the recording …');
-      const [recordings] = await Promise.all([files ?? Promise.all([trace.stream ? growing(trace) : record(trace)]), this.#start()]);
+      const [recordings] = await Promise.all([files ?? Promise.all([trace.stream ? this.#growing(trace) : this.#record(trace)]), this.#start()]);
       if (this.#shown !== shown) return;
       say(this.#host, 'loading', 'Opening the recording …');
       const old = (await this.#viewer.get_state()).recordings ?? [];
@@ -86,6 +88,20 @@ export class Rerun {
       this.#shown = null;
       say(this.#host, 'error', `Rerun cannot show this: ${error.message ?? error}`);
     }
+  }
+
+  #record(trace) {
+    return written(recorded(trace, true), this.#jobs, ({ progress, message }) => {
+      if (this.#shown === trace) say(this.#host, 'loading', `Writing the recording: ${message || 'starting'} …`, progress);
+    });
+  }
+
+  /** The recording that a live run writes itself, which is sent on as it grows; of one that writes none, what there is by now. */
+  async #growing(trace) {
+    const url = `/api/live/${encodeURIComponent(trace.live.name)}.rrd`;
+    const found = await fetch(url);
+    await found.body.cancel();
+    return found.ok ? { url } : this.#record(trace);
   }
 
   /** A recording that has just been opened sets its own time once more when its blueprint comes: insist on ours. */
@@ -154,14 +170,6 @@ export class Rerun {
     if (ours || this.#files || !this.#open || this.#host.dataset.state !== 'ready' || step === this.#step) return;
     if (step >= 0 && step < this.#trace.steps) this.#moved(step);
   }
-}
-
-/** The recording that a live run writes itself, which is sent on as it grows; of one that writes none, what there is by now. */
-async function growing(trace) {
-  const url = `/api/live/${encodeURIComponent(trace.live.name)}.rrd`;
-  const found = await fetch(url);
-  await found.body.cancel();
-  return found.ok ? { url } : record(trace);
 }
 
 const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));

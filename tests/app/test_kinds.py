@@ -93,7 +93,7 @@ def test_a_filter_shows_what_it_has(serve: Serve, name: str, layers: list[str] |
     assert found["modalities"] == (layers[:-1] if layers else [])
     assert (found["no_maps"] is None) == (layers is not None)
     assert look(client, DOOR) == layers
-    answer = client.post("/api/recordings", json={"task": "door", "filter": "own", "episode": 0, "maps": 10})
+    answer = client.post("/api/recordings", json={"task": "door", "filter": "own", "episode": 0})
     assert answer.status_code == 201, answer.text
 
 

@@ -89,7 +89,7 @@ def listed(client: TestClient) -> dict[str, dict[str, Any]]:
 
 
 def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str, settings: Settings) -> None:
-    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "recipe": "", "maps": 20}
+    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "recipe": ""}
     answer = client.post("/api/recordings", json=wanted)
     assert answer.status_code == 201, answer.text
     made = answer.json()

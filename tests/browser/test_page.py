@@ -271,10 +271,10 @@ def test_the_scenes_own_slider_moves_the_page(open_page: Any) -> None:
 
 def test_save_a_recording_open_it_and_move_both_ways(open_page: Any, tmp_path: Path) -> None:
     page = open_page("?step=12")
-    page.page.keyboard.press("s")
-    page.until("() => document.querySelector('#saved a')")
-    with page.page.expect_download() as download:
-        page.page.locator("#saved a").click()
+    with page.page.expect_download(timeout=120_000) as download:
+        page.page.keyboard.press("s")
+        page.until("() => document.querySelector('#saved progress:not([hidden])')")
+        page.page.reload()  # its job goes on, and the page waits for it again
     download.value.save_as(tmp_path / "run.rrd")
     assert (tmp_path / "run.rrd").read_bytes()[:3] == b"RRF"
     page.page.get_by_role("button", name="Open in Rerun tab").click()
