@@ -10,15 +10,16 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Body, Request
 from fastapi.responses import FileResponse, Response
+from pydantic import BaseModel, ConfigDict, Field
 
 from beliefscope.app.api import Asked
 from beliefscope.app.caching import tagged_json
 from beliefscope.app.commands.given import serving
-from beliefscope.app.commands.report import trace_command
+from beliefscope.app.commands.report import report_command, trace_command
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.app.link import moment_link
@@ -26,7 +27,9 @@ from beliefscope.app.security import kept_file
 from beliefscope.app.trash import Deleted, Gone, Trash, size
 from beliefscope.app.work import Report
 from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report import compose, write_report
+from beliefscope.recordings.reportpdf import browser, print_page
 
 NAME = re.compile(r"[\w.+-]+-episode\d+-[0-9a-f]{8}")
 
@@ -34,6 +37,22 @@ PAGE_POLICY = (
     "sandbox allow-popups; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
 )
 """What a report may do that is opened here: show itself, and have its links followed."""
+
+
+MOST_MOMENTS, LONGEST_TITLE = 20, 200
+
+
+class ReportRequest(BaseModel):
+    """Body of ``POST /api/reports/...``, as ``beliefscope report`` takes it.
+
+    Moments: steps that are shown in place of the three worst. Every: slow diagnostics as well. Pdf: printed, too.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    moments: Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=MOST_MOMENTS)] = []
+    every: bool = False
+    pdf: bool = False
+    title: Annotated[str, Field(max_length=LONGEST_TITLE)] = ""
 
 
 class Reports:
@@ -53,10 +72,10 @@ class Reports:
             ]
         return sorted((one for one in found if one), key=lambda one: one["made"], reverse=True)
 
-    def page(self, name: str) -> Path:
-        """Raises Gone where there is no such report."""
-        path = self.folder / name / "report.html"
-        whole = kept_file(self.folder, f"{name}/report.html")
+    def page(self, name: str, file: str = "report.html") -> Path:
+        """Raises Gone where there is no such report, or it has no such page."""
+        path = self.folder / name / file
+        whole = kept_file(self.folder, f"{name}/{file}")
         if not NAME.fullmatch(name) or path.parent.is_symlink() or whole is None:
             raise Gone(f"Report {name!r} is not there, or no longer.")
         return path
@@ -92,6 +111,7 @@ class Reports:
                 shown = {key: said[key] for key in ("title", "made", "task", "filter")}
                 shown |= {"episode": run["episode"], "recipe": str(Recipe.of(run["recipe"]))}
                 shown |= {"name": name, "url": f"/api/reports/{name}.html", "bytes": size(manifest.parent)}
+                shown["pdf"] = f"/api/reports/{name}.pdf" if "report.pdf" in said["files"] else None
                 self._known[name] = made, shown
             return self._known[name][1]
         return None
@@ -108,15 +128,18 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         return tagged_json(request, shown)
 
     @router.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
-    def make(asked: Asked, request: Request) -> dict[str, Job]:
+    def make(asked: Asked, request: Request, wanted: Annotated[ReportRequest | None, Body()] = None) -> dict[str, Job]:
+        wanted = wanted or ReportRequest()
+        _check(library, asked, wanted)
         url = str(request.base_url)
-        key = repr((library.key(asked), asked.filter, asked.data, url))
+        key = repr((library.key(asked), asked.filter, asked.data, url, wanted.model_dump_json()))
         short = hashlib.sha256(key.encode()).hexdigest()[:8]
         name = f"{re.sub(r'[^A-Za-z0-9_.+-]', '-', f'{asked.task}-{asked.filter}')}-episode{asked.episode}-{short}"
         folder = reports.folder / name
         arguments = {
             "settings": library.settings.to_json(),
             "selection": asked.to_json(),
+            "wanted": wanted.model_dump(),
             "url": url,
             "folder": str(folder),
         }
@@ -133,6 +156,11 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         )
         answer.headers["content-security-policy"] = PAGE_POLICY
         return answer
+
+    @router.get("/api/reports/{name}.pdf")
+    def printed(name: str) -> Response:
+        path = reports.page(name, "report.pdf")
+        return FileResponse(path, media_type="application/pdf", filename=f"{name}.pdf")
 
     @router.delete("/api/reports/{name}.html")
     def delete(name: str) -> dict[str, str]:
@@ -151,8 +179,17 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
     return router
 
 
+def _check(library: Library, asked: Selection, wanted: ReportRequest) -> None:
+    """Raises BadInput for a step that the run has not, and for a PDF where nothing can print one."""
+    if wanted.pdf:
+        browser()
+    if wanted.moments and (last := max(wanted.moments)) >= (steps := len(library.traced(asked))):
+        raise BadInput(f"moment {last} does not exist: the run has steps 0 to {steps - 1}")
+
+
 def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """The job of a report: its folder. What was traced before is read, not traced again."""
+    wanted = ReportRequest(**arguments["wanted"])
     library = Library(Settings.of_json(arguments["settings"]))
     try:
         of = Selection.of_json(arguments["selection"])
@@ -170,14 +207,22 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         composed = compose(
             [trace],
             traced.checkpoint,
+            title=wanted.title,
+            chosen=[(0, step) for step in wanted.moments],
+            every=wanted.every,
             link=link,
             opened=f"A link opens its moment in the dashboard while this runs: {served}.",
-            commands=(trace_command(trace, "run.trace", path or "", data), "beliefscope report run.trace -o report"),
+            commands=(
+                trace_command(trace, "run.trace", path or "", data),
+                report_command(["run.trace"], wanted.moments, wanted.every, wanted.title),
+            ),
             progress=lambda share: report(0.1 + 0.4 * share, "measuring"),
         )
         folder = Path(arguments["folder"])
         folder.parent.mkdir(parents=True, exist_ok=True)
-        document = write_report(composed, folder, progress=lambda share: report(0.5 + 0.5 * share, "drawing"))
+        chromium = browser() if wanted.pdf else None
+        printing = None if chromium is None else lambda page, printed: print_page(chromium, page, printed)
+        document = write_report(composed, folder, printing, lambda share: report(0.5 + 0.5 * share, "drawing"))
         return {"folder": str(folder), "files": document["files"]}
     finally:
         library.close()

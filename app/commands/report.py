@@ -89,11 +89,8 @@ def report(
     chosen = [_moment(text, traces) for text in moments or ()]
     link, opened = _links(traces, made_by, filter_, data, url)
     commands = [*(trace_command(trace, file.name, filter_, data) for file, trace in zip(files, traces, strict=True))]
-    given = [*(f"--moment={text}" for text in moments or ()), *(["--all"] if every else [])]
-    given += ["--title", heading] if heading else []
-    given += ["--filter", filter_] if filter_ else []
-    given += ["--data", str(data)] if data else []
-    commands.append(shlex.join(["beliefscope", "report", *(file.name for file in files), *given, "-o", "report"]))
+    given = [*(["--filter", filter_] if filter_ else []), *(["--data", str(data)] if data else [])]
+    commands.append(report_command([file.name for file in files], moments or (), every, heading, *given))
     with console.progress("Reporting") as advance:
         composed = compose(
             traces,
@@ -172,6 +169,13 @@ def _links(
 
     served = serving(files, data, first.seed)
     return link, f"A link opens its moment in the dashboard while this runs: {served}."
+
+
+def report_command(files: Sequence[str], moments: Sequence[object], every: bool, title: str, *more: str) -> str:
+    """What makes the report of its traces again."""
+    given = [*(f"--moment={moment}" for moment in moments), *(["--all"] if every else [])]
+    given += ["--title", title] if title else []
+    return shlex.join(["beliefscope", "report", *files, *given, *more, "-o", "report"])
 
 
 def trace_command(trace: Trace, file: str, filter_: str, data: Path | None) -> str:

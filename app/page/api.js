@@ -134,7 +134,7 @@ export const lookForFailures = async (asked) => (await ask(failuresUrl(asked), {
 export const recordings = async () => (await ask('/api/recordings')).json();
 export const reports = async () => (await ask('/api/reports')).json();
 
-/** Gives a recording another name, or other tags. @param {{url: string}} file @param {{name?: string, tags?: string[]}} change */
+/** Gives a recording another name, or other tags, or keeps it. @param {{url: string}} file @param {{name?: string, tags?: string[], automatic?: false}} change */
 export const changeRecording = async ({ url }, change) => (await post(url, change, 'PATCH')).json();
 
 /** Has a recording read as a run of this workspace; the job's link opens it. @returns {Promise<{job: Job}>} */
@@ -158,15 +158,15 @@ export const job = async (id) => (await ask(`/api/jobs/${id}`)).json();
 /** Cancels a job that is under way, forgets one that has ended. @returns {Promise<Job>} */
 export const cancel = async (id) => (await ask(`/api/jobs/${id}`, { method: 'DELETE' })).json();
 
-/** Has a report of a run made. The job's link is where it lies. @returns {Promise<{job: Job}>} */
-export const report = async ({ task, filter, episode, data, recipe }) =>
-  (await ask(`/api/reports/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, recipe })}`, { method: 'POST' })).json();
+/** Has a report of a run made. The job's link is where it lies. @param {{moments: number[], every: boolean, pdf: boolean, title: string}} wanted @returns {Promise<{job: Job}>} */
+export const report = async ({ task, filter, episode, data, recipe }, wanted) =>
+  (await post(`/api/reports/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, recipe })}`, wanted)).json();
 
-/** Writes a recording of a trace, with maps at even steps. @param {Trace} trace @returns {Promise<Recording>} */
-export async function record(trace) {
-  const maps = Math.ceil(trace.steps / RECORDED_MAPS);
-  return (await post('/api/recordings', { ...trace.selection, maps })).json();
-}
+/** What is asked for to record a trace, with maps at even steps. @param {Trace} trace @param {boolean} automatic whether it is to be looked at only */
+export const recorded = (trace, automatic = false) => ({ ...trace.selection, maps: Math.ceil(trace.steps / RECORDED_MAPS), automatic });
+
+/** Writes a recording; the job that makes it where that takes long: ask again when that is done. @returns {Promise<Recording | {job: Job}>} */
+export const record = async (asked) => (await post('/api/recordings', asked)).json();
 
 /**
  * @typedef {object} Run of fine-tuning (docs/api.md) @property {string} run @property {string} task @property {string} filter

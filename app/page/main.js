@@ -21,6 +21,7 @@ import { reading } from './reading.js';
 import { hold } from './readonly.js';
 import { FaultSheet } from './recipes.js';
 import { saving } from './recordings.js';
+import { ReportSheet } from './report.js';
 import { Rerun } from './rerun.js';
 import { SceneLook } from './scenelook.js';
 import { Slice } from './slice.js';
@@ -90,8 +91,8 @@ class Page {
     this.slice = new Slice($('#slice-label'), $('#slice-true'), store);
     this.scene = new Scene($('#scene'));
     this.sceneLook = new SceneLook($('#scene'), store, (look) => this.socket.look(look), (at) => this.socket.stand(at));
-    this.rerun = new Rerun($('#rerun'), (step) => store.set({ step, playing: false }, { origin: 'rerun' }));
     this.jobs = new Jobs($('#jobs'), $('#jobs-button'));
+    this.rerun = new Rerun($('#rerun'), this.jobs, (step) => store.set({ step, playing: false }, { origin: 'rerun' }));
     this.diagnostics = new Diagnostics($('#diagnostics'), store, this.jobs);
     this.failures = new Failures($('#failures'), store, this.jobs, this.timeline, catalog);
     this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.#overlay(other, name));
@@ -106,8 +107,8 @@ class Page {
     this.library = new Library($('#recordings'), catalog, store, this.jobs, this.rerun);
     this.showTab = tabs(store);
     this.socket = new ViewSocket(this.#handlers(), () => this.theme.dark, () => this.sceneLook.look);
-    this.save = saving($('#save'), $('#saved'), () => api.record(this.#trace), () => store.set({ tab: 'rerun' }), (name) => (store.set({ tab: 'recordings' }), this.library.point(name)));
-    $('#report').addEventListener('click', () => this.#report());
+    this.save = saving($('#save'), $('#saved'), this.jobs, () => this.#trace && api.recorded(this.#trace), () => store.set({ tab: 'rerun' }), (name) => (store.set({ tab: 'recordings' }), this.library.point(name)));
+    this.report = new ReportSheet($('#report'), () => ({ step: store.state.step, pinned: this.heatmaps.pinned }), (trace, wanted) => this.#report(trace, wanted));
     store.listen((state, changed) => this.#follow(state, changed));
     this.#takeKeys();
     this.#takeButtons();
@@ -117,11 +118,9 @@ class Page {
   }
 
   /** Has a report written; its job becomes the link to it. */
-  async #report() {
-    if (!this.#trace) return;
-    const problem = await api.report(this.#trace.selection).then(() => '', (error) => `The report was not asked for: ${error.message}`);
-    messages.say('report', problem);
-    if (!problem && $('#jobs').hidden) this.jobs.toggle();
+  async #report({ selection }, wanted) {
+    await api.report(selection, wanted);
+    if ($('#jobs').hidden) this.jobs.toggle();
     else this.jobs.refresh();
   }
 
@@ -203,7 +202,7 @@ class Page {
     }
     tellApart(trace.modalities);
     bodies.slice(1).forEach((body) => say(body, 'ready'));
-    for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun, this.diagnostics, this.failures]) panel.show(trace);
+    for (const panel of [this.clock, this.camera, this.timeline, this.slice, this.rerun, this.diagnostics, this.failures, this.report]) panel.show(trace);
     $('#maps-what').textContent = spoken(trace.task.map.x).replace(/(^| )x$/, '') || 'position';
     $('#maps').classList.toggle('one', !trace.fuses);
     $('#maps').classList.toggle('handless', !trace.has('effector_position'));

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
+from httpx import Response
 from starlette.testclient import TestClient
 
 from beliefscope.app.library import Settings
@@ -12,12 +14,26 @@ from beliefscope.app.server import create_app
 
 ORIGIN = "http://localhost:8000"
 PATIENCE = 120.0  # s: a job imports PyTorch first
+WANTED = {"moments": [7, 40], "title": "Two moments"}
 
 
 def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
     app = create_app(Settings(tmp_path / "workspace"), warm=False)
     with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
-        asked = client.post("/api/reports/door/crossmodal-ekf/9", params={"data": "sample", "recipe": "blackout=0.4"})
+
+        def ask(**wanted: Any) -> Response:
+            params = {"data": "sample", "recipe": "blackout=0.4"}
+            return client.post("/api/reports/door/crossmodal-ekf/9", params=params, json=WANTED | wanted)
+
+        for wrong, status, said in (
+            ({"moments": [100]}, 400, "moment 100 does not exist: the run has steps 0 to 99"),
+            ({"moments": [-1]}, 422, "moments"),
+            ({"moments": list(range(30))}, 422, "at most 20"),
+            ({"sections": ["all"]}, 422, "sections"),
+        ):
+            answer = ask(**wrong)
+            assert (answer.status_code, said in answer.json()["error"]) == (status, True), answer.text
+        asked = ask()
         assert asked.status_code == 202
         job = asked.json()["job"]
         assert client.get(f"/{job['link']}").status_code == 404
@@ -31,10 +47,12 @@ def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
         assert "attachment" in page.headers["content-disposition"]
         assert f"{ORIGIN}/?task=door&amp;filter=crossmodal-ekf&amp;data=sample&amp;episode=9&amp;step=" in page.text
         assert "recipe=blackout%3D0.4" in page.text
-        again = client.post("/api/reports/door/crossmodal-ekf/9", params={"data": "sample", "recipe": "blackout=0.4"})
-        assert again.json()["job"]["state"] == "done", "what is there is not made again"
+        assert [f"episode=9&amp;step={step}" in page.text for step in (7, 40, 41)] == [True, True, False]
+        assert "--moment=7 --moment=40 --title &#x27;Two moments&#x27; -o report" in page.text
+        assert ask().json()["job"]["state"] == "done", "what is there is not made again"
         (listed,) = client.get("/api/reports").json()["reports"]
-        assert f"/{job['link']}" == listed["url"]
+        assert (f"/{job['link']}", "Two moments", None) == (listed["url"], listed["title"], listed["pdf"])
+        assert client.get(listed["url"].replace(".html", ".pdf")).status_code == 404
         said = tuple(listed[key] for key in ("task", "filter", "episode", "recipe"))
         assert said == ("door", "crossmodal-ekf", 9, "blackout=0.4")
         shown = client.get(listed["url"], params={"shown": "true"})
@@ -48,7 +66,6 @@ def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
         assert client.get("/api/reports").json() == {"reports": [listed], "deleted": []}
         client.delete(listed["url"])
         assert client.delete("/api/reports/deleted").json() == {"freed": listed["bytes"]}
-        again = client.post("/api/reports/door/crossmodal-ekf/9", params={"data": "sample", "recipe": "blackout=0.4"})
-        assert again.json()["job"]["state"] in ("waiting", "running"), "what was deleted is made again"
+        assert ask().json()["job"]["state"] in ("waiting", "running"), "what was deleted is made again"
         assert client.get("/api/reports/door-nosuch-episode9-00000000.html").status_code == 404
         assert client.post("/api/reports/door/nosuch/9").status_code in (400, 404)

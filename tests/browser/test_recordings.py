@@ -132,6 +132,7 @@ def test_a_report_is_made_and_opened(open_page: Callable[..., Any]) -> None:
     shelf = Shelf(open_page("?tab=recordings"))
     page = shelf.page.page
     page.get_by_role("button", name="Report", exact=True).click()
+    page.keyboard.press("Enter")
     shelf.page.until("() => document.querySelector('#recordings .reports tbody tr')", REPORT)
     page.locator("#jobs").get_by_role("button", name="Close").click()
     with page.expect_popup() as opened:
