@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 import beliefscope
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.dataset import DAMAGE, SPLITS, Dataset, EpisodeSummary, damaged, reason
+from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.hdf5 import DAMAGE, damaged, open_hdf5, reason
 from beliefscope.datasets.push_real import RATE, observed
 from beliefscope.datasets.simulate import hand_controls
 from beliefscope.datasets.stored import numbers
@@ -113,7 +114,7 @@ LAYOUTS = (
 def is_authors(path: Path) -> bool:
     """Whether a file looks like one of theirs: HDF5, without a format of ours, with a trajectory and keys of theirs."""
     try:
-        with h5py.File(path) as file:
+        with open_hdf5(path) as file:
             return "format" not in file.attrs and _layout(file) is not None
     except DAMAGE:
         return False
@@ -190,9 +191,11 @@ class AuthorsFiles(Dataset):
         sources = []
         for path in paths:
             try:
-                file = self._open.enter_context(h5py.File(path))
+                file = self._open.enter_context(open_hdf5(path))
                 layout, names = _layout(file), _trajectories(file)
                 groups = [file[name] for name in names]
+            except BadInput:
+                raise
             except DAMAGE as error:
                 raise damaged(path, error) from None
             if layout is None:

@@ -18,6 +18,7 @@ import beliefscope
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.hdf5 import look_over
 from beliefscope.datasets.store import open_dataset, write_dataset
 
 Progress = Callable[[int, int], None]
@@ -85,6 +86,7 @@ class _Parts:
             raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.") from None
         except OSError as error:
             raise BadInput(f"Cannot write {path}: {error.strerror}.") from None
+        look_over(self._folder.glob("*.h5"))  # all at once
 
     def holds(self, index: int) -> bool:
         """Whether this episode is there and undamaged."""
@@ -104,6 +106,7 @@ class _Parts:
 
     def join(self, episodes: int) -> None:
         """Make the one file of them, in the folder so that a kill leaves nothing beside it, and drop the folder."""
+        look_over(self._folder.glob("*.h5"))
         joined = self._folder / "all.h5"
         write_dataset(joined, load_task(self.task), (self._read(i) for i in range(episodes)))
         os.replace(joined, self._whole)

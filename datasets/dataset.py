@@ -14,9 +14,6 @@ from beliefscope.datasets.task import Task
 
 SPLITS = ("train", "val", "test")
 
-DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
-"""What h5py raises on meeting a damaged file. BadInput is a ValueError too."""
-
 
 @dataclass(frozen=True)
 class EpisodeSummary:
@@ -80,13 +77,3 @@ class Dataset(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def damaged(path: Path, error: Exception) -> BadInput:
-    """The error for a file that HDF5 cannot read, with its own words."""
-    return BadInput(f"{path} is damaged or cut short: {reason(error)}. Collect or copy it again.")
-
-
-def reason(error: Exception) -> str:
-    """HDF5's own words, in one line."""
-    return " ".join((getattr(error, "strerror", None) or str(error)).split()).strip(" '\".")

@@ -24,9 +24,10 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 import beliefscope
-from beliefscope.datasets.dataset import DAMAGE, SPLITS, Dataset, EpisodeSummary, damaged
+from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.hdf5 import DAMAGE, damaged, open_hdf5
 from beliefscope.datasets.push_real import CENTRE, OUTLINES, TOUCHING, gap, observed, pictures
 from beliefscope.datasets.simulate import hand_controls
 from beliefscope.datasets.stored import numbers
@@ -99,7 +100,7 @@ def is_mit(path: Path) -> bool:
     if path.suffix == ".json":
         return True
     try:
-        with h5py.File(path) as file:
+        with open_hdf5(path) as file:
             return any(key in file for key in KEYS)
     except DAMAGE:
         return False
@@ -171,7 +172,7 @@ def _content(path: Path) -> dict[str, object]:
         if path.suffix == ".json":
             read = json.loads(path.read_bytes())
         else:
-            with h5py.File(path) as file:
+            with open_hdf5(path) as file:
                 found = {key: file.get(key) for key in KEYS}
                 read = {
                     key: numbers(stored, f"{path}: {key!r}")

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.authors import AuthorsFiles, is_authors
 from beliefscope.datasets.catalog import TASKS, find_task
-from beliefscope.datasets.dataset import DAMAGE, SPLITS, Dataset, EpisodeSummary, damaged, reason
+from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.hdf5 import DAMAGE, SHIPPED, Sink, damaged, look_over, open_hdf5, trust, unwritable
 from beliefscope.datasets.mit_push import MitPushes, is_mit
 from beliefscope.datasets.push_real import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.stored import check_claim
@@ -30,12 +31,10 @@ VERSION = 1
 
 T = TypeVar("T")
 
-_SAMPLES = Path(__file__).parent / "samples"
-
 
 def sample_path(task_name: str) -> Path:
     """The sample set shipped for a task. Raises BadInput for an unknown task, or one that ships none."""
-    path = _SAMPLES / f"{find_task(task_name).name}.h5"
+    path = SHIPPED / f"{find_task(task_name).name}.h5"
     if not path.exists():
         can_simulate = find_task(task_name).simulate is not None
         raise BadInput(
@@ -59,6 +58,7 @@ def open_dataset(path: str | Path, task: Task | None = None, skip_bad: bool = Fa
     """
     path = Path(path)
     files = data_files(path)
+    look_over(files)
     if is_mit(files[0]):
         wanted = task if task in PUSH_REAL_TASKS else PUSH_REAL
         return MitPushes(path, files, wanted, skip_bad)
@@ -87,7 +87,7 @@ class EpisodeFile(Dataset):
 
     def __init__(self, path: Path, skip_bad: bool = False) -> None:
         self.path = path
-        self._file = _open(path)
+        self._file = open_hdf5(path)
         try:
             self.task = self._read_task()
             self._groups = self._usable_groups() if skip_bad else self._find_groups()
@@ -270,13 +270,18 @@ def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> 
         raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.")
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with h5py.File(unfinished, "w", libver=("v110", "v110")) as file:
-            file.attrs["format"], file.attrs["version"], file.attrs["task"] = FORMAT, VERSION, task.name
-            for index, episode in enumerate(episodes):
-                _write_episode(file.create_group(f"trajectory{index}"), episode)
+        with Sink(unfinished, "w+b") as sink:
+            with h5py.File(sink, "w", libver=("v110", "v110")) as file:
+                file.attrs["format"], file.attrs["version"], file.attrs["task"] = FORMAT, VERSION, task.name
+                for index, episode in enumerate(episodes):
+                    _write_episode(file.create_group(f"trajectory{index}"), episode)
+                    sink.check()
+            sink.check()
         os.replace(unfinished, path)
+        trust(path)
     except OSError as error:
-        raise BadInput(f"Cannot write {path}: {reason(error)}.") from None
+        unfinished.unlink(missing_ok=True)
+        raise unwritable(path, error) from None
     finally:
         unfinished.unlink(missing_ok=True)
 
@@ -302,18 +307,3 @@ def _write_episode(group: h5py.Group, episode: Episode) -> None:
             key, (len(array),), element, chunks=(len(array),), compression="gzip", compression_opts=9, shuffle=True
         )
         stored[...] = array
-
-
-def _open(path: Path) -> h5py.File:
-    if not path.exists():
-        raise BadInput(f"{path} does not exist.")
-    if not path.is_file():
-        raise BadInput(f"{path} is not a file.")
-    try:
-        return h5py.File(path, "r")
-    except PermissionError:
-        raise BadInput(f"No permission to read {path}.") from None
-    except DAMAGE as error:
-        if not h5py.is_hdf5(path):
-            raise BadInput(f"{path} is not an HDF5 file.") from None
-        raise damaged(path, error) from None

@@ -89,7 +89,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(name: str, run: Trace
         with room_for(10_000):
             WRITERS[name](run, path)
 
-    (line,) = apart(write)  # HDF5 crashes at the end of a process in which it could not write
+    (line,) = apart(write)
     assert str(path) in line
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path], "nothing half-written is left"

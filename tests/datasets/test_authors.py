@@ -246,7 +246,7 @@ def test_files_of_two_tasks(tmp_path: Path) -> None:
 def test_a_file_among_theirs_that_is_none(tmp_path: Path) -> None:
     write(tmp_path / "a.hdf5", door, 1)
     (tmp_path / "b.hdf5").write_bytes(b"")
-    with pytest.raises(BadInput, match=r"b\.hdf5 is damaged or cut short"):
+    with pytest.raises(BadInput, match=r"b\.hdf5 is not an HDF5 file"):
         open_dataset(tmp_path)
     with h5py.File(tmp_path / "b.hdf5", "w") as file:
         file["trajectory0/numbers"] = np.arange(3)
