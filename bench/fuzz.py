@@ -50,6 +50,10 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
     """All inputs of one reader, in as many processes as it takes."""
     import readers
 
+    from beliefscope.app.commands.given import recording_in
+    from beliefscope.datasets.errors import BadInput
+    from beliefscope.datasets.store import open_dataset
+
     outcome = Outcome(inputs)
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
@@ -66,13 +70,10 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
                 (place / "why.txt").write_text(why)
 
         def contained(number: int) -> bool:
-            """Rerun's reader ends the process on some damaged files. Nobody reads one before another process has."""
-            from beliefscope.app.commands.given import recording_in
-            from beliefscope.datasets.errors import BadInput
-
+            """Some damaged files end the process that reads them. Nobody reads one before another process has."""
             with readers.spoiled(name, seed, number, Path(folder)) as path:
                 try:
-                    recording_in(path)
+                    (open_dataset if name in readers.HDF5 else recording_in)(path)
                 except BadInput:
                     return True
             return False
@@ -88,7 +89,7 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
                 kept(int(error.name), error.read_text())
                 error.unlink()
             first = at + 1 if code else inputs
-            if code == -signal.SIGABRT and name == "recording" and contained(at):
+            if code < 0 and name in ("recording", *readers.HDF5) and contained(at):
                 outcome.refused += 1
             elif code:
                 kept(at, f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}")
@@ -97,9 +98,12 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
 
 
 def _read_all(name: str, seed: int, first: int, inputs: int, folder: str, shared: mmap.mmap) -> None:
-    """In the process: counts go into shared memory, so that they outlive it."""
+    """In the process, which itself is the one that goes over a file first. Counts in shared memory outlive it."""
     import readers
 
+    from beliefscope.datasets import hdf5
+
+    hdf5.is_foreign = lambda path: False
     with open("/proc/self/statm") as file:
         taken = int(file.read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, taken + MEMORY))

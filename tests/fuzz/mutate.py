@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -190,6 +191,38 @@ def spoiled_safetensors(data: bytes, rng: Random, key: str) -> bytes:
     text = json.dumps(header).encode()
     lie = rng.choice((0, 2**63, len(text) + 1)) if rng.random() < 0.05 else len(text)
     return struct.pack("<Q", lie) + text + bytes(body)
+
+
+def spoiled_live(data: bytes, rng: Random) -> bytes:
+    """A live run whose bytes, header or blocks are wrong; the latter two with the checksums that belong to them."""
+    if rng.random() < 0.4:
+        return damaged(data, rng)
+    parts, at = [], 0
+    while at < len(data):  # header, then blocks up to the end
+        mark, number, _ = struct.unpack_from("<4sII", data, at)
+        following = data.find(b"step", at + 12) if mark != b"end\n" else len(data)
+        following = following if following > 0 else len(data) - 12
+        parts.append([mark, number, data[at + 12 : following]])
+        at = following
+    one = parts[0] if rng.random() < 0.6 else rng.choice(parts[1:])
+    if one is parts[0]:
+        header, end = json.JSONDecoder().raw_decode(one[2].decode("latin-1"))
+        one[2] = spoiled_json(json.dumps(header).encode(), rng) + one[2][end:]
+        one[1] = len(one[2])
+    else:
+        match rng.randrange(5):
+            case 0:
+                one[1] = rng.choice((0, 1, 2**31, 2**32 - 1))
+            case 1:
+                one[2] = np.full(len(one[2]) // 4, rng.choice((math.nan, math.inf, 1e38)), "<f4").tobytes()
+            case 2:
+                one[0] = rng.choice((b"end\n", b"step", b"BsL\n", b"\0\0\0\0"))
+            case 3:
+                parts.insert(rng.randrange(len(parts) + 1), list(one))
+            case 4:
+                one[2] = damaged(one[2] or b"\0", rng)
+    sums = [zlib.crc32(content, zlib.crc32(struct.pack("<4sI", mark, number))) for mark, number, content in parts]
+    return b"".join(struct.pack("<4sII", *one[:2], checked) + one[2] for one, checked in zip(parts, sums, strict=True))
 
 
 def spoil_hdf5(path: Path, rng: Random) -> None:

@@ -10,7 +10,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -37,6 +37,7 @@ from beliefscope.filters.kept import Partial
 from beliefscope.filters.study import Cell, rows_of, to_csv, to_markdown
 from beliefscope.filters.train import PLANS, train
 from beliefscope.inspect.diagnostic import as_json
+from beliefscope.inspect.growing import GrowingReader, GrowingWriter, load_live
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
@@ -123,6 +124,27 @@ def read_trace(read: Callable[[Path], Trace], path: Path) -> None:
     can_be_shown(as_json({name: getattr(found, name) for name in ("filter", "modalities", "settings", "seed")}))
     assert len(found.estimate_mean) == len(found.episode.states) == len(found)
     found.episode.digest()
+
+
+def make_live(path: Path) -> None:
+    writer = GrowingWriter(path, traced("crossmodal-pf"), expected=18)
+    for _ in range(3):
+        writer.append(traced("crossmodal-pf"))
+    writer.finish()
+
+
+def read_live(path: Path) -> None:
+    """As a page that follows it, up to where the damage begins; then as a command, which takes it whole or not."""
+    reader = GrowingReader(path)
+    try:
+        with suppress(BadInput):
+            reader.poll()
+        can_be_shown([reader.steps, reader.finished, reader.expected, reader.started, reader.alive])
+        assert len(reader.part()) == reader.steps
+        assert len(reader.part(0, stride=2)) == (reader.steps + 1) // 2
+    finally:
+        reader.close()
+    read_trace(load_live, path)
 
 
 # What a study, a training, a server leave in their folders.
@@ -293,6 +315,8 @@ def _with_header(key: str) -> Callable[[Path, Random], None]:
     return rewritten(lambda data, rng: mutate.spoiled_safetensors(data, rng, key))
 
 
+HDF5 = ("episodes", "authors-door", "authors-push", "authors-real", "mit-hdf5")
+
 READERS: dict[str, Reader] = {
     "episodes": Reader(make_episodes, mutate.spoil_hdf5, read_episodes, ".h5"),
     "authors-door": Reader(partial(make_authors, keys=AUTHORS[0]), mutate.spoil_hdf5, read_episodes, ".hdf5"),
@@ -307,6 +331,7 @@ READERS: dict[str, Reader] = {
     "trace-pf": Reader(
         lambda path: save_trace(traced("crossmodal-pf"), path), _with_header(TRACE), partial(read_trace, load_trace)
     ),
+    "live": Reader(make_live, rewritten(mutate.spoiled_live), read_live, ".live"),
     "recording": Reader(
         lambda path: write_recording(traced("crossmodal-pf"), path),
         rewritten(mutate.damaged),
