@@ -103,6 +103,27 @@ class Desk:
         return None
 
 
+class Turns:
+    """Lets one asker in at a time (``async with``), in the order in which they came, with a rest after each.
+
+    Args:
+        rest: s for each s that it was in. longest: s.
+    """
+
+    def __init__(self, rest: float = 2.0, longest: float = 0.1) -> None:
+        self._rest, self._longest = rest, longest
+        self._lock = asyncio.Lock()
+        self._began = 0.0
+
+    async def __aenter__(self) -> None:
+        await self._lock.acquire()
+        self._began = time.monotonic()
+
+    async def __aexit__(self, *_: object) -> None:
+        rest = min(self._rest * (time.monotonic() - self._began), self._longest)
+        asyncio.get_running_loop().call_later(rest, self._lock.release)
+
+
 def _tell(answer: asyncio.Future[Any], found: Any, error: BaseException | None) -> None:
     def tell() -> None:
         if answer.done():

@@ -14,7 +14,7 @@ from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from beliefscope.app.desk import Desk
+from beliefscope.app.desk import Desk, Turns
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.mapwire import WiredMaps
 from beliefscope.app.memory import give_back
@@ -51,13 +51,14 @@ class View:
         name: unguessable; part of the view's addresses. idle_since: monotonic s when its page went, None while there.
     """
 
-    def __init__(self, library: Library, desk: Desk, dark: bool) -> None:
-        """Blocks for some 50 ms while the scene's server starts."""
+    def __init__(self, library: Library, desk: Desk, turns: Turns, dark: bool) -> None:
+        """Turns: of all views, to draw a scene. Blocks for some 50 ms while the scene's server starts."""
         self.name = secrets.token_urlsafe(12)
         self.scene = Scene(self._moved_in_scene, dark)
         self.idle_since: float | None = time.monotonic()
         self._library = library
         self._desk = desk
+        self._turns = turns
         self._waiting: Cursor | None = None
         self._arrived = asyncio.Event()
         self._shown: tuple[Selection, Traced] | None = None  # in memory for as long as somebody looks at it
@@ -144,17 +145,24 @@ class View:
             self._answered.set()
 
     async def _draw(self, websocket: WebSocket) -> None:
-        """Moves the scene to the newest cursor whose maps are sent."""
+        """Moves the scene to the newest cursor whose maps are sent.
+
+        One scene at a time in their turn, with rests between: many of them hold Python's lock so long that maps wait.
+        """
         while True:
             await self._answered.wait()
             self._answered.clear()
-            drawing, self._drawing = self._drawing, None
-            if drawing is None:
+            if self._drawing is None:
                 continue
-            step, serial = drawing.wanted.step, drawing.wanted.serial
-            show = partial(self.scene.show, drawing.traced, step, drawing.other, drawing.maps)
-            async with self._told(websocket, serial):
-                await self._desk.do(show, SCENE_DUE, frozenset({self}))
+            async with self._told(websocket, self._drawing.wanted.serial):
+                async with self._turns:
+                    drawing, self._drawing = self._drawing, None  # by now maybe a newer one
+                    if drawing is None:
+                        continue
+                    step, serial = drawing.wanted.step, drawing.wanted.serial
+                    await self._desk.do(
+                        partial(self.scene.show, drawing.traced, step, drawing.other, drawing.maps), SCENE_DUE
+                    )
                 await websocket.send_json({"type": "drawn", "serial": serial, "step": step})
 
     async def _maps(self, wanted: Cursor, traced: Traced) -> WiredMaps:
@@ -224,6 +232,7 @@ class Views:
     def __init__(self, library: Library, limit: int = 32, patience: float = 30.0) -> None:
         self._library = library
         self._desk = Desk()
+        self._turns = Turns()
         self._limit = limit
         self._patience = patience
         self._views: dict[str, View] = {}
@@ -243,7 +252,7 @@ class Views:
                 f"{self._limit} pages are open already, as many as this server shows at a time; close one and reload, "
                 "or serve with more --views."
             )
-        view = await asyncio.to_thread(View, self._library, self._desk, dark)
+        view = await asyncio.to_thread(View, self._library, self._desk, self._turns, dark)
         self._views[view.name] = view
         return view
 

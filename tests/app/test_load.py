@@ -6,6 +6,7 @@ import asyncio
 import gc
 import json
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -18,7 +19,7 @@ from websockets.typing import Origin
 
 from beliefscope.app import library as library_module
 from beliefscope.app import selection as selection_module
-from beliefscope.app.desk import Desk
+from beliefscope.app.desk import Desk, Turns
 from beliefscope.app.library import TRACES_IN_MEMORY, Library, Selection
 from beliefscope.app.selection import Traced
 from beliefscope.app.server import Settings
@@ -162,6 +163,29 @@ def test_the_desk_takes_what_is_due_first_and_never_two_that_need_the_same() -> 
         return order, most[0]
 
     assert asyncio.run(scenario()) == (["coarse", "scene", "fine"], 1)
+
+
+def test_one_after_the_other_has_its_turn_and_a_rest_follows_each_even_a_failed_one() -> None:
+    async def scenario() -> list[tuple[str, float]]:
+        turns, told = Turns(rest=2.0), []
+
+        async def one(name: str) -> None:
+            async with turns:
+                told.append((name, time.monotonic()))
+                await asyncio.sleep(0.02)
+                told.append((name, time.monotonic()))
+                if name == "second":
+                    raise ValueError(name)
+
+        await asyncio.gather(*(one(name) for name in ("first", "second", "third")), return_exceptions=True)
+        return told
+
+    told = asyncio.run(scenario())
+    assert [name for name, _ in told] == ["first", "first", "second", "second", "third", "third"]
+    times = [at for _, at in told]
+    for i in (0, 2):
+        # A turn that took t is followed by 2 t of rest; clocks and the loop's timers may differ by their resolution.
+        assert times[i + 2] - times[i + 1] >= 2.0 * (times[i + 1] - times[i]) - 0.002
 
 
 def test_the_desk_gives_back_errors_and_refuses_when_it_is_closed() -> None:

@@ -157,7 +157,7 @@ def test_over_all_held_out_it_is_a_job_that_can_be_cancelled(open_page: Any) -> 
     page.until("() => document.querySelector('#diagnostics article').dataset.state === 'ended'")
     assert article.locator("> .verdict").text_content() == "Cancelled."
     article.get_by_role("button", name="Try again").click()
-    page.until(READY)
+    page.until(READY, patience=180.0)
     assert "Intervals need" not in article.locator("> .verdict").text_content()  # of one trajectory only
     assert page.page.locator(".curves figure").count() == 0
     page.picture("held-out")
