@@ -229,7 +229,7 @@ def lived(folder: Path) -> None:
             continue  # killed between its making and its header
         reader = GrowingReader(path)
         reader.poll()
-        found = reader.trace()
+        found = reader.part()
         assert same(found, traced(0), len(found)), "steps that the filter never took"
         reader.close()
     for path in every_file(folder, ".rrd"):
@@ -243,7 +243,7 @@ def the_last(folder: Path) -> Result:
     reader.poll()
     assert reader.finished
     drawn = read_recording(path.with_suffix(".rrd"))
-    return {"same": same(reader.trace(), traced(0)), "recording": same(drawn, traced(0))}
+    return {"same": same(reader.part(), traced(0)), "recording": same(drawn, traced(0))}
 
 
 KINDS: dict[str, Kind] = {

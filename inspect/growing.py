@@ -17,6 +17,7 @@ import math
 import os
 import struct
 import threading
+from array import array as packed
 from bisect import bisect_right
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -69,7 +70,7 @@ class GrowingWriter:
         self.path, self.steps = Path(path), 0
         arrays = arrays_of(like)
         static = {name: np.ascontiguousarray(arrays.pop(name)) for name in STATIC}
-        self._shapes: Shapes = {name: (array.shape[1:], array.dtype) for name, array in arrays.items()}
+        self._shapes = _shapes_of_step(arrays)
         header = {
             "format": FORMAT,
             "trace": header_of(like),
@@ -90,12 +91,12 @@ class GrowingWriter:
 
     def append(self, part: Trace) -> None:
         """Adds the steps of a trace. Raises BadInput where its arrays are not as at the start, or the disk is full."""
-        arrays = arrays_of(part)
-        for name in (*arrays.keys() ^ {*self._shapes, *STATIC}, *self._shapes):
-            found = (arrays[name].shape[1:], arrays[name].dtype) if name in arrays else None
-            if found != self._shapes.get(name):
-                step, started = (shown and f"{shown[1]} {shown[0]}" for shown in (found, self._shapes.get(name)))
-                raise BadInput(f"step {self.steps} has {name} as {step or 'nothing'}, the run began with {started}")
+        arrays = {name: array for name, array in arrays_of(part).items() if name not in STATIC}
+        found = _shapes_of_step(arrays)
+        for name in self._shapes | found:
+            now, before = (_told(shapes.get(name)) for shapes in (found, self._shapes))
+            if now != before:
+                raise BadInput(f"step {self.steps} has {name} as {now}, the run began with {before}")
         most = max(1, LARGEST_BLOCK // max(1, _bytes(self._shapes)))
         for first in range(0, len(part), most):
             rows = {name: np.ascontiguousarray(arrays[name][first : first + most]) for name in self._shapes}
@@ -149,9 +150,7 @@ class GrowingReader:
             raise BadInput(f"{self._name} cannot be read: {error.strerror}") from None
         self._lock = threading.RLock()
         self._given = 0  # steps that ``read`` has given
-        self._blocks: list[tuple[int, int]] = []  # first step, place in the file
-        self._kept: Arrays = {}
-        self._filled = 0
+        self._firsts, self._places = packed("q"), packed("q")  # each block's first step, its place in the file
         try:
             self._read_header()
         except BaseException:
@@ -198,10 +197,10 @@ class GrowingReader:
             first, self._given = self._given, self.poll()
             return self.part(first, self._given)
 
-    def part(self, first: int, last: int | None = None, stride: int = 1) -> Trace:
+    def part(self, first: int = 0, last: int | None = None, stride: int = 1) -> Trace:
         """Steps ``first`` to ``last - 1`` of those that are known, or every so many-th of them; nothing is kept.
 
-        Raises BadInput for others.
+        Without arguments all. Raises BadInput for others.
         """
         with self._lock:
             last = self.steps if last is None else last
@@ -214,19 +213,6 @@ class GrowingReader:
             for at, step in enumerate(steps if stride > 1 else ()):
                 self._fill({name: array[at : at + 1] for name, array in arrays.items()}, step, step + 1)
             return self._trace(arrays)
-
-    def trace(self) -> Trace:
-        """All steps that are known. They are kept in memory from now on: the next time costs only the new ones."""
-        with self._lock:
-            if self.steps > len(self._kept.get("estimate_mean", ())):
-                room = max(64, 2 * self.steps)
-                larger = {name: np.empty((room, *shape), kind) for name, (shape, kind) in self._shapes.items()}
-                for name, array in self._kept.items():
-                    larger[name][: self._filled] = array[: self._filled]
-                self._kept = larger
-            self._fill({n: a[self._filled : self.steps] for n, a in self._kept.items()}, self._filled, self.steps)
-            self._filled = self.steps
-            return self._trace({name: array[: self.steps] for name, array in self._kept.items()} or self._empty)
 
     def close(self) -> None:
         """Closes the file; traces that were given stay. May be called again."""
@@ -253,8 +239,7 @@ class GrowingReader:
             self._static = {name: array.copy() for name, array in _split(content[end:], static, None).items()}
             self._said = header["trace"]
             self.expected, self.started, self.pid = header["expected"], header["started"], header["pid"]
-            self._empty = {name: np.empty((0, *shape), kind) for name, (shape, kind) in self._shapes.items()}
-            self._trace(self._empty)
+            self._trace({name: np.empty((0, *shape), kind) for name, (shape, kind) in self._shapes.items()})
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise BadInput(f"{self._name} has a header that makes no sense: {error}") from None
         self.bytes_per_step = self._row
@@ -275,18 +260,19 @@ class GrowingReader:
         if mark == END:
             self.finished = True
         else:
-            self._blocks.append((self.steps, self._end + MARK.size))
+            self._firsts.append(self.steps)
+            self._places.append(self._end + MARK.size)
             self.steps += rows
         self._end = end
         return True
 
     def _fill(self, arrays: Arrays, first: int, last: int) -> None:
         """Steps ``first`` to ``last - 1`` into arrays that have room for just these."""
-        number = bisect_right(self._blocks, first, key=lambda block: block[0]) - 1
+        number = bisect_right(self._firsts, first) - 1
         at = first
         while at < last:
-            start, place = self._blocks[number]
-            stop = self._blocks[number + 1][0] if number + 1 < len(self._blocks) else self.steps
+            start, place = self._firsts[number], self._places[number]
+            stop = self._firsts[number + 1] if number + 1 < len(self._firsts) else self.steps
             rows = _split(self._bytes_at(place, (stop - start) * self._row), self._shapes, stop - start)
             to = min(stop, last)
             for name, array in arrays.items():
@@ -310,13 +296,21 @@ def load_live(path: Path) -> Trace:
     try:
         if not reader.poll():
             raise BadInput(f"{str(path)!r} has no step yet")
-        return reader.trace()
+        return reader.part()
     finally:
         reader.close()
 
 
 def _checksum(mark: bytes, number: int, content: bytes) -> int:
     return crc32(content, crc32(struct.pack("<4sI", mark, number)))
+
+
+def _shapes_of_step(arrays: Mapping[str, NDArray[Any]]) -> Shapes:
+    return {name: (array.shape[1:], array.dtype) for name, array in arrays.items()}
+
+
+def _told(one: tuple[tuple[int, ...], np.dtype[Any]] | None) -> str:
+    return "nothing" if one is None else f"{one[1]} {one[0]}"
 
 
 def _described(shapes: Shapes) -> dict[str, Any]:

@@ -89,8 +89,8 @@ def test_what_was_read_is_the_trace(whole: Trace, tmp_path: Path) -> None:
     write(tmp_path / "run.live", whole, [1, 2, 9, 30])
     reader = GrowingReader(tmp_path / "run.live")
     assert (reader.poll(), reader.finished, reader.alive, reader.expected) == (30, True, False, 30)
-    assert same(reader.trace(), whole)
-    save_trace(reader.trace(), tmp_path / "again.trace")
+    assert same(reader.part(), whole)
+    save_trace(reader.part(), tmp_path / "again.trace")
     save_trace(whole, tmp_path / "run.trace")
     assert (tmp_path / "again.trace").read_bytes() == (tmp_path / "run.trace").read_bytes()
 
@@ -106,12 +106,12 @@ def test_any_part_is_that_part(whole: Trace, tmp_path: Path, first: int, last: i
 def test_a_reader_follows_the_writer(whole: Trace, tmp_path: Path) -> None:
     writer = GrowingWriter(tmp_path / "run.live", whole)
     reader = GrowingReader(tmp_path / "run.live")
-    assert (len(reader.read()), len(reader.trace()), reader.expected, reader.alive) == (0, 0, None, True)
+    assert (len(reader.read()), len(reader.part()), reader.expected, reader.alive) == (0, 0, None, True)
     known: list[Trace] = []
     for step in range(30):
         writer.append(cut(whole, step, step + 1))
         assert same(reader.read(), cut(whole, step, step + 1))
-        known.append(reader.trace())
+        known.append(reader.part())
         assert (reader.steps, reader.finished, reader.alive) == (step + 1, False, True)
     assert len(reader.read()) == 0
     writer.finish()
@@ -123,9 +123,9 @@ def test_a_reader_follows_the_writer(whole: Trace, tmp_path: Path) -> None:
 def test_nothing_is_read_where_nothing_is_new(whole: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "run.live", whole, list(range(1, 31)), end=False)
     reader = GrowingReader(tmp_path / "run.live")
-    assert (reader.poll(), len(reader.trace())) == (30, 30)
+    assert (reader.poll(), len(reader.read())) == (30, 30)
     monkeypatch.setattr("os.pread", lambda *_: pytest.fail("read again"))
-    assert (reader.poll(), len(reader.trace())) == (30, 30)
+    assert (reader.poll(), len(reader.read())) == (30, 0)
 
 
 @pytest.mark.parametrize("whole", ["crossmodal-pf"], indirect=True)
@@ -145,7 +145,7 @@ def test_cut_at_every_byte(small: Trace, tmp_path: Path) -> None:
         reader = GrowingReader(path)
         complete = max(count for count, size in zip(steps, sizes, strict=True) if size <= length)
         assert (reader.poll(), reader.finished, reader.alive) == (complete, False, False)
-        assert same(reader.trace(), cut(small, 0, complete))
+        assert same(reader.part(), cut(small, 0, complete))
         reader.close()
 
 
@@ -164,7 +164,7 @@ def test_every_damaged_byte_is_noticed(small: Trace, tmp_path: Path) -> None:
         assert (reader is None) == (place < sizes[0])
         if reader is not None:
             assert not reader.finished
-            assert same(reader.trace(), cut(small, 0, reader.steps))
+            assert same(reader.part(), cut(small, 0, reader.steps))
             reader.close()
 
 

@@ -94,7 +94,7 @@ def test_it_is_the_trace_and_its_recording(
     assert (recorder.steps, recorder.waited, recorder.lost) == (35, 0, 0)
     reader = GrowingReader(recorder.path)
     assert (reader.poll(), reader.finished) == (35, True)
-    assert_same(reader.trace(), whole)
+    assert_same(reader.part(), whole)
     recording = recorder.path.with_suffix(".rrd")
     assert_same(read_recording(recording), whole)
     again = content(write_recording(whole, tmp_path / "run.rrd"))
@@ -129,7 +129,7 @@ def test_a_filter_of_another_kind_that_knows_no_truth(tmp_path: Path) -> None:
     for found in (GrowingReader(recorder.path), read_recording(recorder.path.with_suffix(".rrd"))):
         if isinstance(found, GrowingReader):
             found.poll()
-            found = found.trace()
+            found = found.part()
         steps = np.arange(23, dtype=np.float32)
         np.testing.assert_array_equal(found.estimate_mean, np.repeat(steps[:, None], 3, axis=1))
         np.testing.assert_array_equal(found.estimate_covariance, (1 + steps)[:, None, None] * np.eye(3))
@@ -179,7 +179,7 @@ def test_what_is_handed_over_may_change_afterwards(tmp_path: Path) -> None:
             mean[:], force[:] = -1, -1
     reader = GrowingReader(recorder.path)
     reader.poll()
-    found = reader.trace()
+    found = reader.part()
     for array in (found.estimate_mean, found.episode.observations["force"], found.episode.states):
         np.testing.assert_array_equal(array[:, 0], np.arange(300))
     assert not recorder.path.with_suffix(".rrd").exists()
@@ -360,8 +360,8 @@ def killed(folder: Path, last: int, pause: float, when: str) -> int:
     reader = GrowingReader(folder / "run.live")
     steps = reader.poll()
     assert (reader.finished, reader.alive) == (False, False)
-    np.testing.assert_array_equal(reader.trace().estimate_mean[:, 0], np.arange(steps))
-    np.testing.assert_array_equal(reader.trace().episode.observations["image"][:, 3, 3], np.arange(steps) % 256)
+    np.testing.assert_array_equal(reader.part().estimate_mean[:, 0], np.arange(steps))
+    np.testing.assert_array_equal(reader.part().episode.observations["image"][:, 3, 3], np.arange(steps) % 256)
     return steps
 
 
