@@ -248,7 +248,6 @@ class LiveRecorder:
             if block and self._error is None:
                 try:
                     self._writer.append(self._part(block))
-                    continue
                 except BadInput as error:
                     self._fail(error)
                 except Exception as error:

@@ -40,7 +40,10 @@ from beliefscope.recordings.diagnostics import log_diagnostic
 from beliefscope.recordings.maps import map_columns, map_style
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
 
-STEPS_PER_CHUNK, CHUNKS = 100, 300
+STEPS_PER_CHUNK, CHUNKS = 100, 100
+"""Steps at least that are sent at once, and how often at most: Rerun keeps an index of all that was sent in memory until
+the file ends, some 0.4 MB each time. Larger parts than these need more themselves."""
+
 MAPS_PER_CHUNK = 16
 LAYOUT_STEPS = 1000
 
@@ -137,7 +140,7 @@ def let_go(layout: rrb.Blueprint) -> Iterator[None]:
 
 
 def chunks(steps: int) -> Iterator[tuple[int, int]]:
-    """First step and the one after the last of each part that is sent at once: not too many for Rerun's index."""
+    """First step and the one after the last of each part that is sent at once."""
     size = max(STEPS_PER_CHUNK, math.ceil(steps / CHUNKS))
     for first in range(0, steps, size):
         yield first, min(first + size, steps)
