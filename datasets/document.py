@@ -13,13 +13,22 @@ def read_json(text: str | bytes) -> Any:
     on, and gives up in its own way on what is nested too deeply.
     """
     try:
-        found = json.loads(text, parse_constant=_refuse)
+        found = json.loads(text, parse_constant=_refuse, parse_int=_whole)
         json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     except UnicodeEncodeError:
         raise ValueError("it holds half a character") from None
     return found
+
+
+def _whole(digits: str) -> int:
+    number = int(digits)
+    try:
+        float(number)
+    except OverflowError:  # which pydantic would take as infinity
+        raise ValueError(f"a number of {len(digits)} digits is beyond all floats") from None
+    return number
 
 
 def _refuse(constant: str) -> NoReturn:

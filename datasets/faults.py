@@ -115,7 +115,7 @@ def _checked(fault: str, key: str, parameter: Field[Any], value: Any) -> Any:
     if value is None and parameter.default is None:
         return None
     if wanted["kind"] is str:
-        if not isinstance(value, str) or not value or set(value) & set(",:= "):
+        if not isinstance(value, str) or not value.isprintable() or not value or set(value) & set(",:= "):
             raise BadInput(f"{fault}'s {key!r} is {value!r}, not a name")
         if wanted["choices"] and value not in wanted["choices"]:
             raise one_of(f"{key} of {fault}", value, wanted["choices"])

@@ -317,7 +317,9 @@ BAD = {
     '{"blackout": true}': r"blackout's 'probability' is True, not a number",
     '{"delay": ""}': r"delay's 'modality' is '', not a name",
     '{"delay": "a,b"}': r"delay's 'modality' is 'a,b', not a name",
-    '{"force_bias": 1' + "0" * 500 + "}": r"force_bias's 'x' is 10+, not a number",
+    '{"force_bias": 1' + "0" * 500 + "}": r"recipe is not JSON: a number of 501 digits is beyond all floats",
+    "force_bias=1" + "0" * 500: r"force_bias's 'x' is 10+, not a number",
+    "delay=\ud800:steps=1": r"delay's 'modality' is '\\ud800', not a name",
 }
 
 
