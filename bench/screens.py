@@ -57,7 +57,9 @@ VIEWS: dict[str, Callable[[Page], None]] = {
     "compare": tab("compare", state("#compare .result"), "Run beside"),
     "study": tab("study", state("#study")),
     "rerun": tab("rerun", "['ready', 'error'].includes(document.querySelector('#rerun').dataset.state)"),
+    "layers": tab("scene", state("#scene"), "Layers…"),
     "maps-options": click("#maps-view"),
+    "report": click("#report"),
     "keys": click("#help"),
     "jobs": click("#jobs-button"),
 }
