@@ -11,7 +11,6 @@ import os
 import shutil
 import stat
 import threading
-import time
 import unicodedata
 import uuid
 from collections.abc import Sequence
@@ -30,7 +29,6 @@ from beliefscope.filters.checkpoint import write_atomically
 ENDING = ".rrd"
 LONGEST = 200  # bytes of a name without its ending: a file under way has a longer one
 TAGS, TAG = 20, 40  # of a file, characters of one
-ABANDONED = 86400.0  # s after which a file under way is nobody's
 WAITING = 64  # files read in the background at once, the others when these are done
 AUTOMATIC, AUTOMATIC_BYTES = 50, 10**9  # of the files that were written to be looked at only
 
@@ -78,12 +76,10 @@ class RrdFiles:
         self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reading recordings")
         self._asked: dict[str, tuple[int, int]] = {}  # name -> (bytes, ns) of what is waited for
         self._closing = False
-        self._tidied = False
 
     def all(self) -> list[Recording]:
         """The newest first. What is not known yet is read from now on."""
         with self._lock:
-            self._tidy()
             found = []
             for name, status in self._files():
                 kept = self._kept(name)
@@ -306,15 +302,6 @@ class RrdFiles:
         finally:
             with self._lock:
                 self._asked.pop(name, None)
-
-    def _tidy(self) -> None:
-        """Once a server: files under way that their writer left."""
-        if not self._tidied and self.folder.is_dir():
-            self._tidied = True
-            for path in self.folder.glob(".*.part"):
-                with suppress(OSError):
-                    if path.lstat().st_mtime < time.time() - ABANDONED:
-                        path.unlink()
 
 
 def checked(name: str) -> str:

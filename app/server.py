@@ -24,6 +24,7 @@ from beliefscope.app import compare, descent, diagnostics, failures, finetune, j
 from beliefscope.app.access import LOOPBACK, OPEN, VARIABLE, Access, names_of
 from beliefscope.app.api import routes
 from beliefscope.app.children import with_children
+from beliefscope.app.leftovers import sweep
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.logs import no_false_alarm
 from beliefscope.app.memory import few_heaps, settle
@@ -55,6 +56,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False, acces
     """
     with contextlib.suppress(FileExistsError):  # what is wrong with it is said by who needs it
         settings.workspace.mkdir(mode=0o700, parents=True)
+    sweep(settings.workspace)
     tracer = Tracer() if apart else None
     library = Library(with_children(settings), tracer)
     views = Views(library, settings.views)

@@ -268,7 +268,7 @@ def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> 
     path = Path(path)
     if not path.parent.is_dir():
         raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.")
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with Sink(unfinished, "w+b") as sink:
             with h5py.File(sink, "w", libver=("v110", "v110")) as file:

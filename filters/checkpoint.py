@@ -141,7 +141,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     try:
         if not path.parent.is_dir():
             raise BadInput(f"folder {str(path.parent)!r} does not exist")
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:100]}.", dir=path.parent)
+        handle, temporary = tempfile.mkstemp(".part", f".{path.name[:100]}.", path.parent)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
