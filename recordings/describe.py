@@ -11,6 +11,8 @@ import json
 import resource
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -39,28 +41,20 @@ def describe(path: str | Path) -> dict[str, Any]:
     entities: set[str] = set()
     properties: dict[str, Any] = {}
     title, rows = "", 0
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of files without a footer
-            reader = RrdReader(path)
-            stores = reader.recordings()
-            if not stores:
-                raise BadInput(f"{path}: a Rerun file without a recording in it.")
-            ours = next((store for store in stores if store.application_id == APPLICATION), stores[0])
-            for chunk in (chunk for store in stores for chunk in reader.stream(store=store)):
-                entities.add(chunk.entity_path)
-                rows += chunk.num_rows
-                if chunk.entity_path == f"/{HEADER}" and ours.application_id == APPLICATION:
-                    properties |= properties_of(chunk.to_record_batch())
-                elif chunk.entity_path == "/__properties":
-                    batch = chunk.to_record_batch()
-                    if "RecordingInfo:name" in batch.schema.names:
-                        title = str(_first(batch, "RecordingInfo:name"))
-    except (RuntimeError, ValueError, LookupError, TypeError) as error:
-        if isinstance(error, BadInput):
-            raise
-        reason = str(error).splitlines()[0].split(f"{path}: ")[-1]
-        raise BadInput(f"{path}: not a whole Rerun recording ({reason}).") from None
+    with reading(path) as reader:
+        stores = reader.recordings()
+        if not stores:
+            raise BadInput(f"{path}: a Rerun file without a recording in it.")
+        ours = next((store for store in stores if store.application_id == APPLICATION), stores[0])
+        for chunk in (chunk for store in stores for chunk in reader.stream(store=store)):
+            entities.add(chunk.entity_path)
+            rows += chunk.num_rows
+            if chunk.entity_path == f"/{HEADER}" and ours.application_id == APPLICATION:
+                properties |= properties_of(chunk.to_record_batch())
+            elif chunk.entity_path == "/__properties":
+                batch = chunk.to_record_batch()
+                if "RecordingInfo:name" in batch.schema.names:
+                    title = str(_first(batch, "RecordingInfo:name"))
     return {
         "application": ours.application_id[:TEXT],
         "title": title[:TEXT],
@@ -69,6 +63,20 @@ def describe(path: str | Path) -> dict[str, Any]:
         "properties": {name: value for name, value in properties.items() if name not in LEFT_OUT},
         "problem": _problem(ours.application_id[:TEXT], properties.get("format_version")),
     }
+
+
+@contextmanager
+def reading(path: str | Path) -> Iterator[RrdReader]:
+    """Rerun's reader of a file. What it cannot read within the block is BadInput, in one line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a file without a footer: a live run's, or one that was cut off
+            yield RrdReader(path)
+    except BadInput:
+        raise
+    except (RuntimeError, ValueError, LookupError, TypeError) as error:
+        reason = "".join(str(error).splitlines()[:1]).split(f"{path}: ")[-1]
+        raise BadInput(f"{path}: not a whole Rerun recording ({reason}).") from None
 
 
 def properties_of(batch: pa.RecordBatch) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections import defaultdict
 from dataclasses import fields
 from pathlib import Path
@@ -12,13 +11,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from rerun.chunk import RrdReader
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.intact import check_intact
 from beliefscope.inspect.trace import Trace, stored_recipe
-from beliefscope.recordings.describe import properties_of
+from beliefscope.recordings.describe import properties_of, reading
 from beliefscope.recordings.schema import (
     APPLICATION,
     FORMAT_VERSION,
@@ -99,21 +97,15 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
         raise BadInput(f"{path}: no such file; a recording (.rrd) is wanted.")
     header: dict[str, Any] = {}
     rows: Rows = defaultdict(list)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a file that was cut off is reported below, in one line
-            reader = RrdReader(path)
-            stores = [store for store in reader.recordings() if store.application_id == APPLICATION]
-            if stores:
-                for chunk in reader.stream(store=stores[0]).filter(content=STORED):
-                    batch = chunk.to_record_batch()
-                    if chunk.entity_path == f"/{HEADER}":
-                        header |= properties_of(batch)
-                    else:
-                        rows[chunk.entity_path.removeprefix("/")] += _values(batch)
-    except (RuntimeError, ValueError, LookupError, TypeError) as error:
-        reason = " ".join(str(error).splitlines()[:1]).split(f"{path}: ")[-1]
-        raise BadInput(f"{path}: not a whole Rerun recording ({reason}).") from None
+    with reading(path) as reader:
+        stores = [store for store in reader.recordings() if store.application_id == APPLICATION]
+        if stores:
+            for chunk in reader.stream(store=stores[0]).filter(content=STORED):
+                batch = chunk.to_record_batch()
+                if chunk.entity_path == f"/{HEADER}":
+                    header |= properties_of(batch)
+                else:
+                    rows[chunk.entity_path.removeprefix("/")] += _values(batch)
     version = header.get("format_version")
     if version is None:
         raise BadInput(f"{path}: a Rerun recording, but not one that {APPLICATION} wrote.")

@@ -41,8 +41,8 @@ from beliefscope.recordings.maps import map_columns, map_style
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
 
 STEPS_PER_CHUNK, CHUNKS = 100, 100
-"""Steps at least that are sent at once, and how often at most: Rerun keeps an index of all that was sent in memory until
-the file ends, some 0.4 MB each time. Larger parts than these need more themselves."""
+"""Steps at least that are sent at once, and how often at most: Rerun keeps an index in memory
+until the file ends, some 0.4 MB each time."""
 
 MAPS_PER_CHUNK = 16
 LAYOUT_STEPS = 1000
