@@ -66,10 +66,8 @@ def routes(library: Library) -> APIRouter:
             try:
                 run = runs[name]
                 shown, checkpoint = called(run, library.filters(run.task.name))
-                here = (
-                    not isinstance(checkpoint, Absent) or not run.like.checkpoint_hash
-                )  # one that has no file never is
-                about = {"filter": shown, "here": here, "kind": run.like.kind}
+                lacks_file = isinstance(checkpoint, Absent) and bool(run.like.checkpoint_hash)
+                about = {"filter": shown, "here": not lacks_file, "kind": run.like.kind}
                 found.append(described(run) | about)
             except BadInput as error:
                 found.append({"name": name, "state": "damaged", "told": str(error)})
