@@ -18,12 +18,14 @@ from beliefscope.app.wire import Look, layers
 from beliefscope.datasets.replay import replay
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.likelihood import LikelihoodMap, no_maps
+from beliefscope.inspect.measures import contours
 from beliefscope.inspect.trace import Trace
 
 SIGMAS = 2.0
 POLE_RADIUS = 0.005  # m
 POLE_STEP = 0.06  # m that one pole ends above the next, so that their labels do not meet
 BELIEF_ABOVE = 0.10  # m from the anchor to the plane on which particles and contours are drawn
+NARROWEST = 1e-6  # m, half an axis of a contour
 DISC_STEP = 0.002  # m from one contour down to the next
 FLOOR_MAP = 0.003  # m above the floor, and below the contours where they lie on it
 PALE = 130.0  # gray of a particle without weight
@@ -242,15 +244,14 @@ class Drawing:
         """Positions (S, 3), orientations (S, 4) and scales (S, 3) of the unit disc for each source but the truth."""
         plane = np.ix_(range(len(self._believed) - 1), self._plane)
         means = np.stack([mean[step] for _, mean, _ in self._believed[1:]])[plane]
-        covariances = np.stack([covariance[step] for _, _, covariance in self._believed[1:]]).astype(float)
-        values, vectors = np.linalg.eigh(covariances[:, self._plane][:, :, self._plane])
+        covariances = np.stack([covariance[step] for _, _, covariance in self._believed[1:]])
+        axes, turn = contours(covariances[:, self._plane][:, :, self._plane])
         count = len(means)
         # Apart, the fused one on top: discs in one plane would flicker.
         levels = self._level - DISC_STEP * np.arange(1, count + 1)
-        turn = np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]) / 2.0
         zero = np.zeros(count)
-        wxyz = np.stack([np.cos(turn), zero, zero, np.sin(turn)], axis=1)
-        scales = np.concatenate([SIGMAS * np.sqrt(np.maximum(values, 1e-12)), np.ones((count, 1))], axis=1)
+        wxyz = np.stack([np.cos(turn / 2.0), zero, zero, np.sin(turn / 2.0)], axis=1)
+        scales = np.concatenate([SIGMAS * np.maximum(axes, NARROWEST), np.ones((count, 1))], axis=1)
         return np.column_stack([means, levels]), wxyz, scales
 
     def _viewpoints(self) -> dict[str, tuple[Array, Array]]:

@@ -70,6 +70,13 @@ def nees(trace: Trace) -> Array:
     return np.einsum("tln,tln->tl", error, white) / error.shape[-1]
 
 
+def contours(covariance: NDArray[Any]) -> tuple[Array, Array]:
+    """Ellipses at 1 sigma of covariances (..., 2, 2): half axes (..., 2), the shorter first, and its turn (...) rad."""
+    values, vectors = np.linalg.eigh(covariance.astype(np.float64))
+    # Rounding may leave a flat covariance with an eigenvalue just below zero.
+    return np.sqrt(np.maximum(values, 0.0)), np.arctan2(vectors[..., 1, 0], vectors[..., 0, 0])
+
+
 def particle_log_weights(trace: Trace) -> Array:
     """(T, L, M): predicted particles as each layer weighs them, normalised: prior x its likelihood, the posterior."""
     assert trace.prior_log_weights is not None

@@ -214,7 +214,7 @@ def _estimates(trace: Trace, step: int) -> list[tuple[str, Array, Array]]:
 
 def _contour(centre: Array, covariance: Array, shade: str) -> Ellipse:
     """2 sigma around a centre in cm, of a covariance in m^2."""
-    values, vectors = np.linalg.eigh(covariance.astype(np.float64))
-    width, height = 200.0 * SIGMAS * np.sqrt(np.maximum(values, 0.0))
-    turn = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
-    return Ellipse((centre[0], centre[1]), width, height, angle=turn, fill=False, ec=shade, lw=1.2, zorder=3)
+    half, turn = measures.contours(covariance)
+    width, height = 200.0 * SIGMAS * half
+    angle = float(np.degrees(turn))
+    return Ellipse((centre[0], centre[1]), width, height, angle=angle, fill=False, ec=shade, lw=1.2, zorder=3)

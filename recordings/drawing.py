@@ -10,6 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Component, Ghost, Task
+from beliefscope.inspect.measures import contours
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import STEP, TIME
@@ -220,12 +221,9 @@ def _estimates(trace: Trace, steps: slice) -> Iterator[tuple[str, Array, Array]]
 
 def _ellipses(covariance: Array) -> tuple[Array, Array]:
     """Half axes (T, 2) at ``SIGMAS`` standard deviations and turns (T, 4, xyzw) of covariances (T, 2, 2)."""
-    values, vectors = np.linalg.eigh(covariance.astype(np.float64))
-    # Rounding may leave a flat covariance with an eigenvalue just below zero.
-    axes = SIGMAS * np.sqrt(np.maximum(values, 0.0))
-    half = 0.5 * np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
-    zero = np.zeros_like(half)
-    return axes, np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
+    axes, turn = contours(covariance)
+    zero = np.zeros_like(turn)
+    return SIGMAS * axes, np.stack([zero, zero, np.sin(turn / 2.0), np.cos(turn / 2.0)], axis=1)
 
 
 def _lift(points: Array) -> Array:

@@ -14,6 +14,7 @@ from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
+from beliefscope.inspect.measures import contours
 from beliefscope.inspect.plotting import write_figure
 from beliefscope.inspect.snapshot import footprint, outline, seen, snapshot
 from beliefscope.inspect.trace import Trace, trace
@@ -69,6 +70,17 @@ def test_a_footprint_is_the_objects_own(name: str) -> None:
     np.testing.assert_allclose(nearest.max(axis=0), corners.max(axis=0), atol=0.06)
     np.testing.assert_allclose(nearest.min(axis=0), corners.min(axis=0), atol=0.06)
     assert area == pytest.approx(200.0 if name == "door" else np.pi * 25.0, rel=0.01)
+
+
+def test_an_ellipse_has_the_covariance_that_it_is_drawn_for() -> None:
+    root = np.random.default_rng(2).normal(size=(50, 2, 2))
+    covariance = root @ root.swapaxes(1, 2)
+    half, turn = contours(covariance)
+    axes = np.stack([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]).transpose(2, 1, 0) * half[:, None]
+    np.testing.assert_allclose(axes @ axes.swapaxes(1, 2), covariance, atol=1e-12)
+    assert (half[:, 0] <= half[:, 1]).all()
+    flat = np.array([0.1, 0.3])
+    np.testing.assert_allclose(contours(np.outer(flat, flat))[0], [0.0, np.hypot(*flat)], atol=1e-8)
 
 
 def test_contours_hold_86_percent_of_their_gaussian(run: Trace) -> None:
