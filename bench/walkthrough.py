@@ -96,11 +96,11 @@ def main(folder: Path = IMAGES) -> None:
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         sys.exit("Chromium is not installed")
-    with serving() as url, sync_playwright() as playwright:
+    with serving() as server, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         for shot in SHOTS:
             page = browser.new_page(viewport=SIZE, color_scheme="light")
-            page.goto(f"{url}?{urlencode(MOMENT | shot.asked)}", timeout=1000 * PATIENCE)
+            page.goto(f"{server.url}?{urlencode(MOMENT | shot.asked)}", timeout=1000 * PATIENCE)
             print(f"{shot.name}: {take(page, shot)}", flush=True)
             page.screenshot(path=folder / f"{shot.name}.png", timeout=1000 * PATIENCE)
             page.close()

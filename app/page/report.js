@@ -38,6 +38,8 @@ export class ReportSheet {
     button.setAttribute('aria-haspopup', 'dialog');
     const { steps, which } = this.#form.elements;
     steps.addEventListener('input', () => (which.value = steps.value.trim() ? 'these' : 'worst'));
+    // Who chose with the mouse makes it with Enter, too.
+    this.#form.addEventListener('change', ({ target }) => target.matches(':focus-visible') || this.#form.querySelector('.make').focus());
     this.#form.addEventListener('submit', (event) => (event.preventDefault(), this.#submit()));
     this.#sheet.addEventListener('beforetoggle', ({ newState }) => {
       if (newState !== 'open') return;
