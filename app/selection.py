@@ -21,7 +21,7 @@ from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, no_maps
 from beliefscope.inspect.replay import Edit
 from beliefscope.inspect.trace import Trace, arrays_of
 
-FINE = max(MAP_SIZES)
+COARSE, FINE = MAP_SIZES
 MAPS_IN_MEMORY = 12 << 20  # bytes a trace: 300 coarse ones
 
 
@@ -152,6 +152,12 @@ class Traced:
             while self._kept_bytes > MAPS_IN_MEMORY:
                 self._kept_bytes -= self._kept.popitem(last=False)[1].nbytes
         return made
+
+    def unmade(self, step: int, angle: float | None, count: int) -> list[int]:
+        """The steps, of so many next to this one, whose coarse maps ``wired`` would have to make; the nearest first."""
+        near = sorted(range(max(0, step - count), min(len(self), step + count + 1)), key=lambda at: abs(at - step))
+        with self._keeping:
+            return [at for at in near[:count] if (at, angle, COARSE) not in self._kept]
 
     @property
     def nbytes(self) -> int:

@@ -19,7 +19,7 @@ from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.mapwire import WiredMaps
 from beliefscope.app.memory import give_back
 from beliefscope.app.scene import Scene
-from beliefscope.app.selection import FINE
+from beliefscope.app.selection import COARSE, FINE
 from beliefscope.app.wire import Cursor, cursor, look, viewpoint
 from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput
@@ -28,6 +28,7 @@ from beliefscope.inspect.trace import Trace
 
 log = logging.getLogger("beliefscope.app")
 COARSE_DUE, SCENE_DUE, FINE_DUE = 0.0, 0.25, 0.5  # s: where many scrub, maps under moving hands before all else
+AHEAD_DUE, AHEAD, PAUSE = 5.0, 200, 0.4  # s; steps about the cursor; s that a hand has rested before they are made
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,8 @@ class View:
         self._arrived = asyncio.Event()
         self._shown: tuple[Selection, Traced] | None = None  # in memory for as long as somebody looks at it
         self._drawing: _Drawing | None = None
+        self._looked = asyncio.Event()
+        self._last: tuple[Cursor, Traced] | None = None
         self._answered = asyncio.Event()
         self._moved_to: int | None = None
         self._telling = asyncio.Lock()
@@ -76,7 +79,7 @@ class View:
         self._loop, self.idle_since = asyncio.get_running_loop(), None
         if before is not None:
             await _quietly(before.close(4000, "The view was opened by another page."))
-        answering = [asyncio.create_task(each(websocket)) for each in (self._answer, self._draw)]
+        answering = [asyncio.create_task(each(websocket)) for each in (self._answer, self._draw, self._prepare)]
         try:
             while True:
                 await self._heard(websocket, await websocket.receive_text())
@@ -85,6 +88,7 @@ class View:
         finally:
             for task in answering:
                 task.cancel()
+            self._last = None
             if self._socket is websocket:
                 self._socket, self.idle_since = None, time.monotonic()
 
@@ -140,6 +144,9 @@ class View:
             wired = await self._maps(wanted, traced)
             await websocket.send_bytes(wired.message(wanted.serial))
             maps = wired.maps
+            if not traced.grows:
+                self._last = wanted, traced
+                self._looked.set()
         if wanted.scene:
             self._drawing = _Drawing(wanted, traced, None if other is None else other.trace, maps)
             self._answered.set()
@@ -164,6 +171,23 @@ class View:
                         partial(self.scene.show, drawing.traced, step, drawing.other, drawing.maps), SCENE_DUE
                     )
                 await websocket.send_json({"type": "drawn", "serial": serial, "step": step})
+
+    async def _prepare(self, _: WebSocket) -> None:
+        """Makes the coarse maps about the cursor while a hand rests, so that they are there when it moves."""
+        while True:
+            await self._looked.wait()
+            while self._looked.is_set():
+                self._looked.clear()
+                await asyncio.sleep(PAUSE)
+            if self._last is None:
+                continue
+            wanted, traced = self._last
+            with contextlib.suppress(Exception):  # what goes wrong is told to whom it matters: who looks there
+                for step in traced.unmade(wanted.step, wanted.angle, AHEAD):
+                    make = partial(traced.wired, step, wanted.angle, COARSE)
+                    await self._desk.do(make, AHEAD_DUE, frozenset({traced, COARSE}))
+                    if self._looked.is_set():
+                        break
 
     async def _maps(self, wanted: Cursor, traced: Traced) -> WiredMaps:
         make = partial(traced.wired, wanted.step, wanted.angle, wanted.size)

@@ -5,6 +5,7 @@
     python bench/load.py --counts 8 --real 2    8 raw browsers and 2 of Chromium
 
 Each browser scrubs an episode of its own with the default filter: 3 s at 30 moves a second, then it rests for 1 s.
+Before that it has had its page open for 5 s (``--look``), in which the server makes maps ahead.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ async def one(browser: Browser, selection: Selection, until: float, seed: int) -
         await asyncio.sleep(REST)
 
 
-async def measure(served: Served, count: int, seconds: float, job: bool, real: int) -> dict[str, Any]:
+async def measure(
+    served: Served, count: int, seconds: float, job: bool, real: int, look: float = 5.0
+) -> dict[str, Any]:
     """One point of the curve."""
     async with httpx.AsyncClient(base_url=served.url, headers={"Origin": served.url.rstrip("/")}, timeout=60) as http:
         task = (await http.get("/api/catalog")).json()["tasks"][0]
@@ -53,6 +56,7 @@ async def measure(served: Served, count: int, seconds: float, job: bool, real: i
             await browser.drag(selection, range(5), RATE)  # the scene is built
             browser.scrubs.clear()
             browser.scenes.clear()
+        await asyncio.sleep(look)
         working = await _job(http, common) if job else None
         before, driver, began = served.processor, time.process_time(), time.perf_counter()
         chromium = asyncio.get_running_loop().run_in_executor(None, _real, served.url, real, seconds) if real else None
@@ -111,6 +115,7 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 2, 4, 8, 16, 32], metavar="N")
     parser.add_argument("--seconds", type=float, default=12.0, help="for each of them")
     parser.add_argument("--real", type=int, default=0, metavar="N", help="pages in Chromium beside them")
+    parser.add_argument("--look", type=float, default=5.0, help="s that pages have been open when hands begin to move")
     parser.add_argument("--job", action="store_true", help="with a job running beside them")
     asked = parser.parse_args()
     table = Table(*COLUMNS, title="s of a hand's move to its maps: ms", title_justify="left")
@@ -118,7 +123,7 @@ def main() -> None:
     with serving("--views", str(LIMIT)) as served:
         time.sleep(8.0)  # until it has prepared what it prepares at the start
         for count in asked.counts:
-            found = asyncio.run(measure(served, count, asked.seconds, asked.job, asked.real))
+            found = asyncio.run(measure(served, count, asked.seconds, asked.job, asked.real, asked.look))
             every = [t for scrubs in found["scrubs"] for t in scrubs]
             p50, p95, p99 = 1e3 * np.percentile(every, [50, 95, 99])
             first = first or p95

@@ -23,7 +23,7 @@ from beliefscope.app.desk import Desk, Turns
 from beliefscope.app.library import TRACES_IN_MEMORY, Library, Selection
 from beliefscope.app.selection import Traced
 from beliefscope.app.server import Settings
-from beliefscope.app.session import Views
+from beliefscope.app.session import AHEAD, Views
 from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
 
@@ -96,6 +96,21 @@ def test_maps_are_made_once_for_all_who_look(library: Library, monkeypatch: pyte
         traced.wired(step, None, 41)
     assert len(traced._kept) == 3
     assert traced._kept_bytes == sum(kept.nbytes for kept in traced._kept.values())
+
+
+def test_while_a_hand_rests_the_maps_about_it_are_made(client: TestClient) -> None:
+    view = client.post("/api/views").json()
+    chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1}
+    served: Library = client.app.state.library  # type: ignore[attr-defined]
+    with client.websocket_connect(view["socket"]) as socket:
+        socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **chosen})
+        assert len(socket.receive_bytes()) > 0
+        traced = served.traced(Selection("door", "crossmodal-ekf", 1))
+        assert traced.unmade(3, 0.1, 4) == [3, 2, 4, 1]
+        until = time.monotonic() + PATIENCE
+        while traced.unmade(3, None, AHEAD):
+            assert time.monotonic() < until
+            time.sleep(0.01)
 
 
 def test_a_closed_view_leaves_nothing_behind(open_client: Callable[..., TestClient], settings: Settings) -> None:
