@@ -7,7 +7,6 @@ step has been drawn.
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from page import FLAGS
+from page import browsing, found_chromium
 from served import serving
 from subject import Row
 
@@ -55,33 +54,22 @@ def delays(handed: NDArray[np.float64], drawn: list[dict[str, float]]) -> NDArra
 
 def measure() -> list[Row]:
     """A row for each rate."""
-    command = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
-    if command is None:
-        return [("a live run on the page", "no Chromium here", "")]
-    from playwright.sync_api import sync_playwright
-
+    if found_chromium() is None:
+        return [("a live run on the page", "skipped: no Chromium on the path", "")]
     rows: list[Row] = []
-    with (
-        tempfile.TemporaryDirectory() as workspace,
-        serving(workspace=Path(workspace)) as served,
-        sync_playwright() as play,
-    ):
+    with tempfile.TemporaryDirectory() as workspace, serving(workspace=Path(workspace)) as served, browsing() as page:
         folder = Path(workspace) / "live"
-        browser = play.chromium.launch(executable_path=shutil.which(command), args=FLAGS)
         for rate in RATES:
             steps = int(SECONDS * rate)
             writer = subprocess.Popen([sys.executable, "-c", WRITER, str(folder), str(rate), str(steps)])
             while not (folder / f"at-{rate:.0f}.live").exists():
                 time.sleep(0.1)
-            page = browser.new_page(viewport={"width": 1440, "height": 900})
             page.goto(f"{served.url}?task=door&data=live:at-{rate:.0f}")
             drawn: list[dict[str, float]] = []
             while writer.poll() is None:
                 time.sleep(0.5)
                 drawn = page.evaluate("() => window.beliefscope?.live.latencies ?? []") or drawn
-            page.close()
             late = delays(np.load(folder / f"at-{rate:.0f}.npy"), drawn)
             middle, most = np.percentile(late, [50, 95])
             rows.append((f"step handed over to drawn, {rate:.0f} Hz: p50, p95", f"{middle:.0f}, {most:.0f} ms", ""))
-        browser.close()
     return rows

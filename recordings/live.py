@@ -297,7 +297,7 @@ class LiveRecorder:
             reader.close()
 
     def _part(self, rows: Sequence[_Row]) -> Trace:
-        """Some steps as a trace."""
+        """Some steps as a trace: what a filter of ours knew, or what another one said."""
         episode = Episode(
             task=self._task.name,
             states=np.stack([row.truth for row in rows]),
@@ -310,23 +310,27 @@ class LiveRecorder:
         n = self._sizes["n"]
         unknown = Gaussian(torch.full((1, n), torch.nan), torch.full((1, n, n), torch.nan))
         start = unknown if self._start is None else self._start
-        steps = [row.known for row in rows if isinstance(row.known, StepTrace)]
+        knew = [row.known for row in rows if isinstance(row.known, StepTrace)]
         evidence = [row.evidence for row in rows if row.evidence is not None]
-        if self._checkpoint is not None and steps and len(steps) == len(evidence) == len(rows):
-            return assemble(self._checkpoint, episode, start, _joined(evidence), steps, **self._given)
-        each = [row.known for row in rows if not isinstance(row.known, StepTrace)]
-        always = [name for name in each[0] if all(name in one for one in each)]
-        values = derived({name: _typed(name, torch.cat([one[name] for one in each])) for name in always})
+        if self._checkpoint is not None and len(knew) == len(evidence) == len(rows):
+            return assemble(self._checkpoint, episode, start, _joined(evidence), knew, **self._given)
+        return self._foreign([row.known for row in rows if not isinstance(row.known, StepTrace)], episode, start)
+
+    def _foreign(self, said: Sequence[Values], episode: Episode, start: Gaussian) -> Trace:
+        """What a filter of another kind said at each step, as a trace; without what it said at some of them only."""
+        n = self._sizes["n"]
+        always = [name for name in said[0] if all(name in one for one in said)]
+        values = derived({name: _typed(name, torch.cat([one[name] for one in said])) for name in always})
         modalities = model_names(values, 1, self._modalities, self._task)
         arrays = {name: np.ascontiguousarray(value.numpy()) for name, value in values.items()}
-        said: dict[str, Any] = {"filter": "own"} | self._given | with_unknown(arrays, len(modalities))
+        about: dict[str, Any] = {"filter": "own"} | self._given | with_unknown(arrays, len(modalities))
         return Trace(
             episode=episode,
             modalities=modalities,
             kind="foreign",
             start_mean=start.mean.reshape(n).float().numpy(),
             start_covariance=start.covariance.reshape(n, n).float().numpy(),
-            **said,
+            **about,
         )
 
 
