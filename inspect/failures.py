@@ -124,7 +124,7 @@ class Failures(Diagnostic):
     @property
     def verdict(self) -> str:
         """How many, the worst, and what most of them have in common."""
-        over = f"of {self.episodes} episodes, {self.steps} steps, by {self.title}"
+        over = f"of {self.episodes} episode{'s' * (self.episodes != 1)}, {self.steps} steps, by {self.title}"
         if not self.moments:
             return f"No moment {over} stands out."
         worst = self.moments[0]

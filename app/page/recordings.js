@@ -44,7 +44,7 @@ export function saving(button, host, jobs, wanted, open, keep) {
     const progress = Object.assign(document.createElement('progress'), { ariaLabel: 'Progress of the recording', hidden: true });
     const cancel = act('Cancel', () => jobs.cancel(cancel.value));
     cancel.hidden = true;
-    tell('Writing the recording: numbers of every step, likelihood maps at even steps …', progress, cancel);
+    tell('Writing the recording …', progress, cancel);
     try {
       const recording = await written(asked, jobs, ({ id, progress: share }) => {
         [progress.value, cancel.value, button.textContent] = [share, id, percent(share)];

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.browser
 
 READY = "() => document.querySelector('#recordings').dataset.state === 'ready'"
 REPORT = 240.0  # s: a job that draws some dozen figures
+WRITTEN = 180.0  # s: a job that makes likelihood maps, beside a viewer that draws on the processor
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +111,13 @@ def test_ones_own_files_are_kept_found_and_compared(open_page: Callable[..., Any
         page.emulate_media(color_scheme=theme)
         assert shelf.page.violations() == [], f"the tab of Rerun, {theme}"
     page.get_by_role("button", name="Back to the run").click()
-    shelf.page.until("async () => (await beliefscope.rerun.getState()).recordings.length === 1")
+    shelf.page.until("async () => (await beliefscope.rerun.getState()).recordings.length === 1", WRITTEN)
+    page.keyboard.press("r")
+    page.locator("#recordings .automatic").wait_for()
+    looked_at = "push-crossmodal-ekf-episode"
+    assert not any(name.startswith(looked_at) for name in shelf.names), "nobody asked for it to be kept"
+    page.locator("#recordings .automatic button").click()
+    assert any(name.startswith(looked_at) for name in shelf.names)
 
 
 def test_two_browsers_see_what_either_does(open_page: Callable[..., Any], runs: list[Path]) -> None:
