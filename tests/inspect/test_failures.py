@@ -262,5 +262,5 @@ def test_nothing_stands_out_where_all_is_alike(traces: list[Trace]) -> None:
     exact = replace(traces[0], estimate_mean=traces[0].episode.states)
     found = failures_of(Survey.of([exact]))
     assert found.moments == ()
-    assert found.verdict == f"No moment of 1 episodes, {CUT} steps, by position error stands out."
+    assert found.verdict == f"No moment of 1 episode, {CUT} steps, by position error stands out."
     assert found.tables()[0].rows[0][2] == 0
