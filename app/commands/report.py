@@ -66,7 +66,8 @@ def report(
       beliefscope report run.trace --moment 35 --moment 68 --all
     """
     from beliefscope.datasets.catalog import find_task
-    from beliefscope.recordings.report import check_folder, compose, write_report
+    from beliefscope.recordings.report import compose, write_report
+    from beliefscope.recordings.reportfolder import check_folder
     from beliefscope.recordings.reportpdf import browser, print_page
 
     check(None, json)

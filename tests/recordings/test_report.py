@@ -23,8 +23,9 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace, save_trace, trace
-from beliefscope.recordings.report import FORMAT, compose, new_folder, write_report
+from beliefscope.recordings.report import compose, write_report
 from beliefscope.recordings.reportfigures import zoom_of
+from beliefscope.recordings.reportfolder import FORMAT, new_folder
 from beliefscope.recordings.reportmath import mathml
 from beliefscope.recordings.reportparts import accuracy, moment_table, worst_moments
 from beliefscope.recordings.reporttext import definitions, methods
