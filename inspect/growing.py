@@ -15,6 +15,7 @@ import fcntl
 import json
 import math
 import os
+import re
 import struct
 import threading
 from array import array as packed
@@ -28,6 +29,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_of
 
@@ -229,7 +231,8 @@ class GrowingReader:
         if _checksum(mark, length, content) != checksum:
             raise BadInput(f"{self._name} has no whole header")
         try:
-            header, end = json.JSONDecoder().raw_decode(content.decode("latin-1"))
+            _, end = json.JSONDecoder().raw_decode(content.decode("latin-1"))
+            header = read_json(content[:end])
             if header["format"] != FORMAT:
                 raise BadInput(f"{self._name} is a live run of format {header['format']}; this version reads {FORMAT}")
             self._shapes, static = _shapes(header["arrays"]), _shapes(header["static"])
@@ -238,7 +241,9 @@ class GrowingReader:
                 raise ValueError(f"{self._row} bytes a step")
             self._static = {name: array.copy() for name, array in _split(content[end:], static, None).items()}
             self._said = header["trace"]
-            self.expected, self.started, self.pid = header["expected"], header["started"], header["pid"]
+            self.expected, self.started, self.pid = header["expected"], str(header["started"]), int(header["pid"])
+            if self.expected is not None and (type(self.expected) is not int or self.expected < 0):
+                raise ValueError(f"it expects {self.expected!r} steps")
             self._trace({name: np.empty((0, *shape), kind) for name, (shape, kind) in self._shapes.items()})
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise BadInput(f"{self._name} has a header that makes no sense: {error}") from None
@@ -321,9 +326,10 @@ def _shapes(described: Mapping[str, Any]) -> Shapes:
     """What ``_described`` was made of. Raises ValueError or TypeError for what no array can be."""
     found: Shapes = {}
     for name, (shape, kind) in described.items():
+        numeric = re.fullmatch(r"[<>|][biuf]\d{1,2}", kind)
+        if not numeric or not all(type(size) is int and size >= 0 for size in shape):
+            raise ValueError(f"{name[:100]!r} of type {kind[:100]!r} and shape {str(shape)[:100]}")
         found[name] = tuple(shape), np.dtype(kind)
-        if found[name][1].kind not in "biuf" or not all(type(size) is int and size >= 0 for size in shape):
-            raise ValueError(f"{name} of type {kind} and shape {shape}")
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 import subprocess
 import sys
@@ -187,9 +188,16 @@ def test_absurd_headers_are_refused(whole: Trace, tmp_path: Path) -> None:
     for bad, why in (
         (header | {"format": 2}, "format 2; this version reads 1"),
         (header | {"arrays": arrays | {"estimate_mean": [[10**12], "<f4"]}}, "bytes a step"),
-        (header | {"arrays": arrays | {"estimate_mean": [[-3], "<f4"]}}, "estimate_mean of type <f4"),
-        (header | {"arrays": arrays | {"estimate_mean": [[3], "O"]}}, "estimate_mean of type O"),
+        (header | {"arrays": arrays | {"estimate_mean": [[-3], "<f4"]}}, "'estimate_mean' of type '<f4'"),
+        (header | {"arrays": arrays | {"estimate_mean": [[3], "O"]}}, "'estimate_mean' of type 'O'"),
         (header | {"arrays": arrays | {"estimate_mean": [[3], "nonsense"]}}, "makes no sense"),
+        (header | {"arrays": arrays | {"estimate_mean": [[3], "9" * 5000]}}, "makes no sense"),
+        (header | {"expected": math.nan}, "NaN is no number"),
+        (header | {"expected": 10**400}, "401 digits"),
+        (header | {"expected": 2.5}, r"it expects 2\.5 steps"),
+        (header | {"expected": -1}, "it expects -1 steps"),
+        (header | {"started": "\ud800"}, "half a character"),
+        (header | {"pid": "me"}, "makes no sense"),
         (header | {"arrays": {k: v for k, v in arrays.items() if k != "estimate_mean"}}, "estimate_mean"),
         (header | {"trace": header["trace"] | {"colour": 3}}, "colour"),
         (header | {"static": {}}, "makes no sense"),
