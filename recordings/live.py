@@ -1,15 +1,14 @@
 """Records a filter while it runs: ``NAME.live``, which has every step, and beside it a ``NAME.rrd`` that Rerun opens.
 
 The filter hands over what it knew and goes on. One thread puts that into arrays and into the ``.live`` file; another
-follows that file, as any reader does, and draws its steps into the ``.rrd``. However slow drawing is, neither the
-filter nor the data wait for it.
+follows that file, as any reader does, and draws its steps into the ``.rrd`` (``recordings.liveviews``). However slow
+drawing is, neither the filter nor the data wait for it.
 """
 
 from __future__ import annotations
 
 import queue
 import threading
-import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -18,7 +17,6 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-import rerun as rr
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
@@ -32,20 +30,9 @@ from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.foreign import model_names
 from beliefscope.inspect.foreign import with_unknown
-from beliefscope.inspect.growing import SUFFIX, GrowingReader, GrowingWriter
+from beliefscope.inspect.growing import SUFFIX, GrowingWriter
 from beliefscope.inspect.trace import Trace, assemble
-from beliefscope.recordings.blueprint import blueprint
-from beliefscope.recordings.bodies import Bodies
-from beliefscope.recordings.schema import APPLICATION
-from beliefscope.recordings.write import (
-    STEPS_PER_CHUNK,
-    chunks,
-    let_go,
-    new_recording,
-    send_header,
-    send_steps,
-    thinning,
-)
+from beliefscope.recordings.liveviews import LiveViews, write_live
 
 FOLDER = Path("workspace/live")
 WAITING = 1000
@@ -53,10 +40,6 @@ WAITING = 1000
 
 BLOCK = 100
 """Steps at most that are written at once, where several wait."""
-
-DRAWN_AT_ONCE = 10
-LOOKS, PATIENCE = 0.1, 1.0
-"""s between two looks of the drawing thread at what is new; and after which fewer than DRAWN_AT_ONCE are drawn."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +76,6 @@ class LiveRecorder:
         path: of the ``.live`` file; its ``.rrd`` has the same name. Where the name was taken, with a number behind it.
         steps: taken. waited: of these, how many found WAITING others before them and had to wait for the disk.
         lost: steps that could not be kept, because the disk was full or their arrays were not as at the first.
-        behind: the most steps by which the drawing was ever behind the data.
     """
 
     def __init__(
@@ -139,14 +121,12 @@ class LiveRecorder:
             else {key: getattr(like, key) for key in ("dt", "seed", "split", "provenance")}
         )
         self.path = _free(Path(folder), name)
-        self.steps = self.waited = self.lost = self.behind = 0
+        self.steps = self.waited = self.lost = 0
         self._error: BadInput | None = None
-        self._ended = threading.Event()
+        self._closed = False
         self._queue: queue.Queue[_Row | None] = queue.Queue(WAITING)
-        self._threads = [threading.Thread(target=self._keep, name="live-data", daemon=True)]
-        if views:
-            self._threads.append(threading.Thread(target=self._draw, name="live-views", daemon=True))
-        self._views = views
+        self._keeping = threading.Thread(target=self._keep, name="live-data", daemon=True)
+        self._views = LiveViews(self.path) if views else None
         self._writer: GrowingWriter | None = None
         self._sizes = {"n": len(self._task.components)}
 
@@ -191,6 +171,11 @@ class LiveRecorder:
             self.waited += int(self._queue.full())
             self._queue.put(row)
 
+    @property
+    def behind(self) -> int:
+        """The most steps by which the drawing was ever behind the data."""
+        return 0 if self._views is None else self._views.behind
+
     def __enter__(self) -> Self:
         return self
 
@@ -201,14 +186,15 @@ class LiveRecorder:
 
     def close(self) -> None:
         """Writes what still waits, ends the file, and replaces the ``.rrd`` by the one that ``record`` would write."""
-        if self._writer is None or self._ended.is_set():
+        if self._writer is None or self._closed:
             return
+        self._closed = True
         self._queue.put(None)
-        self._threads[0].join()
-        self._ended.set()
-        for thread in self._threads[1:]:
-            thread.join()
-        if self._error is None and self._views:
+        self._keeping.join()
+        if self._views is None:
+            return
+        self._views.close(draw_rest=self._error is not None)
+        if self._error is None:
             try:
                 write_live(self.path, self.path.with_suffix(".rrd"))
             except BadInput as error:
@@ -232,8 +218,9 @@ class LiveRecorder:
             raise BadInput(f"cannot make folder {str(self.path.parent)!r}: {error.strerror}") from None
         self._writer = GrowingWriter(self.path, first, self._expected)
         self._writer.append(first)
-        for thread in self._threads:
-            thread.start()
+        self._keeping.start()
+        if self._views is not None:
+            self._views.start()
 
     def _keep(self) -> None:
         """The thread of the data: what waits goes into the file, in larger blocks the more of it there is."""
@@ -264,37 +251,6 @@ class LiveRecorder:
     def _fail(self, error: BadInput) -> None:
         self._error = error
         warnings.warn(f"live run {str(self.path)!r} ends at step {self.steps}: {error}", stacklevel=2)
-
-    def _draw(self) -> None:
-        """The thread of the views: follows the file, in larger blocks the further it is behind."""
-        rr.set_strict_mode(True)
-        stream = rr.RecordingStream(APPLICATION)
-        reader = GrowingReader(self.path)
-        try:
-            drawn, ended, at = 0, False, 0.0
-            while not (ended and drawn == reader.steps):
-                ended = self._ended.wait(0.0 if reader.steps > drawn + DRAWN_AT_ONCE else LOOKS)
-                waiting = reader.poll() - drawn
-                self.behind = max(self.behind, waiting)
-                if drawn == 0 and waiting:
-                    first = reader.part(0, 1)
-                    layout, bodies = blueprint(first, self._task, growing=True), Bodies(first, self._task)
-                    with let_go(layout):
-                        # Without the index of every block, which would fill the memory of a long run.
-                        stream.save(self.path.with_suffix(".rrd"), default_blueprint=layout, write_footer=False)
-                    send_header(stream, first, bodies)
-                if ended and self._error is None:
-                    return  # the whole recording is written anew from the file
-                if waiting >= DRAWN_AT_ONCE or (waiting and (ended or time.monotonic() > at + PATIENCE)):
-                    last = min(reader.steps, drawn + STEPS_PER_CHUNK)
-                    send_part(stream, reader, bodies, drawn, last)
-                    stream.flush()
-                    drawn, at = last, time.monotonic()
-        except (BadInput, RuntimeError, ValueError) as error:
-            warnings.warn(f"the views of live run {str(self.path)!r} end: {error}", stacklevel=2)
-        finally:
-            stream.disconnect()
-            reader.close()
 
     def _part(self, rows: Sequence[_Row]) -> Trace:
         """Some steps as a trace: what a filter of ours knew, or what another one said."""
@@ -332,34 +288,6 @@ class LiveRecorder:
             start_covariance=start.covariance.reshape(n, n).float().numpy(),
             **about,
         )
-
-
-def write_live(live: Path, path: Path) -> Path:
-    """A live run's file -> the recording that ``write_recording`` makes of its trace, in memory that does not grow.
-
-    Raises BadInput as ``GrowingReader`` and ``write_recording`` do, and for a run without a step.
-    """
-    reader = GrowingReader(live)
-    try:
-        if not reader.poll():
-            raise BadInput(f"{str(live)!r} has no step yet")
-        sample = reader.part(0, stride=thinning(reader.steps))
-        task = find_task(sample.episode.task)
-        bodies = Bodies(sample, task)
-        with new_recording(path, sample, bodies, reader.steps, blueprint(sample, task)) as stream:
-            for first, last in chunks(reader.steps):
-                send_part(stream, reader, bodies, first, last)
-                stream.flush()  # or all of it would wait in memory for the disk
-    finally:
-        reader.close()
-    return path
-
-
-def send_part(stream: rr.RecordingStream, reader: GrowingReader, bodies: Bodies, first: int, last: int) -> None:
-    """Steps ``first`` to ``last - 1`` of a live run, stored and drawn."""
-    before = max(0, first - 1)
-    part = reader.part(before, last)
-    send_steps(stream, part, find_task(part.episode.task), bodies, slice(first - before, last - before), before)
 
 
 def _free(folder: Path, name: str) -> Path:

@@ -26,7 +26,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.inspect.growing import GrowingReader
 from beliefscope.inspect.trace import Trace, begin, load_trace, trace
-from beliefscope.recordings import live, write
+from beliefscope.recordings import live, liveviews, write
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
@@ -186,16 +186,16 @@ def test_what_is_handed_over_may_change_afterwards(tmp_path: Path) -> None:
 
 
 def test_views_that_hang_keep_nothing_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    release, drawing, send = threading.Event(), threading.Event(), live.send_part
+    release, drawing, send = threading.Event(), threading.Event(), liveviews.send_part
 
     def hanging(*arguments: Any) -> None:
         drawing.set()
         assert release.wait(60)
         send(*arguments)
 
-    monkeypatch.setattr(live, "send_part", hanging)
+    monkeypatch.setattr(liveviews, "send_part", hanging)
     with LiveRecorder("run", task="door", folder=tmp_path) as recorder:
-        for _ in range(live.DRAWN_AT_ONCE):
+        for _ in range(liveviews.DRAWN_AT_ONCE):
             recorder.step(np.zeros(3), {})
         assert drawing.wait(60)
         for _ in range(500):
@@ -372,7 +372,7 @@ def test_a_kill_leaves_every_step_that_was_handed_over(run: Run, tmp_path: Path)
     np.testing.assert_array_equal(found.estimate_mean[:, 0], np.arange(47))
     assert run(f"import {tmp_path}/run.live -o {tmp_path}/run.trace")[0] == 0
     assert len(load_trace(tmp_path / "run.trace")) == 47
-    live.write_live(tmp_path / "run.live", recording)
+    liveviews.write_live(tmp_path / "run.live", recording)
     assert len(read_recording(recording)) == 47, "and the whole recording can be made of it"
 
 
