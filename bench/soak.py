@@ -45,6 +45,7 @@ class Soak:
         self.views = 0
         self.browsers: list[Browser] = []
         self.catalog: dict[str, Any] = {}
+        self.quick: list[str] = []
         self.slow: list[str] = []
 
     async def run(self, browsers: int, hours: float, out: Path) -> np.ndarray[Any, Any]:
