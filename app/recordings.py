@@ -7,6 +7,7 @@ import hashlib
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -71,6 +72,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
     """Every route under ``/api/recordings``."""
     router = APIRouter()
     writing = threading.Lock()
+    drawer = ThreadPoolExecutor(1)  # matplotlib keeps open the fonts of each thread that draws
     runs = Runs(library)
 
     @router.get("/api/recordings")
@@ -104,7 +106,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
                 raise HTTPException(403, f"{READ_ONLY} No recording of this run was written before.")
             path = there
             if path is None and not maps:
-                path = _written(files, traced, made_as, wanted.automatic)
+                path = drawer.submit(_written, files, traced, made_as, wanted.automatic).result()
         if path is None:
             response.status_code = 202
             target = files.unused(made_as)
