@@ -20,7 +20,7 @@ from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.schema import HEADER, PROPERTIES, SCHEMA, STEP, TIME, Entity
-from beliefscope.recordings.write import write_recording
+from beliefscope.recordings.write import CHUNKS, STEPS_PER_CHUNK, chunks, write_recording
 
 MapMaker = Callable[..., LikelihoodMap]
 Compare = Callable[[Trace, Trace], None]
@@ -68,6 +68,15 @@ def written(path: Path) -> Iterator[tuple[str, list[str]]]:
 def test_round_trip_is_exact(trace: Trace, assert_same: Compare, tmp_path: Path) -> None:
     write_recording(trace, tmp_path / "run.rrd")
     assert_same(trace, read_recording(tmp_path / "run.rrd"))
+
+
+@pytest.mark.parametrize("steps", [0, 1, STEPS_PER_CHUNK, STEPS_PER_CHUNK + 1, 9_999, 10_001, 123_457])
+def test_all_steps_are_sent_once_and_in_few_parts(steps: int) -> None:
+    """Rerun keeps an index of every part in memory, so a long recording has no more of them."""
+    parts = list(chunks(steps))
+    assert [step for first, last in parts for step in range(first, last)] == list(range(steps))
+    assert len(parts) <= CHUNKS
+    assert all(last - first >= STEPS_PER_CHUNK for first, last in parts[:-1])
 
 
 def test_round_trip_over_several_chunks_and_of_odd_numbers(
