@@ -182,11 +182,12 @@ def _names(of: Iterable[str]) -> list[str]:
 def main() -> None:
     """In the process: a byte on standard output for each file that it came back from. A signal ends it at another."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY if most == resource.RLIM_INFINITY else min(MEMORY, most), most))
     for path in sys.stdin.buffer.read().split(b"\0"):
         try:
-            most = float(sys.argv[1]) + SECONDS_A_MB * os.stat(path).st_size / 1e6
-            signal.setitimer(signal.ITIMER_PROF, most)  # SIGPROF ends a process that does not care
+            patience = float(sys.argv[1]) + SECONDS_A_MB * os.stat(path).st_size / 1e6
+            signal.setitimer(signal.ITIMER_PROF, patience)  # SIGPROF ends a process that does not care
             _look(os.fsdecode(path))
         except DAMAGE:
             pass
