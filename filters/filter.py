@@ -66,6 +66,8 @@ class Architecture:
             value = getattr(self, name)
             if get_origin(kind) is Literal and value not in get_args(kind):
                 raise one_of(f"{name} of a filter", value, get_args(kind))
+            if kind is str and not isinstance(value, str):
+                raise BadInput(f"{name} of a filter is {value!r:.200}, not a name")
             if kind is int and not (type(value) is int and 1 <= value <= WIDEST):
                 raise BadInput(f"{name} of a filter is {value!r}, not a whole number from 1 to {WIDEST}")
         if not self.models or not all(isinstance(model, str) for model in self.models):

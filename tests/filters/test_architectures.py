@@ -119,6 +119,7 @@ def test_what_an_older_checkpoint_does_not_say_takes_its_default() -> None:
         ({"resampling": "none"}, "resampling of a filter 'none' does not exist. Available: systematic, hard, soft."),
         ({"soft_share": 0.0}, "soft_share must be above 0 and at most 1, not 0.0"),
         ({"colour": "red"}, "not an architecture of this version: .*'colour'"),
+        ({"task": ["door"]}, r"task of a filter is \['door'\], not a name"),
         ({"models": ["smell"]}, r"Modality 'smell' is not in task 'door'\. Available: image, haptics\."),
     ],
 )
