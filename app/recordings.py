@@ -36,9 +36,6 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.growing import SUFFIX, GrowingWriter
 from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.recordings.describe import describe
-from beliefscope.recordings.read import read_recording
-from beliefscope.recordings.write import write_recording
 
 LARGEST = 2 * 10**9  # bytes of a file that is added
 SPARED = 2 * 10**8  # bytes of the disk that adding files leaves free
@@ -222,6 +219,9 @@ def _written(
     report: Report = lambda share, message: None,
 ) -> Path:
     """A new recording. Stride: of the steps with likelihood maps; none for 0."""
+    from beliefscope.recordings.describe import describe  # bring Rerun, a second of a server's start
+    from beliefscope.recordings.write import write_recording
+
     trace = traced.trace
     steps = range(0, len(trace), stride) if stride else range(0)
 
@@ -240,6 +240,8 @@ def _written(
 
 def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """The job that makes a recording a run of the workspace, as a filter that ran live would have left it."""
+    from beliefscope.recordings.read import read_recording  # brings Rerun
+
     report(0.0, "reading the recording")
     run, path = read_recording(arguments["recording"]), Path(arguments["run"])
     report(0.5, "writing its steps")

@@ -28,7 +28,6 @@ from beliefscope.app.trash import Deleted, Gone, Trash, size
 from beliefscope.app.work import Report
 from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.report import compose, write_report
 from beliefscope.recordings.reportpdf import browser, print_page
 
 NAME = re.compile(r"[\w.+-]+-episode\d+-[0-9a-f]{8}")
@@ -189,6 +188,8 @@ def _check(library: Library, asked: Selection, wanted: ReportRequest) -> None:
 
 def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """The job of a report: its folder. What was traced before is read, not traced again."""
+    from beliefscope.recordings.report import compose, write_report  # bring Rerun
+
     wanted = ReportRequest(**arguments["wanted"])
     library = Library(Settings.of_json(arguments["settings"]))
     try:
