@@ -41,6 +41,7 @@ KINDS: dict[str, str] = {
     "reading": "beliefscope.app.recordings:work",
     "recording": "beliefscope.app.recordings:write",
     "report": "beliefscope.app.reports:work",
+    "study": "beliefscope.app.study:work",
 }
 """Kind of job -> ``module:function`` of (arguments, report) -> result; ``report(share done, what it is doing)``."""
 

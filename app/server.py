@@ -95,7 +95,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False, acces
         recordings.routes(library, rrds, work),
         reports.routes(library, work),
         live.routes(library),
-        study.routes(library),
+        study.routes(library, work),
         descent.routes(library),
     ):
         app.include_router(router)

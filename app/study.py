@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
+from beliefscope.app.commands.study import write
+from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library
 from beliefscope.app.shelf import short_names
-from beliefscope.datasets.errors import BadInput
+from beliefscope.app.work import Report
+from beliefscope.datasets.catalog import load_task
+from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
+from beliefscope.filters.study import Cell, run_local
+from beliefscope.filters.train import PLANS
 
 SHIPPED = "shipped"
 """Name of the study that ships, whose first seed's weights do too."""
@@ -38,14 +47,29 @@ class Line(BaseModel):
     each: Mapping[str, Numbers] = Field(default_factory=dict)
 
 
+FINISHED = "finished"
+
+Name = Annotated[str, Field(pattern=r"^[\w.+-]+/[\w.+-]+/seed\d+$")]
+"""Of a cell: task/filter/seedK."""
+
+
 class Results(BaseModel):
-    """What a study's ``study.json`` says. checkpoints: task/filter/seedK -> hash; those of old studies have none."""
+    """What a study's ``study.json`` says.
+
+    checkpoints: hash of each cell that is trained; those of old studies have none. cells: how far each is.
+    """
 
     preset: str
     tasks: Mapping[str, Mapping[str, str]]
     seeds: Annotated[int, Field(ge=1)]
     rows: list[Line]
     checkpoints: Mapping[str, str] = Field(default_factory=dict)
+    cells: Mapping[Name, str] = Field(default_factory=dict)
+
+    @property
+    def left(self) -> list[str]:
+        """The cells that are not finished."""
+        return [name for name, state in self.cells.items() if state != FINISHED]
 
 
 @dataclass(frozen=True)
@@ -81,7 +105,7 @@ def studies_of(given: Mapping[str, Path], workspace: Path) -> list[Study]:
     return [*shown, Study(SHIPPED, PRETRAINED, False)]
 
 
-def routes(library: Library) -> APIRouter:
+def routes(library: Library, jobs: Jobs) -> APIRouter:
     """Every route under ``/api/studies``."""
     router = APIRouter()
 
@@ -94,10 +118,37 @@ def routes(library: Library) -> APIRouter:
         shown, problems = [], []
         for study in known():
             try:
-                shown.append(document(study, shelf))
+                shown.append(document(study, shelf) | cells_left(study))
             except BadInput as error:
                 problems.append(str(error))
         return {"studies": shown, "problems": problems}
+
+    def cells_left(study: Study) -> dict[str, Any]:
+        results = study.read()
+        job = jobs.find("study", _key(study, results))
+        shown = {"left": len(results.left), "cells": len(results.cells), "job": job and job.id, "why_not": ""}
+        try:
+            if results.left:
+                arguments_of(study, results, library)
+        except BadInput as error:
+            shown["why_not"] = str(error)
+        return shown
+
+    @router.post("/api/studies/{name}/cells", status_code=202)
+    def run_cells(name: str) -> dict[str, Job]:
+        study = next((one for one in known() if one.name == name), None)
+        if study is None:
+            raise HTTPException(404, f"Study {name!r} does not exist.")
+        results = study.read()
+        if not results.left:
+            raise BadInput(f"all cells of study {name!r} are finished")
+        arguments, key = arguments_of(study, results, library), _key(study, results)
+        before = jobs.find("study", key)
+        if before is not None and before.state == "done":
+            jobs.cancel(before.id)  # what was finished then is not any more: it is forgotten, and done again
+        return {
+            "job": jobs.submit("study", f"Cells of study {name}", arguments, key, f"?tab=study&study={quote(name)}")
+        }
 
     @router.post("/api/studies/{name}/{task}/{filter}/{seed}")
     def open_checkpoint(name: str, task: str, filter: str, seed: int) -> dict[str, str]:
@@ -148,6 +199,64 @@ def document(study: Study, shelf: Mapping[tuple[str, str], str]) -> dict[str, An
             }
         )
     return {"name": study.name, "preset": results.preset, "seeds": results.seeds, "tasks": tasks}
+
+
+def arguments_of(study: Study, results: Results, library: Library) -> dict[str, Any]:
+    """Of the job that finishes a study's cells. Raises BadInput where this server lacks what they are made of."""
+    if not study.checkpoints:
+        raise BadInput("the study that ships is as it was measured: make one of your own with beliefscope study")
+    if results.preset not in PLANS:
+        raise one_of("preset", results.preset, PLANS)
+    settings, catalog = library.settings, {task["name"]: task for task in library.catalog()["tasks"]}
+    sources = {load_task(source).name: source for source in settings.tasks}
+    files: dict[str, tuple[str, str]] = {}
+    for task, known in results.tasks.items():
+        wanted = known.get("data_hash", "")
+        names = [data["name"] for data in catalog[task]["data"]] if task in catalog else []
+        name = next((one for one in names if library.data_hash(task, one) == wanted), None)
+        if name is None:
+            told = f"{known.get('data', 'its data')} ({wanted[:8]})"
+            raise BadInput(f"no data set of this server is {told}, on which {task} is trained: serve it with --data")
+        files[task] = str(settings.data.get(name) or sample_path(task)), wanted
+    cells = []
+    for cell in results.cells:
+        task, filter_, seed = cell.split("/")
+        if task not in files:
+            raise BadInput(f"study {study.name!r} does not say what {task} is trained on")
+        path, digest = files[task]
+        one = {"task": task, "filter": filter_, "seed": int(seed.removeprefix("seed")), "preset": results.preset}
+        cells.append(one | {"source": sources.get(task, task), "data": path, "data_hash": digest})
+    return {"folder": str(study.folder.resolve()), "preset": results.preset, "cells": cells}
+
+
+def _key(study: Study, results: Results) -> str:
+    named = (str(study.folder.resolve()), results.preset, sorted(results.cells))
+    return hashlib.sha256(repr(named).encode()).hexdigest()
+
+
+def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """The job that trains and measures what is left of a study, as ``beliefscope study`` does, and beside one."""
+    folder, preset = Path(arguments["folder"]), arguments["preset"]
+    cells = [Cell(**one | {"data": Path(one["data"])}) for one in arguments["cells"]]
+    left = [cell for cell in cells if cell.finished(folder) is None]
+    done: list[Cell] = []
+
+    def progress(cell: Cell) -> Callable[[str, int, int, float], None]:
+        def tell(stage: str, step: int, count: int, loss: float) -> None:
+            report(len(done) / len(left), f"{cell}: {stage}, {step / count:.0%}, loss {loss:.3g}")
+
+        return tell
+
+    failed: dict[str, str] = {}
+    for cell, document in run_local(left, folder, progress):
+        done.append(cell)
+        if "error" in document:
+            failed[str(cell)] = document["error"]
+        write(folder, cells, preset)
+    if failed:
+        first, why = next(iter(failed.items()))
+        raise BadInput(f"{len(failed)} of {len(left)} cells failed; the first, {first}: {why}")
+    return {"finished": [str(cell) for cell in done]}
 
 
 def _by_hash(library: Library) -> dict[tuple[str, str], str]:

@@ -191,6 +191,9 @@ export const lineage = async (task, signal) => (await ask(`/api/lineage/${encode
 export const studies = async () => (await ask('/api/studies')).json();
 
 /** Puts a checkpoint that a study measured on the shelf. @returns {Promise<{filter: string}>} its name there */
+export const runCells = async (study) => (await ask(`/api/studies/${encodeURIComponent(study)}/cells`, { method: 'POST' })).json();
+
+/** @see docs/api.md */
 export const openMeasured = async (...parts) => (await ask(`/api/studies/${parts.map(encodeURIComponent).join('/')}`, { method: 'POST' })).json();
 
 /** What becomes of a child. @param {'accept' | 'keep' | 'roll-back'} act @returns {Promise<Run>} */

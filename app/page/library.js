@@ -26,7 +26,7 @@ const BODY = `
   <div class="scroll" tabindex="-1">
     <table class="recordings" aria-label="Recordings"><thead></thead><tbody></tbody></table>
     <p class="rest"></p>
-    <p class="automatic" hidden><span></span> <button type="button" class="text quiet"></button></p>
+    <p class="automatic" hidden><span></span> <button type="button" class="text quiet">Show</button></p>
     <section class="reports"><h2>Reports</h2><table aria-label="Reports"><thead></thead><tbody></tbody></table></section>
     <details class="trash" hidden><summary>Trash</summary><ul></ul><p><button type="button" class="text empty">Empty the trash</button> <span class="sure" hidden>For good? <button type="button" class="text yes">Delete for good</button> <button type="button" class="text no">Keep</button></span></p></details>
   </div>

@@ -97,7 +97,7 @@ class Page {
     this.failures = new Failures($('#failures'), store, this.jobs, this.timeline, catalog);
     this.compare = new Compare($('#compare'), catalog, store, sheet, (other, name) => this.#overlay(other, name));
     this.finetune = new Finetune($('#finetune'), catalog, store, this.jobs, sheet);
-    this.study = new Study($('#study'), catalog, store, this.failures);
+    this.study = new Study($('#study'), catalog, store, this.failures, this.jobs);
     this.live = new Live(document, catalog, store, {
       grown: (trace, fresh) => this.#grow(trace, fresh),
       ended: (trace) => (this.timeline.grow(), this.diagnostics.show(trace), this.failures.show(trace)),

@@ -2,6 +2,7 @@
 
 import * as api from './api.js';
 import { Bars, patch, roam } from './bars.js';
+import { told, underWay } from './jobs.js';
 import { say } from './panel.js';
 import { choice } from './pickers.js';
 import { address } from './state.js';
@@ -21,18 +22,21 @@ const BODY = `
   </div>
   <p class="about"></p>
   <p class="problems" role="status"></p>
+  <div class="cells" role="status" hidden><progress max="1" aria-label="Progress of the study's cells"></progress><span></span> <button type="button" class="text">Train them</button></div>
   <div class="chart"></div>
   <p class="told" aria-hidden="true"></p>
   <div class="scroll" tabindex="-1"><table><thead></thead><tbody></tbody></table></div>
   <p class="note"></p>`;
 
-/** @typedef {{name: string, preset: string, seeds: number, tasks: object[]}} Found a study, as the server tells it (docs/api.md) */
+/** @typedef {{name: string, preset: string, seeds: number, tasks: object[], left: number, cells: number, job: string?, why_not: string}} Found a study, as the server tells it (docs/api.md) */
 
 export class Study {
   #host;
   #store;
   #catalog;
   #failures;
+  #jobs;
+  #list = []; // of all jobs, as last heard
   #bars;
   #open = false;
   #studies = null;
@@ -41,10 +45,10 @@ export class Study {
 
   /**
    * @param {HTMLElement} host @param {api.Catalog} catalog @param {import('./state.js').Store} store
-   * @param {import('./failures.js').Failures} failures that goes to the worst moment
+   * @param {import('./failures.js').Failures} failures that goes to the worst moment @param {import('./jobs.js').Jobs} jobs
    */
-  constructor(host, catalog, store, failures) {
-    [this.#host, this.#catalog, this.#store, this.#failures] = [host, catalog, store, failures];
+  constructor(host, catalog, store, failures, jobs) {
+    [this.#host, this.#catalog, this.#store, this.#failures, this.#jobs] = [host, catalog, store, failures, jobs];
     host.innerHTML = BODY;
     this.#bars = new Bars(this.#part('.chart'), (bar) => this.#tell(bar));
     const body = this.#part('tbody');
@@ -54,6 +58,8 @@ export class Study {
     for (const kind of ['pointerleave', 'focusout']) body.addEventListener(kind, () => this.#bars.mark(''));
     this.#part('select').addEventListener('change', ({ target }) => store.set({ study: target.value }));
     host.addEventListener('click', (event) => this.#click(event));
+    this.#part('.cells button').addEventListener('click', () => this.#run());
+    jobs.listen((list) => this.#hear(list));
     store.listen((_, changed) => ['task', 'study', 'quantity', 'data'].some((key) => changed.has(key)) && this.#draw());
   }
 
@@ -83,6 +89,11 @@ export class Study {
     return this.#studies.find(({ name }) => name === study) ?? this.#studies.find(({ tasks }) => tasks.some(({ name }) => name === task)) ?? this.#studies[0];
   }
 
+  /** The job that trains what is left of it. @returns {api.Job | undefined} */
+  get #job() {
+    return this.#list.find(({ id }) => id === this.#study.job);
+  }
+
   #draw() {
     if (!this.#studies) return;
     const { state } = this.#store;
@@ -92,6 +103,7 @@ export class Study {
     picker.value = study.name;
     picker.parentElement.hidden = this.#studies.length < 2;
     this.#part('.problems').textContent = this.#problems.map(sentence).join(' ');
+    this.#cells();
     const found = study.tasks.find(({ name }) => name === state.task);
     if (!found) {
       const others = study.tasks.map(({ name }) => name).join(', ');
@@ -108,6 +120,44 @@ export class Study {
     this.#chart(view, rows);
     this.#table(view, rows);
     say(this.#host, 'ready');
+  }
+
+  /** How many cells are left, and a button that has them trained; or how far that is, and one that ends it. */
+  #cells() {
+    const { left, cells, why_not: whyNot } = this.#study;
+    const [box, runs] = [this.#part('.cells'), this.#job && underWay(this.#job)];
+    box.hidden = !left && !runs;
+    const [progress, text, button] = box.children;
+    progress.hidden = !runs;
+    progress.value = this.#job?.progress ?? 0;
+    const ended = this.#job && !runs && this.#job.state !== 'done' ? ` ${told(this.#job)}` : '';
+    const rest = `${left} of ${cells} cells ${left === 1 ? 'is' : 'are'} not trained yet.`;
+    text.textContent = runs ? `Training cells: ${told(this.#job)}` : `${rest}${ended}${whyNot ? ` Not from here: ${sentence(whyNot)}` : ''}`;
+    button.textContent = runs ? 'Cancel' : left === 1 ? 'Train it' : 'Train them';
+    button.hidden = !runs && Boolean(whyNot);
+  }
+
+  /** Has what is left trained, or no longer. */
+  async #run() {
+    if (this.#job && underWay(this.#job)) return this.#jobs.cancel(this.#job.id);
+    try {
+      const { job } = await api.runCells(this.#study.name);
+      this.#study.job = job.id;
+      this.#list = [...this.#list, job];
+      this.#cells();
+      this.#jobs.refresh();
+    } catch (error) {
+      this.#part('.problems').textContent = error.message;
+    }
+  }
+
+  /** @param {api.Job[]} list as it has changed. After each cell, and at the end, there are other numbers. */
+  #hear(list) {
+    const before = this.#studies && this.#job;
+    this.#list = list;
+    if (!this.#studies || !this.#open) return;
+    if (this.#job?.state !== before?.state || this.#job?.progress !== before?.progress) this.#load();
+    else this.#cells();
   }
 
   /** All that is known of one filter: its bars, and the checkpoint that they open. */

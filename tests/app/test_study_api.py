@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +13,13 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
+from beliefscope.app.commands.study import matrix, write
 from beliefscope.app.library import Settings
 from beliefscope.app.study import FILE, SHIPPED, Study, studies_of
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
+from beliefscope.filters.study import run_cell
 
 FILTER = "crossmodal-ekf"
 
@@ -122,3 +126,55 @@ def test_what_is_no_study_is_said_in_a_line(tmp_path: Path, text: str) -> None:
     (tmp_path / FILE).write_text(text)
     with pytest.raises(BadInput, match="does not hold a study's results"):
         Study("mine", tmp_path, checkpoints=True).read()
+
+
+def test_the_cells_that_are_left_are_trained_by_a_job(
+    settings: Settings, tmp_path: Path, open_client: Callable[..., TestClient]
+) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    cells = matrix("smoke", ["door"], ["haptics-ekf"], 2, [f"door={settings.data['mine']}"], False)
+    write(folder, cells, "smoke")  # none of them is trained
+    run_cell(cells[0], folder)  # by another process, after which the table was not written
+    with open_client(replace(settings, studies={"mine": folder})) as client:
+        study = named(client, "mine")
+        assert (study["left"], study["cells"], study["job"], study["why_not"]) == (2, 2, None, "")
+        job = client.post("/api/studies/mine/cells").json()["job"]
+        assert named(client, "mine")["job"] == job["id"]
+        until = time.monotonic() + 120.0
+        while not (job := client.get(f"/api/jobs/{job['id']}").json())["ended"]:
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        assert (job["state"], job["error"]) == ("done", "")
+        assert client.get(f"/api/jobs/{job['id']}/result").json() == {"finished": [str(cells[1])]}
+        assert all(cell.finished(folder) for cell in cells)
+        study = named(client, "mine")
+        assert (study["left"], [row["seeds"] for row in study["tasks"][0]["rows"]]) == (0, [2, 2, 2, 0])
+        again = client.post("/api/studies/mine/cells")
+        assert (again.status_code, again.json()["error"]) == (400, "all cells of study 'mine' are finished")
+        cells[1].path(folder).unlink()
+        write(folder, cells, "smoke")
+        assert client.post("/api/studies/mine/cells").json()["job"]["state"] in ("waiting", "running")
+
+
+def test_cells_that_cannot_be_trained_here_say_why(
+    settings: Settings, folder: Path, open_client: Callable[..., TestClient]
+) -> None:
+    def why(**more: Any) -> str:
+        left = {"cells": {f"door/{FILTER}/seed1": "missing"}} | more
+        (folder / FILE).write_text(json.dumps(results("", **left)))
+        shown = named(client, "mine")
+        answer = client.post("/api/studies/mine/cells")
+        assert (answer.status_code, answer.json()["error"]) == (400, shown["why_not"])
+        return str(shown["why_not"])
+
+    with open_client(replace(settings, studies={"mine": folder})) as client:
+        assert why() == "no data set of this server is door.h5 (), on which door is trained: serve it with --data"
+        assert why(preset="huge").startswith("preset 'huge' does not exist")
+        hash_ = open_dataset(settings.data["mine"]).hash
+        known = {"tasks": {"door": {"data": "door.h5", "data_hash": hash_}}}
+        assert why(**known, cells={"push/lstm/seed0": "missing"}) == "study 'mine' does not say what push is trained on"
+        assert client.post("/api/studies/shipped/cells").status_code == 400
+        assert client.post("/api/studies/none/cells").status_code == 404
+        (folder / FILE).write_text(json.dumps(results("", cells={"../../door/seed0": "missing"})))
+        assert "does not hold a study's results: cells" in client.get("/api/studies").json()["problems"][0]
