@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch.overrides import TorchFunctionMode
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.document import read_json
@@ -80,7 +81,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise BadInput(f"{str(path)!r} is not a readable safetensors file: {error}") from None
     header = _header(path, metadata)
     architecture = Architecture.from_json(header["architecture"])
-    with torch.device("meta"):  # takes no memory, whatever sizes the header names
+    with torch.device("meta"), _Unfilled():  # takes no memory, whatever sizes the header names
         expected = {key: tuple(value.shape) for key, value in build(architecture).state_dict().items()}
     found = {key: tuple(value.shape) for key, value in tensors.items()}
     if expected != found:
@@ -96,6 +97,16 @@ def load_checkpoint(path: Path) -> Checkpoint:
     filter_.load_state_dict(tensors)
     filter_.eval().requires_grad_(False)
     return Checkpoint(filter_, header["name"], hashlib.sha256(path.read_bytes()).hexdigest(), header["record"])
+
+
+class _Unfilled(TorchFunctionMode):
+    """Modules get no starting weights. On the meta device, drawing them imports PyTorch's compiler: seconds."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if getattr(func, "__module__", "") == torch.nn.init.__name__:
+            return kwargs["tensor"] if "tensor" in kwargs else args[0]
+        return func(*args, **kwargs)
 
 
 def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

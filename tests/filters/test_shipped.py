@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -20,6 +23,15 @@ def held_out() -> list[Episode]:
 
 
 SHIPPED = sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
+
+
+def test_to_open_them_needs_no_compiler() -> None:
+    code = (
+        "import sys; from beliefscope.filters.checkpoint import *; "
+        "[load_checkpoint(path) for path in PRETRAINED.glob('*.safetensors')]; "
+        "assert 'torch._dynamo' not in sys.modules, 'it takes seconds of every process'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
 @pytest.fixture(scope="module", params=[name for name in SHIPPED if name.startswith("door-crossmodal")])
