@@ -75,16 +75,18 @@ def measure() -> list[Row]:
         return [("page", "skipped: playwright is not installed", "")]
     if found_chromium() is None:
         return [("page", "skipped: no Chromium on the path", "")]
+    with browsing() as page, serving() as served:
+        rows = paint(page, served.url)
     with tempfile.TemporaryDirectory() as folder:
         long = Path(folder) / "long.h5"
         write_dataset(long, find_task("door"), [episode()])
         with browsing() as page, serving("--data", str(long)) as served:
-            return [*paint(page, served.url), *keys(page, served.url), *drag(page, served.url)]
+            return [*rows, *keys(page, served.url), *drag(page, served.url)]
 
 
 def paint(page: Any, url: str) -> list[Row]:
     """Until the page shows what it is for: right after the server listens, and where both are warm."""
-    page.goto(url + "?data=sample", wait_until="commit")
+    page.goto(url, wait_until="commit")
     rows = [("from a fresh server's listening to time line and maps", f"{usable(page):.2f} s", "<= 3 s")]
     page.wait_for_timeout(10_000)  # until the server has prepared the Rerun viewer, once a workspace
     again, new = [], []
@@ -93,7 +95,7 @@ def paint(page: Any, url: str) -> list[Row]:
         again.append(usable(page))
         with page.context.browser.new_context(viewport=page.viewport_size) as stranger:
             other = stranger.new_page()
-            other.goto(url + "?data=sample", wait_until="commit")
+            other.goto(url, wait_until="commit")
             new.append(usable(other))
     for what, took in (("a reload", again), ("a browser's first visit", new)):
         rows.append((f"time line and maps after {what}, median of {VISITS}", f"{np.median(took):.2f} s", "<= 1.5 s"))
@@ -102,7 +104,7 @@ def paint(page: Any, url: str) -> list[Row]:
 
 def keys(page: Any, url: str) -> list[Row]:
     """From a key to the maps drawn."""
-    page.goto(url + "?data=sample")
+    page.goto(url)
     usable(page)
     page.wait_for_timeout(3000)
     page.evaluate("window.beliefscope.stats.scrub.length = 0")
