@@ -142,13 +142,13 @@ class Jobs:
         arguments: Mapping[str, Any],
         key: str,
         link: str = "",
-        made: Path | None = None,
+        there: bool = True,
     ) -> Job:
         """Has it done; one that is under way, or done with what it made still there, is not done again.
 
         Args:
             arguments: JSON, handed to the kind's function. key: hash of all that the result depends on.
-            link: to see the result on the page, from its ``?`` on. made: a file or folder that is made besides.
+            link: to see the result on the page, from its ``?`` on. there: whether what it made besides still is.
 
         Raises BadInput for an unknown kind, and QueueFull.
         """
@@ -159,8 +159,7 @@ class Jobs:
             known = self._jobs.get(id)
             if known is not None and known.state in UNDER_WAY:
                 return known
-            there = self.result(id).is_file() and (made is None or made.exists())
-            if known is not None and known.state == "done" and there:
+            if known is not None and known.state == "done" and there and self.result(id).is_file():
                 return known
             if self._closing:
                 raise BadInput("the server is stopping")

@@ -119,7 +119,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
                 f", {of.recipe}" if of.recipe else ""
             )
             link = _url(target.name).lstrip("/")
-            return {"job": jobs.submit("recording", title, arguments, target.name, link, target)}
+            return {"job": jobs.submit("recording", title, arguments, target.name, link, there=False)}
         if there:
             response.status_code = 200
             if not (wanted.automatic or request.app.state.read_only):
@@ -179,7 +179,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         link = moment_link(find_task(str(about.task)), shown, PREFIX + run, about.episode or 0, 0)
         made = library.live.folder / f"{run}{SUFFIX}"
         arguments = {"recording": str(files.path(name)), "run": str(made)}
-        return {"job": jobs.submit("reading", f"The run in {one.name}", arguments, key, link, made)}
+        return {"job": jobs.submit("reading", f"The run in {one.name}", arguments, key, link, made.is_file())}
 
     @router.post("/api/recordings/deleted/{id}")
     def restore(id: str) -> dict[str, Any]:

@@ -118,13 +118,13 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         shown, problems = [], []
         for study in known():
             try:
-                shown.append(document(study, shelf) | cells_left(study))
+                results = study.read()
+                shown.append(document(study, results, shelf) | cells_left(study, results))
             except BadInput as error:
                 problems.append(str(error))
         return {"studies": shown, "problems": problems}
 
-    def cells_left(study: Study) -> dict[str, Any]:
-        results = study.read()
+    def cells_left(study: Study, results: Results) -> dict[str, Any]:
         job = jobs.find("study", _key(study, results))
         shown = {"left": len(results.left), "cells": len(results.cells), "job": job and job.id, "why_not": ""}
         try:
@@ -143,12 +143,8 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         if not results.left:
             raise BadInput(f"all cells of study {name!r} are finished")
         arguments, key = arguments_of(study, results, library), _key(study, results)
-        before = jobs.find("study", key)
-        if before is not None and before.state == "done":
-            jobs.cancel(before.id)  # what was finished then is not any more: it is forgotten, and done again
-        return {
-            "job": jobs.submit("study", f"Cells of study {name}", arguments, key, f"?tab=study&study={quote(name)}")
-        }
+        link = f"?tab=study&study={quote(name)}"
+        return {"job": jobs.submit("study", f"Cells of study {name}", arguments, key, link, there=False)}
 
     @router.post("/api/studies/{name}/{task}/{filter}/{seed}")
     def open_checkpoint(name: str, task: str, filter: str, seed: int) -> dict[str, str]:
@@ -170,13 +166,12 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
     return router
 
 
-def document(study: Study, shelf: Mapping[tuple[str, str], str]) -> dict[str, Any]:
+def document(study: Study, results: Results, shelf: Mapping[tuple[str, str], str]) -> dict[str, Any]:
     """A study as the page shows it: its rows by task, and which of its checkpoints can be looked at.
 
     Args:
         shelf: task and hash -> name of a filter on the server's shelf.
     """
-    results = study.read()
 
     def trained(task: str, filter_: str) -> Iterator[dict[str, Any]]:
         for seed in range(results.seeds):

@@ -190,10 +190,10 @@ export const lineage = async (task, signal) => (await ask(`/api/lineage/${encode
 /** What studies found. @returns {Promise<{studies: object[], problems: string[]}>} */
 export const studies = async () => (await ask('/api/studies')).json();
 
-/** Puts a checkpoint that a study measured on the shelf. @returns {Promise<{filter: string}>} its name there */
+/** Has a study's cells trained that are not yet. @returns {Promise<{job: Job}>} */
 export const runCells = async (study) => (await ask(`/api/studies/${encodeURIComponent(study)}/cells`, { method: 'POST' })).json();
 
-/** @see docs/api.md */
+/** Puts a checkpoint that a study measured on the shelf. @returns {Promise<{filter: string}>} its name there */
 export const openMeasured = async (...parts) => (await ask(`/api/studies/${parts.map(encodeURIComponent).join('/')}`, { method: 'POST' })).json();
 
 /** What becomes of a child. @param {'accept' | 'keep' | 'roll-back'} act @returns {Promise<Run>} */
