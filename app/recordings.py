@@ -115,11 +115,10 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
                 "maps": maps,
                 "automatic": wanted.automatic,
             }
-            title = f"Recording of {of.filter}, {of.task} episode {of.episode}" + (
-                f", {of.recipe}" if of.recipe else ""
-            )
             link = _url(target.name).lstrip("/")
-            return {"job": jobs.submit("recording", title, arguments, target.name, link, there=False)}
+            return {
+                "job": jobs.submit("recording", f"Recording of {of.told}", arguments, target.name, link, there=False)
+            }
         if there:
             response.status_code = 200
             if not (wanted.automatic or request.app.state.read_only):

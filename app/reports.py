@@ -142,9 +142,11 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
             "url": url,
             "folder": str(folder),
         }
-        title = f"Report of {asked.filter}, {asked.task} episode {asked.episode}"
-        title += f", {asked.recipe}" if asked.recipe else ""
-        return {"job": jobs.submit("report", title, arguments, key, f"api/reports/{name}.html", folder.is_dir())}
+        return {
+            "job": jobs.submit(
+                "report", f"Report of {asked.told}", arguments, key, f"api/reports/{name}.html", folder.is_dir()
+            )
+        }
 
     @router.get("/api/reports/{name}.html")
     def page(name: str, shown: bool = False) -> Response:

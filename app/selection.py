@@ -39,6 +39,11 @@ class Selection:
     data: str = ""
     edit: Edit | None = None
 
+    @property
+    def told(self) -> str:
+        """The run in words."""
+        return f"{self.filter}, {self.task} episode {self.episode}" + (f", {self.recipe}" if self.recipe else "")
+
     def to_json(self) -> dict[str, Any]:
         """As JSON values, for another process."""
         edit = None if self.edit is None else self.edit.to_json()

@@ -280,7 +280,7 @@ def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> 
         os.replace(unfinished, path)
         trust(path)
     except OSError as error:
-        unfinished.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)  # before it is told what is free
         raise unwritable(path, error) from None
     finally:
         unfinished.unlink(missing_ok=True)
