@@ -197,7 +197,8 @@ def _stream(path: Path, key: str, rows: object) -> Array:
     """(N, 4) rows [time, a, b, c] whose time grows. What the recorder wrote twice is kept once."""
     place = f"{path}: {key!r}"
     try:
-        stream = np.asarray(rows, float)
+        fits = not isinstance(rows, np.ndarray) or rows.shape[1:] == (4,)  # or 64 MB of bytes become 512 of floats
+        stream = np.asarray(rows if fits else (), float)
     except (TypeError, ValueError, OverflowError):
         stream = np.zeros(0)
     if stream.ndim != 2 or stream.shape[1] != 4:

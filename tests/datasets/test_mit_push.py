@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -287,6 +288,19 @@ def test_cut_short(tmp_path: Path, share: float) -> None:
     other.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(BadInput, match=r"is damaged or cut short|is not an HDF5 file"):
         open_dataset(other)
+
+
+def test_what_is_no_stream_takes_no_more_memory_than_it_claims(tmp_path: Path) -> None:
+    """A file of 64 KB that claims 16 MB of bytes: as floats they would be 128."""
+    path = write(tmp_path, rows()).with_suffix(".h5")
+    with h5py.File(path, "w") as file:
+        file.update({key: value for key, value in rows().items() if key != "tip_pose"})
+        file.create_dataset("tip_pose", data=np.zeros(2**24, "u1"), chunks=(2**20,), compression="gzip")
+    tracemalloc.start()
+    refuse(path, r"'tip_pose' is not a list of rows of 4 numbers")
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 2**26
 
 
 def test_names_that_are_not_those_of_pushes(tmp_path: Path) -> None:

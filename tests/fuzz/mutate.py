@@ -289,7 +289,7 @@ def _spoil_member(group: h5py.Group, rng: Random) -> None:
             kind = rng.choice(("f8", "i1", "i8", "u8", "f2", ">f4", "c8", "S5", "?"))
             group[name] = np.nan_to_num(array).astype(kind)
         case 3:
-            group[name] = array[..., :1] if array.ndim > 1 else array[: len(array) // 2]
+            group[name] = array[..., :1] if array.ndim > 1 else array.reshape(-1)[: array.size // 2]
         case 4:
             group[name] = rng.choice((np.zeros(()), np.zeros((0, 3), "f4"), array[None], array[..., None]))
         case 5:  # claims far more than it holds
