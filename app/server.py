@@ -12,6 +12,7 @@ import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import CancelledError
 from pathlib import Path
+from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI, Request
@@ -117,7 +118,7 @@ def serve(
     listening: Callable[[str], None] | None = None,
     access: Access = OPEN,
 ) -> None:
-    """Serve until SIGINT or SIGTERM, on one port.
+    """Serve until SIGINT, SIGTERM or SIGHUP, on one port.
 
     Args:
         settings: see ``create_app``.
@@ -168,8 +169,7 @@ def serve(
 
         # An answer passes through several threads, and each hand-over may wait this long for Python's lock: 5 ms else.
         sys.setswitchinterval(0.001)
-        with _signals_end_in_peace():
-            _Server(config, started).run(sockets=[listener])
+        _Server(config, started).run(sockets=[listener])
         log.info("stopped", extra={"event": {"url": url}})
 
 
@@ -182,6 +182,24 @@ class _Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self._listening()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begins to end. At a second signal uvicorn would leave out what ends the jobs: they would go on."""
+        self.should_exit = True
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Of SIGHUP too, which a terminal sends as it is closed, but where it is ignored (nohup)."""
+        heard = threading.current_thread() is threading.main_thread() and (
+            signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+        )
+        before = signal.signal(signal.SIGHUP, self.handle_exit) if heard else None
+        try:
+            with super().capture_signals():
+                yield
+        finally:
+            if heard:
+                signal.signal(signal.SIGHUP, before)
 
 
 def _add_files(app: FastAPI, rerun: RerunViewer) -> None:
@@ -253,20 +271,6 @@ def _bound(host: str, port: int) -> socket.socket:
             f"Cannot listen on {host} port {port}: {reason}. Choose another --port (0: any free one)."
         ) from None
     return listener
-
-
-@contextlib.contextmanager
-def _signals_end_in_peace() -> Iterator[None]:
-    """uvicorn raises the signal that stopped it once more when it is done; a stop that was asked for is no error."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _print_url(url: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -133,6 +134,8 @@ def serve(
                 open_in_browser(url)
 
         serve_until_signal(settings, host=host, port=port, listening=listening, access=access)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it has ended in peace; Python takes another moment for its own end
 
 
 @contextmanager

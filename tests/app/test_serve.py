@@ -74,6 +74,22 @@ def test_a_stop_saves_the_jobs_and_the_log_tells(tmp_path: Path) -> None:
     assert (job.state, job.error) == ("interrupted", "the server stopped")
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP], ids=["Ctrl-C again and again", "a closed terminal"])
+def test_whatever_ends_it_ends_its_jobs(tmp_path: Path, number: signal.Signals) -> None:
+    """uvicorn leaves out what ends the jobs where Ctrl-C is pressed twice: they went on, and the process with them."""
+    workspace = tmp_path / "workspace"
+    with served(workspace) as (server, address):
+        asked(f"{address}/api/finetune/push/crossmodal-ekf", {"train": ["haptics-only"], "steps": 20000})
+        end = time.monotonic() + PATIENCE / 2
+        while server.poll() is None and time.monotonic() < end:
+            server.send_signal(number)
+            time.sleep(0.02)
+        assert server.poll() == 0
+        assert server.communicate() == ("", "")
+    (job,) = (json.loads(path.read_text()) for path in workspace.glob("jobs/*/job.json"))
+    assert (job["state"], job["error"]) == ("interrupted", "the server stopped")
+
+
 def test_the_workspace_is_for_its_user_alone(settings: Settings) -> None:
     create_app(settings, warm=False)
     assert stat.S_IMODE(settings.workspace.stat().st_mode) == 0o700
