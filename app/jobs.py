@@ -31,7 +31,7 @@ from beliefscope import __version__
 from beliefscope.app.record import read_record
 from beliefscope.app.security import kept_file
 from beliefscope.app.work import how_it_ended
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, one_of, unwritable
 from beliefscope.filters.checkpoint import write_atomically
 
 KINDS: dict[str, str] = {
@@ -170,7 +170,7 @@ class Jobs:
             try:
                 folder.mkdir(parents=True)
             except OSError as error:
-                raise BadInput(f"cannot write {str(folder)!r}: {error.strerror}") from None
+                raise unwritable(folder, error) from None
             write_atomically(folder / "arguments.json", json.dumps(arguments).encode())
             # A clock that was set back must not put what is asked for now behind what was.
             asked = max([time.time(), *(job.asked + 1e-3 for job in self._jobs.values())])
@@ -230,21 +230,28 @@ class Jobs:
         while self._queue and len(self._processes) < self._at_once:
             id = self._queue.popleft()
             job = self._jobs[id]
-            # A session of its own: Ctrl-C in the terminal is for the server, and what a job starts ends with it.
-            with (self._folder / id / "log.txt").open("wb") as said:
-                process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", "beliefscope.app.work", self._kinds[job.kind], self._folder / id],
-                    stdin=subprocess.PIPE,  # when it closes, its server is gone
-                    stdout=subprocess.PIPE,
-                    stderr=said,
-                    start_new_session=True,
-                    env=os.environ | {"OMP_NUM_THREADS": "1"},
-                )
-            self._processes[id] = process
+            try:
+                process = self._processes[id] = self._process(job)
+            except OSError as error:  # its folder is gone, or there is no memory for a process, or no descriptor
+                why = f"it could not be started: {error.strerror or error}"
+                self._put(replace(job, state="failed", error=why, ended=max(time.time(), job.asked)))
+                continue
             self._put(replace(job, state="running", started=max(time.time(), job.asked)))
             log.info("job began", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
             self._attending[id] = threading.Thread(target=self._attend, args=(id, process), name=f"job {id}")
             self._attending[id].start()
+
+    def _process(self, job: Job) -> subprocess.Popen[bytes]:
+        # A session of its own: Ctrl-C in the terminal is for the server, and what a job starts ends with it.
+        with (self._folder / job.id / "log.txt").open("wb") as said:
+            return subprocess.Popen(
+                [sys.executable, "-P", "-m", "beliefscope.app.work", self._kinds[job.kind], self._folder / job.id],
+                stdin=subprocess.PIPE,  # when it closes, its server is gone
+                stdout=subprocess.PIPE,
+                stderr=said,
+                start_new_session=True,
+                env=os.environ | {"OMP_NUM_THREADS": "1"},
+            )
 
     def _attend(self, id: str, process: subprocess.Popen[bytes]) -> None:
         hearing = threading.Thread(target=self._hear, args=(id, process), name=f"hearing {id}")

@@ -17,7 +17,7 @@ import mujoco
 import beliefscope
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, unwritable
 from beliefscope.datasets.hdf5 import look_over
 from beliefscope.datasets.store import open_dataset, write_dataset
 
@@ -85,7 +85,7 @@ class _Parts:
         except FileNotFoundError:
             raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.") from None
         except OSError as error:
-            raise BadInput(f"Cannot write {path}: {error.strerror}.") from None
+            raise unwritable(path, error) from None
         look_over(self._folder.glob("*.h5"))  # all at once
 
     def holds(self, index: int) -> bool:

@@ -11,13 +11,11 @@ from __future__ import annotations
 import io
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
-from errno import EDQUOT, ENOSPC
 from pathlib import Path
 from typing import Any
 
@@ -139,14 +137,6 @@ class Sink(io.FileIO):
         """Raises the OSError that was met."""
         if self.error is not None:
             raise self.error
-
-
-def unwritable(path: Path, error: OSError) -> BadInput:
-    """The error for a file that could not be written; of a full disk, with what is free there."""
-    free = ""
-    if error.errno in (ENOSPC, EDQUOT):
-        free = f", {shutil.disk_usage(path.parent).free / 1e6:.1f} MB are free there"
-    return BadInput(f"Cannot write {path}: {reason(error)}{free}.")
 
 
 def _look(path: str) -> None:

@@ -22,7 +22,7 @@ from torch.overrides import TorchFunctionMode
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.document import read_json
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, one_of, unwritable
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.filter import Architecture, Filter, Kind
@@ -148,19 +148,18 @@ def shipped(task: str, name: str) -> Path:
 def write_atomically(path: Path, data: bytes) -> None:
     """The old file or the new one, never half of it. Raises BadInput where it cannot be written: no folder, no room."""
     path = Path(path)
-    temporary = None
     try:
         if not path.parent.is_dir():
             raise BadInput(f"folder {str(path.parent)!r} does not exist")
         handle, temporary = tempfile.mkstemp(".part", f".{path.name[:100]}.", path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise BadInput(f"cannot write {str(path)!r}: {error.strerror}") from None
-    finally:
-        if temporary is not None:
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        finally:
             Path(temporary).unlink(missing_ok=True)
+    except OSError as error:
+        raise unwritable(path, error) from None

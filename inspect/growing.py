@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.document import read_json
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, unwritable
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_of
 
 FORMAT = 1
@@ -85,7 +85,7 @@ class GrowingWriter:
         try:
             self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except OSError as error:
-            raise BadInput(f"cannot write {str(self.path)!r}: {error.strerror}") from None
+            raise unwritable(self.path, error) from None
         fcntl.flock(self._file, fcntl.LOCK_EX)
         self._size = 0
         content = json.dumps(header).encode() + b"".join(array.tobytes() for array in static.values())
@@ -126,7 +126,7 @@ class GrowingWriter:
                 at += os.pwrite(self._file, data[at - self._size :], at)
         except OSError as error:
             os.ftruncate(self._file, self._size)  # so that what is written once there is room again can be read
-            raise BadInput(f"cannot write {str(self.path)!r}: {error.strerror}") from None
+            raise unwritable(self.path, error) from None
         self._size = at
 
 

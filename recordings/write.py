@@ -10,6 +10,7 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
+from errno import ENOSPC
 from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
@@ -27,7 +28,7 @@ from rerun_bindings import flush_and_cleanup_orphaned_recordings
 import beliefscope
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, unwritable
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnostic import Diagnostic
 from beliefscope.inspect.growing import STATIC
@@ -293,6 +294,9 @@ def _blocks(maps: Iterable[LikelihoodMap], size: int) -> Iterator[list[Likelihoo
         yield block
 
 
+_CUT_SHORT = ENOSPC, "Rerun could not write the file to its end"  # it does not say why, and there is hardly another
+
+
 def _finish(stream: rr.RecordingStream, path: Path) -> None:
     """Writes what is still queued, then asks the file for its footer: Rerun only logs that a disk was full."""
     try:
@@ -300,7 +304,7 @@ def _finish(stream: rr.RecordingStream, path: Path) -> None:
         stream.disconnect()
         RrdReader(path).store()
     except (RuntimeError, ValueError):
-        raise OSError("the file could not be written to its end; is the disk full?") from None
+        raise OSError(*_CUT_SHORT) from None
 
 
 @contextmanager
@@ -310,13 +314,14 @@ def _complete_or_absent(path: Path) -> Iterator[Path]:
         raise BadInput(f"cannot write {path}: the folder {path.parent} does not exist.")
     unfinished = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     try:
-        yield unfinished
-        os.replace(unfinished, path)
+        try:
+            yield unfinished
+            os.replace(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
     except OSError as error:
-        raise BadInput(f"cannot write {path}: {error.strerror or error}.") from None
+        raise unwritable(path, error) from None
     except RuntimeError as error:
         if "File-writer" not in str(error):  # Rerun's thread, which ends where it cannot write
             raise
-        raise BadInput(f"cannot write {path}: {error}; is the disk full?") from None
-    finally:
-        unfinished.unlink(missing_ok=True)
+        raise unwritable(path, OSError(*_CUT_SHORT)) from None

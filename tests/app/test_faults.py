@@ -10,6 +10,7 @@ import resource
 import shutil
 import socket
 import struct
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -95,10 +96,28 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(name: str, run: Trace
     assert list(tmp_path.iterdir()) == [path], "nothing half-written is left"
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a disk")
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_disk_without_room_is_told_with_what_is_free(name: str, run: Trace, tmp_path: Path) -> None:
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(place)]
+    if subprocess.run(mounted, capture_output=True, check=False).returncode:
+        pytest.skip("no disk can be mounted here")
+    try:
+        (place / "other").write_bytes(bytes(40_000))
+        (line,) = apart(partial(WRITERS[name], run, place / "wanted"))
+        # 16 pages of 4 KiB, of which the other file has ten: six are left, once what was half written is gone.
+        assert line == f"cannot write {str(place / 'wanted')!r}: No space left on device, 0.0 MB are free there"
+        assert [path.name for path in place.iterdir()] == ["other"]
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+
+
 @pytest.mark.long  # in a process that wrote other recordings before, Rerun may wait for ever
 def test_a_recording_on_a_full_disk_is_one_line_too(run: Trace, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"  # not in a fork, for which Rerun is not made
-    with room_for(10_000), pytest.raises(BadInput, match=r"cannot write .*run\.rrd: .* is the disk full"):
+    with room_for(10_000), pytest.raises(BadInput, match=r"cannot write .*run\.rrd': .* MB are free there"):
         write_recording(run, path)
     assert not list(tmp_path.iterdir())
     assert write_recording(run, path).is_file()
@@ -150,6 +169,24 @@ def test_a_job_whose_folder_is_gone_ends_all_the_same(tmp_path: Path, monkeypatc
         (tmp_path / "b").touch()
         assert until(lambda: jobs[waiting.id].ended and jobs[waiting.id]).state == "failed"
         assert done(jobs, "2").state == "done", "others go on"
+
+
+def test_a_job_that_cannot_be_started_does_not_hold_up_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its folder is gone by the time that it is its turn, as where somebody clears the workspace."""
+    with working(tmp_path, monkeypatch, at_once=1) as jobs:
+        first = jobs.submit("wait", "Wait", {"started": str(tmp_path / "a"), "until": str(tmp_path / "b")}, "1")
+        gone, last = (jobs.submit("add", "Add", {"numbers": [1, 2]}, key) for key in ("2", "3"))
+        until((tmp_path / "a").exists)
+        shutil.rmtree(tmp_path / "jobs" / gone.id)
+        (tmp_path / "b").touch()
+        assert until(lambda: jobs[last.id].ended and jobs[last.id]).state == "done"
+        assert jobs[first.id].state == "done"
+        assert (jobs[gone.id].state, jobs[gone.id].error) == (
+            "failed",
+            "it could not be started: No such file or directory",
+        )
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(run: Trace) -> None:
@@ -232,10 +269,10 @@ def test_a_network_that_overflows_shows_what_there_is(
 
 
 @contextmanager
-def working(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Jobs]:
+def working(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int = 2) -> Iterator[Jobs]:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
     kinds = {name: f"work_for_tests:{name}" for name in ("add", "wait", "hungry")}
-    jobs = Jobs(tmp_path / "jobs", kinds)
+    jobs = Jobs(tmp_path / "jobs", kinds, at_once)
     try:
         yield jobs
     finally:

@@ -15,8 +15,8 @@ import pytest
 
 from beliefscope.datasets import hdf5
 from beliefscope.datasets.door import DOOR
-from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.hdf5 import SHIPPED, look_over, open_hdf5, unwritable
+from beliefscope.datasets.errors import BadInput, unwritable
+from beliefscope.datasets.hdf5 import SHIPPED, look_over, open_hdf5
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 
@@ -112,7 +112,7 @@ def test_where_there_is_no_room_the_process_says_so_and_lives(whole: Path, share
         write_dataset(folder / "later.h5", DOOR, [data[0]] * 3)
     room = int(share * (folder / "later.h5").stat().st_size)
     ran = subprocess.run([sys.executable, "-c", FULL, whole, str(room)], capture_output=True, text=True, check=False)
-    assert (ran.returncode, ran.stdout, ran.stderr) == (0, f"Cannot write {whole}: File too large.\n", "")
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, f"cannot write {str(whole)!r}: File too large\n", "")
     assert whole.read_bytes() == before
     assert sorted(path.name for path in folder.iterdir()) == ["door.h5", "later.h5"], "nothing half-written is left"
     with open_dataset(folder / "later.h5") as data:
@@ -121,5 +121,5 @@ def test_where_there_is_no_room_the_process_says_so_and_lives(whole: Path, share
 
 def test_what_is_free_is_told_where_the_disk_is_full(tmp_path: Path) -> None:
     said = str(unwritable(tmp_path / "x.h5", OSError(errno.ENOSPC, "No space left on device")))
-    assert said.startswith(f"Cannot write {tmp_path / 'x.h5'}: No space left on device, ")
-    assert said.endswith(" MB are free there.")
+    assert said.startswith(f"cannot write '{tmp_path / 'x.h5'}': No space left on device, ")
+    assert said.endswith(" MB are free there")
