@@ -12,7 +12,8 @@ from pydantic import TypeAdapter
 
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.record import read_record
-from beliefscope.filters.checkpoint import load_checkpoint, write_atomically
+from beliefscope.datasets.writing import write_atomically
+from beliefscope.filters.checkpoint import load_checkpoint
 
 FILE = "kept.json"
 

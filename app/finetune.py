@@ -24,7 +24,8 @@ from beliefscope.app.link import beside, moment_link
 from beliefscope.app.record import read_record
 from beliefscope.app.work import Report
 from beliefscope.datasets.document import read_json
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, write_atomically
+from beliefscope.datasets.writing import write_atomically
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from beliefscope.filters.finetune import FineTune, finetune
 from beliefscope.filters.foreign import Foreign
 from beliefscope.filters.modules import chosen, moved, presets, tree, within

@@ -31,8 +31,8 @@ from beliefscope import __version__
 from beliefscope.app.record import read_record
 from beliefscope.app.security import kept_file
 from beliefscope.app.work import how_it_ended
-from beliefscope.datasets.errors import BadInput, one_of, unwritable
-from beliefscope.filters.checkpoint import write_atomically
+from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.writing import unwritable, write_atomically
 
 KINDS: dict[str, str] = {
     "diagnostic": "beliefscope.app.diagnostics:work",

@@ -24,7 +24,7 @@ from typing import NoReturn
 from beliefscope.app.rrdabout import About, Reader
 from beliefscope.app.trash import Deleted, Gone, Taken, Trash
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.checkpoint import write_atomically
+from beliefscope.datasets.writing import write_atomically
 
 ENDING = ".rrd"
 LONGEST = 200  # bytes of a name without its ending: a file under way has a longer one

@@ -17,7 +17,7 @@ import brotli
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
-from beliefscope.filters.checkpoint import write_atomically
+from beliefscope.datasets.writing import write_atomically
 
 UPLOT_FILES = ("uPlot.iife.js", "uPlot.min.css")
 # widget.js is made for notebooks and keeps its viewer class to itself.

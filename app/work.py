@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.writing import write_atomically
 
 Report = Callable[[float, str], None]
 """(share done 0..1, what it is doing) -> None; may be called at every step."""
@@ -49,8 +50,6 @@ def main(function: str, folder: Path) -> int:
         module, _, name = function.partition(":")
         run = getattr(importlib.import_module(module), name)
         result = run(json.loads((folder / "arguments.json").read_bytes()), report)
-        from beliefscope.filters.checkpoint import write_atomically  # brings PyTorch, which takes seconds
-
         write_atomically(folder / "result.json", json.dumps(result, allow_nan=False).encode())
     except BadInput as error:
         tell(error=str(error))

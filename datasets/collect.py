@@ -17,9 +17,10 @@ import mujoco
 import beliefscope
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, unwritable
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.hdf5 import look_over
 from beliefscope.datasets.store import open_dataset, write_dataset
+from beliefscope.datasets.writing import unwritable
 
 Progress = Callable[[int, int], None]
 

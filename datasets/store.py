@@ -19,12 +19,13 @@ from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, unwritable
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.hdf5 import DAMAGE, SHIPPED, Sink, damaged, look_over, open_hdf5, trust
 from beliefscope.datasets.mit_push import MitPushes, is_mit
 from beliefscope.datasets.push_real import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.stored import check_claim
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.writing import unwritable
 
 FORMAT = "beliefscope-episodes"
 VERSION = 1

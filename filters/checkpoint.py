@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +20,9 @@ from torch.overrides import TorchFunctionMode
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.document import read_json
-from beliefscope.datasets.errors import BadInput, one_of, unwritable
+from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.writing import write_atomically
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.filter import Architecture, Filter, Kind
 
@@ -143,23 +142,3 @@ def shipped(task: str, name: str) -> Path:
             f"no trained {name!r} ships for task {task!r}; train one: beliefscope train {task} --filter {name}"
         )
     return path
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """The old file or the new one, never half of it. Raises BadInput where it cannot be written: no folder, no room."""
-    path = Path(path)
-    try:
-        if not path.parent.is_dir():
-            raise BadInput(f"folder {str(path.parent)!r} does not exist")
-        handle, temporary = tempfile.mkstemp(".part", f".{path.name[:100]}.", path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
-    except OSError as error:
-        raise unwritable(path, error) from None

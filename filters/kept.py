@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from beliefscope.filters.checkpoint import write_atomically
+from beliefscope.datasets.writing import write_atomically
 
 
 def key_of(**what: Any) -> str:

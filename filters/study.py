@@ -26,8 +26,9 @@ from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
+from beliefscope.datasets.writing import write_atomically
 from beliefscope.filters.catalog import architecture
-from beliefscope.filters.checkpoint import save_checkpoint, write_atomically
+from beliefscope.filters.checkpoint import save_checkpoint
 from beliefscope.filters.evaluate import LEFT_OUT, metrics
 from beliefscope.filters.train import PLANS, train, versions
 from beliefscope.filters.trainer import BLACKOUTS, Report

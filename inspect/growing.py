@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.document import read_json
-from beliefscope.datasets.errors import BadInput, unwritable
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.writing import unwritable
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_of
 
 FORMAT = 1

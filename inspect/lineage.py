@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint, write_atomically
+from beliefscope.datasets.writing import write_atomically
+from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
 from beliefscope.inspect.diagnostic import as_json
 
 FEWEST_DIGITS = 4

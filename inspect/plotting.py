@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import one_of
-from beliefscope.filters.checkpoint import write_atomically
+from beliefscope.datasets.writing import write_atomically
 from beliefscope.inspect.diagnostic import Curve, Diagnostic, Picture, Plot
 from beliefscope.inspect.measures import stretches
 from beliefscope.inspect.palette import COLOURS, colour

@@ -19,9 +19,10 @@ from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.writing import write_atomically
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, moments
-from beliefscope.filters.checkpoint import Checkpoint, write_atomically
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.foreign import Foreign
 from beliefscope.filters.pf import ParticleFilter

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.filters.checkpoint import write_atomically
+from beliefscope.datasets.writing import write_atomically
 from beliefscope.inspect.diagnostic import as_json
 from beliefscope.inspect.trace import Trace, arrays_of, header_of
 from beliefscope.recordings.columns import Column, columns

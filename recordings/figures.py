@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.task import Task
-from beliefscope.filters.checkpoint import write_atomically
+from beliefscope.datasets.writing import write_atomically
 from beliefscope.filters.study import TRIVIAL, Row
 from beliefscope.inspect.palette import COLOURS, SPARE_COLOURS
 from beliefscope.inspect.plotting import STYLE, WIDTH

@@ -28,8 +28,9 @@ from rerun_bindings import flush_and_cleanup_orphaned_recordings
 import beliefscope
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, unwritable
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.writing import unwritable
 from beliefscope.inspect.diagnostic import Diagnostic
 from beliefscope.inspect.growing import STATIC
 from beliefscope.inspect.likelihood import LikelihoodMap

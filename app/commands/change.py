@@ -122,7 +122,7 @@ def write(folder: Path, document: dict[str, Any], text: str, figure: Any) -> Non
     """The report as numbers, as a figure and as text."""
     import json as json_format
 
-    from beliefscope.filters.checkpoint import write_atomically
+    from beliefscope.datasets.writing import write_atomically
     from beliefscope.inspect.plotting import write_figure
 
     folder.mkdir()

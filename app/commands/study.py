@@ -158,7 +158,7 @@ def write(folder: Path, cells: list[Cell], preset: str) -> tuple[list[Row], dict
     far each cell is, the hashes of what is trained, and the table's numbers, unrounded."""
     from dataclasses import asdict
 
-    from beliefscope.filters.checkpoint import write_atomically
+    from beliefscope.datasets.writing import write_atomically
     from beliefscope.filters.study import rows_of, to_csv, to_markdown
     from beliefscope.filters.train import versions
     from beliefscope.recordings.figures import write_results

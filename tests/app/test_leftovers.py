@@ -15,7 +15,8 @@ from beliefscope.app.library import Settings
 from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters.checkpoint import load_checkpoint, shipped, write_atomically
+from beliefscope.datasets.writing import write_atomically
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.write import write_recording
 

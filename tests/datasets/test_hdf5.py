@@ -15,9 +15,10 @@ import pytest
 
 from beliefscope.datasets import hdf5
 from beliefscope.datasets.door import DOOR
-from beliefscope.datasets.errors import BadInput, unwritable
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.hdf5 import SHIPPED, look_over, open_hdf5
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
+from beliefscope.datasets.writing import unwritable
 
 
 @pytest.fixture
