@@ -30,7 +30,7 @@ from beliefscope.app.library import Library, Settings
 from beliefscope.app.logs import no_false_alarm
 from beliefscope.app.memory import few_heaps, settle
 from beliefscope.app.pagefiles import PageFiles
-from beliefscope.app.patience import CONNECTIONS, HEAD, PatientProtocol
+from beliefscope.app.patience import HEAD, READ_PATIENCE, PatientProtocol, PatientSocket
 from beliefscope.app.rrdfiles import RrdFiles
 from beliefscope.app.security import Guard
 from beliefscope.app.session import Views
@@ -145,7 +145,7 @@ def serve(
         config = uvicorn.Config(
             app,
             http=PatientProtocol,
-            limit_concurrency=CONNECTIONS,
+            ws=PatientSocket,
             h11_max_incomplete_event_size=HEAD,
             proxy_headers=False,  # anyone on this machine could write them
             log_config=None,
@@ -262,6 +262,8 @@ def _bound(host: str, port: int) -> socket.socket:
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # on Linux; the connections that it accepts have it too
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, READ_PATIENCE)
         listener.bind((host, port))
         listener.listen(128)
     except (OSError, OverflowError) as error:

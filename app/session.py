@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from beliefscope.app.desk import Desk, Turns
 from beliefscope.app.library import Library, Selection, Traced
@@ -83,7 +83,8 @@ class View:
         try:
             while True:
                 await self._heard(websocket, await websocket.receive_text())
-        except (WebSocketDisconnect, KeyError):  # KeyError: a binary message, which has no text
+        # The second: it went while it was told something. KeyError: a binary message, which has no text.
+        except (WebSocketDisconnect, WebSocketDisconnected, KeyError):
             await _quietly(websocket.close(1003))
         finally:
             for task in answering:
@@ -260,6 +261,7 @@ class Views:
         self._limit = limit
         self._patience = patience
         self._views: dict[str, View] = {}
+        self._opening = asyncio.Lock()
 
     def __len__(self) -> int:
         return len(self._views)
@@ -270,15 +272,16 @@ class Views:
 
     async def open(self, dark: bool) -> View:
         """A new view. Closes the one that has been idle longest if there are too many; BadInput if all are in use."""
-        await self._close_idle(keep=self._limit - 1)
-        if len(self._views) >= self._limit:
-            raise BadInput(
-                f"{self._limit} pages are open already, as many as this server shows at a time; close one and reload, "
-                "or serve with more --views."
-            )
-        view = await asyncio.to_thread(View, self._library, self._desk, self._turns, dark)
-        self._views[view.name] = view
-        return view
+        async with self._opening:
+            await self._close_idle(keep=self._limit - 1)
+            if len(self._views) >= self._limit:
+                raise BadInput(
+                    f"{self._limit} pages are open already, as many as this server shows at a time; close one and "
+                    "reload, or serve with more --views."
+                )
+            view = await asyncio.to_thread(View, self._library, self._desk, self._turns, dark)
+            self._views[view.name] = view
+            return view
 
     async def tidy(self) -> None:
         """Close views whose page has gone for longer than the patience. Runs until cancelled."""
@@ -290,8 +293,10 @@ class Views:
         before = time.monotonic() - idle_for
         idle = [v for v in self._views.values() if v.idle_since is not None and v.idle_since <= before]
         idle.sort(key=lambda v: v.idle_since or 0.0)
-        for view in idle[: max(0, len(self._views) - keep)]:
+        closing = idle[: max(0, len(self._views) - keep)]
+        for view in closing:  # at once: meanwhile others close some, or a page comes to one
             del self._views[view.name]
+        for view in closing:
             await asyncio.to_thread(view.scene.close)
         if idle:
             await asyncio.to_thread(give_back)
