@@ -42,6 +42,7 @@ class Scene:
         self._key = ""
         self._slider: GuiSliderHandle[int] | None = None
         self._user_moved = -USER_HOLDS
+        self._server.gui.set_panel_label("Step")  # all that is in it
         self.set_dark(dark)
         self._fold_panel()
 

@@ -35,7 +35,8 @@ FORCE_LENGTH = 0.30  # m, the longest arrow
 LOG_SHOWN = 40.0  # nats below the peak at the lower end of a map's colours, as on the page
 SIGHT = 0.2  # of the way from the camera to what it looks at: where its picture hangs
 ENLARGED = 4  # times, so that the browser's smoothing leaves a picture's pixels apart
-GLASS = 0.3  # opacity of what the map on the floor is seen through
+GLASS = 0.35  # opacity of what the map on the floor is seen through
+GLASS_GRAY = 150  # of each colour of it, at least: darker glass would not be seen before a dark ground
 CELLS = (0.05, 0.1, 0.25, 1.0)  # m between the lines of a bare plane, of which it has MOST_CELLS along a side
 MOST_CELLS = 14
 
@@ -192,28 +193,29 @@ class Force:
 
 
 class Stage:
-    """What the robot works on, below ``/bodies``: it stands where the map lies, which is seen through it."""
+    """What the robot works on and its hand, below ``/bodies``: where the map lies, which is seen through them."""
 
     def __init__(self, server: ViserServer, model: Any) -> None:
         """Model: a ``mujoco.MjModel``, in which these shapes are hidden from now on."""
-        bodies = around(model)
+        bodies = around(model) | hand(model)
         parts = sorted((shape for shape in shapes(model) if bodies[shape.body]), key=_body_and_colour)
         self._frames = {
             body: server.scene.add_frame(f"/bodies/{name or body}", show_axes=False)
             for body, name in {(p.body, p.name) for p in parts}
         }
-        self._meshes: list[Any] = []
+        self._meshes: list[tuple[Any, RGB]] = []
         for i, ((body, rgba), group) in enumerate(groupby(parts, key=_body_and_colour)):
             solids = [solid(shape) for shape in group]
             first = np.cumsum([0, *(len(one.vertices) for one in solids)])
+            red, green, blue = (round(255.0 * part) for part in rgba[:3])
             mesh = server.scene.add_mesh_simple(
                 f"{self._frames[body].name}/{i}",
                 np.concatenate([one.vertices for one in solids]),
                 np.concatenate([one.faces + at for one, at in zip(solids, first, strict=False)]),
-                color=np.rint(255.0 * np.array(rgba[:3])).astype(np.uint8),
+                color=(red, green, blue),
                 cast_shadow=False,
             )
-            self._meshes.append(mesh)
+            self._meshes.append((mesh, (red, green, blue)))
         model.geom_rgba[bodies[model.geom_bodyid], 3] = 0.0
 
     def move(self, positions: Array, rotations: Array) -> None:
@@ -223,14 +225,28 @@ class Stage:
 
     def see_through(self, through: bool) -> None:
         """Make glass of it, or what it was."""
-        for mesh in self._meshes:
+        for mesh, own in self._meshes:
             mesh.opacity = GLASS if through else None
+            mesh.color = (*(max(GLASS_GRAY, part) for part in own),) if through else own
 
 
 def around(model: Any) -> NDArray[np.bool_]:
     """(B,) which bodies of a ``mujoco.MjModel`` are not the robot's, whose tree has the most joints, nor the world."""
+    return ~_robot(model) & (np.arange(model.nbody) > 0)
+
+
+def hand(model: Any) -> NDArray[np.bool_]:
+    """(B,) the end of a robot: what nothing hangs on, as fingers, and what only such hang on."""
+    children = np.bincount(model.body_parentid[1:], minlength=model.nbody)
+    last = _robot(model) & (children == 0)
+    held = np.bincount(model.body_parentid[last], minlength=model.nbody)
+    return last | (_robot(model) & (held > 0) & (held == children))
+
+
+def _robot(model: Any) -> NDArray[np.bool_]:
     joints = np.bincount(model.body_rootid[model.jnt_bodyid], minlength=model.nbody)
-    return (model.body_rootid != joints.argmax()) & (np.arange(model.nbody) > 0)
+    found: NDArray[np.bool_] = model.body_rootid == joints.argmax()
+    return found
 
 
 def _body_and_colour(shape: Shape) -> tuple[int, tuple[float, ...]]:

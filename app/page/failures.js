@@ -358,7 +358,7 @@ function momentColumns(found, score) {
     if (modalities.length > 1 || layer === 'fused') columns.push({ title: `${name} cm`, text: (m) => fixed(100 * m.error[i], 2), number, help: 'Distance of its position from the truth' });
   });
   if (score.name !== 'nees' && score.moments[0]?.nees !== null) columns.push({ title: 'NEES', text: (m) => fixed(m.nees), number, help: 'Normalised squared error: mean 1 where the covariance is right' });
-  if (modalities.length > 1 && score.moments[0]?.acting) columns.push({ title: 'follows', text: (m) => leading(modalities, m.acting), help: 'The modality that decides most, with its share as it acted' });
+  if (modalities.length > 1 && score.moments[0]?.acting) columns.push({ title: 'follows', text: (m) => leading(modalities, m.acting), help: 'The modality that decides most, with its share as it acted: the mean over the components' });
   return columns;
 }
 

@@ -15,11 +15,11 @@ const DEFAULT = { preset: 'haptics-only', slice: 'blackout 0.8' }; // of a first
 const STEPS = [['', 'all steps'], ['yes', 'in contact'], ['no', 'out of contact']];
 const PLACES = { kept: 'The child is on the shelf, beside its parent.', default: 'The child is on the shelf, and what this server shows first.' };
 const NUMBERS = [
-  ['nominal', 'Nominal share', 0.05, 'Of the loss that data as they are have: they hold the rest in place'],
-  ['steps', 'Steps', 1, 'Of the optimiser, at most'],
-  ['length', 'Window', 1, 'Steps of each piece of a trajectory that is learned from'],
-  ['rate', 'Rate', 'any', 'Adam’s learning rate'],
-  ['pull', 'Pull', 'any', 'How strongly weights are drawn back to the parent’s'],
+  ['nominal', 'Share of nominal data', 0.05, 'Of the loss: data as they are hold the rest in place'],
+  ['steps', 'Training steps', 1, 'Of the optimiser, at most'],
+  ['length', 'Window, steps', 1, 'Steps of each piece of a trajectory that is learned from'],
+  ['rate', 'Learning rate', 'any', 'Of Adam'],
+  ['pull', 'Pull to the parent', 'any', 'How strongly weights are drawn back to the parent’s'],
   ['seed', 'Seed', 1, 'Of all that is drawn'],
 ];
 
@@ -28,13 +28,13 @@ const FORM = `
     <div class="row"><label>Train <select name="preset"></select></label> <span class="count"></span></div>
     <ul class="tree" aria-label="Modules"></ul>
     <div class="row">
-      <label>Learn <select name="slice"></select></label>
+      <label title="A part of what the filter meets, by its name; what it is stands beside it">Learn from <select name="slice"></select></label>
       <label>Sensors <select name="recipe"></select></label>
-      <label>Steps <select name="contact"></select></label>
-      <label>Who speaks <select name="only"></select></label>
+      <label title="Which steps of an episode count">Steps <select name="contact"></select></label>
+      <label title="What the filter is given: all, or one alone">Modalities <select name="only"></select></label>
     </div>
     <div class="row numbers"></div>
-    <div class="row"><label title="Of the slice, only these steps are learned from: episodes, and steps of them. All training episodes where it is empty.">Only at <input name="moments" placeholder="9, 31:20-60" autocomplete="off" spellcheck="false"></label></div>
+    <div class="row"><label title="Of the slice, only these steps are learned from: episodes, and steps of them. All training episodes where it is empty.">Only episodes, steps <input name="moments" placeholder="9, 31:20-60" autocomplete="off" spellcheck="false"></label></div>
     <div class="row"><button class="text start">Fine-tune</button> <label class="past" hidden>Runs so far <select name="past"></select></label></div>
     <p class="wrong" role="alert"></p>
     <section class="descent"></section>

@@ -8,6 +8,7 @@ import { fixed, percent, signed, spoken } from './units.js';
 const LOOKS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom']; // of the state
 const SHARES = [0.5, 0.95]; // of the likelihood, that the regions hold
 const ROUND = 1.3; // times as long as wide below which a map has no axis
+const CLOSE = 4; // times that maps are magnified, as long as all of the run's fit
 const DIVERGING = 'diverging';
 
 export class Heatmaps {
@@ -22,6 +23,7 @@ export class Heatmaps {
   #fetched = ''; // the moment whose maps were asked for, to be pinned
   #besideName = '';
   #hover = null; // [dx, dy] m
+  #wide = false; // whether maps of this run did not fit into the middle
   #side = 0;
 
   /**
@@ -43,6 +45,8 @@ export class Heatmaps {
   draw(maps, trace, besideName = '') {
     this.#besideName = besideName;
     const first = this.#maps === null || this.#maps.layers.join() !== maps.layers.join();
+    // Once they did not, they stay whole: axes that change from step to step cannot be read.
+    this.#wide = (this.#wide && this.#trace === trace) || !fits(maps);
     [this.#maps, this.#trace] = [maps, trace];
     // Of one measurement model alone the fused map is the same again.
     if (first) this.#figures = this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
@@ -186,7 +190,12 @@ export class Heatmaps {
 
   /** Half of the shown square's side, m. */
   get #half() {
-    return this.#maps.half_width / Number(this.#store.state.zoom);
+    return this.#maps.half_width / this.#zoom;
+  }
+
+  get #zoom() {
+    const { zoom } = this.#store.state;
+    return zoom === 'fit' ? (this.#wide ? 1 : CLOSE) : Number(zoom);
   }
 
   #left(layer) {
@@ -194,8 +203,8 @@ export class Heatmaps {
   }
 
   #look(layer) {
-    const { axes, cloud, zoom } = this.#store.state;
-    return { axes, zoom: Number(zoom), cloud: cloud === 'shown', text: colour('muted'), withY: layer === 0, hover: this.#hover };
+    const { axes, cloud } = this.#store.state;
+    return { axes, zoom: this.#zoom, cloud: cloud === 'shown', text: colour('muted'), withY: layer === 0, hover: this.#hover };
   }
 
   #drawn({ name, cells, borders, shade, table }, layer) {
@@ -310,6 +319,15 @@ export class Heatmaps {
 }
 
 const comparable = (a, b) => a.layers.join() === b.layers.join() && Math.abs(a.half_width - b.half_width) < 1e-6;
+
+/** Whether peaks and 95 % regions, taken for ellipses about them, lie in the middle that is shown close. */
+function fits({ half_width, peak, numbers }) {
+  const most = half_width / CLOSE;
+  return peak.every((at, layer) => {
+    const radius = Math.sqrt((numbers.area95[layer] / Math.PI) * numbers.elongation[layer]);
+    return Math.max(...at.map(Math.abs)) + radius <= most;
+  });
+}
 
 /** A moment of the page's task in words of an address. */
 function moment({ filter, data, episode, recipe }, step, angle) {

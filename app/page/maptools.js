@@ -8,7 +8,7 @@ const LOOKS = {
   scale: ['Colour', [['normalised', 'likelihood / peak'], ['log', 'log-likelihood']]],
   range: ['Peak and range', [['own', 'each its own'], ['same', 'of all maps']]],
   colours: ['Colour map', [['viridis', 'viridis'], ['cividis', 'cividis']]],
-  zoom: ['Square', [['1', 'whole'], ['4', 'middle, 4 ×']]],
+  zoom: ['Square', [['fit', 'as fits'], ['1', 'whole'], ['4', 'middle, 4 ×']]],
   axes: ['Axes', [['offset', 'offset from truth'], ['world', 'world']]],
   regions: ['50 and 95 % regions', [['shown', 'shown'], ['hidden', 'hidden']]],
   cloud: ['Particles', [['hidden', 'hidden'], ['shown', 'by weight']]],

@@ -2,7 +2,8 @@
 
 import { fixed, percent, spoken } from './units.js';
 
-const NEAR = 1; // cm: two errors closer than this are called alike
+const NEAR = 0.2; // cm: two errors closer than this are called alike,
+const ALIKE = 0.8; // and those of which the smaller is this share of the larger, or more
 const SURE = 2; // standard deviations within which an error is what the filter expects
 const LEADS = 0.6; // share from which one modality is said to lead
 const FEW = 0.05; // of the particles
@@ -18,10 +19,11 @@ export function reading(trace, step, component) {
 
   const [best, leader] = [closest(trace, step), leading(trace, step, component)];
   const blind = (leader?.name === 'image' && trace.black[step] && 'the picture is black') || (leader?.name === 'haptics' && !trace.contact[step] && 'there is no contact to feel');
-  const better = leader && best && best.name !== leader.name && best.error + NEAR < error && `${best.name} alone is ${fixed(best.error, 1)} cm off`;
+  const better = leader && best && best.name !== leader.name && best.error < Math.min(error - NEAR, ALIKE * error) && `${best.name} alone is ${fixed(best.error, 1)} cm off`;
+  const of = trace.weightWidth > 1 ? ` in ${spoken(trace.components[component].name)}` : '';
   const though = [blind, better].filter(Boolean).join(' and ');
   if (leader && (leader.share >= LEADS || better)) {
-    said.push(`It follows ${leader.name} (${percent(leader.share)})${though && `, though ${though}`}.`);
+    said.push(`It follows ${leader.name} (${percent(leader.share)}${of})${though && `, though ${though}`}.`);
   }
   if (trace.black[step] && leader?.name !== 'image') said.push('The picture is black.');
   const particles = trace.particles?.[step];

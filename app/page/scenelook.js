@@ -111,7 +111,7 @@ export class SceneLook {
 }
 
 const NAMES = {
-  replay: 'Robot and object', objects: 'Object', estimates: 'Position', contours: '2σ contours',
+  replay: 'Replay: robot and object', objects: 'Object, true and estimated', estimates: 'Position, true and estimated', contours: '2σ contours',
   particles: 'Particles', force: 'Force in contact', map: 'Likelihood', camera: 'Camera and its picture',
 };
 /** What can be chosen of a layer: a part of the state, and the question. */

@@ -30,7 +30,7 @@ import { spoken } from './units.js';
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 /** How likelihood maps are shown: the colours' scale, whether all share its range, the axes, what lies on top, what they gain on the other run. */
-const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], zoom: ['1', '4'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
+const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], zoom: ['fit', '1', '4'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
 const CHOICES = { height: ['floor', 'belief'], tint: ['weight', 'share'], tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study', 'recordings'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
 const FLOOR = 'fused'; // the map on the scene's floor where none is chosen
 const WORST = 'error'; // the measure that ranks failures where none is chosen

@@ -145,4 +145,5 @@ export function shownError(trace, state) {
   return trace.error('fused', trace.angles.includes(component) ? component : 'position');
 }
 
-const capital = (text) => text[0].toUpperCase() + text.slice(1);
+/** A symbol as x stays small. */
+const capital = (text) => (text.length > 1 ? text[0].toUpperCase() + text.slice(1) : text);

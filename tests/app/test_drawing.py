@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beliefscope.app.drawing import OUTLINES, modality_shares
-from beliefscope.app.scenery import LOG_SHOWN, around, paint
+from beliefscope.app.scenery import LOG_SHOWN, around, hand, paint
 from beliefscope.app.wire import LAYERS, Look, layers, look, viewpoint
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.door import DOOR
@@ -61,10 +61,11 @@ def test_every_ghost_can_be_outlined() -> None:
 
 
 @pytest.mark.parametrize(("task", "bodies"), [("door", {"frame", "door"}), ("push", {"puck"})])
-def test_the_map_is_seen_through_all_but_the_robot(task: str, bodies: set[str]) -> None:
+def test_the_map_is_seen_through_all_but_the_arm(task: str, bodies: set[str]) -> None:
     with open_dataset(sample_path(task)) as data:
         model = model_of(TASKS[task], data[0])
     assert {model.body(body).name for body in np.flatnonzero(around(model))} == bodies
+    assert {model.body(body).name for body in np.flatnonzero(hand(model))} == {"hand", "finger_left", "finger_right"}
 
 
 def test_a_map_is_painted_as_the_page_does(maps: LikelihoodMap) -> None:
