@@ -22,6 +22,7 @@ from beliefscope.datasets.errors import BadInput
 
 VARIABLE = "BELIEFSCOPE_TOKEN"
 SHORTEST = 16  # characters of a token of the user's own
+BEYOND_GUESSING = 32  # characters of a token that nobody need be kept from guessing, as ours is
 TRIES, PERIOD = 10, 60.0  # wrong tokens from one address in so many s, after which it has to wait
 ADDRESSES = 1000  # whose wrong tokens are remembered
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -100,12 +101,19 @@ class SignIn:
         return hmac.compare_digest(found.encode(), self._cookie.encode())
 
     def accepts(self, brought: str, address: str) -> bool:
-        """Whether this is the token. Raises TooMany where ``address`` brought wrong ones too often, right or not."""
+        """Whether this is the token. Raises TooMany where ``address`` brought wrong ones too often.
+
+        Then a right one that could be guessed is not taken either. One beyond guessing is: whoever shares an address,
+        behind a proxy or on this machine, cannot lock out its owner.
+        """
+        right = hmac.compare_digest(brought.encode(), self._token)
+        if right and len(self._token) >= BEYOND_GUESSING:
+            return True
         wrong = self._wrong.get(address, ())
         recent = [when for when in wrong if when > self._clock() - PERIOD]
         if len(recent) >= TRIES:
             raise TooMany(recent[0] + PERIOD - self._clock())
-        if hmac.compare_digest(brought.encode(), self._token):
+        if right:
             self._wrong.pop(address, None)
             return True
         self._wrong.setdefault(address, deque(maxlen=TRIES)).append(self._clock())

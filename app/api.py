@@ -15,7 +15,7 @@ from beliefscope.app.caching import tagged
 from beliefscope.app.library import Library, Selection, Traced
 from beliefscope.app.proxy import client_page
 from beliefscope.app.session import Views
-from beliefscope.app.wire import pictures
+from beliefscope.app.wire import closing, pictures
 from beliefscope.datasets.corrupt import Recipe, described
 
 PATIENCE = 0.25  # s that a request for a trace waits before it says how far the trace is
@@ -62,22 +62,24 @@ def routes(library: Library, views: Views) -> APIRouter:
     @router.get("/api/trace/{task}/{filter}/{episode}")
     def trace_header(asked: OfTwo) -> Response:
         traced = library.traced(asked)
-        if not traced.ready(PATIENCE):
-            return JSONResponse({"progress": traced.progress}, status_code=202)
-        return JSONResponse(traced.header() | {"filter": asked.filter})
+        return _once_there(traced, lambda: JSONResponse(traced.header() | {"filter": asked.filter}))
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns")
     def trace_columns(asked: OfTwo, request: Request) -> Response:
         traced = library.traced(asked)
-        return _immutable(request, traced, "columns", lambda: traced.columns[1])
+        return _once_there(traced, lambda: _immutable(request, traced, "columns", lambda: traced.columns[1]))
 
     @router.get("/api/trace/{task}/{filter}/{episode}/images")
     def trace_images(asked: OfTwo, request: Request) -> Response:
         traced = library.traced(asked)
-        shown = pictures(traced.trace)
-        if shown is None:
-            raise HTTPException(404, f"Task {asked.task!r} has no pictures.")
-        return _immutable(request, traced, "images", shown.tobytes)
+
+        def images() -> Response:
+            shown = pictures(traced.trace)
+            if shown is None:
+                raise HTTPException(404, f"Task {asked.task!r} has no pictures.")
+            return _immutable(request, traced, "images", shown.tobytes)
+
+        return _once_there(traced, images)
 
     @router.post("/api/views", status_code=201)
     async def open_view(wanted: Annotated[ViewRequest | None, Body()] = None) -> dict[str, str]:
@@ -113,13 +115,19 @@ def routes(library: Library, views: Views) -> APIRouter:
     return router
 
 
+def _once_there(traced: Traced, answer: Callable[[], Response]) -> Response:
+    """How far the trace is, until it is there. Nobody waits for it here: those who did would keep out all others."""
+    if not traced.ready(PATIENCE):
+        return JSONResponse({"progress": traced.progress}, status_code=202)
+    return answer()
+
+
 def _immutable(request: Request, traced: Traced, part: str, content: Callable[[], bytes]) -> Response:
     """A part of a trace: its key says all that it depends on, so it can be an ETag."""
-    traced.trace  # noqa: B018 - wait for it, or raise what it raised, before anything is answered
     return tagged(request, f"{traced.key[:24]}-{part}", content, "application/octet-stream")
 
 
 async def _no_view(websocket: WebSocket, name: str) -> None:
     # A browser shows its page neither status nor body of a refused handshake, but the code of a close.
     await websocket.accept()
-    await websocket.close(4004, f"View {name!r} is not open.")
+    await websocket.close(4004, closing(f"View {name!r} is not open."))

@@ -19,7 +19,7 @@ from fastapi.responses import StreamingResponse
 from beliefscope.app.library import Library
 from beliefscope.app.liveruns import Absent, LiveRuns, Run, called, described
 from beliefscope.app.security import kept_file
-from beliefscope.app.wire import columns, pictures
+from beliefscope.app.wire import closing, columns, pictures
 from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput
 
@@ -82,7 +82,7 @@ def routes(library: Library) -> APIRouter:
                 first, state = _asked(await websocket.receive_text())
                 await websocket.send_bytes(await _next(runs, name, first, state))
         except BadInput as error:
-            await websocket.close(4000, str(error).encode()[:120].decode(errors="ignore"))
+            await websocket.close(4000, closing(str(error)))
         except (WebSocketDisconnect, KeyError):  # KeyError: a binary message, which has no text
             return
 

@@ -20,6 +20,8 @@ LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
 SECRET = re.compile(r"((?:\btoken=|[Bb]earer |beliefscope-\d+=))[^\s&;\"']+")
 REFUSED = 30  # lines a minute; whoever asks in vain fills no disk
+REFUSALS = ("refused: ", "Invalid HTTP request", "Unsupported upgrade")
+"""What such a line begins with; the others are uvicorn's."""
 
 
 class Lines(logging.Formatter):
@@ -31,7 +33,8 @@ class Lines(logging.Formatter):
 
     def __init__(self, json_lines: bool, secret: str = "") -> None:
         super().__init__()
-        self._json_lines, self._secret = json_lines, secret
+        self._json_lines = json_lines
+        self._secrets = {secret, json.dumps(secret)[1:-1]} - {""}
 
     def format(self, record: logging.LogRecord) -> str:
         when = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -44,14 +47,19 @@ class Lines(logging.Formatter):
             event, traceback = said.pop("event"), said.pop("traceback", "")
             # As JSON, what comes from outside cannot end the line and begin another one.
             values = "".join(f" {key}={json.dumps(value, default=str)}" for key, value in said.items())
-            line = f"{when} {record.levelname.lower()}: {' '.join(event.split())}{values}"
-            line += f"\n{traceback}" if traceback else ""
+            line = f"{when} {record.levelname.lower()}: {_inert(' '.join(event.split()))}{values}"
+            line += "".join(f"\n  {_inert(each)}" for each in traceback.splitlines())
         return self._without_secrets(line)
 
     def _without_secrets(self, line: str) -> str:
-        if self._secret:
-            line = line.replace(self._secret, "...")
+        for secret in self._secrets:
+            line = line.replace(secret, "...")
         return SECRET.sub(r"\1...", line)
+
+
+def _inert(text: str) -> str:
+    """Without what a terminal would obey."""
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in text)
 
 
 class Enough(logging.Filter):
@@ -62,7 +70,7 @@ class Enough(logging.Filter):
         self._clock, self._since, self._count = clock, clock(), 0
 
     def filter(self, record: logging.LogRecord) -> bool:
-        if not record.getMessage().startswith("refused: "):
+        if not record.getMessage().startswith(REFUSALS):
             return True
         if self._clock() - self._since >= 60.0:
             left_out, self._since, self._count = self._count - REFUSED, self._clock(), 0

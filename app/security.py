@@ -34,6 +34,7 @@ from beliefscope.app.access import (
     without_token,
 )
 
+HOST = re.compile(r"(?P<name>\[[^\[\]]*\]|[^:\[\]]*)(:\d{0,5})?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 WITHOUT_TOKEN = frozenset({"/healthz"})
 VIEWING = frozenset({"POST /api/views", "POST /api/recordings"})
@@ -129,6 +130,8 @@ class Guard:
         known = ", ".join(sorted(self.hosts))
         if _name(host) not in self.hosts and not (self.sign_in and is_address(_name(host))):
             return Reply(403, f"Host {host!r} is not answered here. Allowed: {known} (any port).")
+        if scope["type"] == "http" and _from_elsewhere(headers):
+            return Reply(403, "A page of another site asked for this. It may lead here, but use nothing.")
         bearer = next(filter(None, (_bearer(value) for name, value in headers if name == b"authorization")), "")
         if self.sign_in and scope["path"] not in WITHOUT_TOKEN:
             cookies = "; ".join(value for name, value in headers if name == b"cookie")
@@ -191,8 +194,20 @@ def _address(scope: Scope) -> str:
 
 
 def _name(host: str) -> str:
-    """``localhost:8000`` -> ``localhost``; ``[::1]:8000`` -> ``[::1]``."""
-    return host.partition("]")[0] + "]" if host.startswith("[") else host.partition(":")[0]
+    """``localhost:8000`` -> ``localhost``; ``[::1]:8000`` -> ``[::1]``; what is not like these as it is."""
+    found = HOST.fullmatch(host)
+    return found["name"] if found else host
+
+
+def _from_elsewhere(headers: Iterable[tuple[bytes, str]]) -> bool:
+    """Whether a browser asks for a page of another site, or of another server of this machine, and not for its user.
+
+    What is asked for is computed and kept, though such a page could not read it. Browsers say so on the loopback
+    interface and over https; elsewhere the cookie, which they do not send then, is what guards.
+    """
+    said = dict(headers)
+    leads = (said.get(b"sec-fetch-mode"), said.get(b"sec-fetch-dest")) == ("navigate", "document")
+    return said.get(b"sec-fetch-site") in ("cross-site", "same-site") and not leads
 
 
 def _bracketed(host: str) -> str:

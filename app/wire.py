@@ -224,6 +224,11 @@ def header(trace: Trace, described: list[dict[str, Any]], task: Task, no_maps: s
     }
 
 
+def closing(reason: str) -> str:
+    """As much of it as fits the end of a WebSocket: 123 bytes."""
+    return reason.encode()[:123].decode(errors="ignore")
+
+
 def _sigma(covariance: NDArray[Any]) -> NDArray[Any]:
     """(..., n, n) -> (..., n): standard deviations."""
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

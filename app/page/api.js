@@ -69,15 +69,18 @@ export const comparison = ({ task, filter, data, episode, recipe, against }, sig
  * @returns {Promise<Trace>}
  */
 export async function loadTrace(task, selection, progress, signal) {
-  let response = await ask(traceUrl(selection), { signal });
-  while (response.status === 202) {
-    progress((await response.json()).progress);
-    await new Promise((resolve) => setTimeout(resolve, AGAIN));
-    response = await ask(traceUrl(selection), { signal });
-  }
-  const header = await response.json();
+  const there = async (part) => {
+    let response = await ask(traceUrl(selection, part), { signal });
+    while (response.status === 202) {
+      progress((await response.json()).progress);
+      await new Promise((resolve) => setTimeout(resolve, AGAIN));
+      response = await ask(traceUrl(selection, part), { signal });
+    }
+    return response;
+  };
+  const header = await (await there()).json();
   if (header.live) return begun(task, selection, header, signal);
-  const buffer = async (part) => (await ask(traceUrl(selection, part), { signal })).arrayBuffer();
+  const buffer = async (part) => (await there(part)).arrayBuffer();
   const [columns, pictures] = await Promise.all([buffer('/columns'), header.pictures && buffer('/images')]);
   return new Trace(task, selection, header, columns, pictures);
 }

@@ -11,8 +11,10 @@ import pytest
 from starlette.exceptions import HTTPException
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.types import Receive, Scope, Send
+from starlette.websockets import WebSocketDisconnect
 
 from beliefscope.app import security
+from beliefscope.app.access import Access
 from beliefscope.app.security import MAX_BODY, Guard
 from beliefscope.app.server import Settings, create_app
 
@@ -44,7 +46,11 @@ def test_a_known_name_at_any_port_may_read(host: str) -> None:
 
 @pytest.mark.parametrize(
     "host",
-    ["evil.example", "evil.example:8000", "localhost.evil.example", "127.0.0.1.evil.example", "[::2]", "", "lab"],
+    [
+        *("evil.example", "evil.example:8000", "localhost.evil.example", "127.0.0.1.evil.example", "[::2]", "", "lab"),
+        *("localhost.", "user@localhost", "localhost:80@evil.example", 'localhost:1"><script>', "localhost:x"),
+        *("[::1]evil.example", "[::1]x:8000", "::1", "localhost, evil.example", "localhost evil.example", "127.1"),
+    ],
 )
 def test_another_name_may_not_even_read(host: str) -> None:
     assert "is not answered here" in problem(Guard(_nothing), scope(host))
@@ -59,6 +65,25 @@ def test_what_changes_something_comes_from_our_own_page(method: str | None, orig
     guard = Guard(_nothing)
     assert "Origin" in problem(guard, scope("localhost:8000", origin, method))
     assert problem(guard, scope("localhost:8000", "http://localhost:8000", method)) == ""
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+@pytest.mark.parametrize("token", ["", "a-token-that-is-long-enough-for-one"])
+def test_a_page_of_another_site_has_nothing_computed(site: str, token: str) -> None:
+    """Reading needs no Origin, and what is read is made for it: runs of filters, for hours."""
+    guard = Guard(_nothing, access=Access(token))
+    script = [(b"authorization", f"Bearer {token}".encode())] * bool(token)
+
+    def asked(site: str, mode: str, to: str) -> str:
+        said = {"site": site, "mode": mode, "dest": to}
+        headers = [(b"host", b"localhost"), *((f"sec-fetch-{n}".encode(), v.encode()) for n, v in said.items())]
+        return problem(guard, scope("localhost") | {"headers": headers + script})
+
+    for mode, to in (("no-cors", "image"), ("cors", "empty"), ("navigate", "iframe"), ("no-cors", "script")):
+        assert "another site" in asked(site, mode, to)
+        assert asked("same-origin", mode, to) == ""
+    assert asked(site, "navigate", "document") == "", "a link leads here"
+    assert asked("none", "navigate", "document") == "", "its user does"
 
 
 def test_two_hosts_are_none() -> None:
@@ -90,6 +115,17 @@ def test_sockets_are_guarded_too(client: TestClient, path: str) -> None:
             pass
         assert refused.value.status_code == 403
         assert refused.value.json()["error"]
+
+
+@pytest.mark.parametrize("path", ["/api/views/{}", "/scene/{}", "/api/live/{}"])
+@pytest.mark.parametrize("name", ["x" * 3000, "%E2%82%AC" * 500])
+def test_a_long_name_of_a_socket_is_told_as_far_as_it_fits(client: TestClient, path: str, name: str) -> None:
+    with client.websocket_connect(path.format(name)) as socket:
+        socket.send_json({"from": 0})
+        with pytest.raises(WebSocketDisconnect) as closed:
+            socket.receive_text()
+    assert 4000 <= closed.value.code <= 4004
+    assert 100 < len(closed.value.reason.encode()) <= 123
 
 
 ALWAYS = {

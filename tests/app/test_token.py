@@ -145,6 +145,17 @@ def test_addresses_are_not_remembered_without_end() -> None:
     assert len(sign_in._wrong) <= 1000
 
 
+def test_nobody_locks_out_who_shares_an_address() -> None:
+    own = token_for("0.0.0.0", False, {})
+    sign_in = SignIn(own)
+    for _ in range(TRIES):
+        assert not sign_in.accepts("wrong", "10.0.0.7")
+    with pytest.raises(TooMany):
+        sign_in.accepts("wrong", "10.0.0.7")
+    assert sign_in.accepts(own, "10.0.0.7")
+    assert not sign_in.accepts(own.swapcase(), "10.0.0.8")
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.0.0.5", "lab", ""])
 def test_beyond_the_loopback_there_is_always_a_token(settings: Settings, host: str) -> None:
     made = token_for(host, False, {})
