@@ -17,6 +17,8 @@ export class Rerun {
   #shown = null; // the trace whose recording is open, or the files
   #trace = null;
   #files = null; // that are to be shown in place of the trace
+  #settled = null; // of what is shown, once it keeps our time
+  #opened = []; // store ids in the viewer that we opened
   #bar = document.createElement('p');
   #step = 0;
   #pending = null;
@@ -71,20 +73,26 @@ export class Rerun {
       return;
     }
     const shown = (this.#shown = files ?? trace);
+    this.#settled = null;
     try {
       say(this.#host, 'loading', files ? 'Starting Rerun …' : 'Writing the recording …');
       const [recordings] = await Promise.all([files ?? Promise.all([trace.stream ? this.#growing(trace) : this.#record(trace)]), this.#start()]);
       if (this.#shown !== shown) return;
       say(this.#host, 'loading', 'Opening the recording …');
-      const old = (await this.#viewer.get_state()).recordings ?? [];
       const { store_ids: kept } = await this.#viewer.open(recordings.map(({ url }) => new URL(url, location.href).href));
-      const store_ids = old.map((r) => r.store_id).filter((id) => !kept.includes(id));
-      if (store_ids.length) await this.#viewer.close({ store_ids });
+      const others = this.#opened.filter((id) => !kept.includes(id));
+      this.#opened = [...others, ...kept];
+      if (this.#shown !== shown) return;
       this.#viewer.override_panel_state('blueprint', recordings.length > 1 ? 'expanded' : undefined);
-      if (!files) await this.#settle();
       say(this.#host, 'ready');
+      // What follows takes a drawing or more for each answer: the recording can be looked at meanwhile.
+      if (!files) await this.#settle(shown);
+      if (this.#shown !== shown) return;
+      this.#opened = kept;
+      await Promise.allSettled(others.map((id) => this.#viewer.close({ store_ids: [id] }))); // somebody may have before
       this.#seek(this.#step);
     } catch (error) {
+      if (this.#shown !== shown) return;
       this.#shown = null;
       say(this.#host, 'error', `Rerun cannot show this: ${error.message ?? error}`);
     }
@@ -105,14 +113,15 @@ export class Rerun {
   }
 
   /** A recording that has just been opened sets its own time once more when its blueprint comes: insist on ours. */
-  async #settle() {
-    for (let tries = 0, kept = 0; tries < SETTLING && kept < 3; tries++) {
+  async #settle(shown) {
+    for (let tries = 0, kept = 0; tries < SETTLING && kept < 3 && this.#shown === shown; tries++) {
       const { active_store_id: active, recordings } = await this.#viewer.get_state();
       const now = recordings.find((r) => r.store_id === active)?.current_time;
       kept = now?.timeline === 'step' && Number(now.time) === this.#step ? kept + 1 : 0;
       const time = { timeline: 'step', sequence: this.#step, play_state: 'paused' };
       if (!kept) await this.#viewer.set_time(time).catch(() => frame());
     }
+    if (this.#shown === shown) this.#settled = shown;
   }
 
   #start() {
@@ -141,10 +150,15 @@ export class Rerun {
     return this.#starting;
   }
 
+  /** Whether the viewer's time and ours are the same. */
+  get #follows() {
+    return this.#viewer !== null && !this.#files && this.#open && this.#settled === this.#trace && this.#host.dataset.state === 'ready';
+  }
+
   /** Moves the viewer's time, one request at a time: the newest wins. */
   async #seek(step) {
     this.#pending = step;
-    if (this.#busy || this.#files || !this.#viewer || !this.#open || this.#host.dataset.state !== 'ready') return;
+    if (this.#busy || !this.#follows) return;
     this.#busy = true;
     while (this.#pending !== null) {
       const started = performance.now();
@@ -167,7 +181,7 @@ export class Rerun {
     const step = Math.round(time);
     const ours = this.#echo !== null || this.#pending !== null; // on its way: whatever comes is older
     if (step === this.#echo) this.#echo = null;
-    if (ours || this.#files || !this.#open || this.#host.dataset.state !== 'ready' || step === this.#step) return;
+    if (ours || !this.#follows || step === this.#step) return;
     if (step >= 0 && step < this.#trace.steps) this.#moved(step);
   }
 }
