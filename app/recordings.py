@@ -6,9 +6,9 @@ import asyncio
 import hashlib
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -67,9 +67,15 @@ class ChangeRequest(BaseModel):
 
 def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
     """Every route under ``/api/recordings``."""
-    router = APIRouter()
+    drawer = ThreadPoolExecutor(1, "drawing recordings")  # matplotlib keeps the fonts of each thread that draws open
+
+    @asynccontextmanager
+    async def lifespan(_: Any) -> AsyncIterator[None]:
+        yield
+        await asyncio.to_thread(drawer.shutdown, cancel_futures=True)
+
+    router = APIRouter(lifespan=lifespan)
     writing = threading.Lock()
-    drawer = ThreadPoolExecutor(1)  # matplotlib keeps open the fonts of each thread that draws
     runs = Runs(library)
 
     @router.get("/api/recordings")

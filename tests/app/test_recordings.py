@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -104,6 +105,12 @@ def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str,
     (offset,) = (c["offset"] for c in client.get(traced).json()["columns"] if c["name"] == "estimate_mean")
     shown = np.frombuffer(client.get(f"{traced}/columns").content, "<f4", run.estimate_mean.size, offset)
     np.testing.assert_array_equal(run.estimate_mean.ravel(), shown)
+
+
+def test_nothing_of_it_is_left_when_the_server_has_ended(settings: Settings, open_client: Callable[..., Any]) -> None:
+    with open_client(settings) as client:
+        assert client.post(URL, json={"task": "door", "filter": "crossmodal-pf", "episode": 1}).status_code == 201
+    assert not [one for one in threading.enumerate() if "recordings" in one.name]
 
 
 def test_a_recording_that_is_there_is_not_written_again(client: TestClient, traced: str, settings: Settings) -> None:
