@@ -6,7 +6,9 @@ when it runs, so that ``--help`` answers at once.
 
 from __future__ import annotations
 
+import io
 import sys
+from contextlib import suppress
 from typing import Annotated
 
 import typer
@@ -76,8 +78,11 @@ for command in COMMANDS:
 def main() -> None:
     """Runs the command that ``sys.argv`` names and ends the process."""
     debug = "--debug" in sys.argv[1:]
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as standard error: names of files may be no text
     try:
         code = cli(prog_name="beliefscope", standalone_mode=False)
+        console.written()
     except typer.TyperException as error:
         asked = getattr(getattr(error, "ctx", None), "command_path", "beliefscope")
         console.fail(f"{error.format_message().rstrip('.')}. See: {asked} --help", error.exit_code)
@@ -88,6 +93,10 @@ def main() -> None:
             raise
         if isinstance(error, BadInput):
             console.fail(str(error), 2)
+        with suppress(OSError):
+            console.written()
+        if isinstance(error, BrokenPipeError):  # who reads has read enough, as ``head`` does
+            raise SystemExit(1) from None
         console.fail(f"{type(error).__name__}: {error} (beliefscope --debug ... shows where)", 1)
     raise SystemExit(code)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,6 +15,16 @@ def fail(message: str, code: int) -> NoReturn:
     """Ends the process with one line on standard error."""
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(code)
+
+
+def written() -> None:
+    """Has standard output written now, while what goes wrong with it can be told. Raises OSError."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        # What is left is dropped: as Python ends it would try again, and fail in its own words.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise
 
 
 def say(line: str) -> None:

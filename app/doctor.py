@@ -122,19 +122,24 @@ def weights(_: Place) -> Finding:
 
 
 def page(_: Place) -> Finding:
-    """That the browser code which is served out of other packages is there."""
+    """That the page is there, and the browser code which is served out of other packages."""
+    from beliefscope.app.pagefiles import named
     from beliefscope.app.proxy import client_page
+    from beliefscope.app.server import PAGE
     from beliefscope.app.vendor import UPLOT_FILES, installed
 
     static = installed("rerun_notebook") / "static"
     files = [
+        *(PAGE / name for name in named(PAGE) if name not in UPLOT_FILES),
         static / "widget.js",
         static / "re_viewer_bg.wasm",
         *(installed("uplot") / "static" / n for n in UPLOT_FILES),
     ]
     missing = [path.name for path in files if not path.is_file()]
     if missing:
-        return Finding(f"{', '.join(missing)} missing", "failed", "reinstall rerun-notebook and uplot-python")
+        return Finding(
+            f"{', '.join(missing)} missing", "failed", "reinstall beliefscope, rerun-notebook and uplot-python"
+        )
     client_page("/static/frame.js")
     versions = (f"{name} {importlib.metadata.version(name)}" for name in ("rerun-notebook", "viser", "uplot-python"))
     return Finding(f"page complete: {', '.join(versions)}")
@@ -239,7 +244,7 @@ def report(found: Mapping[str, Finding]) -> dict[str, Any]:
 
 def sums(folder: Path) -> dict[str, str]:
     """File name -> SHA-256, from the folder's list."""
-    lines = (folder / SUMS).read_text().splitlines()
+    lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
     return {name: digest for digest, name in (line.split(maxsplit=1) for line in lines)}
 
 

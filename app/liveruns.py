@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from beliefscope.app.record import is_text
 from beliefscope.app.security import kept_file
 from beliefscope.app.selection import Selection, Traced
 from beliefscope.app.wire import header
@@ -211,7 +212,8 @@ class LiveRuns:
         times: dict[str, float] = {}
         for path in self.folder.glob(f"*{SUFFIX}") if self.folder.is_dir() else ():
             with suppress(OSError):
-                times[path.name.removesuffix(SUFFIX)] = path.stat().st_mtime
+                if is_text(path.name):
+                    times[path.name.removesuffix(SUFFIX)] = path.stat().st_mtime
         with self._lock:
             for name in self._runs.keys() - times.keys():
                 self._runs.pop(name).close()

@@ -21,6 +21,7 @@ from beliefscope.app.caching import ASK_AGAIN, FOREVER, tagged
 
 ENTRY = "main.js"
 _IMPORT = re.compile(rb"""^(?:import|export)\b[^'"]*['"]\./([\w.-]+)['"]""", re.MULTILINE)
+_NAMED = re.compile(r"/static/([\w.-]+)")
 
 
 class PageFiles:
@@ -65,6 +66,12 @@ def modules(folder: Path) -> list[str]:
     return found
 
 
+def named(folder: Path) -> list[str]:
+    """Every file that the page is drawn with. Raises OSError where the index or a module is missing."""
+    index = (folder / "index.html").read_text(encoding="utf-8")
+    return [*dict.fromkeys([*_NAMED.findall(index), *modules(folder)])]
+
+
 def _version(files: dict[str, tuple[Path, int, int]]) -> str:
     return _hash(repr(files).encode())[:12]
 
@@ -75,7 +82,7 @@ def _index(folder: Path, version: str) -> bytes:
     # What the first picture needs is asked for at once: no script need be read to know of the next.
     early = ['<link rel="preload" href="/api/catalog" as="fetch" crossorigin="anonymous">']
     early += [f'<link rel="modulepreload" href="{where}{name}">' for name in modules(folder)]
-    text = (folder / "index.html").read_text().replace("/static/", where)
+    text = (folder / "index.html").read_text(encoding="utf-8").replace("/static/", where)
     return text.replace("</head>", "\n".join([*early, "</head>"]), 1).encode()
 
 

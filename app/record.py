@@ -12,6 +12,11 @@ from beliefscope.datasets.document import read_json
 T = TypeVar("T")
 
 
+def is_text(name: str) -> bool:
+    """Whether the name of a file can be told in JSON; on Linux it may be any bytes, of another encoding for example."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+
+
 def read_record(kind: TypeAdapter[T], path: Path) -> T:
     """What a file holds, with fields of the right types. Raises OSError, and ValueError for anything else."""
     data = path.read_bytes()

@@ -21,6 +21,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import NoReturn
 
+from beliefscope.app.record import is_text
 from beliefscope.app.rrdabout import About, Reader
 from beliefscope.app.trash import Deleted, Gone, Taken, Trash
 from beliefscope.datasets.errors import BadInput
@@ -244,7 +245,7 @@ class RrdFiles:
         found = []
         with suppress(FileNotFoundError):
             for entry in os.scandir(self.folder):
-                if entry.name.endswith(ENDING) and not entry.name.startswith("."):
+                if entry.name.endswith(ENDING) and not entry.name.startswith(".") and is_text(entry.name):
                     with suppress(FileNotFoundError):  # it has just gone
                         if entry.is_file(follow_symlinks=False):
                             found.append((entry.name, entry.stat(follow_symlinks=False)))

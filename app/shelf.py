@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
@@ -177,7 +178,7 @@ def served_names(filters: Iterable[str | Path], data: Path | None) -> tuple[dict
 
 
 def _parts(path: Path) -> tuple[str, ...]:
-    whole = path.resolve()
+    whole = Path(os.fsencode(path.resolve()).decode(errors="replace"))  # names are told in JSON
     return (whole if whole.is_dir() else whole.with_suffix("")).parts[1:]
 
 

@@ -124,7 +124,7 @@ class Writer:
         files = tuple(f"figures/{name}.{ending}" for ending in ("svg", "pdf"))
         for file in files:
             write_figure(figure, self.folder / file)
-        return Shown(caption, (*files, *data), svg=(self.folder / files[0]).read_text())
+        return Shown(caption, (*files, *data), svg=(self.folder / files[0]).read_text(encoding="utf-8"))
 
     def table(self, name: str, table: Table) -> Shown:
         """As CSV with all digits, unknown values empty."""

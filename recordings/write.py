@@ -322,6 +322,8 @@ def _complete_or_absent(path: Path) -> Iterator[Path]:
             unfinished.unlink(missing_ok=True)
     except OSError as error:
         raise unwritable(path, error) from None
+    except UnicodeEncodeError:
+        raise BadInput(f"cannot write {str(path)!r}: Rerun writes only to files whose names are text") from None
     except RuntimeError as error:
         if "File-writer" not in str(error):  # Rerun's thread, which ends where it cannot write
             raise

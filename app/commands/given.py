@@ -187,7 +187,7 @@ def recipe_text(text: str) -> str:
     if text.lstrip().startswith(("{", "[")) or not (text.endswith(".json") or os.sep in text):
         return text
     try:
-        return Path(text).read_text()
+        return Path(text).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         raise BadInput(f"recipe {text!r} is not a file that can be read") from None
 

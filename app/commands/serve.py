@@ -155,7 +155,7 @@ def _opening(workspace: Path, secret: bool) -> Iterator[Callable[[str], None]]:
         if not secret:
             webbrowser.open(url)
             return
-        with open(os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        with open(os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
             file.write(onward_page(url))
         webbrowser.open(page.resolve().as_uri())
 
