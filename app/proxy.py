@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib.util
+import logging
 import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterator
@@ -25,10 +26,17 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.exceptions import ConnectionClosedOK
 
 WAITING = 64  # messages of a browser that viser has not taken yet
+BROWSERS = 4  # of one scene, which is one page's: more than one only while a lost one is not known to be lost
+HEARD = frozenset({viser._messages.GuiUpdateMessage})
+"""What a browser can have viser do; and where each looks from, which every connection hears for itself.
+
+It would do more: ask a host on the Internet to lead others here, or keep files that are sent to it, of any size.
+"""
 CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
 if importlib.util.find_spec("cv2") is None:
     # viser asks for OpenCV at every picture, and looks along the whole path for it: half of what a picture takes.
     sys.modules["cv2"] = None  # type: ignore[assignment]
+log = logging.getLogger("beliefscope.app")
 # Construction and stop both touch what the whole process shares: one at a time.
 _process_wide = threading.Lock()
 
@@ -105,9 +113,15 @@ class EmbeddedViser:
                 f"viser {viser.__version__} does not start its socket server through websockets.asyncio.server.serve; "
                 "app/proxy.py was written for viser 1.1."
             )
+        handlers = self.server._websock_server._incoming_handlers
+        for message in handlers.keys() - HEARD:
+            self.server._websock_server.unregister_handler(message)
+        if handlers.keys() != HEARD:
+            self.server.stop()
+            raise RuntimeError(f"viser {viser.__version__} does not hear messages as app/proxy.py knows it.")
         self._handler: Handler = captured[0]
         self._loop = self.server.get_event_loop()
-        self._connections: set[_Connection] = set()
+        self._connections: dict[_Connection, None] = {}  # the oldest first
 
     @property
     def subprotocol(self) -> str:
@@ -122,7 +136,11 @@ class EmbeddedViser:
             return
         await websocket.accept(subprotocol=self.subprotocol)
         connection = _Connection(websocket, self.subprotocol, asyncio.get_running_loop())
-        self._connections.add(connection)
+        self._connections[connection] = None
+        while len(self._connections) > BROWSERS:
+            oldest = next(iter(self._connections))
+            del self._connections[oldest]
+            self._end(oldest)
         handling = asyncio.wrap_future(asyncio.run_coroutine_threadsafe(self._handle(connection), self._loop))
         receiving = asyncio.ensure_future(self._receive(websocket, connection))
         try:
@@ -131,12 +149,15 @@ class EmbeddedViser:
             receiving.cancel()
             self._end(connection)
             await asyncio.wait({handling}, timeout=2.0)
-            self._connections.discard(connection)
+            self._connections.pop(connection, None)
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await websocket.close()
 
     async def _handle(self, connection: _Connection) -> None:
-        await self._handler(connection)
+        try:
+            await self._handler(connection)
+        except Exception as error:  # of viser's, about a message that it cannot read
+            log.debug("a scene's browser is sent away: %s", error)
 
     async def _receive(self, websocket: WebSocket, connection: _Connection) -> None:
         with contextlib.suppress(WebSocketDisconnect, KeyError):

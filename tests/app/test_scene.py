@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
 
+import msgspec
 import pytest
 import viser
 import websockets.asyncio.server
@@ -20,7 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from beliefscope.app.proxy import EmbeddedViser
+from beliefscope.app.proxy import BROWSERS, EmbeddedViser
 from beliefscope.app.server import Settings
 from beliefscope.app.session import Views
 
@@ -160,6 +161,40 @@ def test_another_version_of_the_client_is_turned_away(address: str) -> None:
                 socket.recv(timeout=5.0)
             assert closed.value.rcvd is not None
             assert closed.value.rcvd.code == 1002
+
+
+def test_a_scenes_browser_has_viser_ask_no_host_and_keep_no_file(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    for name in ("request_share_url", "disconnect_share_url"):
+        monkeypatch.setattr(viser.ViserServer, name, lambda _, name=name: asked.append(name))
+    monkeypatch.setattr(viser.GuiApi, "_handle_file_transfer_start", lambda *_: asked.append("upload"))
+    path = open_view(address)["scene"].rstrip("/")
+    upload = {"source_component_uuid": "a", "transfer_uuid": "b", "filename": "c", "mime_type": "d/e"}
+    with joined(address, path, PROTOCOL) as scene:
+        received(scene, 1)
+        for message in (
+            {"type": "ShareUrlRequest"},
+            {"type": "ShareUrlDisconnect"},
+            {"type": "FileTransferStartUpload", "part_count": 10**6, "size_bytes": 10**12, **upload},
+        ):
+            scene.send(msgspec.msgpack.encode(message))
+        scene.send(b"no message of viser's")  # ends the connection once it has taken the others
+        with pytest.raises(ConnectionClosed):
+            received(scene, 10**9)
+    assert asked in ([], ["upload"]), "each connection has a hearing of its own for files, of things that it has not"
+    with joined(address, path, PROTOCOL) as again:
+        received(again, 1)
+
+
+def test_a_scene_has_few_browsers(address: str) -> None:
+    path = open_view(address)["scene"].rstrip("/")
+    with contextlib.ExitStack() as stack:
+        scenes = [stack.enter_context(joined(address, path, PROTOCOL)) for _ in range(BROWSERS + 1)]
+        with pytest.raises(ConnectionClosed):
+            received(scenes[0], 10**9)
+        for scene in scenes[1:]:
+            received(scene, 1)
+            scene.ping().wait(5.0)
 
 
 def test_a_scene_leaves_no_thread_and_no_connection_behind(address: str) -> None:
