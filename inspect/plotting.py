@@ -36,6 +36,8 @@ STYLE: dict[Any, Any] = {
 
 WIDTH = 7.16
 """Inches: two columns of a paper."""
+MANY = 5000
+"""Points of a plot among which looking for the best place of its legend takes seconds."""
 
 
 FORMATS: dict[str, dict[str, Any]] = {
@@ -164,7 +166,8 @@ def draw_plot(axes: Axes, plot: Plot) -> None:
     axes.set_xlabel(plot.x_label)
     axes.set_ylabel(plot.y_label)
     if any(line.name for line in plot.lines):
-        axes.legend(frameon=False)
+        many = sum(len(line.x) for line in plot.lines) > MANY
+        axes.legend(frameon=False, loc="upper right" if many else "best")
 
 
 def draw_picture(axes: Axes, picture: Picture) -> None:

@@ -78,7 +78,7 @@ export class Diagnostics {
     this.#loading.abort();
     this.#loading = new AbortController();
     const trace = this.#trace;
-    if (trace.live?.state === 'running') return say(this.#host, 'empty', 'The run goes on. Diagnostics are made of all its steps once it has ended.');
+    if (trace.live?.state === 'running') return say(this.#host, 'empty', 'The run goes on. Diagnostics are made of all its steps once it has ended, and show here by themselves.');
     try {
       this.#entries = await api.diagnostics(trace.selection, this.#loading.signal);
     } catch (error) {

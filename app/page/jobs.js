@@ -31,18 +31,23 @@ export class Jobs {
     this.#listeners.add(listener);
   }
 
+  /** One as it was last heard of. @returns {api.Job | undefined} */
+  find(id) {
+    return this.#list.find((job) => job.id === id);
+  }
+
   /** Waits until one has ended. @param {(job: api.Job) => void} told of every change before @returns {Promise<api.Job | undefined>} undefined: forgotten */
   async ended(id, told) {
     await this.refresh();
     return new Promise((resolve) => {
-      const hear = (list) => {
-        const job = list.find((one) => one.id === id);
+      const hear = () => {
+        const job = this.find(id);
         if (job && underWay(job)) return told(job);
         this.#listeners.delete(hear);
         resolve(job);
       };
       this.#listeners.add(hear);
-      hear(this.#list);
+      hear();
     });
   }
 

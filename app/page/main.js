@@ -110,6 +110,11 @@ class Page {
     this.save = saving($('#save'), $('#saved'), this.jobs, () => this.#trace && api.recorded(this.#trace), () => store.set({ tab: 'rerun' }), (name) => (store.set({ tab: 'recordings' }), this.library.point(name)));
     this.report = new ReportSheet($('#report'), () => ({ step: store.state.step, pinned: this.heatmaps.pinned }), (trace, wanted) => this.#report(trace, wanted));
     store.listen((state, changed) => this.#follow(state, changed));
+    window.addEventListener('popstate', () => {
+      const { state, problems } = resolve(location.search, catalog);
+      messages.say('link', problems.join('\n'));
+      store.stand(state);
+    });
     this.#takeKeys();
     this.#takeButtons();
     this.#showTab(store.state.tab);

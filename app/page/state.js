@@ -34,6 +34,8 @@ const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['off
 const CHOICES = { height: ['floor', 'belief'], tint: ['weight', 'share'], tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study', 'recordings'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
 const FLOOR = 'fused'; // the map on the scene's floor where none is chosen
 const WORST = 'error'; // the measure that ranks failures where none is chosen
+/** Of the state: another one is another place in the browser's history. */
+const PLACES = ['task', 'filter', 'data', 'episode', 'recipe', 'against', 'tab', 'diagnostic', 'run', 'study'];
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
 /** Holds the state; tells listeners once a frame what has changed. */
@@ -47,11 +49,13 @@ export class Store {
   #listeners = [];
   #changed = new Set();
   #frame = 0;
+  #address;
   #addressTimer = 0;
 
   /** @param {State} state */
   constructor(state) {
     this.state = state;
+    this.#address = address(state);
   }
 
   /** @param {(state: State, changed: Set<string>) => void} listener called in a frame after one or more changes. */
@@ -70,16 +74,27 @@ export class Store {
     if (this.#changed.size && !this.#frame) this.#frame = requestAnimationFrame(() => this.flush());
   }
 
-  /** Tells the listeners now. */
-  flush() {
+  /** The browser has gone back, or on, to a place. @param {State} state of its address */
+  stand({ speed, ...state }) {
+    this.set(state);
+    this.flush(true);
+  }
+
+  /** Tells the listeners now. @param {boolean} stood whether the browser's history is at this place already */
+  flush(stood = false) {
     cancelAnimationFrame(this.#frame);
     this.#frame = 0;
     if (!this.#changed.size) return;
     const changed = this.#changed;
     this.#changed = new Set();
     for (const listener of this.#listeners) listener(this.state, changed);
+    const before = this.#address;
+    this.#address = address(this.state);
     clearTimeout(this.#addressTimer);
-    this.#addressTimer = setTimeout(() => history.replaceState(null, '', address(this.state)), ADDRESS_PAUSE);
+    if (PLACES.some((key) => changed.has(key)) && !stood) {
+      history.replaceState(null, '', before);
+      history.pushState(null, '', this.#address);
+    } else this.#addressTimer = setTimeout(() => history.replaceState(null, '', this.#address), ADDRESS_PAUSE);
   }
 }
 

@@ -36,10 +36,10 @@ export class Study {
   #catalog;
   #failures;
   #jobs;
-  #list = []; // of all jobs, as last heard
   #bars;
   #open = false;
   #studies = null;
+  #heard = ''; // how its job was when the studies were asked for
   #problems = [];
   #sort = { by: 'filter', down: false };
 
@@ -59,7 +59,7 @@ export class Study {
     this.#part('select').addEventListener('change', ({ target }) => store.set({ study: target.value }));
     host.addEventListener('click', (event) => this.#click(event));
     this.#part('.cells button').addEventListener('click', () => this.#run());
-    jobs.listen((list) => this.#hear(list));
+    jobs.listen(() => this.#hear());
     store.listen((_, changed) => ['task', 'study', 'quantity', 'data'].some((key) => changed.has(key)) && this.#draw());
   }
 
@@ -73,6 +73,7 @@ export class Study {
     if (!this.#studies) say(this.#host, 'loading', 'Loading …');
     try {
       ({ studies: this.#studies, problems: this.#problems } = await api.studies());
+      this.#heard = this.#how;
       this.#draw();
     } catch (error) {
       say(this.#host, 'error', error.message);
@@ -91,7 +92,12 @@ export class Study {
 
   /** The job that trains what is left of it. @returns {api.Job | undefined} */
   get #job() {
-    return this.#list.find(({ id }) => id === this.#study.job);
+    return this.#jobs.find(this.#study.job);
+  }
+
+  /** How far that is. */
+  get #how() {
+    return `${this.#job?.state} ${this.#job?.progress}`;
   }
 
   #draw() {
@@ -143,21 +149,19 @@ export class Study {
     try {
       const { job } = await api.runCells(this.#study.name);
       this.#study.job = job.id;
-      this.#list = [...this.#list, job];
-      this.#cells();
-      this.#jobs.refresh();
+      await this.#jobs.refresh();
     } catch (error) {
       this.#part('.problems').textContent = error.message;
     }
   }
 
-  /** @param {api.Job[]} list as it has changed. After each cell, and at the end, there are other numbers. */
-  #hear(list) {
-    const before = this.#studies && this.#job;
-    this.#list = list;
+  /** Jobs have changed. After each cell, and at the end, there are other numbers. */
+  #hear() {
     if (!this.#studies || !this.#open) return;
-    if (this.#job?.state !== before?.state || this.#job?.progress !== before?.progress) this.#load();
-    else this.#cells();
+    this.#cells();
+    if (this.#how === this.#heard) return;
+    this.#heard = this.#how;
+    this.#load();
   }
 
   /** All that is known of one filter: its bars, and the checkpoint that they open. */

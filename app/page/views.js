@@ -24,8 +24,9 @@ export class Scene {
   async open(url, when) {
     say(this.#host, 'loading', 'Starting the 3D scene …');
     await when;
+    if (this.#frame.isConnected) return this.#frame.contentWindow.location.replace(url); // no place in the history
     this.#frame.src = url;
-    if (!this.#frame.isConnected) this.#host.append(this.#frame);
+    this.#host.append(this.#frame);
   }
 
   /** Whether a drawing may be now, and the pause after each where drawing is slow (frame.js). @param {number} times of its cost */
