@@ -73,8 +73,8 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         if not (entry.slow or episodes):
             return Response(made.views(entry, traced, trace, options), media_type="application/json")
         job = jobs.find("diagnostic", _key(library, entry, _selections(library, asked, episodes), options))
-        if job is not None and job.state == "done":
-            return FileResponse(jobs.result(job.id), media_type="application/json")
+        if job is not None and job.state == "done" and (result := jobs.result(job.id)):
+            return FileResponse(result, media_type="application/json")
         return under_way(job)
 
     @router.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)

@@ -57,8 +57,8 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         if asked.data.startswith(PREFIX):
             return _of_live(library, asked)
         job = jobs.find("failures", _key(library, _arguments(library, asked)))
-        if job is not None and job.state == "done" and jobs.result(job.id).is_file():
-            return FileResponse(jobs.result(job.id), media_type="application/json")
+        if job is not None and job.state == "done" and (result := jobs.result(job.id)):
+            return FileResponse(result, media_type="application/json")
         return under_way(job)
 
     @router.post("/api/failures/{task}/{filter}", status_code=202)

@@ -21,7 +21,7 @@ from beliefscope.app.commands.finetune import curves, errors, of
 from beliefscope.app.jobs import UNDER_WAY, Job, Jobs
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.link import beside, moment_link
-from beliefscope.app.record import read_record
+from beliefscope.app.record import content, read_record
 from beliefscope.app.work import Report
 from beliefscope.datasets.document import read_json
 from beliefscope.datasets.writing import write_atomically
@@ -278,7 +278,7 @@ def _shown(library: Library, jobs: Jobs, about: Mapping[str, Any]) -> dict[str, 
 def _read(path: Path) -> dict[str, Any] | None:
     """JSON; None where it is not there."""
     with suppress(OSError, ValueError):
-        found: dict[str, Any] = read_json(path.read_bytes())
+        found: dict[str, Any] = read_json(content(path))
         return found if isinstance(found, dict) else None
     return None
 

@@ -131,9 +131,9 @@ class Jobs:
             return file.read().decode(errors="replace")
         return ""
 
-    def result(self, id: str) -> Path:
-        """Where its result is, once it is done: JSON."""
-        return self._folder / id / "result.json"
+    def result(self, id: str) -> Path | None:
+        """Where its result is, JSON; None where there is none, or a link to what lies elsewhere."""
+        return kept_file(self._folder, f"{id}/result.json")
 
     def submit(
         self,
@@ -159,7 +159,7 @@ class Jobs:
             known = self._jobs.get(id)
             if known is not None and known.state in UNDER_WAY:
                 return known
-            if known is not None and known.state == "done" and there and self.result(id).is_file():
+            if known is not None and known.state == "done" and there and self.result(id):
                 return known
             if self._closing:
                 raise BadInput("the server is stopping")
@@ -266,7 +266,7 @@ class Jobs:
             job = self._jobs[id]
             job = replace(job, ended=max(time.time(), job.started or 0.0))
             stopped = self._stopped.pop(id, None)
-            if code == 0 and self.result(id).is_file():
+            if code == 0 and self.result(id):
                 job = replace(job, state="done", progress=1.0, message="", error="")
             elif stopped:
                 error = "cancelled" if stopped == "cancelled" else "the server stopped"
@@ -329,7 +329,7 @@ def routes(jobs: Jobs) -> APIRouter:
     @router.get("/api/jobs/{id}/result")
     def result(id: str) -> Response:
         job = known(id)
-        path = kept_file(jobs.result(id).parents[1], f"{id}/result.json")
+        path = jobs.result(id)
         if job.state != "done" or path is None:
             raise HTTPException(404, f"Job {id!r} has no result: it is {job.state}{job.error and f', {job.error}'}.")
         return FileResponse(path, media_type="application/json")

@@ -277,8 +277,7 @@ class Library:
                 self._tracer.start()
 
     def _file(self, selection: Selection) -> Path:
-        name = f"{selection.task}-{selection.filter}-episode{selection.episode}-{self.key(selection)[:16]}.trace"
-        return self.settings.workspace / "traces" / name
+        return self.settings.workspace / "traces" / f"{selection.stem}-{self.key(selection)[:16]}.trace"
 
     def _run_apart(self, tracer: Tracer, selection: Selection, progress: Callable[[float], None]) -> Trace:
         """The trace from its file, which the other process writes where there is none that can be read."""

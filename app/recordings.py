@@ -102,7 +102,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         # The name says all that the file depends on, so one that was made under it is this one.
         depends = f"{traced.key} maps {maps} diagnostics version {__version__}"
         parts = hashlib.sha256(depends.encode()).hexdigest()[:8]
-        made_as = f"{wanted.task}-{wanted.filter}-episode{wanted.episode}-{parts}{ENDING}"
+        made_as = f"{of.stem}-{parts}{ENDING}"
         with writing:
             there = files.made_as(made_as)
             if there is None and request.app.state.read_only:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import threading
 from collections.abc import Mapping
@@ -14,7 +13,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Request
 from fastapi.responses import FileResponse, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from beliefscope.app.api import Asked
 from beliefscope.app.caching import tagged_json
@@ -23,6 +22,7 @@ from beliefscope.app.commands.report import report_command, trace_command
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library, Selection, Settings
 from beliefscope.app.link import moment_link
+from beliefscope.app.record import read_record
 from beliefscope.app.security import kept_file
 from beliefscope.app.trash import Deleted, Gone, Trash, size
 from beliefscope.app.work import Report
@@ -52,6 +52,25 @@ class ReportRequest(BaseModel):
     every: bool = False
     pdf: bool = False
     title: Annotated[str, Field(max_length=LONGEST_TITLE)] = ""
+
+
+class _Run(BaseModel):
+    episode: int
+    recipe: Any
+
+
+class Manifest(BaseModel):
+    """What is read of a report's manifest (``recordings.report``). Made: when, ISO 8601. Files: their SHA-256."""
+
+    title: str
+    made: str
+    task: str
+    filter: str
+    traces: Annotated[list[_Run], Field(min_length=1, max_length=1)]
+    files: dict[str, str]
+
+
+MANIFEST = TypeAdapter(Manifest)
 
 
 class Reports:
@@ -102,15 +121,14 @@ class Reports:
     def _shown(self, manifest: Path) -> dict[str, Any] | None:
         """What its manifest says, read once; None where that cannot be read."""
         name = manifest.parent.name
-        with suppress(OSError, ValueError, LookupError, TypeError):
+        with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
             made = manifest.stat().st_mtime_ns
             if name not in self._known or self._known[name][0] != made:
-                said = json.loads(manifest.read_bytes())
-                (run,) = said["traces"]
-                shown = {key: said[key] for key in ("title", "made", "task", "filter")}
-                shown |= {"episode": run["episode"], "recipe": str(Recipe.of(run["recipe"]))}
+                said = read_record(MANIFEST, manifest)
+                shown = said.model_dump(include={"title", "made", "task", "filter"})
+                shown |= {"episode": said.traces[0].episode, "recipe": str(Recipe.of(said.traces[0].recipe))}
                 shown |= {"name": name, "url": f"/api/reports/{name}.html", "bytes": size(manifest.parent)}
-                shown["pdf"] = f"/api/reports/{name}.pdf" if "report.pdf" in said["files"] else None
+                shown["pdf"] = f"/api/reports/{name}.pdf" if "report.pdf" in said.files else None
                 self._known[name] = made, shown
             return self._known[name][1]
         return None
@@ -133,7 +151,7 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         url = str(request.base_url)
         key = repr((library.key(asked), asked.filter, asked.data, url, wanted.model_dump_json()))
         short = hashlib.sha256(key.encode()).hexdigest()[:8]
-        name = f"{re.sub(r'[^A-Za-z0-9_.+-]', '-', f'{asked.task}-{asked.filter}')}-episode{asked.episode}-{short}"
+        name = f"{asked.stem}-{short}"
         folder = reports.folder / name
         arguments = {
             "settings": library.settings.to_json(),

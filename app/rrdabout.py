@@ -65,12 +65,12 @@ class About:
                 steps=None if properties["steps"] == GROWING else int(properties["steps"]),
                 seed=int(properties["seed"]),
                 recipe=str(stored_recipe(json.loads(properties.get("recipe", "null")), settings)),
-                particles=settings.get("particles"),
+                particles=None if settings.get("particles") is None else int(settings["particles"]),
                 edited=bool(settings.get("edits")),
                 checkpoint_hash=str(properties["checkpoint_hash"]),
                 data_hash=str(properties["data_hash"]),
             )
-        except (LookupError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        except (LookupError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
             return cls(**said | {"problem": f"It says that it is ours, but not of what: {error}."})
 
 

@@ -21,7 +21,9 @@ from itertools import accumulate
 from pathlib import Path
 from typing import NoReturn
 
-from beliefscope.app.record import is_text
+from pydantic import TypeAdapter
+
+from beliefscope.app.record import read_record
 from beliefscope.app.rrdabout import About, Reader
 from beliefscope.app.trash import Deleted, Gone, Taken, Trash
 from beliefscope.datasets.errors import BadInput
@@ -29,6 +31,7 @@ from beliefscope.datasets.writing import write_atomically
 
 ENDING = ".rrd"
 LONGEST = 200  # bytes of a name without its ending: a file under way has a longer one
+MOST = 255  # bytes of a file's name
 TAGS, TAG = 20, 40  # of a file, characters of one
 WAITING = 64  # files read in the background at once, the others when these are done
 AUTOMATIC, AUTOMATIC_BYTES = 50, 10**9  # of the files that were written to be looked at only
@@ -47,6 +50,9 @@ class Kept:
     automatic: bool = False
     tags: tuple[str, ...] = ()
     about: About | None = None
+
+
+KEPT = TypeAdapter(Kept)
 
 
 @dataclass(frozen=True)
@@ -105,9 +111,8 @@ class RrdFiles:
 
     def path(self, name: str) -> Path:
         """Of a file that is there; links are not followed. Raises Gone for any other name."""
-        try:
-            path = self.folder / (checked(name.removesuffix(ENDING)) + ENDING)
-        except BadInput:
+        path = self.folder / (name.removesuffix(ENDING) + ENDING)
+        if "/" in name or not _shown(path.name):
             _gone(name)
         try:
             regular = stat.S_ISREG(path.lstat().st_mode)
@@ -245,7 +250,7 @@ class RrdFiles:
         found = []
         with suppress(FileNotFoundError):
             for entry in os.scandir(self.folder):
-                if entry.name.endswith(ENDING) and not entry.name.startswith(".") and is_text(entry.name):
+                if _shown(entry.name):
                     with suppress(FileNotFoundError):  # it has just gone
                         if entry.is_file(follow_symlinks=False):
                             found.append((entry.name, entry.stat(follow_symlinks=False)))
@@ -266,14 +271,12 @@ class RrdFiles:
 
     def _kept(self, name: str) -> Kept | None:
         """Read again only when another server wrote it. Lines that cannot be read are none."""
-        with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
+        with suppress(OSError, ValueError):
             lines = self._lines(name)
             written = lines.stat().st_mtime_ns
             if name not in self._known or self._known[name][0] != written:
-                said = json.loads(lines.read_bytes())
-                about = None if said["about"] is None else About(**said["about"])
-                kept = Kept(**said | {"tags": checked_tags(said["tags"]), "about": about})
-                self._known[name] = written, kept
+                kept = read_record(KEPT, lines)
+                self._known[name] = written, replace(kept, tags=checked_tags(kept.tags))
             return self._known[name][1]
         return None
 
@@ -303,6 +306,11 @@ class RrdFiles:
         finally:
             with self._lock:
                 self._asked.pop(name, None)
+
+
+def _shown(name: str) -> bool:
+    """Whether a file of that name is listed: whoever put it there may have given it any bytes, and lines of its own."""
+    return name.endswith(ENDING) and name[0] != "." and name.isprintable() and len(name.encode()) + len(".json") <= MOST
 
 
 def checked(name: str) -> str:

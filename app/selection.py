@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
@@ -25,6 +26,9 @@ COARSE, FINE = MAP_SIZES
 MAPS_IN_MEMORY = 12 << 20  # bytes a trace: 300 coarse ones
 
 
+STEM = 150  # letters of a file's name that are its filter's
+
+
 @dataclass(frozen=True)
 class Selection:
     """What is being looked at: names of a task and a filter, an episode's index, how its sensors are broken.
@@ -43,6 +47,11 @@ class Selection:
     def told(self) -> str:
         """The run in words."""
         return f"{self.filter}, {self.task} episode {self.episode}" + (f", {self.recipe}" if self.recipe else "")
+
+    @property
+    def stem(self) -> str:
+        """For names of its files. Names of filters may hold anything, since they may come out of a file."""
+        return f"{re.sub(r'[^A-Za-z0-9_.+-]', '-', f'{self.task}-{self.filter}')[:STEM]}-episode{self.episode}"
 
     def to_json(self) -> dict[str, Any]:
         """As JSON values, for another process."""

@@ -108,6 +108,7 @@ def create_app(settings: Settings, warm: bool = True, apart: bool = False, acces
     app.add_exception_handler(Taken, _say(409))
     app.add_exception_handler(RequestValidationError, _say(422))
     app.add_exception_handler(HTTPException, _say(None))
+    app.add_exception_handler(OSError, _say_of_a_file)
     return app
 
 
@@ -253,6 +254,13 @@ def _say(status: int | None) -> Callable[[Request, Exception], JSONResponse]:
         return JSONResponse({"error": str(error)}, status or 500)
 
     return handler
+
+
+def _say_of_a_file(_: Request, error: Exception) -> JSONResponse:
+    """Of the workspace, mostly: no right to it, or a file where a folder should be. Its user can mend that."""
+    if not isinstance(error, OSError) or error.filename is None:
+        raise error
+    return JSONResponse({"error": f"{str(error.filename)!r} cannot be used: {error.strerror}."}, 400)
 
 
 def _bound(host: str, port: int) -> socket.socket:

@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 from beliefscope.app.commands.study import write
 from beliefscope.app.jobs import Job, Jobs
 from beliefscope.app.library import Library
+from beliefscope.app.record import content
 from beliefscope.app.shelf import short_names
 from beliefscope.app.work import Report
 from beliefscope.datasets.catalog import load_task
@@ -84,7 +85,7 @@ class Study:
         """As it is now: a study may still go on. Raises BadInput where there is none, or no such."""
         path = self.folder / FILE
         try:
-            return Results.model_validate_json(path.read_bytes())
+            return Results.model_validate_json(content(path))
         except OSError:
             raise BadInput(f"{str(self.folder)!r} is not the folder of a study: it has no {FILE}") from None
         except ValidationError as error:
