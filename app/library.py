@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
 
+from beliefscope.app.jobs import QueueFull
 from beliefscope.app.liveruns import PREFIX, LiveRuns
 from beliefscope.app.selection import Selection, Traced
 from beliefscope.app.shelf import Shelf, shelves
@@ -34,6 +35,9 @@ TRACES_IN_MEMORY = 8
 
 BYTES_IN_MEMORY = 256 << 20
 """What they may take; one is kept however large it is."""
+
+RUNS_WAITING = 64
+"""Runs of filters that are asked for and not begun; one that somebody asks for beyond that is not taken."""
 
 KEYS_KEPT = 4096
 """Selections whose key is remembered: a few hundred bytes each."""
@@ -106,6 +110,7 @@ class Library:
         self._living: WeakValueDictionary[str, Traced] = WeakValueDictionary()  # those too that only a view still shows
         self._tracing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="tracing")
         self._replay: tuple[str, Replay] | None = None  # of the run that was edited last; for the tracing thread alone
+        self._waiting = 0  # runs that were handed to that thread and are not begun
         self._closing = False
 
     @cached_property
@@ -140,14 +145,20 @@ class Library:
             return Selection(shelf.task.name, next(iter(shelf.filters)), episodes.held_out()[0], data=data)
 
     def traced(self, selection: Selection) -> Traced:
-        """The selection's trace, computed from now on if it is not there. Raises BadInput for what does not exist."""
+        """The selection's trace, computed from now on if it is not there.
+
+        Raises BadInput for what does not exist, and QueueFull.
+        """
         if (live := self._live(selection)) is not None:
             return live
         with self._lock:
             known = self._living.get(self.key(selection))
             if known is None or (known.done.done() and known.done.exception() is not None):
                 checkpoint, episode = self._found(selection)
+                if self._waiting >= RUNS_WAITING:
+                    raise QueueFull(f"{self._waiting} runs of filters wait already, no more are taken: ask again later")
                 known = Traced(self.key(selection), checkpoint)
+                self._waiting += 1
                 self._tracing.submit(self._compute, known, selection, episode)
             self._keep(known)
             return known
@@ -261,6 +272,8 @@ class Library:
                 raise CancelledError
             traced.progress = fraction
 
+        with self._lock:
+            self._waiting -= 1
         try:
             # The first page waits for the first run: it is here sooner than the other process is there.
             if self._tracer is not None and self._tracer.started:

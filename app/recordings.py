@@ -39,6 +39,7 @@ from beliefscope.inspect.likelihood import LikelihoodMap
 
 LARGEST = 2 * 10**9  # bytes of a file that is added
 SPARED = 2 * 10**8  # bytes of the disk that adding files leaves free
+LOOK = 1 << 24  # bytes of it that come between two looks at what is still free
 MAGIC = b"RRF"  # what Rerun's files begin with, of any version
 FREE_IN = 10**7  # bytes to which the free space is told, so that a list does not change all the time
 
@@ -149,7 +150,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
         part = await asyncio.to_thread(files.part)
         try:
             await _receive(request, part, most)
-            about = await asyncio.to_thread(files.examine, part)
+            about = await asyncio.wrap_future(files.examine(part))
             added = await asyncio.to_thread(files.add, part, name, about)
             return await asyncio.to_thread(shown, added)
         finally:
@@ -350,5 +351,7 @@ async def _receive(request: Request, part: Any, most: int) -> None:
                     if not MAGIC.startswith(start[: len(MAGIC)]):
                         raise BadInput("This is not a Rerun recording: an .rrd file begins with RRF and a digit.")
                 await asyncio.to_thread(file.write, chunk)
+                if size // LOOK > (size - len(chunk)) // LOOK:  # others fill the disk meanwhile, with files of theirs
+                    _fits(size, size + await asyncio.to_thread(disk, part.parent) - SPARED)
         except ClientDisconnect:
             raise HTTPException(400, f"The file ended after {size} bytes.") from None

@@ -14,7 +14,7 @@ import threading
 import unicodedata
 import uuid
 from collections.abc import Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import accumulate
@@ -81,6 +81,7 @@ class RrdFiles:
         self._known: dict[str, tuple[int, Kept]] = {}  # name -> (ns at which its lines were written, they)
         self._read = Reader()
         self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reading recordings")
+        self._examining = ThreadPoolExecutor(max_workers=1, thread_name_prefix="examining recordings")
         self._asked: dict[str, tuple[int, int]] = {}  # name -> (bytes, ns) of what is waited for
         self._closing = False
 
@@ -176,12 +177,19 @@ class RrdFiles:
         self.folder.mkdir(parents=True, exist_ok=True)
         return self.folder / f".{uuid.uuid4().hex}.part"
 
-    def examine(self, path: Path) -> About:
-        """Reads a file in a process of its own. Raises BadInput where Rerun cannot read it whole."""
-        about = self._read(path)
-        if not about.application:
-            raise BadInput(about.problem)
-        return about
+    def examine(self, path: Path) -> Future[About]:
+        """Has a file read in a process of its own, one at a time, however many ask.
+
+        The future raises BadInput where Rerun cannot read the file whole.
+        """
+
+        def read() -> About:
+            about = self._read(path)
+            if not about.application:
+                raise BadInput(about.problem)
+            return about
+
+        return self._examining.submit(read)
 
     def add(self, part: Path, name: str, about: About) -> Recording:
         """Gives a file that was examined its name. Raises as ``free``."""
@@ -243,7 +251,8 @@ class RrdFiles:
         """Gives up what is being read."""
         self._closing = True
         self._read.close()
-        self._reading.shutdown(wait=True, cancel_futures=True)
+        for reading in (self._reading, self._examining):
+            reading.shutdown(wait=True, cancel_futures=True)
 
     def _files(self) -> list[tuple[str, os.stat_result]]:
         """Names and states of all that are files themselves."""

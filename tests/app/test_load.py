@@ -5,11 +5,15 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import os
 import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
@@ -18,9 +22,11 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from beliefscope.app import library as library_module
+from beliefscope.app import recordings
 from beliefscope.app import selection as selection_module
 from beliefscope.app.desk import Desk, Turns
 from beliefscope.app.library import TRACES_IN_MEMORY, Library, Selection
+from beliefscope.app.rrdabout import About, Reader
 from beliefscope.app.selection import Traced
 from beliefscope.app.server import Settings
 from beliefscope.app.session import AHEAD, Views
@@ -82,6 +88,67 @@ def test_names_of_what_was_opened_are_forgotten(library: Library, monkeypatch: p
     keys = [library.key(broken(number)) for number in range(1, 8)]
     assert len(library._keys) == 3
     assert [library.key(broken(number)) for number in range(1, 8)] == keys
+
+
+def test_so_many_runs_wait_and_no_more(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library_module, "RUNS_WAITING", 3)
+    served: Library = client.app.state.library  # type: ignore[attr-defined]
+    go_on = threading.Event()
+    served._tracing.submit(go_on.wait, PATIENCE)
+    asked = [client.get("/api/trace/door/crossmodal-ekf/1", params={"recipe": f"blackout=0.{i}"}) for i in range(1, 6)]
+    assert [answer.status_code for answer in asked] == [202, 202, 202, 429, 429]
+    assert "3 runs of filters wait already" in asked[-1].json()["error"]
+    assert client.get("/api/trace/door/crossmodal-ekf/1", params={"recipe": "blackout=0.3"}).status_code == 202
+    assert client.get("/api/trace/door/crossmodal-ekf/1/columns", params={"recipe": "blackout=0.3"}).status_code == 202
+    go_on.set()
+    served.traced(broken(30)).result(PATIENCE)
+    assert client.get("/api/trace/door/crossmodal-ekf/1", params={"recipe": "blackout=0.5"}).status_code in (200, 202)
+
+
+def test_recordings_that_are_read_for_long_hold_up_nobody_else(
+    address: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+
+    def slow(_: Reader, path: Path) -> About:
+        go_on.wait(PATIENCE)
+        return About(problem="read at last")
+
+    monkeypatch.setattr(Reader, "__call__", slow)
+    headers = {"Origin": f"http://{address}"}
+
+    def put(number: int) -> int:
+        url = f"http://{address}/api/recordings/{number}.rrd"
+        try:
+            with urlopen(Request(url, b"RRF2", headers, method="PUT"), timeout=PATIENCE) as answer:
+                return int(answer.status)
+        except HTTPError as error:
+            return error.code
+
+    count = (os.cpu_count() or 2) + 6  # more than asyncio has threads for all that waits
+    with ThreadPoolExecutor(count) as browsers:
+        added = browsers.map(put, range(count))
+        until = time.monotonic() + PATIENCE
+        while len(list((settings.workspace / "recordings").glob(".*.part"))) < count:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        try:
+            with urlopen(Request(f"http://{address}/api/views", b"", headers), timeout=10.0) as answer:
+                assert answer.status == 201
+        finally:
+            go_on.set()
+        assert set(added) == {400}
+    assert not list((settings.workspace / "recordings").glob(".*"))
+
+
+def test_what_others_add_meanwhile_leaves_no_room(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = iter([recordings.SPARED + 10**9, *[recordings.SPARED - 1] * 10])
+    monkeypatch.setattr(recordings, "disk", lambda _: next(free))
+    monkeypatch.setattr(recordings, "LOOK", 1000)
+    folder = client.app.state.library.settings.workspace / "recordings"  # type: ignore[attr-defined]
+    answer = client.put("/api/recordings/x.rrd", content=(b"RRF2" + bytes(596) for _ in range(10)))
+    assert answer.status_code == 413
+    assert not list(folder.iterdir())
 
 
 def test_maps_are_made_once_for_all_who_look(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
