@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 
 from beliefscope.app.library import Library, Settings
 from beliefscope.app.record import read_record
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.writing import write_atomically
 from beliefscope.filters.checkpoint import load_checkpoint
 
@@ -32,11 +33,22 @@ RECORDS = TypeAdapter(list[Child])
 
 
 def read(workspace: Path) -> list[Child]:
-    """Those whose files are still there; of a file that cannot be read, none."""
-    with suppress(OSError, ValueError, TypeError):
-        found = read_record(RECORDS, workspace / FILE)
-        return [one for one in found if Path(one.path).is_file()]
+    """Those whose files are still there; of a list that cannot be read, none."""
+    with suppress(BadInput):
+        return _read(workspace)
     return []
+
+
+def _read(workspace: Path) -> list[Child]:
+    """Raises BadInput for a list that cannot be read, such as a later version's, which is not to be overwritten."""
+    path = workspace / FILE
+    try:
+        found = read_record(RECORDS, path)
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError):
+        raise BadInput(f"{str(path)!r} is damaged or another version's: move it away to begin a new one") from None
+    return [one for one in found if Path(one.path).is_file()]
 
 
 def with_children(settings: Settings) -> Settings:
@@ -49,7 +61,7 @@ def with_children(settings: Settings) -> Settings:
 
 def keep(library: Library, child: Child) -> None:
     """Puts it on the shelf; as the default it takes the place of the one before. Raises BadInput for no checkpoint."""
-    others = [one for one in read(library.settings.workspace) if (one.task, one.name) != (child.task, child.name)]
+    others = [one for one in _read(library.settings.workspace) if (one.task, one.name) != (child.task, child.name)]
     if child.default:
         others = [replace(one, default=one.default and one.task != child.task) for one in others]
     library.adopt(child.task, child.name, load_checkpoint(Path(child.path)), Path(child.path), child.default)
@@ -58,9 +70,10 @@ def keep(library: Library, child: Child) -> None:
 
 def drop(library: Library, task: str, name: str) -> None:
     """Takes it off the shelf; its file stays. What was there before it is what comes first again."""
-    library.dismiss(task, name)
     workspace = library.settings.workspace
-    _write(workspace, [one for one in read(workspace) if (one.task, one.name) != (task, name)])
+    others = [one for one in _read(workspace) if (one.task, one.name) != (task, name)]
+    library.dismiss(task, name)
+    _write(workspace, others)
 
 
 def _write(workspace: Path, children: Sequence[Child]) -> None:
