@@ -75,6 +75,7 @@ class Page {
   #store;
   #trace = null;
   #loading = new AbortController();
+  #failed = false; // the last loading
 
   constructor(catalog, store, live) {
     [this.#catalog, this.#store] = [catalog, store];
@@ -153,7 +154,10 @@ class Page {
       },
       moved: (step) => this.#store.set({ step: this.#within(step), playing: false }, { origin: 'scene' }),
       error: (line) => messages.say('cursor', line),
-      connection: (problem) => messages.say('connection', problem),
+      connection: (problem) => {
+        messages.say('connection', problem);
+        if (!problem && this.#failed) this.#load(); // the server is back
+      },
     };
   }
 
@@ -178,7 +182,7 @@ class Page {
     const { task: name, filter, data, episode, recipe } = this.#store.state;
     this.#loading.abort();
     const loading = (this.#loading = new AbortController());
-    this.#trace = null;
+    [this.#trace, this.#failed] = [null, false];
     this.clock.show(null);
     const wait = (share) => bodies.forEach((body) => say(body, 'loading', 'Running the filter over the episode …', share));
     const patience = setTimeout(() => bodies.forEach((body) => say(body, 'loading', 'Loading …')), 150);
@@ -193,6 +197,8 @@ class Page {
       clearTimeout(patience);
       if (error.name === 'AbortError') return;
       if (!(error instanceof api.ServerError)) console.error(error);
+      this.#failed = true;
+      $('#reading').textContent = '';
       bodies.forEach((body) => say(body, 'error', error.message));
     }
   }

@@ -2,7 +2,7 @@
 
 import { fixed, percent, spoken } from './units.js';
 
-const NEAR = 0.2; // cm: two errors closer than this are called alike,
+const NEAR = { good: 1, else: 0.2 }; // cm: two errors closer than this are called alike, by whether the larger is expected;
 const ALIKE = 0.8; // and those of which the smaller is this share of the larger, or more
 const SURE = 2; // standard deviations within which an error is what the filter expects
 const LEADS = 0.6; // share from which one modality is said to lead
@@ -19,7 +19,7 @@ export function reading(trace, step, component) {
 
   const [best, leader] = [closest(trace, step), leading(trace, step, component)];
   const blind = (leader?.name === 'image' && trace.black[step] && 'the picture is black') || (leader?.name === 'haptics' && !trace.contact[step] && 'there is no contact to feel');
-  const better = leader && best && best.name !== leader.name && best.error < Math.min(error - NEAR, ALIKE * error) && `${best.name} alone is ${fixed(best.error, 1)} cm off`;
+  const better = leader && best && best.name !== leader.name && best.error < Math.min(error - (NEAR[tone] ?? NEAR.else), ALIKE * error) && `${best.name} alone is ${fixed(best.error, 1)} cm off`;
   const of = trace.weightWidth > 1 ? ` in ${spoken(trace.components[component].name)}` : '';
   const though = [blind, better].filter(Boolean).join(' and ');
   if (leader && (leader.share >= LEADS || better)) {

@@ -261,7 +261,7 @@ def test_the_scenes_own_slider_moves_the_page(open_page: Any) -> None:
     scene = page.page.frame_locator("#scene iframe")
     slider = scene.locator("[role=slider]").first
     if not slider.is_visible():
-        scene.get_by_text("Connected").first.click(timeout=60_000)
+        scene.get_by_text("Step", exact=True).first.click(timeout=60_000)
     slider.focus(timeout=60_000)
     assert page.page.frames[-1].evaluate("() => drawing.pause(0)")  # the page's hold on viser's drawing
     page.page.keyboard.press("ArrowRight")
