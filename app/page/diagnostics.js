@@ -219,11 +219,11 @@ export class Diagnostics {
     form.hidden = !entry.options.length;
     const chosen = new URLSearchParams(this.#store.state.options);
     form.replaceChildren(
-      ...entry.options.map(({ name, meaning, default: usual }) => {
+      ...entry.options.map(({ name, default: usual }) => {
         const label = document.createElement('label');
         const input = document.createElement('input');
         Object.assign(input, { name, placeholder: usual, value: chosen.get(name) ?? '', autocomplete: 'off', spellcheck: false });
-        [label.title, label.textContent] = [meaning, name];
+        label.textContent = name;
         label.append(input);
         if (name !== 'step') return label;
         const here = document.createElement('button');
@@ -232,6 +232,7 @@ export class Diagnostics {
         label.append(here);
         return label;
       }),
+      Object.assign(document.createElement('p'), { textContent: entry.options.map(({ name, meaning }) => `${name}: ${meaning}.`).join(' ') }),
     );
     if (focused) form.elements[focused]?.focus();
   }
