@@ -14,8 +14,8 @@ BIN  := $(VENV)/bin
 # Compiling every module of every package would add half a minute to the first start; Python compiles what it imports.
 PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_FLAGS)
 
-# A file's tests stay in one process: they share a server, a browser, a small training.
-PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+# A file's tests stay in one process: they share a server, a browser, a small training. tests/conftest.py orders the files.
+PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help install serve test lint check check-all bench lock licences audit clean

@@ -74,15 +74,15 @@ def test_a_stop_saves_the_jobs_and_the_log_tells(tmp_path: Path) -> None:
     assert (job.state, job.error) == ("interrupted", "the server stopped")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP], ids=["Ctrl-C again and again", "a closed terminal"])
-def test_whatever_ends_it_ends_its_jobs(tmp_path: Path, number: signal.Signals) -> None:
-    """uvicorn leaves out what ends the jobs where Ctrl-C is pressed twice: they went on, and the process with them."""
+def test_whatever_ends_it_ends_its_jobs(tmp_path: Path) -> None:
+    """A closed terminal, and Ctrl-C again and again, after which uvicorn would leave out what ends the jobs."""
     workspace = tmp_path / "workspace"
     with served(workspace) as (server, address):
         asked(f"{address}/api/finetune/push/crossmodal-ekf", {"train": ["haptics-only"], "steps": 20000})
         end = time.monotonic() + PATIENCE / 2
         while server.poll() is None and time.monotonic() < end:
-            server.send_signal(number)
+            server.send_signal(signal.SIGHUP)
+            server.send_signal(signal.SIGINT)
             time.sleep(0.02)
         assert server.poll() == 0
         assert server.communicate() == ("", "")
