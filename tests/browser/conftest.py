@@ -24,6 +24,7 @@ FLAGS = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    "--webgl-antialiasing-mode=none",  # the processor draws the scene, and nobody judges its edges
 ]
 PATIENCE = 60.0  # s: without a GPU the first picture of a 3D view takes long
 
