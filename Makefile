@@ -82,8 +82,8 @@ licences: install
 	@$(BIN)/python bench/licences.py
 
 audit: $(VENV)/tools
-	@$(VENV)/tools/bin/pip-audit --progress-spinner off -r requirements.lock --require-hashes --disable-pip 2>$(VENV)/audit.log || { \
-	  if grep -q Traceback $(VENV)/audit.log; then \
+	@$(VENV)/tools/bin/pip-audit --strict --progress-spinner off -r requirements.lock --require-hashes --disable-pip 2>$(VENV)/audit.log || { \
+	  if grep -qE "Traceback|not be audited" $(VENV)/audit.log; then \
 	    echo "The advisory service was not reached, so nothing is known; $(VENV)/audit.log says more." >&2; \
 	  else tail -n 1 $(VENV)/audit.log >&2; fi; exit 1; }
 

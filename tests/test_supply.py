@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import re
 import runpy
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -78,3 +80,31 @@ def test_every_licence_is_allowed() -> None:
 )
 def test_what_is_no_such_licence_is_seen(licence: str, fits: bool) -> None:
     assert LICENCES["allowed"](licence) is fits
+
+
+# As pip-audit speaks: of an index that knows of no advisories it says nothing bad, unless it is told to be strict.
+SILENT = """#!/bin/sh
+case "$*" in *--strict*)
+  echo "ERROR:pip_audit._cli:numpy: Dependency not found on PyPI and could not be audited: numpy (2.0)" >&2; exit 1
+esac
+echo "No known vulnerabilities found" >&2
+"""
+UNREACHED = "#!/bin/sh\necho Traceback >&2; exit 1\n"
+WEAK = "#!/bin/sh\necho 'Found 1 known vulnerability in 1 package' >&2; exit 1\n"
+
+
+@pytest.mark.parametrize(
+    ("auditor", "said"),
+    [(SILENT, "nothing is known"), (UNREACHED, "nothing is known"), (WEAK, "Found 1 known vulnerability")],
+)
+@pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
+def test_an_audit_that_learned_nothing_does_not_say_that_all_is_well(tmp_path: Path, auditor: str, said: str) -> None:
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    tools = tmp_path / ".venv" / "tools" / "bin"
+    tools.mkdir(parents=True)
+    (tools / "pip-audit").write_text(auditor)
+    (tools / "pip-audit").chmod(0o755)
+    ran = subprocess.run(["make", "audit"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode != 0
+    assert said in ran.stderr
+    assert "No known vulnerabilities" not in ran.stderr
