@@ -156,13 +156,18 @@ def onward_page(address: str) -> str:
     )
 
 
-def sign_in_page(problem: str) -> str:
-    """HTML that asks for the token."""
+def sign_in_page(problem: str, address: str) -> str:
+    """HTML that asks for the token, and leads on to an address of ours.
+
+    A browser that has the cookie leaves it out where a link of another page led to us, of a shown report for one;
+    from here it sends it.
+    """
     return _PAGE.format(
         head="",
         body=f"<p>{escape(problem)}</p>"
         '<form action="/" method="get"><label>Token <input name="token" type="password" autocomplete="off" required '
-        'autofocus></label> <button type="submit">Sign in</button></form>',
+        'autofocus></label> <button type="submit">Sign in</button></form>'
+        f'<p>If you are signed in already and a link led here: <a href="{escape(address)}">go on</a>.</p>',
     )
 
 

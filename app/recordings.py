@@ -140,6 +140,8 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
     @router.get("/api/recordings/{name}.rrd")
     def recording(name: str) -> Response:
         path = files.path(name)
+        with path.open("rb"):  # or it is said, before anything is sent, that nobody may
+            pass
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
     @router.put("/api/recordings/{name}.rrd", status_code=201)

@@ -163,11 +163,12 @@ class Guard:
                 reason = "The token is not right." if brought else "This server asks for a token."
                 reason += " Open the link that `beliefscope serve` printed, or give the token as it prints it."
                 asks = stay | {"www-authenticate": "Bearer"}
-                return Reply(401, reason, asks, sign_in_page(reason) if opens else "")
+                return Reply(401, reason, asks, sign_in_page(reason, without_token(query)) if opens else "")
         except TooMany as error:
             wait = f"{max(1.0, error.args[0]):.0f}"
             reason = f"Too many wrong tokens came from this address; try again in {wait} s."
-            return Reply(429, reason, stay | {"retry-after": wait}, sign_in_page(reason) if opens else "")
+            page = sign_in_page(reason, without_token(query)) if opens else ""
+            return Reply(429, reason, stay | {"retry-after": wait}, page)
         if bearer:
             return None
         onward = onward_page(without_token(query))

@@ -22,6 +22,10 @@ from beliefscope.datasets.writing import write_atomically
 UPLOT_FILES = ("uPlot.iife.js", "uPlot.min.css")
 # widget.js is made for notebooks and keeps its viewer class to itself.
 EXPORT = b"\nexport { WebViewer };\n"
+# The viewer asks without cookies, and a server with a token answers nothing then.
+FETCH = b"""const fetch = (asked, ...more) =>
+  globalThis.fetch(asked instanceof Request ? new Request(asked, { credentials: "same-origin" }) : asked, ...more);
+"""
 COMPRESSED_AT_ONCE = 1 << 20  # bytes between two looks at whether the server is being stopped
 
 
@@ -44,7 +48,7 @@ class RerunViewer:
 
     def script(self) -> bytes:
         """The viewer's module, which exports ``WebViewer`` and loads ``re_viewer_bg.wasm`` from beside itself."""
-        return self._widget.read_bytes() + EXPORT
+        return FETCH + self._widget.read_bytes() + EXPORT
 
     def prepare(self, given_up: Callable[[], bool] = lambda: False) -> None:
         """Make the compressed file if it is missing: about 5 s of one core, once. Ends early when ``given_up``."""

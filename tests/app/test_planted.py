@@ -138,6 +138,15 @@ def test_a_file_of_any_name_that_can_be_read_is_looked_after(
             assert client.delete("/api/recordings/plain.rrd").status_code == 200
 
 
+def test_a_recording_that_nobody_may_read_is_said(workspace: Path, settings: Settings, open_client: Opens) -> None:
+    (workspace / "recordings" / "a.rrd").chmod(0)
+    if os.access(workspace / "recordings" / "a.rrd", os.R_OK):
+        pytest.skip("this user may read everything")
+    with open_client(settings) as client:
+        answer = client.get("/api/recordings/a.rrd")
+    assert (answer.status_code, "Permission denied" in answer.json()["error"]) == (400, True)
+
+
 def test_a_file_of_another_name_is_none(workspace: Path, settings: Settings, open_client: Opens) -> None:
     names = (b"a\nb", b"a\xffb", "a\u2028b".encode(), "a\u202eb".encode(), b"x" * 250)
     for name in names:

@@ -61,6 +61,8 @@ def test_the_installed_viewer_is_what_we_take_it_for() -> None:
     widget = (installed("rerun_notebook") / "static" / "widget.js").read_bytes()
     assert b"var WebViewer = class" in widget
     assert b"re_viewer_bg.wasm" in widget
+    assert b" = fetch(arg0)" in widget, "by a name for which ours stands: one that sends the cookie"
+    assert not re.search(rb"^(?:var|let|const|class|(?:async )?function) fetch\b", widget, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +72,7 @@ def test_the_installed_viewer_is_what_we_take_it_for() -> None:
         ("/static/uPlot.iife.js", "text/javascript", b"uPlot"),
         ("/static/uPlot.min.css", "text/css", b".uplot"),
         ("/vendor/rerun/viewer.js", "text/javascript", b"export { WebViewer };"),
+        ("/vendor/rerun/viewer.js", "text/javascript", b'{ credentials: "same-origin" }'),
     ],
 )
 def test_files_come_with_their_type_and_are_revalidated(

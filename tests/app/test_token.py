@@ -51,6 +51,8 @@ def test_the_page_asks_for_it(client: TestClient) -> None:
     assert answer.headers["content-type"].startswith("text/html")
     assert 'name="token"' in answer.text
     assert "main.js" not in answer.text
+    led = client.get("/", params={"task": "push", "recipe": 'a&b="<c>'})  # a link of a report's, for one
+    assert '<a href="/?task=push&amp;recipe=a%26b%3D%22%3Cc%3E">go on</a>' in led.text
     assert answer.headers["cache-control"] == "no-store"
 
 
