@@ -150,3 +150,15 @@ def test_looks_are_in_the_address_and_a_pinned_moment_is_what_others_gain_on(
     page.page.mouse.move(5, 5)
     page.until("() => !location.search.includes('axes=')")
     assert page.maps() == plain
+
+
+def test_a_moment_is_told_and_drawn_close_where_its_maps_fit(open_page: Any) -> None:
+    page = open_page("?task=push&filter=crossmodal-ekf&episode=79&step=68")
+    assert page.page.locator("#reading").text_content().endswith("though image alone is 0.8 cm off.")
+    shown = {"fit": page.maps()}
+    for zoom in ("4", "1"):
+        page.page.evaluate(f"""() => document.querySelector('#maps-zoom input[value="{zoom}"]').click()""")
+        page.until(f"() => beliefscope.state().zoom === '{zoom}'")
+        page.page.evaluate("() => new Promise(requestAnimationFrame)")
+        shown[zoom] = page.maps()
+    assert shown["fit"] == shown["4"] != shown["1"]

@@ -255,6 +255,18 @@ def test_theme_and_help(open_page: Any) -> None:
     assert not page.page.locator("#keys").is_visible()
 
 
+def test_back_and_forward_go_through_what_was_chosen(open_page: Any) -> None:
+    page = open_page("?step=7")
+    page.page.select_option("#episode", "19")
+    page.page.keyboard.press("f")
+    page.until("() => beliefscope.state().tab === 'failures'")
+    for way, episode, step in (("back", 19, 0), ("back", 9, 7), ("forward", 19, 0)):
+        page.page.evaluate(f"() => history.{way}()")
+        page.until(f"() => beliefscope.state().episode === {episode} && beliefscope.state().tab === 'scene'")
+        assert page.state["step"] == step
+    assert page.page.locator("#episode").input_value() == "19"
+
+
 def test_the_scenes_own_slider_moves_the_page(open_page: Any) -> None:
     page = open_page("?step=20")
     page.until("() => document.querySelector('#scene').dataset.state === 'ready'")
