@@ -232,7 +232,7 @@ export class Diagnostics {
         label.append(here);
         return label;
       }),
-      Object.assign(document.createElement('p'), { textContent: entry.options.map(({ name, meaning }) => `${name}: ${meaning}.`).join(' ') }),
+      Object.assign(document.createElement('p'), { textContent: entry.options.map(({ name, meaning }) => `${name}: ${meaning}`).join('\n') }),
     );
     if (focused) form.elements[focused]?.focus();
   }
