@@ -51,8 +51,8 @@ def routes(library: Library, views: Views) -> APIRouter:
     scene_tag = hashlib.sha256(scene).hexdigest()[:24]
 
     @router.get("/healthz")
-    async def health() -> dict[str, str]:
-        return {"status": "ok", "version": __version__}
+    async def health() -> dict[str, str | float]:
+        return {"status": "ok", "version": __version__, "late": round(views.late(), 1)}
 
     @router.get("/api/catalog")
     def catalog(request: Request) -> dict[str, Any]:

@@ -37,7 +37,8 @@ class Desk:
         self._count = threads or min(4, max(2, os.cpu_count() or 2))
         self._threads: list[threading.Thread] = []
         self._changed = threading.Condition()
-        self._waiting: list[_Task] = []
+        self._asked: set[_Task] = set()  # and not answered
+        self._waiting: list[_Task] = []  # those of them that nobody has begun
         self._taken: set[Hashable] = set()
         self._closed = False
 
@@ -56,6 +57,7 @@ class Desk:
             if self._closed:
                 raise RuntimeError("the server is stopping")
             self._waiting.append(task)
+            self._asked.add(task)
             if len(self._threads) < self._count:
                 self._threads.append(threading.Thread(target=self._serve, name="desk", daemon=True))
                 self._threads[-1].start()
@@ -64,8 +66,14 @@ class Desk:
             return await task.answer
         finally:
             with self._changed:
+                self._asked.remove(task)
                 if task in self._waiting:
                     self._waiting.remove(task)
+
+    def late(self) -> float:
+        """s since when what is asked for was due, begun or not; 0 where nothing is late."""
+        with self._changed:
+            return max([0.0, *(time.monotonic() - task.due for task in self._asked)])
 
     def close(self) -> None:
         """Ends the threads after what they are doing. Blocks."""

@@ -266,6 +266,10 @@ class Views:
     def __len__(self) -> int:
         return len(self._views)
 
+    def late(self) -> float:
+        """s that the maps and scenes which pages wait for are late, at most."""
+        return self._desk.late()
+
     def __getitem__(self, name: str) -> View:
         """Raises KeyError for a view that is not, or no longer, open."""
         return self._views[name]

@@ -227,9 +227,11 @@ def test_the_desk_takes_what_is_due_first_and_never_two_that_need_the_same() -> 
         ]
         await asyncio.sleep(0)
         others[3].cancel()  # whose page has gone meanwhile
-        await asyncio.sleep(0)
+        await asyncio.sleep(0.01)
+        assert 0.01 <= desk.late() < PATIENCE, "of the first, which was due at once"
         go_on.set()
         await asyncio.gather(first, *others[:3])
+        assert desk.late() == 0.0
         desk.close()
 
         desk, inside, most = Desk(threads=4), [0], [0]
