@@ -258,14 +258,16 @@ async def test_views_are_bounded_and_the_idle_ones_go(settings: Settings) -> Non
     assert len(views) == 0
 
 
-@pytest.mark.anyio
-async def test_pages_that_come_at_once_are_no_more_than_there_may_be(settings: Settings) -> None:
+def test_pages_that_come_at_once_are_no_more_than_there_may_be(settings: Settings) -> None:
     from beliefscope.app.library import Library
 
-    views = Views(Library(settings), limit=2)
-    opened = [views.open(dark=False) for _ in range(6)]
-    tidying = [views._close_idle(keep=0) for _ in range(2)]
-    found = await asyncio.gather(*opened, *tidying, return_exceptions=True)
-    assert not [one for one in found if isinstance(one, Exception)]
-    assert len(views) <= 2
-    await views.close()
+    async def scenario() -> None:
+        views = Views(Library(settings), limit=2)
+        opened = [views.open(dark=False) for _ in range(6)]
+        tidying = [views._close_idle(keep=0) for _ in range(2)]
+        found = await asyncio.gather(*opened, *tidying, return_exceptions=True)
+        assert not [one for one in found if isinstance(one, Exception)]
+        assert len(views) <= 2
+        await views.close()
+
+    asyncio.run(scenario())
