@@ -280,7 +280,7 @@ class Views:
             await self._close_idle(keep=self._limit - 1)
             if len(self._views) >= self._limit:
                 raise BadInput(
-                    f"{self._limit} pages are open already, as many as this server shows at a time; close one and "
+                    f"As many pages are open already as this server shows at a time, {self._limit}; close one and "
                     "reload, or serve with more --views."
                 )
             view = await asyncio.to_thread(View, self._library, self._desk, self._turns, dark)

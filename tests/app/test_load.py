@@ -212,7 +212,7 @@ def test_one_page_too_many_is_told_how_many_there_may_be(settings: Settings) -> 
         await views.close()
         return str(told.value)
 
-    assert asyncio.run(scenario()).startswith("1 pages are open already, as many as this server shows at a time")
+    assert asyncio.run(scenario()).startswith("As many pages are open already as this server shows at a time, 1;")
 
 
 def test_the_desk_takes_what_is_due_first_and_never_two_that_need_the_same() -> None:

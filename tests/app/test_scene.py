@@ -252,7 +252,7 @@ async def test_views_are_bounded_and_the_idle_ones_go(settings: Settings) -> Non
     with pytest.raises(KeyError):
         views[second.name]
     third.idle_since = None
-    with pytest.raises(BadInput, match="2 pages are open already"):
+    with pytest.raises(BadInput, match="at a time, 2;"):
         await views.open(dark=False)
     await views.close()
     assert len(views) == 0
