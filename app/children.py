@@ -43,12 +43,11 @@ def _read(workspace: Path) -> list[Child]:
     """Raises BadInput for a list that cannot be read, such as a later version's, which is not to be overwritten."""
     path = workspace / FILE
     try:
-        found = read_record(RECORDS, path)
+        return [one for one in read_record(RECORDS, path) if Path(one.path).is_file()]
     except FileNotFoundError:
         return []
     except (OSError, ValueError, TypeError):
         raise BadInput(f"{str(path)!r} is damaged or another version's: move it away to begin a new one") from None
-    return [one for one in found if Path(one.path).is_file()]
 
 
 def with_children(settings: Settings) -> Settings:

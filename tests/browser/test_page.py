@@ -258,8 +258,9 @@ def test_theme_and_help(open_page: Any) -> None:
 def test_back_and_forward_go_through_what_was_chosen(open_page: Any) -> None:
     page = open_page("?step=7")
     page.page.select_option("#episode", "19")
+    page.until("() => location.search.includes('episode=19')")  # else both may come in one frame, as one place
     page.page.keyboard.press("f")
-    page.until("() => beliefscope.state().tab === 'failures'")
+    page.until("() => location.search.includes('tab=failures')")
     for way, episode, step in (("back", 19, 0), ("back", 9, 7), ("forward", 19, 0)):
         page.page.evaluate(f"() => history.{way}()")
         page.until(f"() => beliefscope.state().episode === {episode} && beliefscope.state().tab === 'scene'")
