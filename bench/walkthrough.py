@@ -84,6 +84,7 @@ def take(page: Page, shot: Shot) -> str:
     # The moment's own maps and scene come after what was waited for.
     drawn = (
         f"() => beliefscope.stats.maps?.size === 135 && beliefscope.stats.maps.step === {(MOMENT | shot.asked)['step']}"
+        " && (scene.offsetParent === null || scene.dataset.state === 'ready')"
     )
     while not page.evaluate(drawn):
         page.wait_for_timeout(200)
