@@ -24,12 +24,12 @@ import numpy as np
 import torch
 from valid import episodes
 
-from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import write_dataset
 from beliefscope.filters.catalog import architecture
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.filters.finetune import FineTune, finetune
-from beliefscope.filters.train import PLANS, train
+from beliefscope.filters.finetuning.finetune import FineTune, finetune
+from beliefscope.filters.training.train import PLANS, train
 from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.trace import arrays_of, trace
 

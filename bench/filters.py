@@ -17,7 +17,7 @@ import torch
 from subject import NAMES, STEPS, Row
 from torch.profiler import ProfilerActivity, profile
 
-from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.evaluate import run

@@ -8,15 +8,15 @@ from collections.abc import Callable
 import subject
 from subject import NAMES, Row
 
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.filters.finetune import FineTune
-from beliefscope.filters.mix import Mix
-from beliefscope.filters.modules import chosen, freeze
-from beliefscope.filters.recall import numbered, recalling
-from beliefscope.filters.slices import Slice
-from beliefscope.filters.tuning import Tuning
+from beliefscope.filters.finetuning.batch_mix import Mix
+from beliefscope.filters.finetuning.finetune import FineTune
+from beliefscope.filters.finetuning.loop import Tuning
+from beliefscope.filters.finetuning.module_selection import chosen, freeze
+from beliefscope.filters.finetuning.slices import Slice
+from beliefscope.filters.training.encoder_cache import numbered, recalling
 
 BARS = {"weights-only": ">= 5 x", "haptics-only": "", "noise-only": ""}
 TURNS = 5

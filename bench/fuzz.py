@@ -53,7 +53,7 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
     """All inputs of one reader, in as many processes as it takes."""
     import readers
 
-    from beliefscope.app.commands.given import recording_in
+    from beliefscope.app.cli.options import recording_in
     from beliefscope.datasets.errors import BadInput
     from beliefscope.datasets.store import open_dataset
 
@@ -107,9 +107,9 @@ def _read_all(name: str, seed: int, first: int, last: int, folder: str, shared: 
     """In the process, which itself is the one that goes over a file first. Counts in shared memory outlive it."""
     import readers
 
-    from beliefscope.datasets import hdf5
+    from beliefscope.datasets.readers import hdf5_guard
 
-    hdf5.is_foreign = lambda path: False
+    hdf5_guard.is_foreign = lambda path: False
     with open("/proc/self/statm") as file:
         taken = int(file.read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, taken + MEMORY))

@@ -34,20 +34,20 @@ import numpy as np
 import torch
 from valid import episodes
 
-from beliefscope.datasets.collect import collect
-from beliefscope.datasets.corrupt import WHOLE
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import WHOLE
+from beliefscope.datasets.simulation.collect import collect
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, write_dataset
 from beliefscope.filters.catalog import architecture
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.finetune import FineTune, finetune
-from beliefscope.filters.modules import digest
-from beliefscope.filters.study import Cell, run_local
-from beliefscope.filters.train import PLANS, train
-from beliefscope.inspect.growing import GrowingReader
+from beliefscope.filters.finetuning.finetune import FineTune, finetune
+from beliefscope.filters.finetuning.module_selection import digest
+from beliefscope.filters.training.study import Cell, run_local
+from beliefscope.filters.training.train import PLANS, train
 from beliefscope.inspect.trace import Trace, arrays_of, begin, load_trace, save_trace, trace
+from beliefscope.inspect.traces.live_file import GrowingReader
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording

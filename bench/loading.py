@@ -19,8 +19,8 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.batch import Statistics, Steps
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.train import PLANS
-from beliefscope.filters.trainer import Trainer
+from beliefscope.filters.training.stages import Trainer
+from beliefscope.filters.training.train import PLANS
 
 EPISODES, WRITTEN = 600, 20
 TURNS = 10

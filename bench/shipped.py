@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
 from beliefscope.filters.evaluate import evaluate
-from beliefscope.filters.trainer import BLACKOUTS
+from beliefscope.filters.training.stages import BLACKOUTS
 
 COLLECTED = {
     "door": "beliefscope collect door --episodes 600 --steps 100 --seed 1 -o door.h5",

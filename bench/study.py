@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.filters.study import TRIVIAL
+from beliefscope.filters.training.study import TRIVIAL
 
 TIMES_BETTER = 5.0
 """Than the training mean, for what fuses, on the place and with whole pictures."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from beliefscope.datasets import own
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.push import PUSH
-from beliefscope.datasets.push_real import PUSH_REAL_TASKS
+from beliefscope.datasets.io import user_code
+from beliefscope.datasets.readers.push_real_task import PUSH_REAL_TASKS
+from beliefscope.datasets.simulation.door import DOOR
+from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.datasets.task import Task
 
 TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, *PUSH_REAL_TASKS)}
@@ -42,7 +42,7 @@ def _foreign(name: str) -> Task:
     place, _, attribute = name.rpartition(":")
     key = (str(Path(place).resolve()) if place.endswith(".py") else place, attribute)
     if key not in _FOREIGN:
-        module = own.run(place)
+        module = user_code.run(place)
         task = getattr(module, attribute, None)
         if not isinstance(task, Task):
             found = ", ".join(n for n, value in vars(module).items() if isinstance(value, Task)) or "none"

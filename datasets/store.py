@@ -14,18 +14,18 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.authors import AuthorsFiles, is_authors
 from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
-from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.hdf5 import DAMAGE, SHIPPED, Sink, damaged, look_over, open_hdf5, trust
-from beliefscope.datasets.mit_push import MitPushes, is_mit
-from beliefscope.datasets.push_real import PUSH_REAL, PUSH_REAL_TASKS
-from beliefscope.datasets.stored import check_claim
+from beliefscope.datasets.io.atomic_write import unwritable
+from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.datasets.readers.hdf5_guard import DAMAGE, SHIPPED, Sink, damaged, look_over, open_hdf5, trust
+from beliefscope.datasets.readers.hdf5_limits import check_claim
+from beliefscope.datasets.readers.mit_push import MitPushes, is_mit
+from beliefscope.datasets.readers.paper_authors import AuthorsFiles, is_authors
+from beliefscope.datasets.readers.push_real_task import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.writing import unwritable
 
 FORMAT = "beliefscope-episodes"
 VERSION = 1

@@ -13,7 +13,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import one_of
 
 if TYPE_CHECKING:
-    from beliefscope.datasets.camera import Camera
+    from beliefscope.datasets.simulation.camera import Camera
 
 Unit = Literal["m", "rad"]
 Array = NDArray[np.float64]

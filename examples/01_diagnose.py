@@ -6,11 +6,11 @@ python examples/01_diagnose.py [DIR]; with a folder, a figure of each answer is 
 import sys
 from pathlib import Path
 
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.plotting import write_figure
+from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.trace import trace
 
 checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))

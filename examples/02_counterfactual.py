@@ -6,13 +6,13 @@ python examples/02_counterfactual.py [FIGURE.pdf]; all edits are compared with o
 import sys
 from pathlib import Path
 
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.counterfactual import compare
-from beliefscope.inspect.plotting import write_figure
-from beliefscope.inspect.replay import Edit, Replay
+from beliefscope.inspect.compare.counterfactual import compare
+from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.trace import trace
+from beliefscope.inspect.traces.replay import Edit, Replay
 
 checkpoint = load_checkpoint(shipped("push", "crossmodal-pf"))
 with open_dataset(sample_path("push")) as data:

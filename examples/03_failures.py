@@ -3,11 +3,11 @@
 import sys
 from pathlib import Path
 
-from beliefscope.app.link import moment_link
+from beliefscope.app.protocol.permalinks import moment_link
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.failures import find_failures
-from beliefscope.inspect.plotting import write_figure
+from beliefscope.inspect.diagnostics.plotting import write_figure
+from beliefscope.inspect.failures.moments import find_failures
 
 checkpoint = load_checkpoint(shipped("push", "crossmodal-pf"))
 with open_dataset(sample_path("push")) as data:

@@ -10,11 +10,11 @@ import torch
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import one_of
 from beliefscope.datasets.task import Task
-from beliefscope.filters.ekf import ExtendedKalmanFilter
 from beliefscope.filters.filter import Architecture, Filter, Kind
-from beliefscope.filters.lstm import Lstm
-from beliefscope.filters.pf import ParticleFilter
-from beliefscope.filters.ukf import UnscentedKalmanFilter
+from beliefscope.filters.models.ekf import ExtendedKalmanFilter
+from beliefscope.filters.models.lstm import Lstm
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.ukf import UnscentedKalmanFilter
 
 KINDS: dict[Kind, type[Filter]] = {
     "ekf": ExtendedKalmanFilter,

@@ -19,10 +19,10 @@ from safetensors.torch import save
 from torch.overrides import TorchFunctionMode
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.document import read_json
 from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.writing import write_atomically
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.filter import Architecture, Filter, Kind
 

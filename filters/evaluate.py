@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import WHOLE, Recipe
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
+from beliefscope.filters.external.load import Foreign
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.foreign import Foreign
 from beliefscope.filters.rollout import rollout, start_at_truth
 
 LEFT_OUT = 30

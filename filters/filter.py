@@ -15,10 +15,10 @@ from beliefscope.datasets.errors import BadInput, one_of
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Statistics
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
-from beliefscope.filters.dynamics import Dynamics
-from beliefscope.filters.fusion import CovarianceRule
-from beliefscope.filters.networks import Encoders, Pooling, Residual, Stack
-from beliefscope.filters.resample import Resampling
+from beliefscope.filters.models.dynamics import Dynamics
+from beliefscope.filters.models.fusion import CovarianceRule
+from beliefscope.filters.models.networks import Encoders, Pooling, Residual, Stack
+from beliefscope.filters.models.resampling import Resampling
 
 Kind = Literal["ekf", "ukf", "pf", "lstm"]
 Fusion = Literal["crossmodal", "unimodal", "none"]

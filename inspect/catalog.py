@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect import consistency, maps, particles, saliency, shapley, weights
-from beliefscope.inspect.diagnostic import Diagnostic, Entry
+from beliefscope.inspect.diagnostics import (
+    consistency,
+    likelihood_maps,
+    particle_health,
+    saliency,
+    shapley,
+    weight_audit,
+)
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.trace import Trace
 
 ENTRIES: tuple[Entry, ...] = (
-    maps.ENTRY,
-    weights.ENTRY,
+    likelihood_maps.ENTRY,
+    weight_audit.ENTRY,
     consistency.ENTRY,
-    particles.ENTRY,
+    particle_health.ENTRY,
     shapley.ENTRY,
     saliency.ENTRY,
 )

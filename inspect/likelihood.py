@@ -14,11 +14,11 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.foreign import Foreign
-from beliefscope.filters.fusion import mixture
-from beliefscope.filters.pf import ParticleFilter
-from beliefscope.inspect.cells import Cells, one_thread
-from beliefscope.inspect.measures import wrapped
+from beliefscope.filters.external.load import Foreign
+from beliefscope.filters.models.fusion import mixture
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.inspect.maps.grid import Cells, one_thread
+from beliefscope.inspect.statistics.measures import wrapped
 from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float32]

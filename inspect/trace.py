@@ -15,20 +15,20 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
-from beliefscope.datasets.corrupt import WHOLE, Recipe
-from beliefscope.datasets.document import read_json
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.writing import write_atomically
+from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, moments
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import Foreign
 from beliefscope.filters.filter import Filter, Kind
-from beliefscope.filters.foreign import Foreign
-from beliefscope.filters.pf import ParticleFilter
-from beliefscope.filters.resample import effective_sample_size
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.resampling import effective_sample_size
 from beliefscope.filters.rollout import rollout, start_at_truth
-from beliefscope.inspect.intact import check_intact
+from beliefscope.inspect.traces.validate import check_intact
 
 Array = NDArray[np.float32]
 FORMAT = 1
@@ -148,7 +148,7 @@ def trace(
         BadInput: the episode does not fit the checkpoint's task, the recipe does not, or a setting is out of range.
     """
     if isinstance(checkpoint, Foreign):
-        from beliefscope.inspect.foreign import trace_foreign  # which builds upon this module
+        from beliefscope.inspect.traces.foreign import trace_foreign  # which builds upon this module
 
         return trace_foreign(checkpoint, episode, episode_index, seed, recipe, progress)
     run = begin(checkpoint, episode, episode_index, seed, particles, recipe)

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.writing import write_atomically
-from beliefscope.inspect.diagnostic import as_json
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.inspect.diagnostics.base import as_json
 from beliefscope.inspect.trace import Trace, arrays_of, header_of
-from beliefscope.recordings.columns import Column, columns
-from beliefscope.recordings.drawing import plane_height
+from beliefscope.recordings.rerun_log.columns import Column, columns
+from beliefscope.recordings.rerun_log.entities import plane_height
 
 NAME = "beliefscope"
 """Of what is kept beside the numbers: Parquet's and MCAP's metadata, an array of the npz."""

@@ -24,15 +24,15 @@ from torch import Tensor
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.adapter import Values, checked, derived, named
 from beliefscope.filters.batch import check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.foreign import model_names
-from beliefscope.inspect.foreign import with_unknown
-from beliefscope.inspect.growing import SUFFIX, GrowingWriter
+from beliefscope.filters.external.adapter import Values, checked, derived, named
+from beliefscope.filters.external.load import model_names
 from beliefscope.inspect.trace import Trace, assemble
-from beliefscope.recordings.liveviews import LiveViews, write_live
+from beliefscope.inspect.traces.foreign import with_unknown
+from beliefscope.inspect.traces.live_file import SUFFIX, GrowingWriter
+from beliefscope.recordings.rerun_log.live_views import LiveViews, write_live
 
 FOLDER = Path("workspace/live")
 WAITING = 1000

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.intact import check_intact
 from beliefscope.inspect.trace import Trace, stored_recipe
-from beliefscope.recordings.describe import properties_of, reading
+from beliefscope.inspect.traces.validate import check_intact
+from beliefscope.recordings.rerun_log.metadata import properties_of, reading
 from beliefscope.recordings.schema import (
     APPLICATION,
     FORMAT_VERSION,

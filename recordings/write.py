@@ -29,17 +29,17 @@ import beliefscope
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.atomic_write import unwritable
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.writing import unwritable
-from beliefscope.inspect.diagnostic import Diagnostic
-from beliefscope.inspect.growing import STATIC
+from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_of
-from beliefscope.recordings import drawing
-from beliefscope.recordings.blueprint import blueprint
-from beliefscope.recordings.bodies import Bodies
-from beliefscope.recordings.diagnostics import log_diagnostic
-from beliefscope.recordings.maps import map_columns, map_style
+from beliefscope.inspect.traces.live_file import STATIC
+from beliefscope.recordings.rerun_log import entities
+from beliefscope.recordings.rerun_log.blueprint import blueprint
+from beliefscope.recordings.rerun_log.bodies import Bodies
+from beliefscope.recordings.rerun_log.diagnostics import log_diagnostic
+from beliefscope.recordings.rerun_log.maps import map_columns, map_style
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
 
 STEPS_PER_CHUNK, CHUNKS = 100, 100
@@ -233,9 +233,9 @@ def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task, steps: in
             height, width = array.shape[1:]
             gray = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8")
             stream.log(f"observations/{key}", rr.Image.from_fields(format=gray), static=True)
-    for path, what in drawing.style(trace, task):
+    for path, what in entities.style(trace, task):
         stream.log(path, what, static=True)
-    stream.log("about", drawing.about(trace, task, steps), static=True)
+    stream.log("about", entities.about(trace, task, steps), static=True)
 
 
 def send_steps(
@@ -247,7 +247,7 @@ def send_steps(
         steps: of the trace, from and to. offset: which step of the run the trace's first is, where it is only a part.
             A part that is not the run's beginning begins at least one step before ``steps``: what changed is told.
     """
-    times = drawing.time_columns(np.arange(steps.start, steps.stop) + offset, trace.episode.dt)
+    times = entities.time_columns(np.arange(steps.start, steps.stop) + offset, trace.episode.dt)
     for path, static, array in stored_arrays(trace):
         if not static:
             rows = array[steps]
@@ -256,16 +256,16 @@ def send_steps(
     for key, array in trace.episode.observations.items():
         rows = array[steps]
         columns = (
-            rr.Image.columns(buffer=list(rows.reshape(len(rows), -1))) if is_picture(array) else drawing.series(rows)
+            rr.Image.columns(buffer=list(rows.reshape(len(rows), -1))) if is_picture(array) else entities.series(rows)
         )
         stream.send_columns(f"observations/{key}", times, columns)
-    for path, columns in drawing.columns(trace, task, steps):
+    for path, columns in entities.columns(trace, task, steps):
         stream.send_columns(path, times, columns)
     for path, columns in bodies.columns(trace.episode.qpos[steps]):
         stream.send_columns(path, times, columns)
-    changes, states = drawing.contact_changes(trace, steps)
+    changes, states = entities.contact_changes(trace, steps)
     if len(changes):
-        stream.send_columns("contact", drawing.time_columns(changes + offset, trace.episode.dt), states)
+        stream.send_columns("contact", entities.time_columns(changes + offset, trace.episode.dt), states)
 
 
 def _send_maps(
@@ -276,7 +276,7 @@ def _send_maps(
             raise BadInput(f"map of step {one.step}: the trace has steps 0 to {len(trace) - 1}.")
         if one.layers != layers or one.log_likelihood.shape != maps[0].log_likelihood.shape:
             raise BadInput(f"map of step {one.step}: all maps of a recording have one size and one set of layers.")
-    times = drawing.time_columns(np.array([one.step for one in maps]), trace.episode.dt)
+    times = entities.time_columns(np.array([one.step for one in maps]), trace.episode.dt)
     for path, columns in map_columns(maps, trace, task):
         stream.send_columns(path, times, columns)
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from beliefscope.app.cli import main
+from beliefscope.app.cli.main import main
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import save_checkpoint

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from beliefscope.app.cli import COMMANDS, cli, main
+from beliefscope.app.cli.main import COMMANDS, cli, main
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
@@ -95,7 +95,7 @@ def test_version(run: Run) -> None:
 
 def test_help_imports_nothing_heavy() -> None:
     heavy = {"torch", "mujoco", "h5py", "rerun", "fastapi", "uvicorn", "viser", "mjviser", "numpy", "rich"}
-    code = f"import sys, beliefscope.app.cli; print(*sorted(set(sys.modules) & {heavy}))"
+    code = f"import sys, beliefscope.app.cli.main; print(*sorted(set(sys.modules) & {heavy}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.split() == []
 

@@ -62,7 +62,7 @@ def test_readme_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_sheet_of_keys_has_every_key() -> None:
     page = ROOT / "app" / "page"
-    (table,) = re.findall(r"    keys\(\{\n(.*?)\n    \}\);", (page / "main.js").read_text(), re.DOTALL)
+    (table,) = re.findall(r"    keys\(\{\n(.*?)\n    \}\);", (page / "core" / "main.js").read_text(), re.DOTALL)
     does = {key.strip("'") for key in re.findall(r"^      ('.+?'|\w+):", table, re.MULTILINE)}
     (sheet,) = re.findall(r'<dialog id="keys".*?</dialog>', (page / "index.html").read_text(), re.DOTALL)
     said = {unescape(key) for key in re.findall(r"<kbd>(.*?)</kbd>", sheet)}

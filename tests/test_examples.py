@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beliefscope.app.cli import main
-from beliefscope.app.library import Library, Selection, Settings
+from beliefscope.app.cli.main import main
+from beliefscope.app.runs.trace_store import Library, Selection, Settings
 from beliefscope.datasets import catalog
 from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.growing import load_live
 from beliefscope.inspect.trace import load_trace, trace
+from beliefscope.inspect.traces.live_file import load_live
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_task.py"
 SPEC = f"{EXAMPLE}:TASK"

@@ -16,7 +16,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.torch import load_file, save
 
-from beliefscope.app.shelf import shelves
+from beliefscope.app.runs.catalog import shelves
 from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
@@ -138,7 +138,7 @@ def test_a_file_that_claims_too_much_is_refused(tmp_path: Path) -> None:
 SINKS = re.compile(r"\.(?:inner|outer)HTML\s*\+?=(?!=)\s*([^;]*)|insertAdjacentHTML|document\.write|srcdoc")
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "app" / "page").glob("*.js")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted((ROOT / "app" / "page").rglob("*.js")), ids=lambda path: path.name)
 def test_markup_is_written_by_constants_alone(path: Path) -> None:
     """Whatever becomes HTML is a text in the script itself, with nothing put into it."""
     text = path.read_text()

@@ -15,10 +15,10 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save
 from starlette.testclient import TestClient
 
-from beliefscope.app.children import Child, keep
-from beliefscope.app.jobs import Job, Jobs
-from beliefscope.app.library import Settings
-from beliefscope.app.server import create_app
+from beliefscope.app.jobs.queue import Job, Jobs
+from beliefscope.app.runs.kept_filters import Child, keep
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.server.main import create_app
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped

@@ -13,8 +13,8 @@ import pytest
 import uvicorn
 from starlette.testclient import TestClient, WebSocketTestSession
 
-from beliefscope.app.server import Settings, create_app
-from beliefscope.datasets.door import DOOR
+from beliefscope.app.server.main import Settings, create_app
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import write_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build

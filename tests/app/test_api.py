@@ -13,8 +13,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope import __version__
-from beliefscope.app.server import Settings
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.app.server.main import Settings
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.inspect.trace import load_trace
 
 OpenClient = Callable[..., TestClient]

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.drawing import OUTLINES
-from beliefscope.app.library import Selection, Settings
-from beliefscope.app.scene import Scene
-from beliefscope.app.server import create_app
-from beliefscope.app.shadow import dashed
-from beliefscope.datasets.corrupt import Recipe
-from beliefscope.inspect.replay import Edit
+from beliefscope.app.runs.trace_store import Selection, Settings
+from beliefscope.app.server.main import create_app
+from beliefscope.app.views.scene import Scene
+from beliefscope.app.views.scene_belief import OUTLINES
+from beliefscope.app.views.scene_comparison import dashed
+from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.inspect.traces.replay import Edit
 
 ORIGIN = "http://localhost:8000"
 EPISODE = 9

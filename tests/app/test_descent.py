@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.children import Child, keep
-from beliefscope.app.finetune import offered
-from beliefscope.app.library import Library
-from beliefscope.app.server import Settings
+from beliefscope.app.api.finetune import offered
+from beliefscope.app.runs.kept_filters import Child, keep
+from beliefscope.app.runs.trace_store import Library
+from beliefscope.app.server.main import Settings
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 
 MIX = [{"slice": {"name": "haptics alone"}, "share": 1.0}]

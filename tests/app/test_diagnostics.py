@@ -12,14 +12,14 @@ from urllib.parse import parse_qsl
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app import diagnostics
-from beliefscope.app.library import Settings
-from beliefscope.app.server import create_app
+from beliefscope.app.api import diagnostics
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.server.main import create_app
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnostic import VIEWS, Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import VIEWS, Diagnostic, Entry
 from beliefscope.inspect.trace import trace
 
 ORIGIN = "http://localhost:8000"

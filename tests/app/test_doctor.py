@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from beliefscope.app import doctor, server
-from beliefscope.app.doctor import CHECKS, Finding, Place, changed, examined, report, sums
+from beliefscope.app.cli import checks as doctor
+from beliefscope.app.cli.checks import CHECKS, Finding, Place, changed, examined, report, sums
+from beliefscope.app.server import main
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import PRETRAINED
 
@@ -89,19 +90,19 @@ def test_a_damaged_weight_is_named(tmp_path: Path, place: Place, monkeypatch: py
     assert "door-crossmodal-ekf.safetensors, door-image-ekf.safetensors not as shipped" in found.says
 
 
-@pytest.mark.parametrize("gone", ["heatmap.js", "maps.css", "index.html"])
+@pytest.mark.parametrize("gone", ["maps/maps.js", "styles/maps.css", "index.html"])
 def test_a_page_that_lacks_a_file_is_seen(
     gone: str, tmp_path: Path, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As in a wheel whose page was left out: the server starts, and has nothing to show."""
-    shutil.copytree(server.PAGE, tmp_path / "page")
-    monkeypatch.setattr(server, "PAGE", tmp_path / "page")
+    shutil.copytree(main.PAGE, tmp_path / "page")
+    monkeypatch.setattr(main, "PAGE", tmp_path / "page")
     monkeypatch.setattr(doctor, "CHECKS", (doctor.page,))
     assert examined(place)["page"].state == "ok"
     (tmp_path / "page" / gone).unlink()
     found = examined(place)["page"]
     assert found.state == "failed"
-    assert gone in found.says
+    assert Path(gone).name in found.says
 
 
 def test_a_package_of_another_version_is_named(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:

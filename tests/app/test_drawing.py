@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beliefscope.app.drawing import OUTLINES, modality_shares
-from beliefscope.app.scenery import LOG_SHOWN, around, hand, paint
-from beliefscope.app.wire import LAYERS, Look, layers, look, viewpoint
+from beliefscope.app.protocol.messages import LAYERS, Look, layers, look, viewpoint
+from beliefscope.app.views.scene_belief import OUTLINES, modality_shares
+from beliefscope.app.views.scene_context import LOG_SHOWN, around, hand, paint
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.replay import model_of
+from beliefscope.datasets.simulation.door import DOOR
+from beliefscope.datasets.simulation.replay import model_of
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.diagnostics.plotting import colour_table
 from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.plotting import colour_table
 from beliefscope.inspect.trace import Trace, trace
 
 

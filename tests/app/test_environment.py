@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.library import Settings
-from beliefscope.app.shelf import short_names
+from beliefscope.app.runs.catalog import short_names
+from beliefscope.app.runs.trace_store import Settings
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import sample_path
 
@@ -43,8 +43,8 @@ def test_a_result_that_cannot_be_written_is_one_line() -> None:
 ASCII = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 DRAWN = """
 from pathlib import Path
-from beliefscope.app import pagefiles
-assert "\\u2026" in pagefiles._index(Path(pagefiles.__file__).parent / "page", "version").decode()
+from beliefscope.app.server import static_files
+assert "\\u2026" in static_files._index(Path(static_files.__file__).parent / "page", "version").decode()
 """
 
 

@@ -9,10 +9,10 @@ from urllib.parse import parse_qs
 
 import pytest
 
-from beliefscope.app.cli import main
-from beliefscope.app.link import moment_link
-from beliefscope.app.server import Settings
-from beliefscope.datasets.door import DOOR
+from beliefscope.app.cli.main import main
+from beliefscope.app.protocol.permalinks import moment_link
+from beliefscope.app.server.main import Settings
+from beliefscope.datasets.simulation.door import DOOR
 
 Run = Callable[..., tuple[int, str, str]]
 

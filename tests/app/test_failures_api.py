@@ -11,11 +11,11 @@ from urllib.parse import parse_qsl
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.failures import LISTED, document
-from beliefscope.app.library import Library
-from beliefscope.app.server import Settings
-from beliefscope.datasets.corrupt import Recipe
-from beliefscope.inspect.failures import survey_of
+from beliefscope.app.api.failures import LISTED, document
+from beliefscope.app.runs.trace_store import Library
+from beliefscope.app.server.main import Settings
+from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.inspect.failures.moments import survey_of
 
 PATIENCE = 90.0  # s: a job imports PyTorch first
 URL = "/api/failures/door/crossmodal-ekf"

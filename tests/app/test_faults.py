@@ -26,13 +26,13 @@ import torch
 from starlette.testclient import TestClient
 from websockets.sync.client import connect
 
-from beliefscope.app import jobs as jobs_module
-from beliefscope.app.jobs import Job, Jobs
-from beliefscope.app.library import Settings
-from beliefscope.app.server import create_app
-from beliefscope.app.session import Views
-from beliefscope.datasets.door import DOOR
+from beliefscope.app.jobs import queue as jobs_module
+from beliefscope.app.jobs.queue import Job, Jobs
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.server.main import create_app
+from beliefscope.app.views.view import Views
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 from beliefscope.inspect.trace import Trace, save_trace, trace

@@ -12,8 +12,8 @@ from urllib.parse import parse_qsl
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.finetune import Diary
-from beliefscope.app.server import Settings
+from beliefscope.app.api.finetune import Diary
+from beliefscope.app.server.main import Settings
 from beliefscope.filters.checkpoint import load_checkpoint
 
 PATIENCE = 120.0  # s: a job imports PyTorch first

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.cli import main
-from beliefscope.app.server import Settings
-from beliefscope.filters.foreign import load_foreign
+from beliefscope.app.cli.main import main
+from beliefscope.app.server.main import Settings
+from beliefscope.filters.external.load import load_foreign
 from beliefscope.inspect.trace import load_trace
 from beliefscope.recordings.read import read_recording
 

@@ -14,7 +14,7 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from beliefscope.app.jobs import Job, Jobs, QueueFull, routes
+from beliefscope.app.jobs.queue import Job, Jobs, QueueFull, routes
 from beliefscope.datasets.errors import BadInput
 
 KINDS = {name: f"work_for_tests:{name}" for name in ("add", "wait", "crash", "vanish", "refuse", "hopeless")}

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.server import Settings
+from beliefscope.app.server.main import Settings
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.door import DOOR
-from beliefscope.datasets.push import PUSH
+from beliefscope.datasets.simulation.door import DOOR
+from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.datasets.store import write_dataset
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Steps

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.leftovers import ABANDONED, FOLDERS, sweep
-from beliefscope.app.library import Settings
-from beliefscope.datasets.door import DOOR
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.workspace.partial_files import ABANDONED, FOLDERS, sweep
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.datasets.writing import write_atomically
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.write import write_recording

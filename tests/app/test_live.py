@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 
-from beliefscope.app.library import Selection, Settings
-from beliefscope.app.live import PATIENCE
-from beliefscope.app.wire import columns, pictures
+from beliefscope.app.api.live import PATIENCE
+from beliefscope.app.protocol.messages import columns, pictures
+from beliefscope.app.runs.trace_store import Selection, Settings
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.failures import failures_of
-from beliefscope.inspect.growing import GrowingReader, GrowingWriter
-from beliefscope.inspect.survey import Survey
+from beliefscope.inspect.failures.moments import failures_of
+from beliefscope.inspect.failures.step_scores import Survey
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_of
+from beliefscope.inspect.traces.live_file import GrowingReader, GrowingWriter
 from beliefscope.recordings.read import read_recording
 
 STEPS = 24
@@ -137,7 +137,7 @@ def test_a_page_that_does_not_ask_costs_nothing(address: str, settings: Any, who
 def test_one_message_is_bounded(client: TestClient, writer: GrowingWriter, whole: Trace, monkeypatch: Any) -> None:
     """However long the run: the page asks again for the rest."""
     writer.append(whole)
-    monkeypatch.setattr("beliefscope.app.live.BLOCK", 5 * writer_row(writer))
+    monkeypatch.setattr("beliefscope.app.api.live.BLOCK", 5 * writer_row(writer))
     first, parts = 0, []
     with client.websocket_connect("/api/live/run") as socket:
         while first < STEPS:

@@ -21,17 +21,17 @@ from starlette.testclient import TestClient
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from beliefscope.app import library as library_module
-from beliefscope.app import recordings
-from beliefscope.app import selection as selection_module
-from beliefscope.app.desk import Desk, Turns
-from beliefscope.app.library import TRACES_IN_MEMORY, Library, Selection
-from beliefscope.app.rrdabout import About, Reader
-from beliefscope.app.selection import Traced
-from beliefscope.app.server import Settings
-from beliefscope.app.session import AHEAD, Views
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.app.api import recordings
+from beliefscope.app.runs import selection as selection_module
+from beliefscope.app.runs import trace_store as library_module
+from beliefscope.app.runs.selection import Traced
+from beliefscope.app.runs.trace_store import TRACES_IN_MEMORY, Library, Selection
+from beliefscope.app.server.main import Settings
+from beliefscope.app.views.scheduler import Desk, Turns
+from beliefscope.app.views.view import AHEAD, Views
+from beliefscope.app.workspace.recording_probe import About, Reader
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 
 PATIENCE = 30.0  # s
 

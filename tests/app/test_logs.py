@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app import logs
-from beliefscope.app.jobs import Jobs
-from beliefscope.app.logs import REFUSED, Enough
+from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.server import logs
+from beliefscope.app.server.logs import REFUSED, Enough
 
 log = logging.getLogger("beliefscope.app")
 

@@ -16,9 +16,9 @@ from fastapi import FastAPI
 from starlette.testclient import TestClient
 from starlette.types import Message
 
-from beliefscope.app.jobs import Job
-from beliefscope.app.security import kept_file
-from beliefscope.app.server import Settings
+from beliefscope.app.jobs.queue import Job
+from beliefscope.app.server.main import Settings
+from beliefscope.app.server.security import kept_file
 
 SECRET = "what lies outside"
 EVIL = (
@@ -116,7 +116,7 @@ def test_no_name_leads_out_of_the_workspace(client: TestClient, outside: Path) -
 
 @pytest.mark.parametrize("path", ["/static/{}", "/vendor/uplot/{}", "/{}"])
 def test_nor_out_of_the_page(client: TestClient, outside: Path, path: str) -> None:
-    for evil in (*EVIL, "../server.py", "..%2fserver.py", "%2e%2e/server.py", "../../app/server.py"):
+    for evil in (*EVIL, "../server.py", "..%2fserver.py", "%2e%2e/server.py", "../../app/server/main.py"):
         status, told = ask(client, "GET", path.format(evil.format(outside=quote(str(outside)[1:], safe=""))), b"")
         assert status == 404 or (status, path) == (200, "/{}"), evil
         assert b"create_app" not in told

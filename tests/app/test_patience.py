@@ -12,8 +12,8 @@ import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
 
-from beliefscope.app import patience, server
-from beliefscope.app.patience import PARTS, PatientProtocol, PatientSocket
+from beliefscope.app.server import main, timeouts
+from beliefscope.app.server.timeouts import PARTS, PatientProtocol, PatientSocket
 
 SECONDS = 20.0
 UPGRADE = (
@@ -39,9 +39,9 @@ async def _listens(scope: Scope, receive: Receive, send: Send) -> None:
 @pytest.fixture
 def running(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
     """Listens as ``serve`` does, with few buffers, and gives up half a second after nothing is taken any more."""
-    monkeypatch.setattr(server, "READ_PATIENCE", 500)
+    monkeypatch.setattr(main, "READ_PATIENCE", 500)
     config = uvicorn.Config(_listens, log_level="critical", http=PatientProtocol, ws=PatientSocket, lifespan="off")
-    with server._bound("127.0.0.1", 0) as listener:
+    with main._bound("127.0.0.1", 0) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 14)
         running = uvicorn.Server(config)
         thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
@@ -94,7 +94,7 @@ def test_what_is_no_websocket_is_closed(running: uvicorn.Server, head: str) -> N
 def test_there_are_so_many_connections_sockets_among_them(
     running: uvicorn.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patience, "CONNECTIONS", 2)
+    monkeypatch.setattr(timeouts, "CONNECTIONS", 2)
     first, second = called(running, SOCKET), called(running, SOCKET)
     assert first.recv(12) == second.recv(12) == b"HTTP/1.1 101"
     with called(running, "") as third:

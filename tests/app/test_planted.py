@@ -14,10 +14,10 @@ from urllib.parse import quote
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.jobs import Jobs
-from beliefscope.app.record import content
-from beliefscope.app.selection import Selection
-from beliefscope.app.server import Settings
+from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.runs.selection import Selection
+from beliefscope.app.server.main import Settings
+from beliefscope.app.workspace.json_files import content
 
 PATIENCE = 60.0  # s
 REPORT = "door-crossmodal-ekf-episode{}-0123abcd"

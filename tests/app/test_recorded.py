@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app import rrdfiles
-from beliefscope.app.library import Settings
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.workspace import recordings as rrdfiles
 
 URL = "/api/recordings"
 PATIENCE = 120.0  # s: a job imports PyTorch first

@@ -15,17 +15,18 @@ import pytest
 import rerun as rr
 from starlette.testclient import TestClient
 
-from beliefscope.app import recordings, trash
-from beliefscope.app.library import Settings
-from beliefscope.app.rrdabout import About, Reader
-from beliefscope.app.rrdfiles import checked
-from beliefscope.datasets.door import DOOR
+from beliefscope.app.api import recordings
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.workspace import trash
+from beliefscope.app.workspace.recording_probe import About, Reader
+from beliefscope.app.workspace.recordings import checked
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.trace import trace
-from beliefscope.recordings.describe import describe
 from beliefscope.recordings.read import read_recording
+from beliefscope.recordings.rerun_log.metadata import describe
 from beliefscope.recordings.write import write_recording
 
 URL = "/api/recordings"

@@ -11,8 +11,8 @@ from urllib.parse import parse_qs
 import numpy as np
 from starlette.testclient import TestClient
 
-from beliefscope.app.library import Settings
-from beliefscope.datasets.door import DOOR
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.trace import trace

@@ -9,8 +9,8 @@ from typing import Any
 from httpx import Response
 from starlette.testclient import TestClient
 
-from beliefscope.app.library import Settings
-from beliefscope.app.server import create_app
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.server.main import create_app
 
 ORIGIN = "http://localhost:8000"
 PATIENCE = 120.0  # s: a job imports PyTorch first

@@ -21,9 +21,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from beliefscope.app.proxy import BROWSERS, EmbeddedViser
-from beliefscope.app.server import Settings
-from beliefscope.app.session import Views
+from beliefscope.app.server.main import Settings
+from beliefscope.app.views.embedded_viser import BROWSERS, EmbeddedViser
+from beliefscope.app.views.view import Views
 
 PROTOCOL = f"viser-v{viser.__version__}"
 
@@ -95,7 +95,7 @@ def test_the_scene_comes_through_our_own_port(address: str) -> None:
     before = listening()
     view = open_view(address)
     with urlopen(f"http://{address}{view['scene']}") as page:
-        ours, _, others = page.read().partition(b'<script src="/static/frame.js"></script>')
+        ours, _, others = page.read().partition(b'<script src="/static/scene/viser_frame_throttle.js"></script>')
     assert b"<script" not in ours
     assert b"<script" in others
     assert b'<div id="root">' in others
@@ -240,7 +240,7 @@ def anyio_backend() -> str:
 
 @pytest.mark.anyio
 async def test_views_are_bounded_and_the_idle_ones_go(settings: Settings) -> None:
-    from beliefscope.app.library import Library
+    from beliefscope.app.runs.trace_store import Library
     from beliefscope.datasets.errors import BadInput
 
     views = Views(Library(settings), limit=2)
@@ -259,7 +259,7 @@ async def test_views_are_bounded_and_the_idle_ones_go(settings: Settings) -> Non
 
 
 def test_pages_that_come_at_once_are_no_more_than_there_may_be(settings: Settings) -> None:
-    from beliefscope.app.library import Library
+    from beliefscope.app.runs.trace_store import Library
 
     async def scenario() -> None:
         views = Views(Library(settings), limit=2)

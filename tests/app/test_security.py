@@ -13,10 +13,10 @@ from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
-from beliefscope.app import security
-from beliefscope.app.access import Access
-from beliefscope.app.security import MAX_BODY, Guard
-from beliefscope.app.server import Settings, create_app
+from beliefscope.app.server import security
+from beliefscope.app.server.auth import Access
+from beliefscope.app.server.main import Settings, create_app
+from beliefscope.app.server.security import MAX_BODY, Guard
 
 JSON = {"content-type": "application/json"}
 
@@ -138,7 +138,7 @@ ALWAYS = {
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/healthz", "/api/catalog", "/nowhere", "/api/trace/door/none/0", "/static/main.js"]
+    "path", ["/", "/healthz", "/api/catalog", "/nowhere", "/api/trace/door/none/0", "/static/core/main.js"]
 )
 def test_every_answer_has_the_security_headers(client: TestClient, path: str) -> None:
     headers = client.get(path).headers

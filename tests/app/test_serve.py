@@ -21,11 +21,11 @@ import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
 
-from beliefscope.app import patience
-from beliefscope.app.commands.serve import _opening
-from beliefscope.app.jobs import Jobs
-from beliefscope.app.patience import PatientProtocol
-from beliefscope.app.server import Settings, create_app
+from beliefscope.app.cli.commands.serve import _opening
+from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.server import timeouts
+from beliefscope.app.server.main import Settings, create_app
+from beliefscope.app.server.timeouts import PatientProtocol
 
 PATIENCE = 60.0  # s
 
@@ -120,7 +120,7 @@ async def _says_yes(scope: Scope, receive: Receive, send: Send) -> None:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
     """Address of a server that waits half a second for the head of a request."""
-    monkeypatch.setattr(patience, "HEAD_PATIENCE", 0.5)
+    monkeypatch.setattr(timeouts, "HEAD_PATIENCE", 0.5)
     config = uvicorn.Config(_says_yes, port=0, log_level="error", http=PatientProtocol, lifespan="off")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 import shutil
 import signal
@@ -16,10 +17,10 @@ import pytest
 from starlette.requests import Request
 from starlette.testclient import TestClient
 
-from beliefscope.app.access import Access
-from beliefscope.app.pagefiles import PageFiles
-from beliefscope.app.server import PAGE, Settings, _bound, serve
-from beliefscope.app.vendor import RerunViewer, installed, without_names
+from beliefscope.app.server.auth import Access
+from beliefscope.app.server.main import PAGE, Settings, _bound, serve
+from beliefscope.app.server.static_files import PageFiles
+from beliefscope.app.server.vendor_files import RerunViewer, installed, without_names
 from beliefscope.datasets.errors import BadInput
 
 # A module with a type section, a `name` section and another custom section.
@@ -89,22 +90,24 @@ def test_files_come_with_their_type_and_are_revalidated(
 
 def test_the_page_names_its_modules_by_what_is_in_them(client: TestClient) -> None:
     page = client.get("/").text
-    named = re.findall(r'<link rel="modulepreload" href="(/static/[0-9a-f]+/([\w.]+))">', page)
-    assert {name for _, name in named} >= {"main.js", "api.js", "mapvalues.js"}
+    named = re.findall(r'<link rel="modulepreload" href="(/static/[0-9a-f]+/([\w./]+))">', page)
+    assert {name for _, name in named} >= {"core/main.js", "data/api.js", "maps/map_values.js"}
     assert len({name for _, name in named}) == len(named)
     for address, name in named:
         answer = client.get(address)
         assert "immutable" in answer.headers["cache-control"]
         assert answer.content == (PAGE / name).read_bytes()
         # Whatever it imports is named too, so that none is found out late.
-        assert set(re.findall(r"^import .* from '\./([\w.]+)'", answer.text, re.MULTILINE)) <= {n for _, n in named}
+        imported = re.findall(r"^import .* from '(\.[\w./]+)'", answer.text, re.MULTILINE)
+        assert {posixpath.normpath(f"{posixpath.dirname(name)}/{other}") for other in imported} <= {n for _, n in named}
     # The name of another content is not kept: a browser with an old page does not hold on to the new file.
-    assert client.get("/static/0123456789ab/main.js").headers["cache-control"] == "no-cache"
+    assert client.get("/static/0123456789ab/core/main.js").headers["cache-control"] == "no-cache"
 
 
 def test_a_file_that_is_edited_has_another_name(tmp_path: Path) -> None:
-    (tmp_path / "index.html").write_text('<head><script src="/static/main.js"></script></head>')
-    (tmp_path / "main.js").write_text("import { a } from './a.js';")
+    (tmp_path / "index.html").write_text('<head><script src="/static/core/main.js"></script></head>')
+    (tmp_path / "core").mkdir()
+    (tmp_path / "core" / "main.js").write_text("import { a } from '../a.js';")
     (tmp_path / "a.js").write_text("export const a = 1;")
     files = PageFiles(tmp_path)
     before = bytes(files.index(request("br")).body)
@@ -143,7 +146,7 @@ def test_an_impossible_address_is_one_clear_line(settings: Settings, host: str, 
 def test_a_signal_ends_the_server_in_peace(settings: Settings) -> None:
     """Also without the command; of that, and of other signals, ``test_serve.py``."""
     code = (
-        "from pathlib import Path; from beliefscope.app.server import Settings, serve; "
+        "from pathlib import Path; from beliefscope.app.server.main import Settings, serve; "
         f"data = {{'mine': Path({str(settings.data['mine'])!r})}}; "
         f"serve(Settings(Path({str(settings.workspace)!r}), data=data), port=0)"
     )

@@ -12,13 +12,13 @@ import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 
-from beliefscope.app.library import Traced
-from beliefscope.app.mapwire import LOG_RANGE, quantised
-from beliefscope.app.server import Settings
+from beliefscope.app.protocol.map_format import LOG_RANGE, quantised
+from beliefscope.app.runs.trace_store import Traced
+from beliefscope.app.server.main import Settings
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.likelihood import MapEngine
-from beliefscope.inspect.mapnumbers import measure_maps
-from beliefscope.inspect.measures import particle_log_weights
+from beliefscope.inspect.maps.statistics import measure_maps
+from beliefscope.inspect.statistics.measures import particle_log_weights
 from beliefscope.inspect.trace import load_trace
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from beliefscope.app.server import Settings
-from beliefscope.app.shelf import SAMPLE, shelves, short_names
+from beliefscope.app.runs.catalog import SAMPLE, shelves, short_names
+from beliefscope.app.server.main import Settings
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import write_dataset
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import architecture, build

@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.commands.study import matrix, write
-from beliefscope.app.library import Settings
-from beliefscope.app.study import FILE, SHIPPED, Study, studies_of
+from beliefscope.app.api.studies import FILE, SHIPPED, Study, studies_of
+from beliefscope.app.cli.commands.study import matrix, write
+from beliefscope.app.runs.trace_store import Settings
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
-from beliefscope.filters.study import run_cell
+from beliefscope.filters.training.study import run_cell
 
 FILTER = "crossmodal-ekf"
 

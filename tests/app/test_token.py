@@ -12,9 +12,9 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
-from beliefscope.app import logs
-from beliefscope.app.access import PERIOD, SHORTEST, TRIES, VARIABLE, Access, SignIn, TooMany, names_of, token_for
-from beliefscope.app.server import Settings, create_app, serve
+from beliefscope.app.server import logs
+from beliefscope.app.server.auth import PERIOD, SHORTEST, TRIES, VARIABLE, Access, SignIn, TooMany, names_of, token_for
+from beliefscope.app.server.main import Settings, create_app, serve
 from beliefscope.datasets.errors import BadInput
 
 TOKEN = "k7-Zq0_long-enough-to-be-one"
@@ -36,7 +36,7 @@ def signed_in(client: TestClient) -> TestClient:
     return client
 
 
-@pytest.mark.parametrize("path", ["/api/catalog", "/static/main.js", "/vendor/rerun/viewer.js", "/nowhere"])
+@pytest.mark.parametrize("path", ["/api/catalog", "/static/core/main.js", "/vendor/rerun/viewer.js", "/nowhere"])
 def test_without_a_token_nothing_is_told(client: TestClient, path: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 401
@@ -50,7 +50,7 @@ def test_the_page_asks_for_it(client: TestClient) -> None:
     assert answer.status_code == 401
     assert answer.headers["content-type"].startswith("text/html")
     assert 'name="token"' in answer.text
-    assert "main.js" not in answer.text
+    assert "core/main.js" not in answer.text
     led = client.get("/", params={"task": "push", "recipe": 'a&b="<c>'})  # a link of a report's, for one
     assert '<a href="/?task=push&amp;recipe=a%26b%3D%22%3Cc%3E">go on</a>' in led.text
     assert answer.headers["cache-control"] == "no-store"

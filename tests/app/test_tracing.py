@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from beliefscope.app.library import Library, Selection, Settings
-from beliefscope.app.tracing import Tracer
+from beliefscope.app.runs.trace_store import Library, Selection, Settings
+from beliefscope.app.runs.trace_worker import Tracer
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.trace import arrays_of, header_of
 

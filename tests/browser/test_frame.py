@@ -1,4 +1,4 @@
-"""What the scene's frame does with the animation frames that viser asks for (app/page/frame.js)."""
+"""Throttling of viser's animation frames in the scene (app/page/scene/viser_frame_throttle.js)."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ import pytest
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
-from beliefscope.inspect.mapnumbers import measure_maps
+from beliefscope.inspect.maps.statistics import measure_maps
 from beliefscope.inspect.trace import Trace, trace
 
 pytestmark = pytest.mark.browser

@@ -16,7 +16,7 @@ HEAD = f"?filter=crossmodal-ekf&episode={EPISODE}&step=40"
 MINUS = "\N{MINUS SIGN}"
 
 OTHER = """async () => {
-  const api = await import('/static/api.js');
+  const api = await import('/static/data/api.js');
   const { task: name, data, episode } = beliefscope.state();
   const task = (await api.catalog()).tasks.find((t) => t.name === name);
   const selection = { task: name, filter: 'unimodal-ekf', data, episode, recipe: '' };

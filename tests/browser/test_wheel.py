@@ -77,7 +77,7 @@ def test_it_holds_everything(wheel: Path, tree: Path) -> None:
 
 
 def test_it_is_well_where_it_is_installed(installed: Path, tmp_path: Path) -> None:
-    show = "import beliefscope.app.cli as c; print(c.__file__)"
+    show = "import beliefscope.app.cli.main as c; print(c.__file__)"
     run = [installed.with_name("python"), "-c", show]
     found = subprocess.run(run, cwd="/", capture_output=True, text=True, check=True, timeout=120).stdout.strip()
     assert Path(found).is_relative_to(installed.parents[1])

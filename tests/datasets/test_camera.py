@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from beliefscope.datasets.camera import Camera, Picture, RayCaster
-from beliefscope.datasets.door import CAMERA, DoorPhysics, door_model
+from beliefscope.datasets.simulation.camera import Camera, Picture, RayCaster
+from beliefscope.datasets.simulation.door import CAMERA, DoorPhysics, door_model
 
 SNAPSHOT = """
 import hashlib, mujoco
-from beliefscope.datasets.camera import RayCaster
-from beliefscope.datasets.door import CAMERA, DoorPhysics, door_model
+from beliefscope.datasets.simulation.camera import RayCaster
+from beliefscope.datasets.simulation.door import CAMERA, DoorPhysics, door_model
 model = door_model(DoorPhysics((0.8, -0.3), 0.6))
 data = mujoco.MjData(model)
 mujoco.mj_kinematics(model, data)

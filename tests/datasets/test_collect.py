@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from beliefscope.datasets.collect import collect
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.collect import collect
 from beliefscope.datasets.store import open_dataset
 
 COLLECT = """
 import sys
-from beliefscope.datasets.collect import collect
+from beliefscope.datasets.simulation.collect import collect
 if __name__ == "__main__":
     collect("door", 400, 40, 11, 2, sys.argv[1])
 """

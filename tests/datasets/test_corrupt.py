@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import beliefscope
-from beliefscope.datasets.corrupt import READY, WHOLE, Recipe, broken_copies, described
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults import FAULTS, Fault, parameters
-from beliefscope.datasets.simulate import hand_controls
+from beliefscope.datasets.faults.faults import FAULTS, Fault, parameters
+from beliefscope.datasets.faults.recipe import READY, WHOLE, Recipe, broken_copies, described
+from beliefscope.datasets.simulation.door import DOOR
+from beliefscope.datasets.simulation.simulate import hand_controls
 from beliefscope.datasets.store import open_dataset, sample_path
 
 Array = np.ndarray[Any, Any]

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter
 
-from beliefscope.app.record import read_record
-from beliefscope.datasets.document import read_json
+from beliefscope.app.workspace.json_files import read_record
+from beliefscope.datasets.io.strict_json import read_json
 
 REFUSED = {
     "NaN": "NaN is no number",

@@ -8,8 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from beliefscope.datasets.control import HandController
-from beliefscope.datasets.door import (
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.controller import HandController
+from beliefscope.datasets.simulation.door import (
     DOOR,
     IMPEDANCE,
     MAX_ANGLE,
@@ -19,11 +21,9 @@ from beliefscope.datasets.door import (
     policy_of,
     simulate_door,
 )
-from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.replay import replay
-from beliefscope.datasets.sensors import HandSensors
-from beliefscope.datasets.simulate import hand_controls, quantise, split_of
+from beliefscope.datasets.simulation.replay import replay
+from beliefscope.datasets.simulation.sensors import HandSensors
+from beliefscope.datasets.simulation.simulate import hand_controls, quantise, split_of
 
 STEPS = 60
 PHYSICS = DoorPhysics((0.8, -0.3), 0.6)

@@ -13,12 +13,12 @@ import h5py
 import numpy as np
 import pytest
 
-from beliefscope.datasets import hdf5
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.hdf5 import SHIPPED, look_over, open_hdf5
+from beliefscope.datasets.io.atomic_write import unwritable
+from beliefscope.datasets.readers import hdf5_guard
+from beliefscope.datasets.readers.hdf5_guard import SHIPPED, look_over, open_hdf5
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.datasets.writing import unwritable
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def endless(path: Path) -> Path:
 def test_a_file_that_libhdf5_never_comes_back_from_is_refused_in_time(
     whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hdf5, "SECONDS", 0.5)
+    monkeypatch.setattr(hdf5_guard, "SECONDS", 0.5)
     path, began = endless(whole), time.process_time()
     for skip_bad in (False, True):  # the second time it is known
         with pytest.raises(BadInput, match=r"endless\.h5 cannot be read as HDF5 within 1 s: it is damaged"):
@@ -55,7 +55,7 @@ def test_a_file_that_libhdf5_never_comes_back_from_is_refused_in_time(
 def test_one_bad_file_among_many_is_found_and_the_others_are_read(
     tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hdf5, "SECONDS", 0.5)
+    monkeypatch.setattr(hdf5_guard, "SECONDS", 0.5)
     paths = [tmp_path / f"{name}.h5" for name in "abcd"]
     for number, path in enumerate(paths):  # files of their own, which this process has not written as a set
         path.write_bytes(whole.read_bytes())
@@ -75,7 +75,7 @@ def test_a_process_is_started_for_new_files_of_others_only(
 ) -> None:
     started: list[object] = []
     run = subprocess.run
-    monkeypatch.setattr(hdf5.subprocess, "run", lambda *a, **b: started.append(a) or run(*a, **b))
+    monkeypatch.setattr(hdf5_guard.subprocess, "run", lambda *a, **b: started.append(a) or run(*a, **b))
     (tmp_path / "text.h5").write_text("no HDF5")
     look_over([*SHIPPED.glob("*.h5"), whole, tmp_path / "text.h5", tmp_path / "gone.h5", tmp_path])
     assert not started, "what ships, what was just written, and what is no HDF5"
@@ -89,7 +89,7 @@ def test_a_process_is_started_for_new_files_of_others_only(
 FULL = """
 import resource, sys
 from pathlib import Path
-from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, write_dataset
 path, room = Path(sys.argv[1]), int(sys.argv[2])

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from beliefscope.datasets import looks
-from beliefscope.datasets.door import DoorPhysics, door_model
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.push import push_model
+from beliefscope.datasets.simulation import panda_meshes
+from beliefscope.datasets.simulation.door import DoorPhysics, door_model
+from beliefscope.datasets.simulation.push import push_model
 
 # A tetrahedron of 10 cm, its faces seen from outside.
 CORNERS = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
@@ -22,7 +22,7 @@ PHYSICS = DoorPhysics((0.8, -0.3), 0.6)
 
 def write_stl(path: Path, triangles: np.ndarray) -> None:
     """(F, 3, 3) m."""
-    solid = np.zeros(len(triangles), looks._STL)
+    solid = np.zeros(len(triangles), panda_meshes._STL)
     solid["corners"] = triangles
     path.write_bytes(b"\0" * 80 + len(triangles).to_bytes(4, "little") + solid.tobytes())
 
@@ -30,10 +30,10 @@ def write_stl(path: Path, triangles: np.ndarray) -> None:
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a package that holds the meshes, and cannot be imported."""
-    folder = tmp_path / looks.PACKAGE / looks.FOLDER
+    folder = tmp_path / panda_meshes.PACKAGE / panda_meshes.FOLDER
     folder.mkdir(parents=True)
-    (tmp_path / looks.PACKAGE / "__init__.py").write_text("raise ImportError('it is read, not imported')\n")
-    for name in set(looks.MESHES.values()):
+    (tmp_path / panda_meshes.PACKAGE / "__init__.py").write_text("raise ImportError('it is read, not imported')\n")
+    for name in set(panda_meshes.MESHES.values()):
         write_stl(folder / f"{name}.stl", CORNERS[FACES])
     monkeypatch.syspath_prepend(str(tmp_path))
     importlib.invalidate_caches()
@@ -43,7 +43,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is installed, whatever is."""
-    monkeypatch.setattr(looks, "PACKAGE", "no_such_package")
+    monkeypatch.setattr(panda_meshes, "PACKAGE", "no_such_package")
 
 
 def is_mesh(model: mujoco.MjModel) -> np.ndarray:
@@ -51,7 +51,7 @@ def is_mesh(model: mujoco.MjModel) -> np.ndarray:
 
 
 def test_without_the_package_the_shapes_are_what_is_seen(bare: None) -> None:
-    assert looks.mesh_folder() is None
+    assert panda_meshes.mesh_folder() is None
     dressed = door_model(PHYSICS, looks=True)
     assert not is_mesh(dressed).any()
     assert (dressed.geom_group == 0).all()
@@ -59,27 +59,27 @@ def test_without_the_package_the_shapes_are_what_is_seen(bare: None) -> None:
 
 @pytest.mark.parametrize("build", [lambda looks: door_model(PHYSICS, looks), push_model])
 def test_meshes_take_the_shapes_places_and_nothing_else(installed: Path, build: object) -> None:
-    assert looks.mesh_folder() == installed
+    assert panda_meshes.mesh_folder() == installed
     assert callable(build)
     plain, dressed = build(False), build(True)
     meshes = is_mesh(dressed)
     assert not is_mesh(plain).any()
     named = {dressed.body(b).name for b in dressed.geom_bodyid[meshes]}
-    assert named == set(looks.MESHES)
+    assert named == set(panda_meshes.MESHES)
     assert not dressed.geom_contype[meshes].any()
     assert not dressed.geom_conaffinity[meshes].any()
     ours = np.isin(dressed.geom_bodyid, dressed.geom_bodyid[meshes]) & ~meshes
-    assert (dressed.geom_group[ours] == looks.HIDDEN_GROUP).all()
+    assert (dressed.geom_group[ours] == panda_meshes.HIDDEN_GROUP).all()
     assert (dressed.geom_group[~ours] == 0).all()
     for quantity in ("body_mass", "body_inertia", "body_ipos", "body_pos", "body_quat", "jnt_range"):
         np.testing.assert_array_equal(getattr(dressed, quantity), getattr(plain, quantity))
-    assert dressed.ngeom == plain.ngeom + len(looks.MESHES)
+    assert dressed.ngeom == plain.ngeom + len(panda_meshes.MESHES)
 
 
 def test_vertices_of_one_cell_become_one(tmp_path: Path) -> None:
     # Each edge of the tetrahedron is halved a tenth of a cell beside its first corner: the slivers vanish.
     write_stl(tmp_path / "fine.stl", np.concatenate([CORNERS[FACES], CORNERS[FACES][:, [0, 0, 1]]]))
-    vertices, faces = looks.read_stl(tmp_path / "fine.stl")
+    vertices, faces = panda_meshes.read_stl(tmp_path / "fine.stl")
     assert sorted(map(tuple, vertices.round(6).tolist())) == sorted(map(tuple, CORNERS.round(6).tolist()))
     edges = vertices[faces]
     normals = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
@@ -91,4 +91,4 @@ def test_vertices_of_one_cell_become_one(tmp_path: Path) -> None:
 def test_another_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.stl").write_text("solid cube\nendsolid cube\n" * 20)
     with pytest.raises(BadInput, match=r"text\.stl is not a binary STL file"):
-        looks.read_stl(tmp_path / "text.stl")
+        panda_meshes.read_stl(tmp_path / "text.stl")

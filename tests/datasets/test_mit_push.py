@@ -16,8 +16,8 @@ import pytest
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.mit_push import AREA, read_push, stitch
-from beliefscope.datasets.push_real import (
+from beliefscope.datasets.readers.mit_push import AREA, read_push, stitch
+from beliefscope.datasets.readers.push_real_task import (
     CAMERA,
     CENTRE,
     OUTLINES,
@@ -30,7 +30,7 @@ from beliefscope.datasets.push_real import (
     gap,
     pictures,
 )
-from beliefscope.datasets.replay import replay
+from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.store import open_dataset, write_dataset
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "mit_push"

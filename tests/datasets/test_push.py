@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beliefscope.datasets.control import HandController
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.push import (
+from beliefscope.datasets.simulation.controller import HandController
+from beliefscope.datasets.simulation.push import (
     CAMERA,
     FRICTION,
     HALF_RANGE,
@@ -22,9 +22,9 @@ from beliefscope.datasets.push import (
     push_model,
     simulate_push,
 )
-from beliefscope.datasets.replay import replay
-from beliefscope.datasets.sensors import HandSensors
-from beliefscope.datasets.simulate import hand_controls
+from beliefscope.datasets.simulation.replay import replay
+from beliefscope.datasets.simulation.sensors import HandSensors
+from beliefscope.datasets.simulation.simulate import hand_controls
 from beliefscope.datasets.store import open_dataset, sample_path
 
 Array = NDArray[np.float64]

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beliefscope.datasets.control import HandController
-from beliefscope.datasets.door import HINGE_CENTRE, IMPEDANCE, DoorPhysics, door_model
-from beliefscope.datasets.robot import ARM_JOINTS, GRIP_OFFSET
-from beliefscope.datasets.sensors import HandSensors
+from beliefscope.datasets.simulation.controller import HandController
+from beliefscope.datasets.simulation.door import HINGE_CENTRE, IMPEDANCE, DoorPhysics, door_model
+from beliefscope.datasets.simulation.panda import ARM_JOINTS, GRIP_OFFSET
+from beliefscope.datasets.simulation.sensors import HandSensors
 
 FREE = np.array([0.45, 0.1, 0.6])  # away from everything
 

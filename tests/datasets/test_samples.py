@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beliefscope.datasets.door import HINGE_CENTRE, HINGE_HALF_RANGE, simulate_door
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.simulation.door import HINGE_CENTRE, HINGE_HALF_RANGE, simulate_door
 from beliefscope.datasets.store import open_dataset, sample_path
 
 Array = NDArray[np.float64]

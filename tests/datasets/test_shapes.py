@@ -5,10 +5,10 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from beliefscope.datasets.door import DoorPhysics, door_model
-from beliefscope.datasets.push import HEIGHT, RADIUS, push_model
-from beliefscope.datasets.push_real import block_model
-from beliefscope.datasets.shapes import shapes
+from beliefscope.datasets.readers.push_real_task import block_model
+from beliefscope.datasets.simulation.door import DoorPhysics, door_model
+from beliefscope.datasets.simulation.push import HEIGHT, RADIUS, push_model
+from beliefscope.datasets.simulation.shapes import shapes
 
 
 def test_every_shape_but_the_floor_is_there() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.statistics import AUTHORS, scale, statistics
 from beliefscope.datasets.store import open_dataset, sample_path
 

@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 import pytest
 
-from beliefscope.datasets import hdf5
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.hdf5 import look_over
+from beliefscope.datasets.readers import hdf5_guard
+from beliefscope.datasets.readers.hdf5_guard import look_over
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 STEPS = 7
@@ -152,7 +152,7 @@ def test_any_flipped_byte_is_noticed_or_harmless(path: Path, monkeypatch: pytest
         damaged[at] ^= 0xFF
         others.append(path.with_name(f"{at}.h5"))
         others[-1].write_bytes(damaged)
-    monkeypatch.setattr(hdf5, "SECONDS", 0.5)
+    monkeypatch.setattr(hdf5_guard, "SECONDS", 0.5)
     look_over(others)  # all at once
     for other in others:
         try:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from beliefscope.filters.belief import Evidence
-from beliefscope.filters.pf import ParticleFilter
+from beliefscope.filters.models.pf import ParticleFilter
 
 A = np.array([[0.9, 0.1, 0.0], [0.0, 0.8, 0.2], [0.1, 0.0, 0.7]])
 Q_STD = np.array([0.3, 0.2, 0.25])

@@ -10,19 +10,19 @@ import torch
 from torch import Tensor, nn
 
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian, Particles
 from beliefscope.filters.catalog import architecture, build, filters_of
-from beliefscope.filters.ekf import ExtendedKalmanFilter
 from beliefscope.filters.filter import Architecture, Filter
-from beliefscope.filters.lstm import Lstm
-from beliefscope.filters.networks import ImageEncoder, SpatialSoftmax
-from beliefscope.filters.pf import ParticleFilter
+from beliefscope.filters.models.ekf import ExtendedKalmanFilter
+from beliefscope.filters.models.lstm import Lstm
+from beliefscope.filters.models.networks import ImageEncoder, SpatialSoftmax
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.ukf import sigma_points, unscented
 from beliefscope.filters.rollout import Rollout, rollout, start_at_truth
-from beliefscope.filters.ukf import sigma_points, unscented
 
 MakeWindow = Callable[..., Batch]
 NAMES = tuple(filters_of(DOOR))

@@ -12,8 +12,8 @@ from torch import Tensor
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.draws import Common, normal, uniform
 from beliefscope.filters.filter import Filter
+from beliefscope.filters.models.common_random_numbers import Common, normal, uniform
 from beliefscope.filters.rollout import rollout, start_at_truth
 
 STEPS, PARTICLES = 6, 50

@@ -10,18 +10,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters import losses
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
-from beliefscope.filters.finetune import FineTune, FineTuned, finetune
-from beliefscope.filters.mix import Mix, Moment
-from beliefscope.filters.modules import chosen, freeze, tensors_of
-from beliefscope.filters.recall import numbered, recalling
-from beliefscope.filters.slices import NOMINAL, Slice
-from beliefscope.filters.tuning import Look, Tuning, score
+from beliefscope.filters.finetuning.batch_mix import Mix, Moment
+from beliefscope.filters.finetuning.finetune import FineTune, FineTuned, finetune
+from beliefscope.filters.finetuning.loop import Look, Tuning, score
+from beliefscope.filters.finetuning.module_selection import chosen, freeze, tensors_of
+from beliefscope.filters.finetuning.slices import NOMINAL, Slice
+from beliefscope.filters.training import losses
+from beliefscope.filters.training.encoder_cache import numbered, recalling
 
 DARK = Slice("dark", Recipe.parse("blackout=1"), only=("haptics",))
 TOUCH = Slice("touch", contact=True)

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from torch import nn
 
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.adapter import Adapter
-from beliefscope.filters.foreign import Foreign, load_foreign
+from beliefscope.filters.external.adapter import Adapter
+from beliefscope.filters.external.load import Foreign, load_foreign
 
 
 @pytest.fixture(scope="module")

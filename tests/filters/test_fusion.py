@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from beliefscope.filters.belief import Gaussian
-from beliefscope.filters.fusion import mixture, positive_definite, product_of_experts, weighted_average
+from beliefscope.filters.models.fusion import mixture, positive_definite, product_of_experts, weighted_average
 
 torch.manual_seed(0)
 

@@ -12,7 +12,7 @@ import torch
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import KINDS
 from beliefscope.filters.filter import Architecture
-from beliefscope.filters.resample import Resampling
+from beliefscope.filters.models.resampling import Resampling
 from beliefscope.filters.rollout import rollout
 
 sys.path.insert(0, str(Path(__file__).parent))

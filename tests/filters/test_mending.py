@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
-from beliefscope.filters.finetune import FineTune, finetune
-from beliefscope.filters.slices import Slice
+from beliefscope.filters.finetuning.finetune import FineTune, finetune
+from beliefscope.filters.finetuning.slices import Slice
 
 BIAS = Slice("bias", Recipe.parse("force_bias=5:y=5"), only=("haptics",))
 DARK = Slice("dark", Recipe.parse("blackout=0.95"))

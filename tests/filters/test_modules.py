@@ -12,7 +12,7 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.catalog import architecture, build, filters_of
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.modules import chosen, digest, freeze, moved, presets, tensors_of, tree
+from beliefscope.filters.finetuning.module_selection import chosen, digest, freeze, moved, presets, tensors_of, tree
 
 
 def door(name: str = "crossmodal-ekf") -> Filter:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from beliefscope.filters.dynamics import Dynamics
-from beliefscope.filters.resample import effective_sample_size, multinomial, resample, soft, systematic
+from beliefscope.filters.models.dynamics import Dynamics
+from beliefscope.filters.models.resampling import effective_sample_size, multinomial, resample, soft, systematic
 
 
 def test_jacobian_agrees_with_finite_differences() -> None:

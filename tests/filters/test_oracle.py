@@ -14,11 +14,11 @@ from torch import Tensor
 
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import KINDS
-from beliefscope.filters.dynamics import Dynamics
 from beliefscope.filters.filter import Architecture
-from beliefscope.filters.resample import systematic
+from beliefscope.filters.models.dynamics import Dynamics
+from beliefscope.filters.models.resampling import systematic
+from beliefscope.filters.models.ukf import ALPHA, BETA, KAPPA
 from beliefscope.filters.rollout import rollout
-from beliefscope.filters.ukf import ALPHA, BETA, KAPPA
 
 sys.path.insert(0, str(Path(__file__).parent))
 import linear

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
 from beliefscope.filters.evaluate import evaluate

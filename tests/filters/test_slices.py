@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults import FAULTS, parameters
+from beliefscope.datasets.faults.faults import FAULTS, parameters
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.finetuning.slices import NOMINAL, Slice, slices_of
 from beliefscope.filters.rollout import rollout, start_at_truth
-from beliefscope.filters.slices import NOMINAL, Slice, slices_of
 
 TEXTS = {
     "black-in-contact:recipe=blackout=1:contact=yes:only=haptics": Slice(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Statistics, Steps
 

@@ -27,16 +27,16 @@ from PIL import Image
 from scipy.stats import chi2
 from tensorboardX.proto.event_pb2 import Event
 
-from beliefscope.app.cli import main
+from beliefscope.app.cli.main import main
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
-from beliefscope.filters import study
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
-from beliefscope.filters.study import TRIVIAL, Cell, Row, nees_bounds, rows_of, run_cell, run_ray
-from beliefscope.filters.trainer import BLACKOUTS
-from beliefscope.recordings.figures import looks, results
+from beliefscope.filters.training import study
+from beliefscope.filters.training.stages import BLACKOUTS
+from beliefscope.filters.training.study import TRIVIAL, Cell, Row, nees_bounds, rows_of, run_cell, run_ray
+from beliefscope.recordings.rerun_log.figures import looks, results
 
 FILTERS = ("haptics-ekf", "lstm")
 NAMES = [f"door/{name}/seed{seed}" for seed in range(2) for name in FILTERS]

@@ -21,8 +21,8 @@ from valid import episodes
 from beliefscope.filters.catalog import architecture
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.finetune import FineTune, finetune
-from beliefscope.filters.train import PLANS, train
+from beliefscope.filters.finetuning.finetune import FineTune, finetune
+from beliefscope.filters.training.train import PLANS, train
 
 MAKE = """
 import sys, torch

@@ -14,9 +14,9 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build, filters_of
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
-from beliefscope.filters.networks import ImageEncoder
-from beliefscope.filters.train import PLANS, Plan, train
-from beliefscope.filters.trainer import Trainer
+from beliefscope.filters.models.networks import ImageEncoder
+from beliefscope.filters.training.stages import Trainer
+from beliefscope.filters.training.train import PLANS, Plan, train
 
 SMOKE = PLANS["smoke"]
 NAMES = tuple(filters_of(find_task("door")))

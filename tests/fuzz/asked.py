@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from schemathesis import GenerationMode
 from starlette.testclient import TestClient, WebSocketTestSession
 
-from beliefscope.app.jobs import Jobs
-from beliefscope.app.library import Settings
-from beliefscope.app.server import create_app
-from beliefscope.datasets.corrupt import READY
-from beliefscope.filters.finetune import FineTune
+from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.server.main import create_app
+from beliefscope.datasets.faults.recipe import READY
+from beliefscope.filters.finetuning.finetune import FineTune
 from beliefscope.inspect.catalog import DIAGNOSTICS
 
 ORIGIN = "http://localhost:8000"

@@ -23,22 +23,22 @@ import torch
 from fastapi import HTTPException
 from valid import AUTHORS, episodes, make_authors, make_episodes, make_push
 
-from beliefscope.app import children
-from beliefscope.app.finetune import routes as tuned_routes
-from beliefscope.app.jobs import Job, Jobs
-from beliefscope.app.library import Library, Settings
-from beliefscope.datasets.corrupt import READY, Recipe
+from beliefscope.app.api.finetune import routes as tuned_routes
+from beliefscope.app.jobs.queue import Job, Jobs
+from beliefscope.app.runs import kept_filters
+from beliefscope.app.runs.trace_store import Library, Settings
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import READY, Recipe
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
-from beliefscope.filters.kept import Partial
-from beliefscope.filters.study import Cell, rows_of, to_csv, to_markdown
-from beliefscope.filters.train import PLANS, train
-from beliefscope.inspect.diagnostic import as_json
-from beliefscope.inspect.growing import GrowingReader, GrowingWriter, load_live
+from beliefscope.filters.training.resume import Partial
+from beliefscope.filters.training.study import Cell, rows_of, to_csv, to_markdown
+from beliefscope.filters.training.train import PLANS, train
+from beliefscope.inspect.diagnostics.base import as_json
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
+from beliefscope.inspect.traces.live_file import GrowingReader, GrowingWriter, load_live
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
 
@@ -215,13 +215,13 @@ def read_job(path: Path) -> None:
 
 
 def make_children(path: Path) -> None:
-    own = children.Child("door", "mine", str(shipped("door", "image-ekf")), True)
+    own = kept_filters.Child("door", "mine", str(shipped("door", "image-ekf")), True)
     path.write_text(json.dumps([asdict(own)]))
 
 
 def read_children(path: Path) -> None:
-    shutil.copy(path, path.parent / children.FILE)
-    settings = children.with_children(Settings(path.parent))
+    shutil.copy(path, path.parent / kept_filters.FILE)
+    settings = kept_filters.with_children(Settings(path.parent))
     can_be_shown(settings.to_json())
     if not settings.checkpoints:
         raise BadInput("no child of ours")

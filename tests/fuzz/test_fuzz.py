@@ -14,7 +14,7 @@ import asked
 import mutate
 import readers
 
-from beliefscope.datasets import hdf5
+from beliefscope.datasets.readers import hdf5_guard
 
 SLOW = ("study", "mit-hdf5", "mit-json", "recording")
 """Whose valid file takes a training to make, whose pictures are taken, or whose reader can end this process."""
@@ -25,7 +25,7 @@ def test_nothing_but_bad_input_comes_out_of_a_reader(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if name in readers.HDF5:  # which another process goes over first: here they are only cut off, and edited
-        monkeypatch.setattr(hdf5, "is_foreign", lambda path: False)
+        monkeypatch.setattr(hdf5_guard, "is_foreign", lambda path: False)
         monkeypatch.setattr(mutate, "damaged", lambda data, rng: data[: rng.randrange(len(data))])
     readers.check_whole(name, tmp_path)
     came = [readers.attempt(name, seed=11, number=number, folder=tmp_path) for number in range(25)]

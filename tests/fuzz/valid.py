@@ -10,9 +10,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.mit_push import KEYS
+from beliefscope.datasets.readers.mit_push import KEYS
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 

@@ -14,22 +14,22 @@ import numpy as np
 import pytest
 import torch
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.slices import Slice
-from beliefscope.inspect.change import Change, change_of
-from beliefscope.inspect.differences import Difference, differences
-from beliefscope.inspect.drift import heard
-from beliefscope.inspect.measures import position_error
-from beliefscope.inspect.replay import Edit, Replay
-from beliefscope.inspect.tally import measures_of, spread
+from beliefscope.filters.finetuning.slices import Slice
+from beliefscope.inspect.compare.checkpoints import Change, change_of
+from beliefscope.inspect.compare.effects import Difference, differences
+from beliefscope.inspect.compare.modules import heard
+from beliefscope.inspect.statistics.episode_sums import measures_of, spread
+from beliefscope.inspect.statistics.measures import position_error
 from beliefscope.inspect.trace import trace
+from beliefscope.inspect.traces.replay import Edit, Replay
 
 EPISODES = (9, 19, 29, 39, 49, 59)
 """Of those held out: enough for intervals."""

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.comparison import Comparison, compare_runs
-from beliefscope.inspect.consistency import consistency
-from beliefscope.inspect.measures import nees
+from beliefscope.inspect.compare.two_runs import Comparison, compare_runs
+from beliefscope.inspect.diagnostics.consistency import consistency
+from beliefscope.inspect.statistics.measures import nees
 from beliefscope.inspect.trace import Trace, trace
 
 BROKEN = "blackout=0.5"

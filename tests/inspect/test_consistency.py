@@ -14,14 +14,14 @@ from scipy.stats import chi2, kstest, norm
 from statsmodels.stats.diagnostic import acorr_ljungbox
 from uncertainty_toolbox.metrics_scoring_rule import crps_gaussian
 
-from beliefscope.inspect.calibration import (
+from beliefscope.inspect.diagnostics.consistency import Consistency, consistency, innovations
+from beliefscope.inspect.statistics.calibration import (
     gaussian_crps,
     gaussian_level,
     ljung_box,
     particle_crps,
     particle_level,
 )
-from beliefscope.inspect.consistency import Consistency, consistency, innovations
 
 sys.path.insert(0, str(Path(__file__).parent))
 import planted as plant

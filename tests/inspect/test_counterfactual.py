@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.counterfactual import compare
+from beliefscope.inspect.compare.counterfactual import compare
 from beliefscope.inspect.likelihood import MapEngine
-from beliefscope.inspect.replay import Edit, Replay
 from beliefscope.inspect.trace import ARRAYS, Trace, trace
+from beliefscope.inspect.traces.replay import Edit, Replay
 
 
 @pytest.fixture(scope="module", params=("crossmodal-ekf", "crossmodal-pf"))

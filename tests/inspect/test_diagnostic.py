@@ -15,9 +15,9 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import LEFT_OUT
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnostic import Diagnostic, Entry, as_json
-from beliefscope.inspect.measures import blackout
-from beliefscope.inspect.plotting import write_figure
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry, as_json
+from beliefscope.inspect.diagnostics.plotting import write_figure
+from beliefscope.inspect.statistics.measures import blackout
 from beliefscope.inspect.trace import Trace
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -12,10 +12,10 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import LEFT_OUT, evaluate
-from beliefscope.inspect.diagnostic import as_json
-from beliefscope.inspect.episodes import POINTS, by_episode
-from beliefscope.inspect.failures import survey_of
-from beliefscope.inspect.survey import Survey
+from beliefscope.inspect.diagnostics.base import as_json
+from beliefscope.inspect.failures.by_episode import POINTS, by_episode
+from beliefscope.inspect.failures.moments import survey_of
+from beliefscope.inspect.failures.step_scores import Survey
 
 CHOSEN = (9, 19, 59)
 

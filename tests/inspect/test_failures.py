@@ -9,16 +9,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.inspect import measures
-from beliefscope.inspect.failures import failures_of, find_failures, stretches
-from beliefscope.inspect.survey import GROUPS, Survey, disagreement, scores_of
+from beliefscope.inspect.diagnostics.weight_audit import position_regret
+from beliefscope.inspect.failures.moments import failures_of, find_failures, stretches
+from beliefscope.inspect.failures.step_scores import GROUPS, Survey, disagreement, scores_of
+from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
-from beliefscope.inspect.weights import position_regret
 
 EPISODES = 5
 CUT = 60  # steps: enough for every group, and quick

@@ -12,16 +12,16 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.adapter import Adapter
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
-from beliefscope.filters.foreign import Foreign
+from beliefscope.filters.external.adapter import Adapter
+from beliefscope.filters.external.load import Foreign
 from beliefscope.inspect.likelihood import MapEngine, no_maps
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 

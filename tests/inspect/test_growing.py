@@ -18,8 +18,8 @@ import pytest
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.growing import MARK, GrowingReader, GrowingWriter
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, save_trace, trace, trace_of
+from beliefscope.inspect.traces.live_file import MARK, GrowingReader, GrowingWriter
 
 
 def cut(whole: Trace, first: int, last: int) -> Trace:
@@ -242,7 +242,7 @@ FULL = """
 import resource, sys
 from pathlib import Path
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.growing import GrowingReader, GrowingWriter
+from beliefscope.inspect.traces.live_file import GrowingReader, GrowingWriter
 from beliefscope.inspect.trace import load_trace
 whole = load_trace(sys.argv[1])
 path = Path(sys.argv[2])

@@ -10,7 +10,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.filters.pf import ParticleFilter
+from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
 from beliefscope.inspect.trace import trace
 

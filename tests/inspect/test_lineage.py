@@ -12,7 +12,7 @@ import torch
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
-from beliefscope.inspect.lineage import export, lineage_of
+from beliefscope.inspect.compare.lineage import export, lineage_of
 
 Run = Callable[[str], tuple[int, str, str]]
 ROOT = shipped("door", "crossmodal-ekf")

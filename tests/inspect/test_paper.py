@@ -14,9 +14,9 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
-from beliefscope.inspect import paper
+from beliefscope.inspect.diagnostics.plotting import write_figure
+from beliefscope.inspect.figures import paper
 from beliefscope.inspect.likelihood import MapEngine
-from beliefscope.inspect.plotting import write_figure
 from beliefscope.inspect.trace import Trace, trace
 
 SIZE = 21

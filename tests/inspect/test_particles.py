@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beliefscope.inspect.particles import ENTRY, modes, of_trace, particle_health
+from beliefscope.inspect.diagnostics.particle_health import ENTRY, modes, of_trace, particle_health
 from beliefscope.inspect.trace import Trace
 
 sys.path.insert(0, str(Path(__file__).parent))

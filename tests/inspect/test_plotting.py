@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from beliefscope.inspect.diagnostic import Picture, Plot
-from beliefscope.inspect.measures import stretches
-from beliefscope.inspect.plotting import draw_bands, png_of
+from beliefscope.inspect.diagnostics.base import Picture, Plot
+from beliefscope.inspect.diagnostics.plotting import draw_bands, png_of
+from beliefscope.inspect.statistics.measures import stretches
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import pytest
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.replay import Edit, Replay
 from beliefscope.inspect.trace import ARRAYS, trace
+from beliefscope.inspect.traces.replay import Edit, Replay
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ukf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"])

@@ -12,17 +12,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.pf import ParticleFilter
-from beliefscope.inspect import measures
-from beliefscope.inspect.moment import Moment, channel_names
-from beliefscope.inspect.replay import Edit, Replay
-from beliefscope.inspect.saliency import COMPLETE, ENTRY, LEAST, Saliency, integrate, occlude, saliency
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.inspect.diagnostics.saliency import COMPLETE, ENTRY, LEAST, Saliency, integrate, occlude, saliency
+from beliefscope.inspect.diagnostics.single_step import Moment, channel_names
+from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
+from beliefscope.inspect.traces.replay import Edit, Replay
 
 BLACK, SEEN = 15, 20
 """A step with a black picture, and one with a picture, both in contact."""

@@ -19,16 +19,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
-from beliefscope.inspect import measures, shapley
-from beliefscope.inspect.replay import Edit, Replay
-from beliefscope.inspect.shapley import MOST, members, run_subsets, shapley_weights
+from beliefscope.inspect.diagnostics import shapley
+from beliefscope.inspect.diagnostics.shapley import MOST, members, run_subsets, shapley_weights
+from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
+from beliefscope.inspect.traces.replay import Edit, Replay
 
 sys.path.insert(0, str(Path(__file__).parent))
 import planted as plant

@@ -10,13 +10,13 @@ import pytest
 from matplotlib.patches import Ellipse, Polygon
 
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.door import DOOR
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.diagnostics.plotting import write_figure
+from beliefscope.inspect.figures.top_view import footprint, outline, seen, snapshot
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
-from beliefscope.inspect.measures import contours
-from beliefscope.inspect.plotting import write_figure
-from beliefscope.inspect.snapshot import footprint, outline, seen, snapshot
+from beliefscope.inspect.statistics.measures import contours
 from beliefscope.inspect.trace import Trace, trace
 
 STEP = 25

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from beliefscope.datasets.corrupt import WHOLE, Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import WHOLE, Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped

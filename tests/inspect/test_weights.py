@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beliefscope.inspect.bootstrap import FEWEST, correlate, sums_of
+from beliefscope.inspect.diagnostics.weight_audit import ENTRY, audit, oracle_weights
+from beliefscope.inspect.statistics.bootstrap import FEWEST, correlate, sums_of
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.weights import ENTRY, audit, oracle_weights
 
 sys.path.insert(0, str(Path(__file__).parent))
 import planted as plant

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 

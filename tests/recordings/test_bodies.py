@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from beliefscope.datasets.door import DOOR
-from beliefscope.datasets.replay import replay
-from beliefscope.datasets.shapes import shapes
+from beliefscope.datasets.simulation.door import DOOR
+from beliefscope.datasets.simulation.replay import replay
+from beliefscope.datasets.simulation.shapes import shapes
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.solids import solid
+from beliefscope.inspect.figures.meshes import solid
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.recordings.write import write_recording
 

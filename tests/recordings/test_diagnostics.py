@@ -18,15 +18,15 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS, quick
-from beliefscope.inspect.diagnostic import Curve, Diagnostic, Picture, Plot, Table
+from beliefscope.inspect.diagnostics.base import Curve, Diagnostic, Picture, Plot, Table
 from beliefscope.inspect.trace import Trace, trace
-from beliefscope.recordings.diagnostics import diagnostic_tab, log_diagnostic, slug
 from beliefscope.recordings.read import read_recording
+from beliefscope.recordings.rerun_log.diagnostics import diagnostic_tab, log_diagnostic, slug
 from beliefscope.recordings.schema import SCHEMA, STEP, TIME
 from beliefscope.recordings.write import write_recording
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from beliefscope.datasets.door import DOOR
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint

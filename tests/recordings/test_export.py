@@ -15,15 +15,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from beliefscope.app.cli import main
-from beliefscope.datasets.corrupt import Recipe
+from beliefscope.app.cli.main import main
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.trace import Trace, arrays_of, load_trace, save_trace, trace
-from beliefscope.recordings.columns import columns
 from beliefscope.recordings.export import export_trace
+from beliefscope.recordings.rerun_log.columns import columns
 from beliefscope.recordings.write import write_recording
 
 Compare = Callable[[Trace, Trace], None]

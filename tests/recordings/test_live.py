@@ -19,16 +19,17 @@ import pytest
 import torch
 from rerun.chunk import RrdReader
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.inspect.growing import GrowingReader
 from beliefscope.inspect.trace import Trace, begin, load_trace, trace
-from beliefscope.recordings import live, liveviews, write
+from beliefscope.inspect.traces.live_file import GrowingReader
+from beliefscope.recordings import live, write
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.read import read_recording
+from beliefscope.recordings.rerun_log import live_views
 from beliefscope.recordings.write import write_recording
 
 Compare = Callable[[Trace, Trace], None]
@@ -186,16 +187,16 @@ def test_what_is_handed_over_may_change_afterwards(tmp_path: Path) -> None:
 
 
 def test_views_that_hang_keep_nothing_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    release, drawing, send = threading.Event(), threading.Event(), liveviews.send_part
+    release, drawing, send = threading.Event(), threading.Event(), live_views.send_part
 
     def hanging(*arguments: Any) -> None:
         drawing.set()
         assert release.wait(60)
         send(*arguments)
 
-    monkeypatch.setattr(liveviews, "send_part", hanging)
+    monkeypatch.setattr(live_views, "send_part", hanging)
     with LiveRecorder("run", task="door", folder=tmp_path) as recorder:
-        for _ in range(liveviews.DRAWN_AT_ONCE):
+        for _ in range(live_views.DRAWN_AT_ONCE):
             recorder.step(np.zeros(3), {})
         assert drawing.wait(60)
         for _ in range(500):
@@ -372,7 +373,7 @@ def test_a_kill_leaves_every_step_that_was_handed_over(run: Run, tmp_path: Path)
     np.testing.assert_array_equal(found.estimate_mean[:, 0], np.arange(47))
     assert run(f"import {tmp_path}/run.live -o {tmp_path}/run.trace")[0] == 0
     assert len(load_trace(tmp_path / "run.trace")) == 47
-    liveviews.write_live(tmp_path / "run.live", recording)
+    live_views.write_live(tmp_path / "run.live", recording)
     assert len(read_recording(recording)) == 47, "and the whole recording can be made of it"
 
 

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.foreign import load_foreign
-from beliefscope.inspect.growing import GrowingReader
+from beliefscope.filters.external.load import load_foreign
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, load_trace, trace
+from beliefscope.inspect.traces.live_file import GrowingReader
 from beliefscope.recordings.read import read_recording
 
 Compare = Callable[[Trace, Trace], None]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from beliefscope.datasets.corrupt import Recipe
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.recipe import Recipe
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings import write
 from beliefscope.recordings.read import read_recording

@@ -23,12 +23,12 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace, save_trace, trace
-from beliefscope.recordings.report import compose, write_report
-from beliefscope.recordings.reportfigures import zoom_of
-from beliefscope.recordings.reportfolder import FORMAT, new_folder
-from beliefscope.recordings.reportmath import mathml
-from beliefscope.recordings.reportparts import accuracy, moment_table, worst_moments
-from beliefscope.recordings.reporttext import definitions, methods
+from beliefscope.recordings.report.compose import compose, write_report
+from beliefscope.recordings.report.figures import zoom_of
+from beliefscope.recordings.report.folder import FORMAT, new_folder
+from beliefscope.recordings.report.mathml import mathml
+from beliefscope.recordings.report.sections import accuracy, moment_table, worst_moments
+from beliefscope.recordings.report.text import definitions, methods
 
 EPISODE = 9
 TITLE = 'Doors <script>alert("1")</script> & 40 %'

@@ -8,7 +8,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.tuning import tuning_curves
+from beliefscope.recordings.rerun_log.training_curves import tuning_curves
 
 LOOKS = {
     0: {"nominal/position_cm": 0.5, "dark touch/position_cm": 2.0},

@@ -1,0 +1,190 @@
+"""The real pushes: a robot's tip pushes a steel block over plywood; estimate where the block is.
+
+World axes: those of the robot's base, x away from it, y to its left, z up from the table; m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beliefscope.datasets.episode import Episode, FloatArray
+from beliefscope.datasets.errors import one_of
+from beliefscope.datasets.simulation.camera import Camera, Picture, RayCaster
+from beliefscope.datasets.task import Component, Ghost, Task
+
+Array = NDArray[np.float64]
+
+RATE = 18  # Hz
+CENTRE = (0.35, -0.03)  # of the table's part that is used, m
+HEIGHT = 0.013  # of every block
+TIP_RADIUS = 0.00475
+TOUCHING = 0.002
+"""A gap that still counts as contact, m: in contact, motion capture and outline disagree by 1 to 2 mm."""
+
+VIEW = 0.2  # half the side of the table's part that a picture shows, m
+CAMERA = Camera((*CENTRE, 0.8), (0, 0, -1), (1, 0, 0), float(2 * np.arctan(VIEW / 0.8)))
+
+
+def _ellipse(a: float, b: float) -> Array:
+    angles = np.arange(64) * (2 * np.pi / 64)
+    return np.stack([a * np.cos(angles), b * np.sin(angles)], 1)
+
+
+def _box(a: float, b: float) -> Array:
+    return np.array([(a, b), (-a, b), (-a, -b), (a, -b)])
+
+
+OUTLINES: dict[str, Array] = {
+    "rect1": _box(0.045, 0.045),
+    "rect2": _box(0.045, 0.05625),
+    "rect3": _box(0.0675, 0.045),
+    "tri1": np.array([(0.045, 0.045), (-0.0809, 0.045), (0.045, -0.0809)]),
+    "tri2": np.array([(0.045, 0.045), (-0.106, 0.045), (0.045, -0.0809)]),
+    "tri3": np.array([(0.045, 0.045), (-0.1315, 0.045), (0.045, -0.0806)]),
+    "ellip1": _ellipse(0.0525, 0.0525),
+    "ellip2": _ellipse(0.0525, 0.0654),
+    "ellip3": _ellipse(0.0525, 0.0785),
+    "hex": 0.0605 * np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], 1),
+}
+"""Shape -> (P, 2) corners of its convex outline in the block's own axes, counter-clockwise, m."""
+
+
+def gap(shape: str, poses: Array, tips: Array) -> Array:
+    """(T,) m between the tip's circle and the block's outline, negative where they overlap.
+
+    Args:
+        poses: (T, 3) the block's x, y (m) and yaw (rad). tips: (T, 2) the tip's centre, m; both world.
+    """
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    dx, dy = (tips - poses[:, :2]).T
+    local = np.stack([c * dx + s * dy, c * dy - s * dx], 1)[:, None]  # (T, 1, 2)
+    corner = OUTLINES[shape]
+    edge = np.roll(corner, -1, axis=0) - corner  # (P, 2)
+    along = np.clip(((local - corner) * edge).sum(-1) / (edge**2).sum(-1), 0, 1)  # (T, P)
+    nearest = np.linalg.norm(local - corner - along[..., None] * edge, axis=-1).min(1)
+    beyond = edge[:, 1] * (local - corner)[..., 0] - edge[:, 0] * (local - corner)[..., 1]
+    return np.where((beyond > 0).any(1), nearest, -nearest) - TIP_RADIUS
+
+
+def block_model(shape: str) -> mujoco.MjModel:
+    """Table, block and tip. qpos (5): the block's x, y and yaw, the tip's x and y."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    world = spec.worldbody
+    world.add_light(pos=(0, 0, 3.5), dir=(0, 0, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(3, 3, 0.1), rgba=(0.36, 0.3, 0.24, 1))
+    block = world.add_body(name="block", pos=(0, 0, HEIGHT / 2))
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    block.add_joint(name="block_x", type=slide, axis=(1, 0, 0))
+    block.add_joint(name="block_y", type=slide, axis=(0, 1, 0))
+    block.add_joint(name="block_yaw", type=hinge, axis=(0, 0, 1))
+    outline = OUTLINES[shape]
+    _add_prism(spec, block, "block", outline, HEIGHT / 2, (0.82, 0.84, 0.88, 1))
+    # A dark mark off the centre tells in a picture which way the block is turned.
+    mark = 0.35 * outline + [0.5 * outline[:, 0].max(), 0.0]
+    _add_prism(spec, block, "mark", mark, HEIGHT / 2 + 0.001, (0.12, 0.14, 0.2, 1))
+    tip = world.add_body(name="tip", pos=(0, 0, 0.06))
+    tip.add_joint(name="tip_x", type=slide, axis=(1, 0, 0))
+    tip.add_joint(name="tip_y", type=slide, axis=(0, 1, 0))
+    tip.add_geom(
+        name="tip", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=(TIP_RADIUS, 0.06, 0), rgba=(0.75, 0.42, 0.12, 1)
+    )
+    return spec.compile()
+
+
+def _add_prism(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, outline: Array, half: float, rgba: tuple[float, ...]
+) -> None:
+    corners = np.concatenate([np.column_stack([outline, np.full(len(outline), z)]) for z in (-half, half)])
+    spec.add_mesh(name=name, uservert=corners.ravel())
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba)
+
+
+def pictures(shape: str, qpos: NDArray[np.floating]) -> Picture:
+    """(T, 32, 32) uint8: the scene at joint positions (T, 5), from above, x upwards and y to the left."""
+    model = block_model(shape)
+    data, camera = mujoco.MjData(model), RayCaster(model, CAMERA)
+    taken = np.empty((len(qpos), CAMERA.size, CAMERA.size), np.uint8)
+    for step, joints in enumerate(qpos):
+        data.qpos[:] = joints
+        mujoco.mj_kinematics(model, data)
+        taken[step] = camera.picture(data)
+    return taken
+
+
+def replay(episode: Episode) -> mujoco.MjModel:
+    """Block and tip of an episode. Raises BadInput where its provenance names no shape that is known."""
+    shape = episode.provenance.get("shape")
+    if shape not in OUTLINES:
+        raise one_of("shape", str(shape), OUTLINES)
+    return block_model(str(shape))
+
+
+def post_ghost(states: ArrayLike) -> Ghost:
+    """A post on the block's centre for states (..., 2) = (x, y): which way the block is turned is not in the state."""
+    states = np.asarray(states, float)
+    return _ghost(states, np.zeros(states.shape[:-1]), (0.02, 0.02, 2 * HEIGHT))
+
+
+def block_ghost(states: ArrayLike) -> Ghost:
+    """The block ``rect1`` for states (..., 3) = (x, y, yaw): see ``Ghost``."""
+    states = np.asarray(states, float)
+    return _ghost(states, states[..., 2], (0.09, 0.09, HEIGHT))
+
+
+def _ghost(states: Array, yaw: Array, size: tuple[float, float, float]) -> Ghost:
+    zero = np.zeros_like(yaw)
+    return Ghost(
+        position=np.stack([states[..., 0], states[..., 1], np.full_like(yaw, size[2] / 2)], -1),
+        wxyz=np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], -1),
+        size=size,
+        anchor=np.stack([states[..., 0], states[..., 1], np.full_like(yaw, size[2])], -1),
+    )
+
+
+def _task(name: str, rate: int, yaw: bool) -> Task:
+    ghost: Callable[[ArrayLike], Ghost] = block_ghost if yaw else post_ghost
+    return Task(
+        name=name,
+        components=(Component("x", "m"), Component("y", "m"), *([Component("yaw", "rad")] if yaw else [])),
+        observations={"image": (32, 32), "effector_position": (3,), "force": (3,), "torque": (3,), "contact": (1,)},
+        modalities={"image": ("image",), "haptics": ("effector_position", "force", "torque", "contact")},
+        control_size=7,
+        dt=1 / rate,
+        map_components=("x", "y"),
+        map_half_width=0.135,
+        positions={"effector_position": (0, 1), "control": (0, 1)},
+        replay=replay,
+        ghost=ghost,
+        camera=CAMERA,
+    )
+
+
+PUSH_REAL = _task("push-real", RATE, yaw=False)
+PUSH_REAL_TASKS = (
+    PUSH_REAL,
+    _task("push-real-yaw", RATE, yaw=True),
+    _task("push-real-50hz", 50, yaw=False),
+    _task("push-real-yaw-50hz", 50, yaw=True),
+)
+"""The same pushes with the block's yaw as a third component, and at a higher rate."""
+
+
+def observed(tips: Array, force: Array, torque: Array, touching: NDArray[np.bool_]) -> dict[str, FloatArray]:
+    """Haptic observations by key, from the tip (T, 2) m, force (T, 2) N, torque about z (T,) N m, contact (T,).
+
+    The sensor has three channels: the force across the table and the torque about its normal. The others are zero, so
+    that ``force`` and ``torque`` mean the same in every task. The tip's height was not recorded: half the block's.
+    """
+    steps = len(tips)
+    position = np.column_stack([tips, np.full(steps, HEIGHT / 2)]).astype(np.float32)
+    return {
+        "effector_position": position,
+        "force": np.column_stack([force, np.zeros(steps)]).astype(np.float32),
+        "torque": np.column_stack([np.zeros((steps, 2)), torque]).astype(np.float32),
+        "contact": touching[:, None].astype(np.float32),
+    }

@@ -1,0 +1,106 @@
+"""How the hand moves a door. The policies know the door, as a person in front of it does, but must not give it away.
+
+Were the grasp always at the same radius, or the retreats always as far from the door, then the hand's position alone
+would tell the hinge. Hence the random radii, the wide retreats around where a door stands on average, and the noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from beliefscope.datasets.simulation.door import HINGE_CENTRE, MAX_ANGLE, DoorPhysics
+from beliefscope.datasets.simulation.simulate import Policy, Waypoint, random_speed, random_wait
+
+Vector = NDArray[np.float64]
+
+YAW_SHARE = 0.45  # of the door's angle that the hand turns along with it
+
+
+class _ByTheDoor(Policy):
+    """What both share. The hand turns with the door: else its side would meet the panel before its fingertips do."""
+
+    def __init__(self, door: DoorPhysics, rng: Generator, angles: tuple[float, float]) -> None:
+        self._door, self._rng = door, rng
+        self._start_angle = float(rng.uniform(*angles))
+        self.object_start = np.array([self._start_angle])
+
+    def yaw(self, joints: Vector) -> float:
+        return YAW_SHARE * float(joints[0])
+
+
+class Pull(_ByTheDoor):
+    """Holds the bar and moves along its arc to random angles, off the arc by a few centimetres."""
+
+    fingers = 0.016
+    squeeze = True
+
+    def __init__(self, door: DoorPhysics, rng: Generator) -> None:
+        super().__init__(door, rng, (0.0, 1.3))
+        self._radius = float(rng.uniform(0.25, 0.42))
+        self._goal = self._start_angle
+
+    def start(self) -> Vector:
+        return self._on_bar(self._start_angle)
+
+    def next(self, joints: Vector) -> Waypoint:
+        rng, angle = self._rng, float(joints[0])
+        if abs(self._goal - angle) < 0.12 or rng.random() < 0.15:
+            self._goal = float(rng.uniform(-0.1, MAX_ANGLE + 0.05))
+        angle_next = angle + float(np.clip(self._goal - angle, -0.35, 0.35))
+        noise = rng.normal(0.0, 0.03, 3)
+        return Waypoint(self._on_bar(angle_next) + noise, random_speed(rng), random_wait(rng))
+
+    def _on_bar(self, angle: float) -> Vector:
+        """(3,) m: where the hand holds the bar, which then lies clear of the tips of its fingers."""
+        return self._door.bar_point(angle, self._radius) + 0.006 * _inward(angle)
+
+
+class Push(_ByTheDoor):
+    """Pushes the bar with closed fingertips, draws back to some place, and comes again. A spring opens the door."""
+
+    fingers = 0.0
+    squeeze = False
+
+    def __init__(self, door: DoorPhysics, rng: Generator) -> None:
+        super().__init__(door, rng, (0.15, 1.45))
+        self._average = DoorPhysics(HINGE_CENTRE, door.bar_height)
+        self._radius = 0.0
+        self._queue: list[str] = []
+
+    def start(self) -> Vector:
+        return self._retreat(self._start_angle)
+
+    def next(self, joints: Vector) -> Waypoint:
+        rng, angle = self._rng, float(joints[0])
+        if not self._queue:
+            self._queue = ["touch", *["push"] * int(rng.integers(1, 3)), *["retreat"] * int(rng.integers(2, 5))]
+        move = self._queue.pop(0)
+        if move == "retreat":
+            return Waypoint(self._retreat(angle), max(0.12, random_speed(rng)), 2 * random_wait(rng))
+        if move == "touch":
+            self._radius = float(rng.uniform(0.23, 0.43))
+            target = self._door.bar_point(angle, self._radius) - 0.03 * _inward(angle)
+            target[2] += rng.normal(0.0, 0.006)
+            return Waypoint(target, max(0.08, random_speed(rng)), 0)
+        slip = rng.normal(0.0, 0.02, 3) * (1, 1, 0.5)
+        depth = float(rng.uniform(0.02, 0.16))
+        target = self._door.bar_point(angle, self._radius) + depth * _inward(angle) + slip
+        return Waypoint(target, max(0.05, random_speed(rng)), random_wait(rng) // 2)
+
+    def _retreat(self, angle: float) -> Vector:
+        """(3,) m: a place before the average door at this angle, and before this door too."""
+        rng = self._rng
+        inward = _inward(angle)
+        along = np.array([-inward[1], inward[0], 0.0])
+        away = self._average.bar_point(angle, float(rng.uniform(0.23, 0.43)))
+        away += -rng.uniform(0.06, 0.24) * inward + rng.uniform(-0.12, 0.12) * along
+        away[2] += rng.uniform(-0.1, 0.12)
+        clearance = float((self._door.bar_point(angle, 0.3) - away) @ inward)
+        return away - max(0.0, 0.04 - clearance) * inward
+
+
+def _inward(angle: float) -> Vector:
+    """Unit normal of the panel, away from the robot."""
+    return np.array([np.cos(angle), np.sin(angle), 0.0])

@@ -1,0 +1,78 @@
+"""The shapes of a MuJoCo model as points, for whoever draws it without MuJoCo: in a figure, in a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.simulation.panda_meshes import HIDDEN_GROUP
+
+Array = NDArray[np.float64]
+
+_TURN = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+_RIM = np.stack([np.cos(_TURN), np.sin(_TURN), np.zeros(24)], axis=1)
+_SLOPES = np.linspace(-np.pi / 2, np.pi / 2, 13)
+_BALL = np.concatenate([np.cos(slope) * _RIM + [0.0, 0.0, np.sin(slope)] for slope in _SLOPES[1:-1]])
+_BALL = np.concatenate([_BALL, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]])
+_BOX = np.array([[bit >> axis & 1 for axis in range(3)] for bit in range(8)]) * 2.0 - 1.0
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One geom of a model.
+
+    Attributes:
+        body: index of the body it moves with. name: that body's.
+        points: (V, 3) m, in the body's frame. faces: (F, 3) of a mesh; None: it is the convex hull of its points.
+        rgba: (4,) 0..1.
+    """
+
+    body: int
+    name: str
+    points: Array
+    faces: NDArray[np.int32] | None
+    rgba: Array
+
+
+def shapes(model: Any, looks: bool = True) -> list[Shape]:
+    """Every shape of a model (``mujoco.MjModel``) but its planes.
+
+    Args:
+        looks: those that are seen, meshes among them; else those that collide, which are there whatever is installed.
+    """
+    found = []
+    for geom in range(model.ngeom):
+        kind, body = int(model.geom_type[geom]), int(model.geom_bodyid[geom])
+        hidden = model.geom_group[geom] >= HIDDEN_GROUP
+        dressed = not (model.geom_contype[geom] or model.geom_conaffinity[geom]) and kind == mujoco.mjtGeom.mjGEOM_MESH
+        if kind == mujoco.mjtGeom.mjGEOM_PLANE or (hidden if looks else dressed):
+            continue
+        points, faces = _of(model, geom, kind)
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+        placed = points @ turn.reshape(3, 3).T + model.geom_pos[geom]
+        found.append(Shape(body, model.body(body).name, placed, faces, model.geom_rgba[geom].astype(float)))
+    return found
+
+
+def _of(model: Any, geom: int, kind: int) -> tuple[Array, NDArray[np.int32] | None]:
+    """Points in the geom's frame, and a mesh's faces."""
+    size, types = model.geom_size[geom].astype(float), mujoco.mjtGeom
+    if kind == types.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        face, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+        return model.mesh_vert[first : first + count].astype(float), model.mesh_face[face : face + faces].copy()
+    if kind == types.mjGEOM_BOX:
+        return _BOX * size, None
+    if kind == types.mjGEOM_SPHERE:
+        return _BALL * size[0], None
+    if kind == types.mjGEOM_ELLIPSOID:
+        return _BALL * size, None
+    end = size[0] * (_RIM if kind == types.mjGEOM_CYLINDER else _BALL[_BALL[:, 2] >= 0.0]) + size[1] * _UP
+    return np.concatenate([end, -end]), None

@@ -1,0 +1,216 @@
+"""The loop of every simulated trajectory: the policy decides, the controller acts, sensors and camera record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+import beliefscope
+from beliefscope.datasets.episode import Episode, FloatArray
+from beliefscope.datasets.simulation.camera import Camera, Picture, RayCaster
+from beliefscope.datasets.simulation.controller import HandController, Impedance
+from beliefscope.datasets.simulation.panda import ARM_JOINTS, FINGERS
+from beliefscope.datasets.simulation.sensors import HandSensors
+
+Vector = NDArray[np.float64]
+
+DT = 0.1  # s, of a step
+SETTLING_STEPS = 5  # before the record begins, so that a grasp has closed
+TURN = 0.05  # rad that the hand turns in a step, at most
+ROBOT_JOINTS = len(ARM_JOINTS) + len(FINGERS)  # they come first in qpos; the object's follow
+
+# The sensors' resolution, in powers of two so that the values compress: 15 um, 1 mN, 61 uN m, 15 urad.
+POSITION_BITS, FORCE_BITS, TORQUE_BITS, ANGLE_BITS = 16, 10, 14, 16
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """Where to send the hand (m, world), how fast the set point goes (m/s), and how many steps it waits there."""
+
+    position: Vector
+    speed: float
+    wait: int
+
+    def steps(self, start: Vector) -> int:
+        """Steps until the next waypoint: the way at this speed, at most 4 s of it, and the wait.
+
+        Time, not arrival, ends a waypoint: against a door at its stop the hand would never arrive.
+        """
+        way = float(np.linalg.norm(self.position - start))
+        return 1 + min(40, int(way / (DT * self.speed))) + self.wait
+
+    def approach(self, point: Vector, duration: float) -> Vector:
+        """(3,) m: ``point`` moved towards the waypoint for ``duration`` s."""
+        way = self.position - point
+        return point + way * min(1.0, self.speed * duration / max(float(np.linalg.norm(way)), 1e-9))
+
+
+class Policy(Protocol):
+    """Moves the hand. ``joints`` are the object's: what follows the robot's in qpos (rad, m, unit quaternions).
+
+    Attributes:
+        object_start: (j,) the object's joints at the start.
+        fingers: m of opening of each finger at the start. squeeze: whether they then close with their full force.
+    """
+
+    object_start: Vector
+    fingers: float
+    squeeze: bool
+
+    def start(self) -> Vector:
+        """(3,) m, world: where the hand starts."""
+
+    def next(self, joints: Vector) -> Waypoint:
+        """The next waypoint, whenever one is over."""
+
+    def yaw(self, joints: Vector) -> float:
+        """rad: how the hand should be turned about the vertical."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the loop is given of a task.
+
+    Attributes:
+        model: the robot and one object.
+        impedance: of the hand, as given to ``add_controller``. camera: what takes the pictures.
+    """
+
+    model: mujoco.MjModel
+    impedance: Impedance
+    camera: Camera
+
+
+def episode_rng(seed: int, index: int) -> Generator:
+    """All randomness of trajectory ``index`` of the collection with ``seed``."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+
+
+def simulate(
+    task: str,
+    scene: Scene,
+    policy: Policy,
+    states: Callable[[FloatArray], FloatArray],
+    seed: int,
+    index: int,
+    steps: int,
+    provenance: Mapping[str, Any],
+) -> Episode:
+    """Trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s.
+
+    Args:
+        states: (T, nq) recorded joint positions -> (T, n) true states.
+        provenance: what the replay needs, and what else is worth knowing, as JSON values.
+    """
+    log = _run(scene, policy, steps)
+    effector = quantise(np.stack(log.effector), POSITION_BITS)
+    wrench, contact = np.stack(log.wrench), np.array(log.contact)
+    qpos = quantise(np.stack(log.qpos), ANGLE_BITS)
+    touch = contact[:, None].astype(np.float32)
+    return Episode(
+        task=task,
+        states=states(qpos),
+        controls=hand_controls(effector, touch),
+        observations={
+            "image": np.stack(log.image),
+            "effector_position": effector,
+            "force": quantise(wrench[:, :3], FORCE_BITS),
+            "torque": quantise(wrench[:, 3:], TORQUE_BITS),
+            "contact": touch,
+        },
+        contact=contact,
+        qpos=qpos,
+        dt=DT,
+        seed=seed,
+        split=split_of(index),
+        provenance={
+            **provenance,
+            "spawn_index": index,
+            "beliefscope": beliefscope.__version__,
+            "mujoco": mujoco.__version__,
+        },
+    )
+
+
+def split_of(index: int) -> str:
+    """Of every ten trajectories, number 8 is for validation and number 9 for the test."""
+    return {8: "val", 9: "test"}.get(index % 10, "train")
+
+
+def quantise(values: NDArray[np.float64], bits: int) -> FloatArray:
+    """Round to multiples of 2^-bits; exact in float32 up to 2^(24 - bits)."""
+    return (np.rint(values * 2.0**bits) / 2.0**bits).astype(np.float32)
+
+
+def hand_controls(position: FloatArray, touch: FloatArray) -> FloatArray:
+    """(T, 7): previous hand position (T, 3), its change, touch (T, 1); the position before step 0 is that of step 0."""
+    previous = np.concatenate([position[:1], position[:-1]])
+    return np.concatenate([previous, position - previous, touch], axis=1)
+
+
+def random_speed(rng: Generator) -> float:
+    """3 to 25 cm/s, log-uniform."""
+    return float(0.03 * np.exp(rng.uniform(0.0, np.log(25 / 3))))
+
+
+def random_wait(rng: Generator) -> int:
+    """0 to 5 steps."""
+    return int(rng.integers(0, 6))
+
+
+@dataclass
+class _Log:
+    """One entry a step. ``wrench`` is the mean over the step; ``contact`` is true if there was any during it."""
+
+    image: list[Picture] = field(default_factory=list)
+    effector: list[Vector] = field(default_factory=list)
+    wrench: list[Vector] = field(default_factory=list)
+    contact: list[bool] = field(default_factory=list)
+    qpos: list[Vector] = field(default_factory=list)
+
+
+def _run(scene: Scene, policy: Policy, steps: int) -> _Log:
+    model = scene.model
+    data = mujoco.MjData(model)
+    controller, sensors = HandController(model, data, scene.impedance), HandSensors(model, data)
+    camera, log = RayCaster(model, scene.camera), _Log()
+    substeps = round(DT / model.opt.timestep)
+
+    data.qpos[ROBOT_JOINTS:] = policy.object_start
+    yaw = policy.yaw(policy.object_start)
+    # One push of a door in eighty would start out of reach. It then starts as near as the arm gets, and goes on.
+    controller.place(policy.start(), yaw)
+    controller.set_fingers(policy.fingers, policy.squeeze)
+    mujoco.mj_forward(model, data)
+    set_point = controller.position
+    for _ in range(SETTLING_STEPS):
+        controller.command(set_point, yaw)
+        mujoco.mj_step(model, data, substeps)
+
+    waypoint, left = Waypoint(set_point, 0.0, 0), 0
+    for _ in range(steps):
+        joints = np.array(data.qpos[ROBOT_JOINTS:])
+        if left == 0:
+            waypoint = policy.next(joints)
+            left = waypoint.steps(set_point)
+        left -= 1
+        set_point = controller.command(waypoint.approach(set_point, DT), yaw)
+        yaw += float(np.clip(policy.yaw(joints) - yaw, -TURN, TURN))
+        wrench, touched = np.zeros(6), False
+        for _ in range(substeps):
+            mujoco.mj_step(model, data)
+            wrench += sensors.wrench() / substeps
+            touched |= sensors.touching()
+        mujoco.mj_kinematics(model, data)
+        log.image.append(camera.picture(data))
+        log.effector.append(controller.position)
+        log.wrench.append(wrench)
+        log.contact.append(touched)
+        log.qpos.append(np.array(data.qpos))
+    return log

@@ -1,0 +1,70 @@
+"""The dynamics model that every filter shares."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from beliefscope.filters.models.networks import Residual, Stack, dual_linear, vector_stack
+
+
+class Dynamics(nn.Module):
+    """``x_t = x_{t-1} + f1(x_{t-1}, u_t) * sigmoid(f2(x_{t-1}, u_t))`` plus process noise (Lee et al., sec. V).
+
+    f1 is a vector, f2 a scalar gate, so that direction and size of the change are learned apart. State and control go
+    through three layers each; the seven that follow are shared. The first of these is kept as two summands, so that the
+    controls' part is computed once for all steps.
+    """
+
+    def __init__(self, n: int, control_size: int, units: int) -> None:
+        super().__init__()
+        self.n = n
+        self.state_encoder = vector_stack(n, units)
+        self.control_encoder = vector_stack(control_size, units)
+        self.join_state = nn.Linear(units, units, bias=False)
+        self.join_control = nn.Linear(units, units)
+        self.shared = Stack(nn.ReLU(inplace=True), Residual(units), Residual(units), Residual(units))
+        self.output = nn.Linear(units, n + 1)
+        self.log_noise = nn.Parameter(torch.empty(n))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Fresh weights: the state hardly changes, with little noise."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                module.reset_parameters()
+        nn.init.normal_(self.output.weight, std=1e-2)
+        nn.init.zeros_(self.output.bias)
+        nn.init.constant_(self.log_noise, -3.0)
+
+    @property
+    def noise(self) -> Tensor:
+        """(n,) standard deviation of the process noise, the square root of Q's diagonal."""
+        return self.log_noise.clamp(-7.0, 1.0).exp()
+
+    def control_part(self, controls: Tensor) -> Tensor:
+        """Controls (..., c) to their part of the first shared layer (..., units)."""
+        part: Tensor = self.join_control(self.control_encoder(controls))
+        return part
+
+    def forward(self, states: Tensor, control_part: Tensor) -> Tensor:
+        """Next states (..., n), without noise; ``control_part`` must broadcast against the states' leading axes."""
+        hidden = self.shared(self.join_state(self.state_encoder(states)) + control_part)
+        change, gate = self.output(hidden).split([self.n, 1], dim=-1)
+        return states + change * torch.sigmoid(gate)
+
+    def with_jacobian(self, states: Tensor, control_part: Tensor) -> tuple[Tensor, Tensor]:
+        """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass of dual numbers."""
+        identity = torch.eye(self.n, dtype=states.dtype, device=states.device)
+        tangents = identity.expand(*states.shape[:-1], self.n, self.n)
+        x = torch.cat([states.unsqueeze(-2), tangents], dim=-2)
+        x = dual_linear(self.join_state, self.state_encoder.dual(x))
+        value_only = torch.zeros_like(x[..., :1]).index_fill_(-2, torch.tensor(0, device=x.device), 1.0)
+        x = x + value_only * control_part.unsqueeze(-2)
+        change, gate = dual_linear(self.output, self.shared.dual(x)).split([self.n, 1], dim=-1)
+        scale = torch.sigmoid(gate[..., :1, :])
+        next_states = states + change[..., 0, :] * scale[..., 0, :]
+        slope = scale * (1.0 - scale)
+        # Row i holds d(next)/d(state i); A has d(next j)/d(state i) at [j, i].
+        derivative = scale * change[..., 1:, :] + slope * gate[..., 1:, :] * change[..., :1, :]
+        return next_states, identity + derivative.transpose(-1, -2)

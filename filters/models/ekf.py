@@ -1,0 +1,122 @@
+"""Extended Kalman filters with learned virtual sensors, one per measurement model, and their fusion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from beliefscope.datasets.task import Task
+from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
+from beliefscope.filters.filter import Architecture, Filter, WeightModel, encoders
+from beliefscope.filters.models.dynamics import Dynamics
+from beliefscope.filters.models.fusion import product_of_experts, symmetric, weighted_average
+from beliefscope.filters.models.networks import Residual, Stack
+
+
+def predict(belief: Gaussian, mean: Tensor, jacobian: Tensor, noise: Tensor) -> Gaussian:
+    """Prediction: ``m' = f(m, u)``, ``S' = A S A^T + Q`` (Lee et al., eq. 5, 6).
+
+    Args:
+        mean: (..., n) f at the old mean. jacobian: (..., n, n) A. noise: (n,) square root of Q's diagonal.
+    """
+    covariance = jacobian @ belief.covariance @ jacobian.transpose(-1, -2) + torch.diag_embed(noise**2)
+    return Gaussian(mean, symmetric(covariance))
+
+
+def update(belief: Gaussian, observation: Tensor, noise: Tensor) -> Gaussian:
+    """Update with an observation of the whole state, H = I: ``K = S (S + R)^-1`` (Lee et al., eq. 7-9).
+
+    The covariance ``(I - K) S`` is computed as the equal ``(I - K) S (I - K)^T + K R K^T``, which rounding leaves
+    positive.
+
+    Args:
+        observation: (..., n) z. noise: (..., n) square root of R's diagonal.
+    """
+    r = torch.diag_embed(noise**2)
+    # K^T = (S + R)^-1 S, as S and R are symmetric.
+    gain = torch.linalg.solve(belief.covariance + r, belief.covariance).transpose(-1, -2)
+    mean = belief.mean + (gain @ (observation - belief.mean).unsqueeze(-1)).squeeze(-1)
+    keep = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain
+    covariance = keep @ belief.covariance @ keep.transpose(-1, -2) + gain @ r @ gain.transpose(-1, -2)
+    return Gaussian(mean, symmetric(covariance))
+
+
+class VirtualSensor(nn.Module):
+    """Observations of one measurement model to a virtual observation of the state and its standard deviations."""
+
+    def __init__(self, task: Task, model: str, architecture: Architecture) -> None:
+        super().__init__()
+        n, units = len(task.components), architecture.units
+        self.encoders = encoders(task, model.split("+"), architecture)
+        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), Residual(units))
+        self.state = nn.Linear(units, n)
+        self.log_noise = nn.Sequential(nn.Linear(units, units), nn.ReLU(), nn.Linear(units, n))
+
+    def forward(self, observations: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """z (T, N, n) and the square root of R's diagonal (T, N, n)."""
+        features = self.trunk(self.encoders(observations))
+        return self.state(features), self.log_noise(features).clamp(-5.0, 3.0).exp()
+
+
+class ExtendedKalmanFilter(Filter):
+    """A bank of K unimodal EKFs that share the dynamics model, fused after every step.
+
+    The belief passed between steps is the bank, Gaussian (N, K, n): the unimodal filters run on alone, as in the
+    paper's text, unless ``architecture.feedback`` hands each the fused belief.
+    """
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__(architecture)
+        self.dynamics = Dynamics(self.n, self.task.control_size, architecture.units)
+        self.virtual_sensors = nn.ModuleDict({m: VirtualSensor(self.task, m, architecture) for m in self.names})
+        if architecture.fusion == "crossmodal":
+            self.weight_model = WeightModel(self.task, architecture, self.n)
+
+    def encode(self, batch: Batch) -> Evidence:
+        observations = self.observations(batch)
+        z, noise = zip(*(self.virtual_sensors[m](observations) for m in self.names), strict=True)
+        return Evidence(
+            control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
+            observation=torch.stack(z, dim=2),
+            noise=torch.stack(noise, dim=2),
+            log_weights=self.weights_part(batch),
+        )
+
+    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Gaussian:
+        k = len(self.names)
+        mean = belief.mean.unsqueeze(1).expand(-1, k, -1)
+        return Gaussian(mean, belief.covariance.unsqueeze(1).expand(-1, k, -1, -1))
+
+    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Gaussian, StepTrace]:
+        assert isinstance(belief, Gaussian)
+        assert evidence.noise is not None
+        predicted = self.predict(belief, evidence.control.unsqueeze(1))
+        bank = update(predicted, evidence.observation, evidence.noise)
+        if evidence.present is not None:
+            seen = evidence.present.unsqueeze(-1)
+            mean = torch.where(seen, bank.mean, predicted.mean)
+            bank = Gaussian(mean, torch.where(seen.unsqueeze(-1), bank.covariance, predicted.covariance))
+        fused = self.fuse(bank, evidence.log_weights, evidence.present)
+        trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)
+        if self.architecture.feedback:
+            bank = Gaussian(
+                fused.mean.unsqueeze(1).expand_as(bank.mean),
+                fused.covariance.unsqueeze(1).expand_as(bank.covariance),
+            )
+        return bank, trace
+
+    def predict(self, belief: Gaussian, control_part: Tensor) -> Gaussian:
+        """The bank (N, K, n) after the dynamics; ``control_part`` (N, 1, u)."""
+        mean, jacobian = self.dynamics.with_jacobian(belief.mean, control_part)
+        return predict(belief, mean, jacobian, self.dynamics.noise)
+
+    def fuse(self, bank: Gaussian, log_weights: Tensor | None, present: Tensor | None = None) -> Gaussian:
+        """The fused belief (N, n) of a bank (N, K, n). present: (N, K) bool, as in ``Evidence``."""
+        if log_weights is not None:
+            return weighted_average(bank, log_weights, self.architecture.covariance)
+        if len(self.names) == 1:
+            return Gaussian(bank.mean[:, 0], bank.covariance[:, 0])
+        return product_of_experts(bank, present)

@@ -1,0 +1,129 @@
+"""What each stage of training minimises. Functions of a filter and a batch of training windows; standardised units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Evidence, Gaussian
+from beliefscope.filters.filter import Filter
+from beliefscope.filters.models.pf import MeasurementModel
+from beliefscope.filters.rollout import START_VARIANCE, rollout, start_at_truth
+
+
+def state(filter_: Filter, batch: Batch) -> Tensor:
+    """(T, N, n) the truth."""
+    return filter_.statistics.standardise("state", batch.states)
+
+
+def prediction(filter_: Filter, batch: Batch) -> Tensor:
+    """Mean squared error of the dynamics alone, T steps ahead from the truth."""
+    control = filter_.dynamics.control_part(filter_.statistics.standardise("control", batch.controls))
+    target, total = state(filter_, batch), torch.zeros((), device=batch.states.device)
+    x = filter_.statistics.standardise("state", batch.previous)
+    for t in range(len(batch)):
+        x = filter_.dynamics(x, control[t])
+        total = total + (x - target[t]).square().mean()
+    return total / len(batch)
+
+
+def likelihood(filter_: Filter, model: MeasurementModel, batch: Batch, noise: torch.Generator) -> Tensor:
+    """Of a measurement model: the log density where there is a picture, contrast where there is none or it is black."""
+    part = model.observation_part(filter_.observations(batch)).flatten(0, 1)
+    truth = state(filter_, batch).flatten(0, 1)
+    lit = shown(batch, model.encoders.by_modality).flatten()
+    total = torch.zeros((), device=truth.device)
+    if bool(lit.any()):
+        total = total + lit.float().mean() * log_density(model, part[lit], truth[lit], noise)
+    if not bool(lit.all()):
+        total = total + (~lit).float().mean() * contrast(model, part[~lit], truth[~lit])
+    return total
+
+
+def shown(batch: Batch, modalities: Iterable[str]) -> Tensor:
+    """(T, N) whether one of these modalities is a picture that is not black."""
+    lit = torch.zeros(batch.states.shape[:2], dtype=torch.bool, device=batch.states.device)
+    for modality in modalities:
+        values = batch.observations[modality]
+        if values.dtype == torch.int64:
+            lit = lit | (values >= 0)
+        elif values.dtype == torch.uint8:
+            lit = lit | (values.amax((-2, -1)) > 0)
+    return lit
+
+
+def log_density(model: MeasurementModel, part: Tensor, truth: Tensor, noise: torch.Generator) -> Tensor:
+    """Regression of the Gaussian log density around the truth (B, n), covariance 0.1 I, as in the paper's training.
+
+    Half of the 20 states a step come from that Gaussian; half from a unit one, so that the likelihood is also right far
+    from the truth, where maps show it. The constant is left out; values end at -10.
+    """
+    scale = torch.ones(20, 1, device=truth.device)
+    scale[:10] = START_VARIANCE**0.5
+    offset = scale * torch.randn((len(truth), 20, truth.shape[-1]), generator=noise, device=truth.device)
+    target = (-0.5 * offset.square().sum(-1) / START_VARIANCE).clamp_min(-10.0)
+    value = model.log_likelihood(part.unsqueeze(1), model.state_part(truth.unsqueeze(1) + offset))
+    return nn.functional.smooth_l1_loss(value, target)
+
+
+def contrast(model: MeasurementModel, part: Tensor, states: Tensor) -> Tensor:
+    """Which of the states (B, n) belongs to an observation (B, units)? The best answer is log p(z | x) / p(z) + c(z).
+
+    A regression of the expected log density is no likelihood where an observation says little: it bulges where the
+    training states end. This is flat there. The second term pins c(z) at 0.
+    """
+    value = model.log_likelihood(part.unsqueeze(1), model.state_part(states))
+    evidence = torch.logsumexp(value, dim=1) - math.log(len(value))
+    return (evidence - value.diagonal()).mean() + 0.01 * evidence.square().mean()
+
+
+def through_filter(
+    filter_: Filter,
+    evidence: Evidence,
+    batch: Batch,
+    noise: torch.Generator,
+    particles: int,
+    likelihood_weight: float,
+    weight: Tensor | None = None,
+) -> Tensor:
+    """Of the filter's estimates over T steps: squared error and, where it has a covariance, negative log-likelihood.
+
+    Args:
+        noise: of the first belief and of the filter's own draws.
+        weight: (T, N) of each step of each trajectory, sum 1; without it all count alike.
+    """
+    start = perturbed(start_at_truth(filter_, batch), noise)
+    estimate = rollout(filter_, evidence, start, noise, particles).estimate
+    error = estimate.mean - state(filter_, batch)
+    total = averaged(error.square().sum(-1), weight)
+    if not filter_.has_covariance:
+        return total
+    return total + likelihood_weight * averaged(negative_log_likelihood(error, estimate.covariance), weight)
+
+
+def averaged(values: Tensor, weight: Tensor | None) -> Tensor:
+    """The mean of (T, N), or their sum with these weights."""
+    return values.mean() if weight is None else (weight * values).sum()
+
+
+def perturbed(start: Gaussian, noise: torch.Generator) -> Gaussian:
+    """A first belief whose mean is off by as much as its covariance says: the filter must learn to come back."""
+    unit = torch.randn(start.mean.shape, generator=noise, device=start.mean.device)
+    return replace(start, mean=start.mean + START_VARIANCE**0.5 * unit)
+
+
+def negative_log_likelihood(error: Tensor, covariance: Tensor) -> Tensor:
+    """``0.5 (e^T S^-1 e + log det S)``, without the constant: (..., n), (..., n, n) to (...).
+
+    A floor of 1e-4 on the diagonal keeps a collapsed particle set from a gradient without bound.
+    """
+    covariance = covariance + 1e-4 * torch.eye(error.shape[-1], device=error.device)
+    factor = torch.linalg.cholesky(covariance)
+    white = torch.linalg.solve_triangular(factor, error.unsqueeze(-1), upper=False).squeeze(-1)
+    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return 0.5 * white.square().sum(-1) + log_det

@@ -1,0 +1,67 @@
+"""Whether a trace out of a file holds together: its arrays' shapes and types, and what is said of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from beliefscope.datasets.dataset import SPLITS
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.external.adapter import SHAPES
+from beliefscope.filters.filter import Kind
+
+if TYPE_CHECKING:
+    from beliefscope.inspect.trace import Trace
+
+KINDS = (*get_args(Kind), "foreign")
+STATIC = {"start_mean": "n", "start_covariance": "nn"}
+LARGEST_SEED = 2**63 - 1
+
+
+def check_intact(trace: Trace) -> None:
+    """Raises BadInput, naming what is wrong, for what no run of a filter can have left."""
+    episode = trace.episode
+    _check(trace.kind in KINDS, "kind", trace.kind)
+    for name in ("filter", "checkpoint_hash", "data_hash"):
+        _check(isinstance(getattr(trace, name), str), name, getattr(trace, name))
+    for name, index in (("episode_index", trace.episode_index), ("seed", trace.seed)):
+        _check(type(index) is int and 0 <= index <= LARGEST_SEED, name, index)
+    _check(all(isinstance(name, str) for name in trace.modalities), "modalities", trace.modalities)
+    _check(isinstance(trace.settings, Mapping), "settings", trace.settings)
+    _check(isinstance(episode.task, str), "task of the episode", episode.task)
+    _check(type(episode.dt) in (int, float) and 0 < episode.dt < math.inf, "dt of the episode", episode.dt)
+    _check(type(episode.seed) is int and abs(episode.seed) <= LARGEST_SEED, "seed of the episode", episode.seed)
+    _check(episode.split in SPLITS, "split of the episode", episode.split)
+    _check(isinstance(episode.provenance, Mapping), "provenance of the episode", episode.provenance)
+    sizes = {"T": len(np.atleast_1d(trace.estimate_mean)), "K": len(trace.modalities)}
+    shapes = {name: f"T{letters}" for name, letters in SHAPES.items()} | STATIC
+    for name, letters in shapes.items():
+        _check_array(name, getattr(trace, name), letters, sizes, "i" if name == "ancestors" else "f")
+    for name, letters, kinds in (("states", "Tn", "f"), ("controls", "Tc", "f"), ("contact", "T", "b")):
+        _check_array(name, getattr(episode, name), letters, sizes, kinds)
+    _check_array("qpos", episode.qpos, "Tq", sizes, "f")
+    for name, values in episode.observations.items():
+        _check_array(f"observation {name!r}", values, "T" + "_" * (np.ndim(values) - 1), sizes, "biuf")
+    ancestors, particles = trace.ancestors, sizes.get("M", 0)
+    if ancestors is not None and ancestors.size and not 0 <= ancestors.min() <= ancestors.max() < particles:
+        raise BadInput(f"ancestors are {ancestors.min()} to {ancestors.max()}, the trace has {particles} particles")
+
+
+def _check(good: bool, name: str, value: Any) -> None:
+    if not good:
+        raise BadInput(f"{name} is {value!r:.200}")
+
+
+def _check_array(name: str, array: Any, letters: str, sizes: dict[str, int], kinds: str) -> None:
+    """Letters stand for sizes, those of the conventions; what a letter is at first, it is in all arrays."""
+    if array is None:
+        return
+    if array.dtype.kind not in kinds:
+        raise BadInput(f"{name} is {array.dtype}")
+    wanted = [sizes.get(letter, "any") for letter in letters]
+    if array.ndim != len(letters) or any(n not in ("any", m) for n, m in zip(wanted, array.shape, strict=True)):
+        raise BadInput(f"{name} has shape {array.shape}, expected ({', '.join(map(str, wanted))})")
+    sizes |= {letter: size for letter, size in zip(letters, array.shape, strict=True) if letter != "_"}

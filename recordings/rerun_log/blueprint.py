@@ -1,0 +1,154 @@
+"""The layout that every recording carries: the scene and what the robot senses left, the story over time right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.diagnostics.base import Diagnostic
+from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.rerun_log.diagnostics import diagnostic_tab
+from beliefscope.recordings.rerun_log.entities import SHOWN_SCALE, SHOWN_UNIT, SIGMAS, angles, plane_height, positions
+from beliefscope.recordings.schema import STEP
+
+TRAIL_STEPS = 100
+VIEWING_DISTANCE = 1.2
+"""m from the scene's middle: an arm's reach is in view."""
+# Dark whatever the viewer's theme, so that a map's empty cells look empty.
+BACKGROUND = rrb.Background(kind="SolidColor", color=[16, 17, 24])
+LINKED = rrb.TimeAxis(link="LinkToGlobal")
+
+
+def blueprint(
+    trace: Trace,
+    task: Task,
+    first: LikelihoodMap | None = None,
+    diagnostics: Mapping[str, Diagnostic] = MappingProxyType({}),
+    growing: bool = False,
+) -> rrb.Blueprint:
+    """The layout for a trace.
+
+    Args:
+        first: of its maps; where there is none, they have no views. diagnostics: by name, a tab each beside the story.
+        growing: whether this is the beginning of a run that goes on: the cursor follows it, and so do the axes.
+    """
+    sensed = [_picture(key) for key, shape in task.observations.items() if len(shape) == 2]
+    if first is not None:
+        sensed += [_map(layer, len(first.offsets_x)) for layer in first.layers]
+    scene = rrb.Vertical(
+        _scene(trace, task),
+        rrb.Horizontal(*sensed) if sensed else rrb.TextDocumentView(origin="about"),
+        row_shares=[3, 2] if len(sensed) < 4 else [5, 2],
+    )
+    story = _story(trace, task, growing)
+    if diagnostics:
+        story = rrb.Tabs(story, *(diagnostic_tab(one, name) for name, one in diagnostics.items()), active_tab=0)
+    return rrb.Blueprint(
+        rrb.Horizontal(scene, story, column_shares=[1, 1]),
+        rrb.TimePanel(state="collapsed", timeline=STEP, play_state="following" if growing else "paused"),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _scene(trace: Trace, task: Task) -> rrb.Container:
+    """The whole scene from behind the robot, and the belief from straight above, as the maps show it."""
+    x, y = task.map_indices
+    anchor = np.array([*positions(trace)[:, [x, y]].mean(axis=0), plane_height(trace, task)])
+    effector = trace.episode.observations.get("effector_position")
+    middle = anchor if effector is None else 0.5 * (anchor + effector.mean(axis=0))
+    trail = rr.VisibleTimeRange(
+        STEP,
+        start=rrb.TimeRangeBoundary.cursor_relative(seq=-TRAIL_STEPS),
+        end=rrb.TimeRangeBoundary.cursor_relative(seq=0),
+    )
+    scene = rrb.Spatial3DView(
+        origin="world",
+        name="Scene",
+        eye_controls=_eye(middle, middle + VIEWING_DISTANCE * np.array([-0.62, -0.12, 0.78]), (0, 0, 1)),
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=True, spacing=0.1, plane=rr.components.Plane3D.XY),
+        overrides={"world/effector": rrb.VisibleTimeRanges(trail)},
+    )
+    above = rrb.Spatial3DView(
+        origin="world",
+        contents="world/plane/**",
+        name=f"Belief: {task.map_components[0]}, {task.map_components[1]}",
+        eye_controls=_eye(anchor, anchor + np.array([0.0, 0.0, 3.4 * task.map_half_width]), (0, 1, 0)),
+        background=BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+    about = rrb.TextDocumentView(origin="about", name="About")
+    return rrb.Horizontal(rrb.Tabs(scene, about, active_tab=0), above, column_shares=[5, 4])
+
+
+def _eye(target: NDArray[np.float64], position: NDArray[np.float64], up: tuple[int, int, int]) -> rrb.EyeControls3D:
+    return rrb.EyeControls3D(position=position, look_target=target, eye_up=up, kind="Orbital")
+
+
+def _picture(key: str) -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(origin=f"observations/{key}", name="Camera")
+
+
+def _map(layer: str, side: int) -> rrb.Spatial2DView:
+    # Without bounds the view would shrink the map to make room for an estimate that lies outside it.
+    bounds = rrb.VisualBounds2D(x_range=[0, side], y_range=[0, side])
+    return rrb.Spatial2DView(origin=f"maps/{layer}", name=layer, visual_bounds=bounds)
+
+
+def _story(trace: Trace, task: Task, growing: bool) -> rrb.Container:
+    rows: list[rrb.View | rrb.Container] = []
+    rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=LINKED))
+    shares = [1.6]
+    shown = {"weights": "Fusion weights beta", "acting": "Share as it acted"}
+    fusion = [_plot(name, title, (-0.05, 1.05)) for name, title in shown.items() if getattr(trace, name) is not None]
+    if fusion:
+        rows.append(rrb.Tabs(*fusion, active_tab=0))
+        shares.append(2.5)
+    for component in task.components:
+        rows.append(_estimate(trace, task, component, growing))
+        shares.append(2.5)
+    errors = [_plot("errors/position", "Position error (cm)")]
+    errors += [_plot(f"errors/{c.name}", f"Error of {c.name} (deg)") for c in angles(task)]
+    rows.append(rrb.Tabs(*errors, active_tab=0))
+    shares.append(2.5)
+    if trace.log_weights is not None:
+        rows.append(_plot("diagnostics/effective_sample_size", "Effective sample size"))
+        shares.append(2.0)
+    return rrb.Vertical(*rows, row_shares=shares, name="Run")
+
+
+def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> rrb.TimeSeriesView:
+    i, scale = task.index(component.name), SHOWN_SCALE[component.unit]
+    limits = None
+    if not growing:
+        # The axis fits the truth and the fused band; a modality that runs away may leave it.
+        sigma = np.nan_to_num(SIGMAS * np.sqrt(trace.estimate_covariance[:, i, i]))
+        mean = trace.estimate_mean[:, i]
+        values = np.concatenate([trace.episode.states[:, i], mean - sigma, mean + sigma])
+        low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
+        margin = 0.1 * (high - low) or 1.0
+        limits = (low - margin, high + margin)
+    name = f"{component.name} ({SHOWN_UNIT[component.unit]}): truth green, fused red"
+    name += ", thin lines 2 sigma" if trace.has_covariance else ""
+    return _plot(f"states/{component.name}", name, limits, legend=False)
+
+
+def _plot(origin: str, name: str, limits: tuple[float, float] | None = None, legend: bool = True) -> rrb.TimeSeriesView:
+    axis = None if limits is None else rrb.ScalarAxis(range=limits)
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        axis_x=LINKED,
+        axis_y=axis,
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
+    )
