@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fuzz"))
 
 import numpy as np
 import torch
-from valid import episodes
+from valid_files import episodes
 
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import write_dataset

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fuzz"))
 
 import numpy as np
 import torch
-from valid import episodes
+from valid_files import episodes
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.recipe import WHOLE

@@ -1,4 +1,4 @@
-"""The 3D scene's layers: chosen on the page, in its address, each view's own (drawn: tests/app/test_scene.py)."""
+"""Layers of the 3D scene: selection on the page, permalinks, per-view state (drawing: tests/app/views/)."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ import mutate
 import numpy as np
 import torch
 from fastapi import HTTPException
-from valid import AUTHORS, episodes, make_authors, make_episodes, make_push
+from valid_files import AUTHORS, episodes, make_authors, make_episodes, make_push
 
 from beliefscope.app.api.finetune import routes as tuned_routes
 from beliefscope.app.jobs.queue import Job, Jobs

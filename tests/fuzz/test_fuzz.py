@@ -10,7 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import asked
+import http_fuzz as asked
 import mutate
 import readers
 

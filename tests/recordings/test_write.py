@@ -38,9 +38,9 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
         "ekf": trace.kind in ("ekf", "ukf"),
         "pf": trace.kind == "pf",
         "maps": maps,
-        "diagnostics": False,  # tests/recordings/test_diagnostics.py
+        "diagnostics": False,  # tests/recordings/rerun_log/test_diagnostics.py
         "replay": trace.episode.qpos.size > 0,
-        "bodies": False,  # tests/recordings/test_bodies.py
+        "bodies": False,  # tests/recordings/rerun_log/test_bodies.py
         "ghost": task.ghost is not None,
     }
     if not there[entity.needs]:

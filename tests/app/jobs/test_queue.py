@@ -17,7 +17,7 @@ from starlette.testclient import TestClient
 from beliefscope.app.jobs.queue import Job, Jobs, QueueFull, routes
 from beliefscope.datasets.errors import BadInput
 
-KINDS = {name: f"work_for_tests:{name}" for name in ("add", "wait", "crash", "vanish", "refuse", "hopeless")}
+KINDS = {name: f"job_functions:{name}" for name in ("add", "wait", "crash", "vanish", "refuse", "hopeless")}
 PATIENCE = 60.0  # s: a process of Python with torch takes seconds to start on a busy machine
 
 Open = Callable[..., Jobs]

@@ -26,7 +26,7 @@ from beliefscope.inspect.likelihood import MapEngine, no_maps
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 
 sys.path.insert(0, str(Path(__file__).parent))
-import lookalikes as alike
+import torchfilter_stubs as alike
 
 SEED = 3
 

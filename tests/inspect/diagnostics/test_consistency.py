@@ -24,7 +24,7 @@ from beliefscope.inspect.statistics.calibration import (
 )
 
 sys.path.insert(0, str(Path(__file__).parent))
-import planted as plant
+import planted_traces as plant
 
 
 @pytest.fixture(scope="module")

@@ -270,8 +270,8 @@ def test_a_network_that_overflows_shows_what_there_is(
 
 @contextmanager
 def working(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int = 2) -> Iterator[Jobs]:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
-    kinds = {name: f"work_for_tests:{name}" for name in ("add", "wait", "hungry")}
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "jobs"))
+    kinds = {name: f"job_functions:{name}" for name in ("add", "wait", "hungry")}
     jobs = Jobs(tmp_path / "jobs", kinds, at_once)
     try:
         yield jobs

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "fuzz"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "fuzz"))
 
-from valid import episodes
+from valid_files import episodes
 
 from beliefscope.filters.catalog import architecture
 from beliefscope.filters.checkpoint import load_checkpoint, shipped

@@ -101,8 +101,8 @@ def test_refusals_do_not_fill_the_log() -> None:
 def test_a_job_is_told_of_when_it_begins_and_ends(
     written: io.StringIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
-    jobs = Jobs(tmp_path / "jobs", {"crash": "work_for_tests:crash"})
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "jobs"))
+    jobs = Jobs(tmp_path / "jobs", {"crash": "job_functions:crash"})
     job = jobs.submit("crash", "Dividing", {"numbers": []}, "key")
     end = time.monotonic() + 60.0
     while jobs[job.id].ended is None:

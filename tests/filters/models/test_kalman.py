@@ -16,7 +16,7 @@ from beliefscope.filters.models.resampling import Resampling
 from beliefscope.filters.rollout import rollout
 
 sys.path.insert(0, str(Path(__file__).parent))
-import linear
+import linear_system as linear
 
 START = Gaussian(torch.zeros(1, 3, dtype=torch.float64), torch.from_numpy(linear.START)[None])
 

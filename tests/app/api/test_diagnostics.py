@@ -218,4 +218,4 @@ def test_settings_travel_as_json(tmp_path: Path, root: Path) -> None:
 
 @pytest.fixture
 def root() -> Path:
-    return Path(__file__).resolve().parents[2]
+    return Path(__file__).resolve().parents[3]

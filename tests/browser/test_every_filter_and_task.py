@@ -32,7 +32,7 @@ def choose(page: Any, picker: str, value: str) -> None:
     page.page.locator(f"#{picker}").select_option(value)
 
 
-@pytest.mark.long  # tests/app/test_kinds.py asks the server the same
+@pytest.mark.long  # tests/app/api/test_every_filter_and_task.py asks the server the same
 def test_what_a_filter_has_not_is_said(open_page: Any, serve: Any, tmp_path: Path) -> None:
     names = ("feature-ekf", "lstm")
     for name in names:

@@ -14,7 +14,7 @@ from beliefscope.inspect.diagnostics.particle_health import ENTRY, modes, of_tra
 from beliefscope.inspect.trace import Trace
 
 sys.path.insert(0, str(Path(__file__).parent))
-import planted as plant
+import planted_traces as plant
 
 M = 100
 

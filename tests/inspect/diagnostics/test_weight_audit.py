@@ -16,7 +16,7 @@ from beliefscope.inspect.statistics.bootstrap import FEWEST, correlate, sums_of
 from beliefscope.inspect.trace import Trace
 
 sys.path.insert(0, str(Path(__file__).parent))
-import planted as plant
+import planted_traces as plant
 
 REAL = ("crossmodal-ekf", "crossmodal-pf", "unimodal-ekf")
 

@@ -16,7 +16,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import save_checkpoint
 
-MIT = Path(__file__).resolve().parents[3] / "shared" / "data" / "mit_push"
+MIT = Path(__file__).resolve().parents[4] / "shared" / "data" / "mit_push"
 
 
 def test_names_are_short_and_tell_files_apart(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from beliefscope.inspect.trace import Trace, trace
 from beliefscope.inspect.traces.replay import Edit, Replay
 
 sys.path.insert(0, str(Path(__file__).parent))
-import planted as plant
+import planted_traces as plant
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from beliefscope.inspect.statistics.measures import blackout
 from beliefscope.inspect.trace import Trace
 
 sys.path.insert(0, str(Path(__file__).parent))
-import planted as plant
+import planted_traces as plant
 
 OF_TRACES = [entry for entry in DIAGNOSTICS.values() if entry.needs == "trace"]
 

@@ -20,7 +20,7 @@ from beliefscope.filters.external.load import load_foreign
 from beliefscope.inspect.trace import load_trace
 from beliefscope.recordings.read import read_recording
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "04_own_filter.py"
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "04_own_filter.py"
 SPEC = f"{EXAMPLE}:build"
 FAILS = """
 from torch import nn

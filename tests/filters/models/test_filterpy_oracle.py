@@ -21,7 +21,7 @@ from beliefscope.filters.models.ukf import ALPHA, BETA, KAPPA
 from beliefscope.filters.rollout import rollout
 
 sys.path.insert(0, str(Path(__file__).parent))
-import linear
+import linear_system as linear
 
 kalman = pytest.importorskip("filterpy.kalman", reason="FilterPy is not installed: pip install -e '.[dev]'")
 monte_carlo = pytest.importorskip("filterpy.monte_carlo")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-STYLE = (Path(__file__).resolve().parents[2] / "app" / "page" / "styles" / "page.css").read_text()
+STYLE = (Path(__file__).resolve().parents[3] / "app" / "page" / "styles" / "page.css").read_text()
 FOUND = re.findall(r"^  --([\w-]+): light-dark\((#\w+), (#\w+)\);", STYLE, re.MULTILINE)
 COLOURS = {name: (light, dark) for name, light, dark in FOUND}
 GROUNDS = ("surface", "raised", "ground")
