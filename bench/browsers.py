@@ -21,7 +21,7 @@ SCENE = f"viser-v{importlib.metadata.version('viser')}"
 AGAIN = 0.15  # s until a trace that is being computed is asked for again
 LOST = 10.0  # s until an answer is taken for lost
 Selection = dict[str, Any]
-"""``task``, ``filter``, ``data``, ``episode``, ``recipe``."""
+"""``task``, ``filter``, ``data``, ``episode``, ``faults``."""
 
 
 class Browser:
@@ -172,5 +172,5 @@ class Browser:
 
 def trace_path(selection: Selection) -> tuple[str, dict[str, str]]:
     """Path and query of a selection's trace."""
-    query = {"recipe": selection["recipe"], "data": selection["data"]}
+    query = {"faults": selection["faults"], "data": selection["data"]}
     return f"/api/trace/{selection['task']}/{selection['filter']}/{selection['episode']}", query

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import subject
 from subject import NAMES, Row
 
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.finetuning.batch_mix import Mix
@@ -27,7 +27,7 @@ def measure() -> list[Row]:
     rows: list[Row] = []
     with open_dataset(sample_path("push")) as data:
         episodes = [data[i] for i in range(8)]
-    settings = FineTune(mix=((Slice("blackout", Recipe.parse("blackout=0.4")), 1.0),))
+    settings = FineTune(mix=((Slice("blackout", Faults.parse("blackout=0.4")), 1.0),))
     for name in NAMES:
         filter_ = load_checkpoint(shipped("push", name)).filter
         mix = Mix.of(filter_.task, filter_.names, settings.shares(), episodes, settings.seed)

@@ -35,7 +35,7 @@ import torch
 from valid_files import episodes
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import WHOLE
+from beliefscope.datasets.faults.injection import WHOLE
 from beliefscope.datasets.simulation.collect import collect
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, write_dataset

@@ -47,7 +47,7 @@ async def measure(
     async with httpx.AsyncClient(base_url=served.url, headers={"Origin": served.url.rstrip("/")}, timeout=60) as http:
         task = (await http.get("/api/catalog")).json()["tasks"][0]
         data = task["data"][0]
-        common = {"task": task["name"], "filter": task["filters"][0]["name"], "data": data["name"], "recipe": ""}
+        common = {"task": task["name"], "filter": task["filters"][0]["name"], "data": data["name"], "faults": ""}
         selections = [{**common, "episode": one["index"]} for one in data["episodes"]]
         browsers = [Browser(served.url) for _ in range(count)]
         for browser, selection in zip(browsers, selections, strict=False):
@@ -83,7 +83,7 @@ async def measure(
 
 async def _job(http: httpx.AsyncClient, common: dict[str, Any]) -> str:
     """Failures over a whole data set: minutes of work in a process of its own."""
-    query = {"data": common["data"], "among": "all", "recipe": f"blackout={time.time() % 1:.6f}"}
+    query = {"data": common["data"], "among": "all", "faults": f"blackout={time.time() % 1:.6f}"}
     path = f"/api/failures/{common['task']}/{common['filter']}"
     return str((await http.post(path, params=query)).json()["job"]["id"])
 

@@ -65,7 +65,7 @@ def measure() -> list[Row]:
 def live(name: str, steps: int, folder: Path) -> dict[str, float]:
     """A live run of so many steps: the first 100 of the subject's over and over, so that only recording is measured."""
     episode, checkpoint = subject.episode(), subject.checkpoint(name)
-    run = begin(checkpoint, episode, 0, 0, 300, subject.traced(name).recipe)
+    run = begin(checkpoint, episode, 0, 0, 300, subject.traced(name).faults)
     generator, filter_ = run.generator(), checkpoint.filter
     belief, taken = filter_.start(run.start, 300, generator), []
     for t in range(100):

@@ -26,7 +26,7 @@ LONG = "a-filter-trained-on-the-third-floor-with-the-new-camera-v12b"
 PATIENCE = 120_000  # ms
 REST = 1200  # ms until what moves has come to rest
 
-BAD = "?task=door&episode=4711&recipe=blakout%3D0.4&filter=crossmodal-fp"
+BAD = "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp"
 """A link that asks for what is not there."""
 
 

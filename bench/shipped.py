@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beliefscope.datasets.catalog import TASKS
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
 from beliefscope.filters.evaluate import evaluate
@@ -54,7 +54,7 @@ def on_the_sample(checkpoint: Checkpoint) -> dict[str, dict[str, dict]]:
     return {
         f"{share:g}": {
             only or "fused": evaluate(
-                checkpoint.filter, test, recipe=Recipe.parse(f"blackout={share}"), only=only
+                checkpoint.filter, test, faults=Faults.parse(f"blackout={share}"), only=only
             ).to_dict()
             for only in models
         }
@@ -85,7 +85,7 @@ def section(task: str, paths: list[Path]) -> list[str]:
     except ValueError:
         return [*lines, ""]
     lines += ["", "On the test episodes of the sample set that ships, none of which is in that file "]
-    lines[-1] += f"(`beliefscope evaluate {task} --filter NAME --recipe blackout=B --only MODALITY`):"
+    lines[-1] += f"(`beliefscope evaluate {task} --filter NAME --faults blackout=B --only MODALITY`):"
     lines += ["", *head(task)]
     for c in checkpoints:
         lines += rows(c.name, on_the_sample(c))

@@ -2,7 +2,7 @@
 
     python bench/soak.py --hours 2 --out soak.csv
 
-A few raw browsers look at random filters, episodes and recipes, scrub, rest, record, ask for jobs and cancel them, and
+A few raw browsers select random filters, episodes and faults, scrub, rest, record, ask for jobs and cancel them, and
 leave, politely or not. Every 10 s a line of the CSV tells what the server takes. At the end straight lines are fitted
 to what came after the warm-up.
 """
@@ -153,13 +153,13 @@ class Soak:
     def _any(self) -> Selection:
         task = self.random.choice(self.catalog["tasks"])
         data = self.random.choice(task["data"])
-        recipes = ["", *(recipe["recipe"] for recipe in task["recipes"])]
+        fault_sets = ["", *(faults["faults"] for faults in task["fault_presets"])]
         return {
             "task": task["name"],
             "filter": self.random.choice(task["filters"])["name"],
             "data": data["name"],
             "episode": self.random.choice(data["episodes"])["index"],
-            "recipe": self.random.choice(recipes),
+            "faults": self.random.choice(fault_sets),
         }
 
     async def _guarded(self, doing: Any) -> None:

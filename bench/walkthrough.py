@@ -22,7 +22,7 @@ SIZE = {"width": 1440, "height": 900}
 SETTLING = 10.0  # s: drawn without a graphics card, the scene fades in slowly
 PATIENCE = 300.0  # s: integrated gradients take a while on a busy processor
 
-READY = "#diagnostics article[data-state=ready] > .verdict"
+FAULT_PRESETS = "#diagnostics article[data-state=ready] > .verdict"
 
 
 @dataclass(frozen=True)
@@ -45,18 +45,18 @@ SHOTS = (
             "episode": 9,
             "step": 25,
             "component": "angle",
-            "recipe": "blackout=0.4",
+            "faults": "blackout=0.4",
         },
         "#maps-pairs",
     ),
     Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Look for failures"),
     Shot("walkthrough-moment", {"tab": "scene"}, "#maps-pairs"),
-    Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, READY),
-    Shot("walkthrough-shapley", {"tab": "diagnostics", "diagnostic": "shapley"}, READY, "Compute"),
+    Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, FAULT_PRESETS),
+    Shot("walkthrough-shapley", {"tab": "diagnostics", "diagnostic": "shapley"}, FAULT_PRESETS, "Compute"),
     Shot(
         "walkthrough-saliency",
         {"tab": "diagnostics", "diagnostic": "saliency", "options": "step=68&target=beta:image"},
-        READY,
+        FAULT_PRESETS,
         "Compute",
     ),
     Shot("walkthrough-edit", {"tab": "compare", "against": "from=30&to=76&weights=haptics=0"}, "#compare .verdict"),

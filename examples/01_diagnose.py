@@ -6,7 +6,7 @@ python examples/01_diagnose.py [DIR]; with a folder, a figure of each answer is 
 import sys
 from pathlib import Path
 
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
@@ -14,9 +14,9 @@ from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.trace import trace
 
 checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
-broken = Recipe.parse("blackout=0.4")  # four of ten pictures are black
+broken = Faults.parse("blackout=0.4")  # four of ten pictures are black
 with open_dataset(sample_path("door")) as data:
-    traces = [trace(checkpoint, data[i], i, recipe=broken) for i in data.held_out()[:5]]
+    traces = [trace(checkpoint, data[i], i, faults=broken) for i in data.held_out()[:5]]
 
 for name, entry in DIAGNOSTICS.items():
     why = entry.refusal(traces[0], checkpoint)

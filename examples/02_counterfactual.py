@@ -6,7 +6,7 @@ python examples/02_counterfactual.py [FIGURE.pdf]; all edits are compared with o
 import sys
 from pathlib import Path
 
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.compare.counterfactual import compare
@@ -19,7 +19,7 @@ with open_dataset(sample_path("push")) as data:
     index = data.held_out()[0]
     replay = Replay(checkpoint, trace(checkpoint, data[index], index))
 
-black = Recipe.parse("blackout")
+black = Faults.parse("blackout")
 edits = {
     "the picture is black": Edit(40, 60, black),
     "the picture is black, and beta still trusts it": Edit(40, 60, black, {"image": 1.0}),

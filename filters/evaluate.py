@@ -13,7 +13,7 @@ from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.faults.injection import WHOLE, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.external.load import Foreign
@@ -57,7 +57,7 @@ def evaluate(
     filter_: Filter | Foreign,
     episodes: Sequence[Episode],
     *,
-    recipe: Recipe = WHOLE,
+    faults: Faults = WHOLE,
     only: str | None = None,
     particles: int = 300,
     seed: int = 0,
@@ -66,17 +66,17 @@ def evaluate(
     """Runs the filter over whole episodes, each started at the truth with covariance 0.1 I (standardised).
 
     Args:
-        recipe: how the sensors are broken. only: one modality's name: beta one-hot on it.
+        faults: how the sensors are broken. only: one modality's name: beta one-hot on it.
         particles: of this project's filters; one from outside has its own number.
-        seed: of the filter's randomness and of the recipe's.
+        seed: of the filter's randomness and of the faults's.
 
     Raises:
-        BadInput: no episode, one that does not fit the filter's task, or a recipe or modality that does not.
+        BadInput: no episode, one that does not fit the filter's task, or a faults or modality that does not.
     """
     if isinstance(filter_, Foreign) and only is not None:
         raise BadInput(f"only {only!r}: {filter_.source} is from outside, and cannot be told whom to follow")
     device = torch.device("cpu") if isinstance(filter_, Foreign) else next(filter_.parameters()).device
-    broken = [recipe.apply(episode, seed) for episode in episodes]
+    broken = [faults.apply(episode, seed) for episode in episodes]
     steps = Steps.of(filter_.task, broken, device)
     groups: dict[int, list[int]] = {}
     for number, length in enumerate(steps.length.tolist()):

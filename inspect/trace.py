@@ -17,7 +17,7 @@ from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.faults.injection import WHOLE, Faults
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.filters.batch import Steps
@@ -63,8 +63,8 @@ class Trace:
         log_likelihood: PF: (T, K, M), not normalised.
         ancestors: PF: (T, M) int32: the particle each resampled one came from.
         checkpoint_hash, data_hash: SHA-256 of the checkpoint's file and of the episode (``Episode.digest``).
-        episode_index: index in its data set. seed: of the filter's randomness and of the recipe's.
-        recipe: how its sensors were broken; ``data_hash`` is of the episode before that.
+        episode_index: index in its data set. seed: of the filter's randomness and of the faults's.
+        faults: how its sensors were broken; ``data_hash`` is of the episode before that.
         settings: JSON values: particles, versions.
     """
 
@@ -93,7 +93,7 @@ class Trace:
     data_hash: str = ""
     episode_index: int = 0
     seed: int = 0
-    recipe: Recipe = WHOLE
+    faults: Faults = WHOLE
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -132,7 +132,7 @@ def trace(
     episode_index: int = 0,
     seed: int = 0,
     particles: int = 300,
-    recipe: Recipe = WHOLE,
+    faults: Faults = WHOLE,
     progress: Callable[[float], None] | None = None,
 ) -> Trace:
     """Runs a filter over an episode from the true state, covariance 0.1 I (standardised), and keeps everything.
@@ -141,17 +141,17 @@ def trace(
     a step knew is kept instead of dropped.
 
     Args:
-        recipe: how the sensors are broken; the trace's episode then holds what the filter was given.
+        faults: how the sensors are broken; the trace's episode then holds what the filter was given.
         progress: called with the share done, 0..1.
 
     Raises:
-        BadInput: the episode does not fit the checkpoint's task, the recipe does not, or a setting is out of range.
+        BadInput: the episode does not fit the checkpoint's task, the faults does not, or a setting is out of range.
     """
     if isinstance(checkpoint, Foreign):
         from beliefscope.inspect.traces.foreign import trace_foreign  # which builds upon this module
 
-        return trace_foreign(checkpoint, episode, episode_index, seed, recipe, progress)
-    run = begin(checkpoint, episode, episode_index, seed, particles, recipe)
+        return trace_foreign(checkpoint, episode, episode_index, seed, faults, progress)
+    run = begin(checkpoint, episode, episode_index, seed, particles, faults)
     result = rollout(
         checkpoint.filter, run.evidence, run.start, run.generator(), particles, keep=True, progress=progress
     )
@@ -179,7 +179,7 @@ class Run:
 
 @torch.no_grad()
 def begin(
-    checkpoint: Checkpoint, episode: Episode, episode_index: int, seed: int, particles: int, recipe: Recipe
+    checkpoint: Checkpoint, episode: Episode, episode_index: int, seed: int, particles: int, faults: Faults
 ) -> Run:
     """Args and errors: as ``trace``."""
     if particles < 1:
@@ -189,8 +189,8 @@ def begin(
             f"filter {checkpoint.name!r} is for task {checkpoint.task.name!r}, the episode is of {episode.task!r}"
         )
     filter_ = checkpoint.filter
-    given = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "recipe": recipe}
-    episode = recipe.apply(episode, seed)
+    given = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "faults": faults}
+    episode = faults.apply(episode, seed)
     batch = Steps.of(filter_.task, [episode]).episode(0)
     settings = {"particles": particles, "torch": torch.__version__}
     return Run(episode, start_at_truth(filter_, batch), filter_.encode(batch), given | {"settings": settings})
@@ -315,11 +315,11 @@ def arrays_of(trace: Trace) -> dict[str, NDArray[Any]]:
 def header_of(trace: Trace) -> dict[str, Any]:
     """All of a trace that is not an array, as JSON values."""
     episode = trace.episode
-    apart = (*ARRAYS, "episode", "recipe", "settings")
+    apart = (*ARRAYS, "episode", "faults", "settings")
     return {
         "format": FORMAT,
         **{f.name: getattr(trace, f.name) for f in fields(Trace) if f.name not in apart},
-        "recipe": trace.recipe.to_json(),
+        "faults": trace.faults.to_json(),
         "settings": dict(trace.settings),
         "episode": {
             "task": episode.task,
@@ -368,14 +368,16 @@ def trace_of(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> Trace:
         observations={n.removeprefix(prefix): a for n, a in of_episode.items() if n.startswith(prefix)},
     )
     said = {name: value for name, value in header.items() if name not in ("format", "episode")}
-    said |= {"modalities": tuple(said["modalities"]), "recipe": stored_recipe(said.get("recipe"), said["settings"])}
+    said |= {"modalities": tuple(said["modalities"]), "faults": stored_faults(said)}
+    said.pop("recipe", None)
     found = Trace(**said, episode=episode, **{n: a for n, a in arrays.items() if not n.startswith("episode/")})
     check_intact(found)
     return found
 
 
-def stored_recipe(recipe: Any, settings: Mapping[str, Any]) -> Recipe:
-    """The recipe of a file. Those from before there were recipes have none, and may name a chance of black pictures."""
-    if recipe is None and settings.get("blackout"):
-        recipe = {"blackout": settings["blackout"]}
-    return Recipe.of(recipe or [])
+def stored_faults(header: Mapping[str, Any]) -> Faults:
+    """Faults in a stored header, or in an earlier one: key ``recipe``, or a blackout probability in the settings."""
+    faults = header.get("faults", header.get("recipe"))
+    if faults is None and (blackout := header["settings"].get("blackout")):
+        faults = {"blackout": blackout}
+    return Faults.of(faults or [])

@@ -103,7 +103,7 @@ class LiveRecorder:
             like: of which this is a run, where it is known: its dt, seed, split and provenance are those of the run.
             expected: how many steps there will be, for those who watch.
             views: whether there is to be an ``.rrd`` as well.
-            given: fields of the trace that say where it comes from: filter, seed, recipe, data_hash, settings, ...
+            given: fields of the trace that say where it comes from: filter, seed, faults, data_hash, settings, ...
 
         Raises:
             BadInput: neither a checkpoint nor a task, an unknown task, a name with a folder in it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.trace import Trace, stored_recipe
+from beliefscope.inspect.trace import Trace, stored_faults
 from beliefscope.inspect.traces.validate import check_intact
 from beliefscope.recordings.rerun_log.metadata import properties_of, reading
 from beliefscope.recordings.schema import (
@@ -85,10 +86,15 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
         data_hash=header["data_hash"],
         episode_index=int(header["episode_index"]),
         seed=int(header["seed"]),
-        recipe=stored_recipe(json.loads(header.get("recipe", "null")), settings),
+        faults=stored_faults(_parsed(header, "faults", "recipe") | {"settings": settings}),
         settings=settings,
         **{name: fields_of[name] for name in fields_of.keys() - of_episode},
     )
+
+
+def _parsed(header: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """The JSON values of those properties that are there."""
+    return {name: json.loads(header[name]) for name in names if name in header}
 
 
 def _load(path: Path) -> tuple[dict[str, Any], Rows]:
@@ -112,7 +118,7 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
     if version != FORMAT_VERSION:
         by = " ".join(str(header.get("versions", "an unknown version")).split())
         raise BadInput(f"{path}: recording format {version}, by {by}; this version reads format {FORMAT_VERSION}.")
-    if missing := PROPERTIES.keys() - header.keys() - {"recipe"}:
+    if missing := PROPERTIES.keys() - header.keys() - {"faults"}:
         raise BadInput(f"{path}: the recording lacks the properties {', '.join(sorted(missing))}.")
     return header, rows
 

@@ -207,9 +207,12 @@ PROPERTIES: dict[str, str] = {
     "seed": "seed of the filter's randomness",
     "checkpoint_hash": "SHA-256 of the checkpoint's file",
     "data_hash": "SHA-256 of the episode",
-    "recipe": "JSON list: the faults its sensors were given, in order; not there in older recordings",
+    "faults": "JSON list: the faults its sensors were given, in order; not there in older recordings",
     "settings": "JSON: the filter's settings",
     "episode": "JSON: the episode's seed, split and provenance",
     "shapes": "JSON: stored path -> shape and type of one step",
 }
 """Properties of the recording (``property:beliefscope:...`` in Rerun's own queries)."""
+
+EARLIER_PROPERTIES = ("recipe",)
+"""Properties that earlier versions wrote in place of ``faults``; still read."""

@@ -214,7 +214,7 @@ def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> No
         "seed": trace.seed,
         "checkpoint_hash": trace.checkpoint_hash,
         "data_hash": trace.data_hash,
-        "recipe": text(trace.recipe.to_json()),
+        "faults": text(trace.faults.to_json()),
         "settings": text(dict(trace.settings)),
         "episode": text({"seed": episode.seed, "split": episode.split, "provenance": dict(episode.provenance)}),
         "shapes": text(shapes),

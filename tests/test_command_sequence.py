@@ -53,7 +53,7 @@ def test_collect_to_recording(run: Run, folder: Path) -> None:
     assert "Evaluating" in err
     assert evaluated["data_hash"] == collected["data_hash"]
     assert set(evaluated["rmse"]) == {"hinge_x_cm", "hinge_y_cm", "angle_deg", "position_cm"}
-    assert {"task", "filter", "checkpoint_hash", "episodes", "recipe", "nll", "nees", "coverage95"} <= set(evaluated)
+    assert {"task", "filter", "checkpoint_hash", "episodes", "faults", "nll", "nees", "coverage95"} <= set(evaluated)
 
     code, out, _ = run(f"trace {EKF} --data few.h5 --episode 1 -o one.trace --json -")
     assert code == 0
@@ -92,19 +92,19 @@ def test_counterfactual_says_what_an_edit_did(run: Run, folder: Path) -> None:
     """The text, the JSON, the figure and the edited trace agree, and a trace keeps what was edited."""
     line = "counterfactual door --filter crossmodal-pf --particles 50 --from 40 --to 60"
     outputs = "-o what.svg --trace edited.trace"
-    code, out, _ = run(f"{line} --recipe blackout --weights image=0.9 {outputs} --json -")
+    code, out, _ = run(f"{line} --faults blackout --weights image=0.9 {outputs} --json -")
     found = json.loads(out)
     assert code == 0
     assert found["edit"]["weights"] == {"image": 0.9}
     assert (found["edit"]["from"], found["edit"]["to"]) == (40, 60)
     edited = load_trace(folder / "edited.trace")
     assert edited.settings["edits"] == [found["edit"]]
-    assert str(edited.recipe) == "blackout:from=40:to=60"
+    assert str(edited.faults) == "blackout:from=40:to=60"
     assert edited.weights is not None
     np.testing.assert_allclose(edited.weights[40:60, 0], 0.9, rtol=1e-6)  # float32, through a logarithm
     np.testing.assert_array_equal(edited.estimate_mean, np.float32(found["edited"]))
     assert (folder / "what.svg").read_text().startswith("<?xml")
-    code, out, _ = run(f"{line} --recipe blackout --weights image=0.9")
+    code, out, _ = run(f"{line} --faults blackout --weights image=0.9")
     title, *tables = out.split("\n\n")
     assert (code, title) == (0, found["verdict"])
     assert "Blackout, beta of image 0.9 over steps 40 to 59 moved the estimate by at most " in title
@@ -117,26 +117,26 @@ def test_counterfactual_says_what_an_edit_did(run: Run, folder: Path) -> None:
 
 def test_one_option_breaks_any_sensor(run: Run, folder: Path) -> None:
     run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
-    faults = json.loads(run("recipes --json -")[1])
+    faults = json.loads(run("faults --json -")[1])
     names = [fault["fault"] for fault in faults["faults"]]
     assert {"blackout", "force_stuck", "effector_offset", "contact_late", "delay", "drop"} <= set(names)
-    text = run("recipes")[1]
+    text = run("faults")[1]
     assert all(f"\n{name} " in f"\n{text}" for name in names)
     everything = ",".join(names)
-    line = f"{EKF} --data one.h5 --episode 0 --recipe {everything} --json - -o"
+    line = f"{EKF} --data one.h5 --episode 0 --faults {everything} --json - -o"
     traced = json.loads(run(f"trace {line} all.trace")[1])
-    assert [fault["fault"] for fault in traced["recipe"]] == names
-    assert load_trace(folder / "all.trace").recipe.to_json() == traced["recipe"]
+    assert [fault["fault"] for fault in traced["faults"]] == names
+    assert load_trace(folder / "all.trace").faults.to_json() == traced["faults"]
     recorded = json.loads(run(f"record {line} all.rrd --maps 0")[1])
-    assert recorded["recipe"] == traced["recipe"] == read_recording(folder / "all.rrd").recipe.to_json()
+    assert recorded["faults"] == traced["faults"] == read_recording(folder / "all.rrd").faults.to_json()
     assert (
-        f"with {load_trace(folder / 'all.trace').recipe}" in run(f"trace {line.replace('--json -', '')} all.trace")[1]
+        f"with {load_trace(folder / 'all.trace').faults}" in run(f"trace {line.replace('--json -', '')} all.trace")[1]
     )
 
 
-def test_every_way_to_write_a_recipe_is_the_same(run: Run, folder: Path) -> None:
+def test_every_way_to_write_a_faults_is_the_same(run: Run, folder: Path) -> None:
     run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
-    (folder / "recipe.json").write_text('[{"fault": "blackout", "probability": 0.4}]')
+    (folder / "faults.json").write_text('[{"fault": "blackout", "probability": 0.4}]')
 
     def evaluated(rest: str) -> dict[str, Any]:
         code, out, _ = run(f"evaluate {EKF} --data one.h5 --json - {rest}")
@@ -144,21 +144,21 @@ def test_every_way_to_write_a_recipe_is_the_same(run: Run, folder: Path) -> None
         return dict(json.loads(out))
 
     whole = evaluated("")
-    assert (whole["recipe"], whole["only"]) == ([], None)
-    asked = evaluated("--recipe blackout=0.4")
-    assert asked["recipe"] == [{"fault": "blackout", "probability": 0.4}]
+    assert (whole["faults"], whole["only"]) == ([], None)
+    asked = evaluated("--faults blackout=0.4")
+    assert asked["faults"] == [{"fault": "blackout", "probability": 0.4}]
     assert asked["rmse"] != whole["rmse"]
     for other in (
         """'{"blackout": 0.4}'""",
-        "recipe.json",
-        "./recipe.json",
+        "faults.json",
+        "./faults.json",
         """'[{"fault": "blackout", "probability": 0.4}]'""",
     ):
-        assert evaluated(f"--recipe {other}") == asked
-    alone = evaluated("--recipe blackout=0.4 --only image")
+        assert evaluated(f"--faults {other}") == asked
+    alone = evaluated("--faults blackout=0.4 --only image")
     assert alone["only"] == "image"
     assert alone["rmse"] != asked["rmse"]
-    assert evaluated("""--recipe '{"blackout": 0.4, "only": "image"}'""") == alone
+    assert evaluated("""--faults '{"blackout": 0.4, "only": "image"}'""") == alone
 
 
 def test_what_is_bad_can_be_left_out(run: Run, folder: Path) -> None:
@@ -179,15 +179,15 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert code == 0
     assert "dynamics" in err
     assert trained["record"]["command"].startswith("beliefscope train door --filter crossmodal-pf --data ten.h5")
-    assert trained["record"]["recipe"] == []
+    assert trained["record"]["faults"] == []
     episodes = trained["record"]["episodes"]
-    more = "--recipe force_bias:x=5,blackout=0.4 --blackouts 0,0.8 --json"
+    more = "--faults force_bias:x=5,blackout=0.4 --blackouts 0,0.8 --json"
     hardened = json.loads(run(line.replace("--json", more))[1])["record"]
     assert (trained["record"]["blackouts"], hardened["blackouts"]) == ([0.0, 0.4, 0.8], [0.0, 0.8])
     assert hardened["command"].partition("--blackouts ")[2].startswith("0,0.8")
-    assert [fault["fault"] for fault in hardened["recipe"]] == ["force_bias", "blackout"]
+    assert [fault["fault"] for fault in hardened["faults"]] == ["force_bias", "blackout"]
     assert hardened["episodes"] == episodes | {"train": 2 * episodes["train"]}
-    assert "--recipe force_bias=5,blackout=0.4" in hardened["command"]
+    assert "--faults force_bias=5,blackout=0.4" in hardened["command"]
     trained = json.loads(run(line)[1])
     code, out, _ = run("evaluate door --filter pf.safetensors --data ten.h5 --particles 50 --json -")
     assert code == 0

@@ -43,9 +43,9 @@ def _names(asked: Selection, other: Selection) -> tuple[str, str]:
     """What tells the two runs apart, by the names under which the page shows them."""
     if other.edit is not None:
         return "original", "edited"
-    recipes = [str(run.recipe) or "as recorded" for run in (asked, other)]
+    fault_sets = [str(run.faults) or "as recorded" for run in (asked, other)]
     if asked.filter == other.filter:
-        return recipes[0], recipes[1]
-    if asked.recipe == other.recipe:
+        return fault_sets[0], fault_sets[1]
+    if asked.faults == other.faults:
         return asked.filter, other.filter
-    return f"{asked.filter}, {recipes[0]}", f"{other.filter}, {recipes[1]}"
+    return f"{asked.filter}, {fault_sets[0]}", f"{other.filter}, {fault_sets[1]}"

@@ -26,7 +26,7 @@ from beliefscope.inspect.trace import Trace
 
 RESULTS_IN_MEMORY = 64
 HELD_OUT = "held-out"
-NAMES_OF_A_TRACE = ("recipe", "data", "episodes")
+NAMES_OF_A_TRACE = ("faults", "data", "episodes")
 """What a query names beside the diagnostic's own options."""
 
 
@@ -90,7 +90,7 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
         }
         where = f"all {len(selections)} held-out episodes" if episodes else f"episode {asked.episode}"
         title = ", ".join(
-            [f"{entry.title} of {asked.filter}", f"{asked.task} {where}", *filter(None, [str(asked.recipe)])]
+            [f"{entry.title} of {asked.filter}", f"{asked.task} {where}", *filter(None, [str(asked.faults)])]
         )
         key = _key(library, entry, selections, options)
         return under_way(jobs.submit("diagnostic", title, arguments, key, _link(entry, asked, options, episodes)))
@@ -172,5 +172,5 @@ def _key(library: Library, entry: Entry, selections: list[Selection], options: M
 def _link(entry: Entry, asked: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:
     """The page's address with this open."""
     kept = {"task": asked.task, "filter": asked.filter, "data": asked.data, "episode": asked.episode}
-    opened = {"recipe": str(asked.recipe), "diagnostic": entry.name, "options": urlencode(options), "over": episodes}
+    opened = {"faults": str(asked.faults), "diagnostic": entry.name, "options": urlencode(options), "over": episodes}
     return "?" + urlencode(kept | {"tab": "diagnostics"} | {name: text for name, text in opened.items() if text})

@@ -17,7 +17,7 @@ from beliefscope.app.jobs.worker import Report
 from beliefscope.app.protocol.permalinks import moment_link
 from beliefscope.app.runs.live_runs import PREFIX
 from beliefscope.app.runs.trace_store import Library, Selection, Settings
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.diagnostics.base import as_json
 from beliefscope.inspect.failures.by_episode import by_episode
 from beliefscope.inspect.failures.moments import Failures, failures_of, survey_of
@@ -37,11 +37,11 @@ class Wanted:
     filter: str
     data: str
     among: Among
-    recipe: Recipe
+    faults: Faults
 
 
-def _wanted(task: str, filter: str, data: str = "", among: Among = "held-out", recipe: str = "") -> Wanted:
-    return Wanted(task, filter, data, among, Recipe.parse(recipe))
+def _wanted(task: str, filter: str, data: str = "", among: Among = "held-out", faults: str = "") -> Wanted:
+    return Wanted(task, filter, data, among, Faults.parse(faults))
 
 
 Asked = Annotated[Wanted, Depends(_wanted)]
@@ -64,10 +64,10 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
     @router.post("/api/failures/{task}/{filter}", status_code=202)
     def look(asked: Asked) -> Response:
         arguments = _arguments(library, asked)
-        count, recipe = len(arguments["episodes"]), arguments["recipe"]
+        count, faults = len(arguments["episodes"]), arguments["faults"]
         where = f"all {count} episodes" if asked.among == "all" else f"{count} held-out episodes"
-        title = ", ".join([f"Failures of {asked.filter}", f"{asked.task} {where}", *filter(None, [recipe])])
-        kept = {name: arguments[name] for name in ("task", "filter", "data", "among", "recipe") if arguments[name]}
+        title = ", ".join([f"Failures of {asked.filter}", f"{asked.task} {where}", *filter(None, [faults])])
+        kept = {name: arguments[name] for name in ("task", "filter", "data", "among", "faults") if arguments[name]}
         link = "?" + urlencode(kept | {"tab": "failures"})
         return under_way(jobs.submit("failures", title, arguments, _key(library, arguments), link))
 
@@ -76,7 +76,7 @@ def routes(library: Library, jobs: Jobs) -> APIRouter:
 
 def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """The job: runs the filter over the episodes, keeps none of the traces, and ranks the moments by each score."""
-    episodes, recipe = arguments["episodes"], Recipe.parse(arguments["recipe"])
+    episodes, faults = arguments["episodes"], Faults.parse(arguments["faults"])
     settings = Settings.of_json(arguments["settings"])
     library = Library(settings)
 
@@ -89,7 +89,7 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             library.checkpoint(arguments["task"], arguments["filter"]),
             library.dataset(arguments["task"], arguments["data"])[1],
             episodes,
-            recipe=recipe,
+            faults=faults,
             seed=settings.seed,
             particles=settings.particles,
             progress=progress,
@@ -102,16 +102,16 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 def _of_live(library: Library, asked: Wanted) -> Response:
     """Of a live run, whose one episode is not run for it again. Raises BadInput while the run goes on."""
     run = library.live.ended(asked.data)
-    of = Selection(asked.task, asked.filter, run.like.episode_index, asked.recipe, asked.data)
+    of = Selection(asked.task, asked.filter, run.like.episode_index, asked.faults, asked.data)
     traced = library.traced(of)
     if not traced.ready(PATIENCE):
         return JSONResponse({"progress": traced.progress}, status_code=202)
     found = document(Survey.of([traced.trace]), asked.filter, asked.data)
-    return JSONResponse(_named(vars(asked) | {"recipe": str(asked.recipe)}) | found)
+    return JSONResponse(_named(vars(asked) | {"faults": str(asked.faults)}) | found)
 
 
 def _named(asked: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: asked[name] for name in ("filter", "data", "recipe", "among")}
+    return {name: asked[name] for name in ("filter", "data", "faults", "among")}
 
 
 def document(survey: Survey, filter_: str, data: str) -> dict[str, Any]:
@@ -156,7 +156,7 @@ def _ranked(found: Failures, survey: Survey, filter_: str, data: str) -> dict[st
             "nees": m.nees[-1],
             "ess": m.ess,
             "acting": m.acting,
-            "link": moment_link(survey.task, filter_, data, m.episode, m.step, survey.recipe, found.by),
+            "link": moment_link(survey.task, filter_, data, m.episode, m.step, survey.faults, found.by),
         }
         for m in found.worst(LISTED)
     ]
@@ -174,14 +174,14 @@ def _ranked(found: Failures, survey: Survey, filter_: str, data: str) -> dict[st
 def _arguments(library: Library, asked: Wanted) -> dict[str, Any]:
     """Of the job. Raises BadInput for what does not exist."""
     name, data = library.dataset(asked.task, asked.data)
-    asked.recipe.check(library.checkpoint(asked.task, asked.filter).task)
+    asked.faults.check(library.checkpoint(asked.task, asked.filter).task)
     return {
         "settings": library.settings.to_json(),
         "task": asked.task,
         "filter": asked.filter,
         "data": name,
         "among": asked.among,
-        "recipe": str(asked.recipe),
+        "faults": str(asked.faults),
         "episodes": data.held_out() if asked.among == "held-out" else list(range(len(data))),
     }
 
@@ -189,6 +189,6 @@ def _arguments(library: Library, asked: Wanted) -> dict[str, Any]:
 def _key(library: Library, arguments: Mapping[str, Any]) -> str:
     """Of all that a result depends on; names are in its links."""
     task, filter_, data = (arguments[name] for name in ("task", "filter", "data"))
-    named = tuple(arguments[name] for name in ("task", "filter", "data", "among", "recipe", "episodes"))
+    named = tuple(arguments[name] for name in ("task", "filter", "data", "among", "faults", "episodes"))
     hashes = (library.checkpoint(task, filter_).hash, library.data_hash(task, data))
     return hashlib.sha256(repr((named, hashes, library.settings.seed, library.settings.particles)).encode()).hexdigest()

@@ -200,7 +200,7 @@ def _document(found: Change, child: Checkpoint, about: Mapping[str, Any], data: 
     record, weighed = child.record, child.filter.architecture.fusion == "crossmodal"
 
     def link(m: Worsening) -> str:
-        return moment_link(child.task, name, data, m.episode, m.step, m.recipe)
+        return moment_link(child.task, name, data, m.episode, m.step, m.faults)
 
     return {
         "child": {"name": name, "hash": child.hash} | {key: record[key] for key in ("best_step", "steps", "seconds")},

@@ -32,7 +32,7 @@ from beliefscope.app.workspace.recording_probe import About
 from beliefscope.app.workspace.recordings import ENDING, Recording, RrdFiles, disk
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.traces.live_file import SUFFIX, GrowingWriter
@@ -51,7 +51,7 @@ class RecordingRequest(BaseModel):
     task: str
     filter: str
     episode: int
-    recipe: str = ""
+    faults: str = ""
     data: str = ""
     maps: Annotated[int, Field(ge=0)] = 0
     automatic: bool = False
@@ -96,7 +96,7 @@ def routes(library: Library, files: RrdFiles, jobs: Jobs) -> APIRouter:
     @router.post("/api/recordings", status_code=201)
     def record(wanted: RecordingRequest, request: Request, response: Response) -> dict[str, Any]:
         started = time.perf_counter()
-        of = Selection(wanted.task, wanted.filter, wanted.episode, Recipe.parse(wanted.recipe), wanted.data)
+        of = Selection(wanted.task, wanted.filter, wanted.episode, Faults.parse(wanted.faults), wanted.data)
         traced = library.traced(of)
         # A job makes the maps. Of a run that goes on it would find more steps than were asked for.
         maps = 0 if traced.grows or traced.no_maps else wanted.maps

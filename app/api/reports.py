@@ -27,7 +27,7 @@ from beliefscope.app.server.security import kept_file
 from beliefscope.app.workspace.json_files import read_record
 from beliefscope.app.workspace.trash import Deleted, Gone, Trash, size
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.recordings.report.pdf import browser, print_page
 
 NAME = re.compile(r"[\w.+-]+-episode\d+-[0-9a-f]{8}")
@@ -56,7 +56,7 @@ class ReportRequest(BaseModel):
 
 class _Run(BaseModel):
     episode: int
-    recipe: Any
+    faults: Any
 
 
 class Manifest(BaseModel):
@@ -126,7 +126,7 @@ class Reports:
             if name not in self._known or self._known[name][0] != made:
                 said = read_record(MANIFEST, manifest)
                 shown = said.model_dump(include={"title", "made", "task", "filter"})
-                shown |= {"episode": said.traces[0].episode, "recipe": str(Recipe.of(said.traces[0].recipe))}
+                shown |= {"episode": said.traces[0].episode, "faults": str(Faults.of(said.traces[0].faults))}
                 shown |= {"name": name, "url": f"/api/reports/{name}.html", "bytes": size(manifest.parent)}
                 shown["pdf"] = f"/api/reports/{name}.pdf" if "report.pdf" in said.files else None
                 self._known[name] = made, shown
@@ -223,7 +223,7 @@ def work(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         served = serving([path] if path else [], data, settings.seed)
 
         def link(index: int, step: int) -> str:
-            return arguments["url"] + moment_link(task, of.filter, of.data, of.episode, step, str(of.recipe))
+            return arguments["url"] + moment_link(task, of.filter, of.data, of.episode, step, str(of.faults))
 
         composed = compose(
             [trace],

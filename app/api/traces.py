@@ -16,7 +16,7 @@ from beliefscope.app.protocol.messages import closing, pictures
 from beliefscope.app.runs.trace_store import Library, Selection, Traced
 from beliefscope.app.views.embedded_viser import client_page
 from beliefscope.app.views.view import Views
-from beliefscope.datasets.faults.recipe import Recipe, described
+from beliefscope.datasets.faults.injection import Faults, described
 
 PATIENCE = 0.25  # s that a request for a trace waits before it says how far the trace is
 
@@ -28,8 +28,8 @@ class ViewRequest(BaseModel):
     dark: bool = False
 
 
-def _selection(task: str, filter: str, episode: int, recipe: str = "", data: str = "") -> Selection:
-    return Selection(task, filter, episode, Recipe.parse(recipe), data)
+def _selection(task: str, filter: str, episode: int, faults: str = "", data: str = "") -> Selection:
+    return Selection(task, filter, episode, Faults.parse(faults), data)
 
 
 Asked = Annotated[Selection, Depends(_selection)]

@@ -23,6 +23,7 @@ from beliefscope.app.cli.commands.doctor import doctor
 from beliefscope.app.cli.commands.evaluate import evaluate
 from beliefscope.app.cli.commands.export import export
 from beliefscope.app.cli.commands.failures import failures
+from beliefscope.app.cli.commands.faults import faults
 from beliefscope.app.cli.commands.figure import figure
 from beliefscope.app.cli.commands.finetune import finetune
 from beliefscope.app.cli.commands.import_ import restore
@@ -30,7 +31,6 @@ from beliefscope.app.cli.commands.inspect import inspect
 from beliefscope.app.cli.commands.lineage import lineage
 from beliefscope.app.cli.commands.live import live
 from beliefscope.app.cli.commands.modules import modules
-from beliefscope.app.cli.commands.recipes import recipes
 from beliefscope.app.cli.commands.record import record
 from beliefscope.app.cli.commands.report import report
 from beliefscope.app.cli.commands.serve import serve
@@ -60,7 +60,7 @@ COMMANDS = (
     counterfactual,
     figure,
     failures,
-    recipes,
+    faults,
     doctor,
 )
 

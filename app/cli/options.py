@@ -18,7 +18,7 @@ from beliefscope.datasets.errors import BadInput
 if TYPE_CHECKING:
     from beliefscope.datasets.dataset import Dataset
     from beliefscope.datasets.episode import Episode
-    from beliefscope.datasets.faults.recipe import Recipe
+    from beliefscope.datasets.faults.injection import Faults
     from beliefscope.datasets.task import Task
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.inspect.trace import Trace
@@ -78,13 +78,13 @@ EpisodeIndex = Annotated[
         help="Index in the data set. Without it: the first that is held out.",
     ),
 ]
-RecipeText = Annotated[
+FaultsText = Annotated[
     str,
     typer.Option(
-        "--recipe",
+        "--faults",
         metavar="FAULTS",
         help="How the sensors are broken: blackout=0.4,force_bias:x=5:from=20, or JSON, or a .json file of it. "
-        "beliefscope recipes lists the faults.",
+        "beliefscope faults lists the faults.",
     ),
 ]
 Particles = Annotated[int, typer.Option("--particles", parser=whole(1), metavar="M", help="Of a particle filter.")]
@@ -182,21 +182,21 @@ def serving(filters: Iterable[str | Path], data: Path | None, seed: int) -> str:
     return shlex.join(["beliefscope", "serve", *given, *(["--seed", str(seed)] if seed else [])])
 
 
-def recipe_text(text: str) -> str:
+def faults_text(text: str) -> str:
     """What the file says, where the text is a path: it ends in .json or holds a separator."""
     if text.lstrip().startswith(("{", "[")) or not (text.endswith(".json") or os.sep in text):
         return text
     try:
         return Path(text).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
-        raise BadInput(f"recipe {text!r} is not a file that can be read") from None
+        raise BadInput(f"faults {text!r} is not a file that can be read") from None
 
 
-def recipe(text: str, task: Task) -> Recipe:
-    """The recipe that the text, or the file it names, stands for. Raises BadInput for one that does not fit."""
-    from beliefscope.datasets.faults.recipe import Recipe
+def faults(text: str, task: Task) -> Faults:
+    """The faults that the text, or the file it names, stands for. Raises BadInput for one that does not fit."""
+    from beliefscope.datasets.faults.injection import Faults
 
-    found = Recipe.parse(recipe_text(text))
+    found = Faults.parse(faults_text(text))
     found.check(task)
     return found
 
@@ -234,7 +234,7 @@ def one_run(
     data: DataPath = None,
     skip_bad: SkipBad = False,
     episode: EpisodeIndex = None,
-    recipe_: RecipeText = "",
+    faults_: FaultsText = "",
     particles: Particles = 300,
     seed: Seed = 0,
 ) -> tuple[Checkpoint, Trace]:
@@ -242,7 +242,7 @@ def one_run(
     from beliefscope.inspect.trace import trace
 
     loaded = checkpoint(task, filter_)
-    broken = recipe(recipe_, loaded.task)
+    broken = faults(faults_, loaded.task)
     shown, index = one_episode(loaded.task, data, skip_bad, episode)
     with console.progress("Filtering") as advance:
         return loaded, trace(loaded, shown, index, seed, particles, broken, advance)
@@ -262,7 +262,7 @@ def described(trace: Trace, path: Path) -> dict[str, Any]:
         "filter": trace.filter,
         "episode": trace.episode_index,
         "steps": len(trace),
-        "recipe": trace.recipe.to_json(),
+        "faults": trace.faults.to_json(),
         "seed": trace.seed,
         "checkpoint_hash": trace.checkpoint_hash,
         "data_hash": trace.data_hash,
@@ -274,7 +274,7 @@ def described(trace: Trace, path: Path) -> dict[str, Any]:
 def title(trace: Trace, path: Path) -> str:
     """The same in one line of text."""
     what = f"{trace.filter} over {len(trace)} steps of {trace.episode.task} episode {trace.episode_index}"
-    return f"{size(path)}: {what}" + (f" with {trace.recipe}" if trace.recipe else "")
+    return f"{size(path)}: {what}" + (f" with {trace.faults}" if trace.faults else "")
 
 
 def size(path: Path) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.faults.injection import WHOLE, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.training.study import nees_bounds
 from beliefscope.inspect.diagnostics.consistency import innovations
@@ -25,7 +25,7 @@ SENSORS = ("effector_position", "force")
 class Cursor:
     """The page's whole selection, as one message of it says.
 
-    Serial: the page's own count of its cursors. Recipe: how the sensors are broken. Scene: whether the 3D scene
+    Serial: the page's own count of its cursors. Faults: how the sensors are broken. Scene: whether the 3D scene
     follows, or only the maps. Data: name of the data set; empty for the task's first. Against: what differs in the
     other run, whose estimate the scene shows too (``Selection.against``); empty without one. Beside: whether its maps
     are wanted too.
@@ -38,7 +38,7 @@ class Cursor:
     step: int
     angle: float | None
     size: int
-    recipe: Recipe = WHOLE
+    faults: Faults = WHOLE
     scene: bool = True
     data: str = ""
     against: str = ""
@@ -123,8 +123,8 @@ def cursor(message: dict[str, Any]) -> Cursor:
     angle = message.get("angle")
     if angle is not None and not _is_number(angle):
         raise BadInput(f"cursor's 'angle' is a number of radians or null; got {angle!r}.")
-    recipe, data, against = (message.get(key, "") for key in ("recipe", "data", "against"))
-    for key, text in (("recipe", recipe), ("data", data), ("against", against)):
+    faults, data, against = (message.get(key, "") for key in ("faults", "data", "against"))
+    for key, text in (("faults", faults), ("data", data), ("against", against)):
         if not isinstance(text, str):
             raise BadInput(f"cursor's {key!r} is text; got {text!r}.")
     size = message.get("size", MAP_SIZES[0])
@@ -139,7 +139,7 @@ def cursor(message: dict[str, Any]) -> Cursor:
         filter=message["filter"],
         angle=angle,
         size=size,
-        recipe=Recipe.parse(recipe),
+        faults=Faults.parse(faults),
         scene=scene,
         data=data,
         against=against,
@@ -214,7 +214,7 @@ def header(trace: Trace, described: list[dict[str, Any]], task: Task, no_maps: s
         "checkpoint_hash": trace.checkpoint_hash,
         "data_hash": trace.data_hash,
         "seed": trace.seed,
-        "recipe": str(trace.recipe),
+        "faults": str(trace.faults),
         "settings": dict(trace.settings),
         "nees_bounds": nees_bounds(len(components), 1) if trace.has_covariance else None,
         "no_maps": no_maps,

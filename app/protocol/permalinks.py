@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 
 def moment_link(
-    task: Task, filter_: str, data: str, episode: int, step: int, recipe: str = "", by: str = "error"
+    task: Task, filter_: str, data: str, episode: int, step: int, faults: str = "", by: str = "error"
 ) -> str:
     """``?task=...&step=...``, as the page's own address says it.
 
     Args:
-        filter_, data: names as the page shows them. recipe: text. by: name of the score that ranks the page's list of
+        filter_, data: names as the page shows them. faults: text. by: name of the score that ranks the page's list of
             failures; it chooses what the time line draws too: the angle that it is of, the particles of ``ess``, the
             normalised squared error of ``nees``, the weights as they acted of ``regret``.
     """
@@ -32,8 +32,8 @@ def moment_link(
         "track": {"ess": "particles", "nees": "nees"}.get(by, "error"),
         "tab": "scene",
     }
-    if recipe:
-        kept["recipe"] = recipe
+    if faults:
+        kept["faults"] = faults
     if by != "error":
         kept["by"] = by
     # Browsers' URLSearchParams leave the star as it is and encode the tilde.

@@ -14,7 +14,7 @@ from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.faults.recipe import ready
+from beliefscope.datasets.faults.injection import ready
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import filters_of
@@ -102,7 +102,7 @@ class Shelf:
             "modalities": list(task.modalities),
             "dt": task.dt,
             "map": {"x": x, "y": y, "half_width": task.map_half_width},
-            "recipes": [{"name": name, "recipe": text} for name, text in ready(task).items()],
+            "fault_presets": [{"name": name, "faults": text} for name, text in ready(task).items()],
             "filters": [_filter(name, checkpoint) for name, checkpoint in self.filters.items()],
             "data": [
                 {"name": name, "first": data.held_out()[0], "episodes": [asdict(summary) for summary in data.summaries]}

@@ -26,7 +26,7 @@ from beliefscope.app.workspace.json_files import is_text
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import WHOLE
+from beliefscope.datasets.faults.injection import WHOLE
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import Foreign
@@ -231,7 +231,7 @@ class LiveRuns:
                 f"live run {run.name!r} is of task {run.task.name!r}, episode {run.like.episode_index}, "
                 f"not of {asked.task!r}, episode {asked.episode}"
             )
-        if (asked.filter, asked.recipe, asked.edit) != (name, WHOLE, None):
+        if (asked.filter, asked.faults, asked.edit) != (name, WHOLE, None):
             return None
         if run.state == "running":
             return run.growing(checkpoint)
@@ -290,7 +290,7 @@ def described(run: Run) -> dict[str, Any]:
         "data": f"{PREFIX}{run.name}",
         "task": run.task.name,
         "episode": run.like.episode_index,
-        "recipe": str(run.like.recipe),
+        "faults": str(run.like.faults),
         "steps": run.reader.steps,
         "expected": run.reader.expected,
         "started": run.reader.started,

@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl
 from beliefscope.app.protocol.map_format import WiredMaps, wire_maps
 from beliefscope.app.protocol.messages import MAP_SIZES, columns, header
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.faults.injection import WHOLE, Faults
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, no_maps
 from beliefscope.inspect.trace import Trace, arrays_of
@@ -39,14 +39,14 @@ class Selection:
     task: str
     filter: str
     episode: int
-    recipe: Recipe = WHOLE
+    faults: Faults = WHOLE
     data: str = ""
     edit: Edit | None = None
 
     @property
     def told(self) -> str:
         """The run in words."""
-        return f"{self.filter}, {self.task} episode {self.episode}" + (f", {self.recipe}" if self.recipe else "")
+        return f"{self.filter}, {self.task} episode {self.episode}" + (f", {self.faults}" if self.faults else "")
 
     @property
     def stem(self) -> str:
@@ -56,28 +56,28 @@ class Selection:
     def to_json(self) -> dict[str, Any]:
         """As JSON values, for another process."""
         edit = None if self.edit is None else self.edit.to_json()
-        return {**vars(self), "recipe": self.recipe.to_json(), "edit": edit}
+        return {**vars(self), "faults": self.faults.to_json(), "edit": edit}
 
     @classmethod
     def of_json(cls, shown: Mapping[str, Any]) -> Selection:
         """What ``to_json`` gave."""
         edit = None if shown["edit"] is None else Edit.of(shown["edit"])
-        return cls(**{**shown, "recipe": Recipe.of(shown["recipe"]), "edit": edit})
+        return cls(**{**shown, "faults": Faults.of(shown["faults"]), "edit": edit})
 
     def against(self, text: str) -> Selection:
         """The other run that this one is compared with, from what is different about it.
 
-        ``filter=NAME``, ``recipe=FAULTS`` (none where empty) or both; or an edit over some steps, ``from=20&to=40``
-        with ``recipe=FAULTS``, ``weights=MODALITY=BETA`` or both. Raises BadInput for anything else, and the same run.
+        ``filter=NAME``, ``faults=FAULTS`` (none where empty) or both; or an edit over some steps, ``from=20&to=40``
+        with ``faults=FAULTS``, ``weights=MODALITY=BETA`` or both. Raises BadInput for anything else, and the same run.
         """
         given = dict(parse_qsl(text, keep_blank_values=True))
         if given.keys() & {"from", "to", "weights"}:
             return replace(self, edit=Edit.parse(text))
         for key in given:
-            if key not in ("filter", "recipe"):
-                raise one_of("part of the other run", key, ("filter", "recipe", "from", "to", "weights"))
-        recipe = Recipe.parse(given["recipe"]) if "recipe" in given else self.recipe
-        other = replace(self, filter=given.get("filter", self.filter), recipe=recipe)
+            if key not in ("filter", "faults"):
+                raise one_of("part of the other run", key, ("filter", "faults", "from", "to", "weights"))
+        faults = Faults.parse(given["faults"]) if "faults" in given else self.faults
+        other = replace(self, filter=given.get("filter", self.filter), faults=faults)
         if other == self:
             raise BadInput(f"{text!r} is the run that is shown, not another")
         return other
@@ -87,7 +87,7 @@ class Traced:
     """A trace that is being computed, or is there; and what is derived from it.
 
     Attributes:
-        key: hash of everything the trace depends on: checkpoint, episode, seed, particles, recipe.
+        key: hash of everything the trace depends on: checkpoint, episode, seed, particles, faults.
         done: the trace, or the error that computing it ended in. progress: 0..1.
         shown: what a scene that is there already can go on showing: the key, or that of all states of a live run.
         grows: whether it is of a live run, and more steps may come (``app/runs/live_runs.py``).

@@ -190,7 +190,7 @@ class Library:
             if selection not in self._keys:
                 checkpoint, episode = self._found(selection)
                 seed, particles = self.settings.seed, self.settings.particles
-                parts = [checkpoint.hash, episode.digest(), seed, particles, str(selection.recipe)]
+                parts = [checkpoint.hash, episode.digest(), seed, particles, str(selection.faults)]
                 if selection.edit is not None:
                     parts.append(selection.edit.to_json())
                 self._keys[selection] = hashlib.sha256(repr(tuple(parts)).encode()).hexdigest()
@@ -249,9 +249,9 @@ class Library:
         checkpoint = shelf.filter(selection.filter)
         live = selection.data.startswith(PREFIX)
         episode = self.live.episode(selection.data) if live else shelf.episode(selection.data, selection.episode)
-        selection.recipe.check(checkpoint.task)
+        selection.faults.check(checkpoint.task)
         if selection.edit is not None:
-            selection.edit.recipe.check(checkpoint.task)
+            selection.edit.faults.check(checkpoint.task)
         return checkpoint, episode
 
     def _live(self, selection: Selection) -> Traced | None:
@@ -319,7 +319,7 @@ class Library:
             episode_index=selection.episode,
             seed=self.settings.seed,
             particles=self.settings.particles,
-            recipe=selection.recipe,
+            faults=selection.faults,
             progress=progress,
         )
         path.parent.mkdir(parents=True, exist_ok=True)

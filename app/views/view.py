@@ -127,7 +127,7 @@ class View:
                 await self._answer_one(websocket, wanted)
 
     async def _answer_one(self, websocket: WebSocket, wanted: Cursor) -> None:
-        selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.recipe, wanted.data)
+        selection = Selection(wanted.task, wanted.filter, wanted.episode, wanted.faults, wanted.data)
         traced = await self._traced(selection)
         if not traced.grows and not await self._ready_before_newer(traced):
             return

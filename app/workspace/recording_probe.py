@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from beliefscope.inspect.trace import stored_recipe
+from beliefscope.inspect.trace import stored_faults
 from beliefscope.recordings.schema import GROWING
 
 PATIENCE = 300.0  # s that a file is read for at most
@@ -26,7 +26,7 @@ class About:
         application, title: as the file has them. entities, rows: how many.
         problem: why no run can be read out of it; empty where one can. Of a file that Rerun cannot read either,
             ``application`` is empty.
-        task ... data_hash: of the trace, where it is one of ours; ``recipe`` as text, ``steps`` None of a live run.
+        task ... data_hash: of the trace, where it is one of ours; ``faults`` as text, ``steps`` None of a live run.
         edited: whether some steps of the run were changed by hand.
     """
 
@@ -40,7 +40,7 @@ class About:
     episode: int | None = None
     steps: int | None = None
     seed: int | None = None
-    recipe: str = ""
+    faults: str = ""
     particles: int | None = None
     edited: bool = False
     checkpoint_hash: str = ""
@@ -57,6 +57,7 @@ class About:
             return cls(**said)
         try:
             settings = json.loads(properties["settings"])
+            stored = properties.get("faults", properties.get("recipe"))
             return cls(
                 **said,
                 task=str(properties["task"]),
@@ -64,7 +65,7 @@ class About:
                 episode=int(properties["episode_index"]),
                 steps=None if properties["steps"] == GROWING else int(properties["steps"]),
                 seed=int(properties["seed"]),
-                recipe=str(stored_recipe(json.loads(properties.get("recipe", "null")), settings)),
+                faults=str(stored_faults({"settings": settings, "faults": json.loads(stored or "null")})),
                 particles=None if settings.get("particles") is None else int(settings["particles"]),
                 edited=bool(settings.get("edits")),
                 checkpoint_hash=str(properties["checkpoint_hash"]),

@@ -1,6 +1,6 @@
 """The ways in which a sensor breaks: small frozen values that print, and that turn what was read into what is reported.
 
-Values are SI, gray levels 0 to 255 and pixels. ``datasets/faults/recipe.py`` puts them on episodes.
+Values are SI, gray levels 0 to 255 and pixels. ``datasets/faults/injection.py`` puts them on episodes.
 """
 
 from __future__ import annotations

@@ -90,20 +90,20 @@ class Mix:
         device: torch.device | str = "cpu",
     ) -> Mix:
         """Args:
-            shares: of each slice in the loss; they sum to 1. seed: of the recipes.
+            shares: of each slice in the loss; they sum to 1. seed: of the faults.
             moments: place among the episodes -> what of it counts, and nothing else does but for nominal data.
 
         Raises BadInput for a slice that does not fit task or filter, and an episode that does not fit the task.
         """
         for one in shares:
             one.check(task, models)
-        recipes = list(dict.fromkeys(one.recipe for one in shares))
-        copies = [recipe.apply(episode, seed) for recipe in recipes for episode in episodes]
+        fault_sets = list(dict.fromkeys(one.faults for one in shares))
+        copies = [faults.apply(episode, seed) for faults in fault_sets for episode in episodes]
         steps = Steps.of(task, copies, device)
         every = steps.windows(torch.arange(len(steps.states), device=device), 1)
         parts = []
         for one, share in shares.items():
-            first = recipes.index(one.recipe) * len(episodes)
+            first = fault_sets.index(one.faults) * len(episodes)
             mask = one.mask(every)[0]
             if moments and one != NOMINAL:
                 mask = mask & _inside(steps, first, moments)

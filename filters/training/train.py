@@ -14,7 +14,7 @@ import torch
 from beliefscope import __version__
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build
 from beliefscope.filters.evaluate import evaluate
@@ -204,7 +204,7 @@ def measure(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, Any]:
     return {
         f"{blackout:g}": {
             name or "fused": evaluate(
-                filter_, episodes, recipe=Recipe.parse(f"blackout={blackout}"), only=name
+                filter_, episodes, faults=Faults.parse(f"blackout={blackout}"), only=name
             ).to_dict()
             for name in names
         }

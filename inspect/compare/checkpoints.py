@@ -330,7 +330,7 @@ def _judged(d: Difference) -> str:
 def _part_row(part: Part) -> tuple[Value, ...]:
     one = part.slice
     contact = "all" if one.contact is None else "contact" if one.contact else "no contact"
-    return one.name, str(one.recipe), contact, " + ".join(one.only), part.episodes, part.steps
+    return one.name, str(one.faults), contact, " + ".join(one.only), part.episodes, part.steps
 
 
 def _module_row(m: ModuleChange) -> tuple[Value, ...]:

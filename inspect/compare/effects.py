@@ -77,13 +77,13 @@ class Worsening:
     """A stretch of steps at which the error rose, and its peak.
 
     Attributes:
-        slice: the first one in whose run it is. recipe: how the sensors were broken. only: who spoke.
+        slice: the first one in whose run it is. faults: how the sensors were broken. only: who spoke.
         episode: index in the data set. first, last, step: its steps, and the peak among them. contact: at the peak.
         before, after: m, distance of the estimate from the truth on the map, at the peak.
     """
 
     slice: str
-    recipe: str
+    faults: str
     only: tuple[str, ...]
     episode: int
     first: int
@@ -128,17 +128,17 @@ def worsenings(
     counted = step >= np.minimum(LEFT_OUT, last)
     bridge = max(1, round(RECENT / dt))
     moments: list[Worsening] = []
-    for (recipe, only), distance in found.distance.items():
+    for (faults, only), distance in found.distance.items():
         before, after = np.concatenate(distance, axis=1)
         rise = np.where(counted, after - before, -np.inf)
         high = rise > max(RISE, float(np.quantile(rise[counted], HIGH)))
-        name = next(one.name for one in slices if condition(one) == (recipe, only))
+        name = next(one.name for one in slices if condition(one) == (faults, only))
         for a, b in stretches(high, episode, bridge):
             at = a + int(np.argmax(rise[a : b + 1]))
             moments.append(
                 Worsening(
                     slice=name,
-                    recipe=recipe,
+                    faults=faults,
                     only=only,
                     episode=indices[episode[at]],
                     first=int(step[a]),

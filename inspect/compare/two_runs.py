@@ -182,7 +182,7 @@ CONFIDENCE = "Error in stated standard deviations (root of NEES/n)"
 
 
 def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None) -> Comparison:
-    """This run and the other, of one episode. names: what they are called; their filters' names, or their recipes.
+    """This run and the other, of one episode. names: what they are called; their filters' names, or their faults.
 
     Raises BadInput for runs of two episodes.
     """
@@ -248,13 +248,13 @@ def _nll(run: Trace) -> Array:
 
 
 def _names(this: Trace, other: Trace) -> tuple[str, str]:
-    """What tells the two apart: filter, recipe, or both."""
-    recipes = [str(run.recipe) or "as recorded" for run in (this, other)]
+    """What tells the two apart: filter, faults, or both."""
+    fault_sets = [str(run.faults) or "as recorded" for run in (this, other)]
     if this.filter == other.filter:
-        return recipes[0], recipes[1]
-    if recipes[0] == recipes[1]:
+        return fault_sets[0], fault_sets[1]
+    if fault_sets[0] == fault_sets[1]:
         return this.filter, other.filter
-    return f"{this.filter}, {recipes[0]}", f"{other.filter}, {recipes[1]}"
+    return f"{this.filter}, {fault_sets[0]}", f"{other.filter}, {fault_sets[1]}"
 
 
 def _row(kind: str, measure: str, both: Array, relative: bool = False) -> tuple[Value, ...]:

@@ -12,7 +12,7 @@ from scipy.special import bdtrc
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.faults.injection import WHOLE, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import UNITS
@@ -88,7 +88,7 @@ class Failures(Diagnostic):
     """Moments of a data set's episodes at which a filter's score is high; SI units.
 
     Attributes:
-        task, filter, checkpoint_hash, recipe, seed, particles: what was traced.
+        task, filter, checkpoint_hash, faults, seed, particles: what was traced.
         by: name of the score. title, unit: of it: m, rad, sigma, x (times) or none.
         threshold: above which a score is high. episodes, steps: how many were looked at.
         layers: the K modalities, then ``fused``: L. angles: names of the A components in rad.
@@ -100,7 +100,7 @@ class Failures(Diagnostic):
     task: str
     filter: str
     checkpoint_hash: str
-    recipe: str
+    faults: str
     seed: int
     particles: int | None
     by: str
@@ -211,7 +211,7 @@ def find_failures(
     episodes: Iterable[int] | None = None,
     *,
     by: str = "error",
-    recipe: Recipe = WHOLE,
+    faults: Faults = WHOLE,
     seed: int = 0,
     particles: int = 300,
     progress: Callable[[float], None] | None = None,
@@ -229,7 +229,7 @@ def find_failures(
         episodes = data.held_out()
     elif episodes is None:
         episodes = data if isinstance(data, Mapping) else range(len(data))
-    found = survey_of(checkpoint, data, episodes, recipe=recipe, seed=seed, particles=particles, progress=progress)
+    found = survey_of(checkpoint, data, episodes, faults=faults, seed=seed, particles=particles, progress=progress)
     return failures_of(found, by)
 
 
@@ -238,7 +238,7 @@ def survey_of(
     data: Dataset | Mapping[int, Episode] | Sequence[Episode],
     episodes: Iterable[int],
     *,
-    recipe: Recipe = WHOLE,
+    faults: Faults = WHOLE,
     seed: int = 0,
     particles: int = 300,
     progress: Callable[[float], None] | None = None,
@@ -248,7 +248,7 @@ def survey_of(
 
     def traces() -> Iterator[Trace]:
         for done, index in enumerate(chosen):
-            yield trace(checkpoint, data[index], index, seed, particles, recipe, _part(progress, done, len(chosen)))
+            yield trace(checkpoint, data[index], index, seed, particles, faults, _part(progress, done, len(chosen)))
 
     return Survey.of(traces())
 
@@ -271,7 +271,7 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
         task=survey.task.name,
         filter=survey.filter,
         checkpoint_hash=survey.checkpoint_hash,
-        recipe=survey.recipe,
+        faults=survey.faults,
         seed=survey.seed,
         particles=survey.particles,
         by=by,

@@ -43,7 +43,7 @@ class Survey:
     """S steps of all episodes, end to end in the order of the episodes' indices; SI units.
 
     Attributes:
-        task, filter, checkpoint_hash, recipe, seed, particles: what was traced. particles: None where there are none.
+        task, filter, checkpoint_hash, faults, seed, particles: what was traced. particles: None where there are none.
         layers: the K modalities, then ``fused``: L. angles: names of the A components in rad.
         episode, step: (S,) of the data set, and of the episode.
         scores: name -> (S,), for those that the filter has. refused: name -> why it has not.
@@ -56,7 +56,7 @@ class Survey:
     task: Task
     filter: str
     checkpoint_hash: str
-    recipe: str
+    faults: str
     seed: int
     particles: int | None
     layers: tuple[str, ...]
@@ -77,7 +77,7 @@ class Survey:
     def of(cls, traces: Iterable[Trace]) -> Survey:
         """Takes what it needs of each trace and lets go of it. Their order does not matter.
 
-        Raises BadInput where there is none, or they are of several filters, recipes or seeds.
+        Raises BadInput where there is none, or they are of several filters, faults or seeds.
         """
         found: dict[int, dict[str, NDArray[Any]]] = {}
         one: Trace | None = None
@@ -97,7 +97,7 @@ class Survey:
             task=task,
             filter=one.filter,
             checkpoint_hash=one.checkpoint_hash,
-            recipe=str(one.recipe),
+            faults=str(one.faults),
             seed=one.seed,
             particles=None if one.particles is None else one.particles.shape[1],
             layers=measures.layers(one),
@@ -172,7 +172,7 @@ SCORES: dict[str, Score] = {
 
 
 def _check_alike(first: Trace, other: Trace) -> None:
-    for what in ("checkpoint_hash", "recipe", "seed"):
+    for what in ("checkpoint_hash", "faults", "seed"):
         a, b = str(getattr(first, what)), str(getattr(other, what))
         if a != b:
             raise BadInput(f"traces of {what} {a!r} and {b!r}: failures are looked for in those of one run")

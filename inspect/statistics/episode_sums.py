@@ -25,7 +25,7 @@ SMALLEST = 1e-9
 """m, rad: an error below it has no logarithm to speak of."""
 
 Condition = tuple[str, tuple[str, ...]]
-"""A slice's recipe as text, and its ``only``: slices that share both are parts of one run."""
+"""A slice's faults as text, and its ``only``: slices that share both are parts of one run."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Tally:
 
 def condition(slice_: Slice) -> Condition:
     """What has to be run for a slice."""
-    return str(slice_.recipe), slice_.only
+    return str(slice_.faults), slice_.only
 
 
 def measures_of(task: Task) -> tuple[Measure, ...]:
@@ -124,14 +124,14 @@ def tally(
     n = len(task.components)
     sums = np.zeros((len(episodes), len(filters), len(slices), n + 4 + len(LEVELS)))
     distance = {condition(one): [np.zeros((len(filters), len(e))) for e in episodes] for one in slices}
-    by_recipe: dict[str, list[int]] = {}
+    by_faults: dict[str, list[int]] = {}
     for s, one in enumerate(slices):
-        by_recipe.setdefault(str(one.recipe), []).append(s)
+        by_faults.setdefault(str(one.faults), []).append(s)
     groups: dict[int, list[int]] = {}
     for number, episode in enumerate(episodes):
         groups.setdefault(len(episode), []).append(number)
     total, done = len(distance) * len(filters) * len(episodes), 0
-    for recipe, chosen in by_recipe.items():
+    for faults, chosen in by_faults.items():
         steps = Steps.of(task, slices[chosen[0]].broken(episodes, seed))
         for length, members in sorted(groups.items()):
             batch = steps.windows(steps.first[members], length)
@@ -157,7 +157,7 @@ def tally(
                     for s in alike:
                         sums[members, f, s] = _added(columns, slices[s].mask(batch))
                     for i, number in enumerate(members):
-                        distance[recipe, only][number][f] = np.sqrt(columns[:, i, n + 1])
+                        distance[faults, only][number][f] = np.sqrt(columns[:, i, n + 1])
                     done += len(members)
     return Tally(sums, distance)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.faults.injection import WHOLE, Faults
 from beliefscope.filters.external.load import Foreign
 from beliefscope.inspect.trace import Trace
 
@@ -21,7 +21,7 @@ def trace_foreign(
     episode: Episode,
     episode_index: int = 0,
     seed: int = 0,
-    recipe: Recipe = WHOLE,
+    faults: Faults = WHOLE,
     progress: Callable[[float], None] | None = None,
 ) -> Trace:
     """Runs a filter from outside over an episode from the true state, and keeps what it says and what can be seen.
@@ -36,7 +36,7 @@ def trace_foreign(
     if episode.task != foreign.task.name:
         raise BadInput(f"filter {foreign.name!r} is for task {foreign.task.name!r}, the episode is of {episode.task!r}")
     data_hash = episode.digest()
-    episode = recipe.apply(episode, seed)
+    episode = faults.apply(episode, seed)
     values, modalities = foreign.run([episode], seed, progress)
     start = foreign.start([episode])
     arrays = {name: np.ascontiguousarray(value[:, 0].numpy()) for name, value in values.items()}
@@ -54,7 +54,7 @@ def trace_foreign(
         data_hash=data_hash,
         episode_index=episode_index,
         seed=seed,
-        recipe=recipe,
+        faults=faults,
         settings=settings,
         **with_unknown(arrays, len(modalities)),
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.faults.injection import WHOLE, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Belief, Evidence, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
@@ -26,7 +26,7 @@ class Edit:
     """What is changed from step ``first`` up to, but without, step ``to``.
 
     Attributes:
-        recipe: how sensors are broken meanwhile, on top of how they already were. The span is the edit's: a fault with
+        faults: how sensors are broken meanwhile, on top of how they already were. The span is the edit's: a fault with
             one of its own is refused.
         weights: modality -> beta, 0 to 1, in place of the network's, in all components. Modalities that are not named
             share what is left in the proportions that the network gave them; where all are named, they sum to one.
@@ -36,13 +36,13 @@ class Edit:
 
     first: int
     to: int
-    recipe: Recipe = WHOLE
+    faults: Faults = WHOLE
     weights: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if not 0 <= self.first < self.to:
             raise BadInput(f"an edit from step {self.first} to {self.to} has no steps: 'to' is the first step after it")
-        for fault in self.recipe.faults:
+        for fault in self.faults:
             if fault.from_ != 0 or fault.to is not None:
                 raise BadInput(f"{fault} has a span of its own; that of an edit is for all its faults")
         total = sum(self.weights.values())
@@ -52,34 +52,34 @@ class Edit:
 
     @classmethod
     def parse(cls, text: str) -> Edit:
-        """From its text, ``from=20&to=40&recipe=blackout&weights=image=0.9``, as in an address.
+        """From its text, ``from=20&to=40&faults=blackout&weights=image=0.9``, as in an address.
 
-        Raises BadInput for anything else, and where neither a recipe nor weights are given.
+        Raises BadInput for anything else, and where neither a faults nor weights are given.
         """
         given = dict(parse_qsl(text, keep_blank_values=True))
-        known = ("from", "to", "recipe", "weights")
+        known = ("from", "to", "faults", "weights")
         for key in given:
             if key not in known:
                 raise one_of("part of an edit", key, known)
         edit = cls(
             _step(text, given, "from"),
             _step(text, given, "to"),
-            Recipe.parse(given.get("recipe", "")),
+            Faults.parse(given.get("faults", "")),
             betas(given.get("weights", "")),
         )
-        if not edit.recipe and not edit.weights:
-            raise BadInput(f"nothing is edited by {text!r}: give a recipe, weights or both")
+        if not edit.faults and not edit.weights:
+            raise BadInput(f"nothing is edited by {text!r}: give a faults, weights or both")
         return edit
 
     @classmethod
     def of(cls, value: Mapping[str, Any]) -> Edit:
         """From ``to_json``'s values."""
-        return cls(value["from"], value["to"], Recipe.of(value["recipe"]), value["weights"])
+        return cls(value["from"], value["to"], Faults.of(value["faults"]), value["weights"])
 
     @property
-    def faults(self) -> Recipe:
-        """The recipe over the edit's span."""
-        return Recipe(tuple(replace(fault, from_=self.first, to=self.to) for fault in self.recipe.faults))
+    def timed_faults(self) -> Faults:
+        """The faults, limited to the edited steps."""
+        return Faults(tuple(replace(fault, from_=self.first, to=self.to) for fault in self.faults))
 
     def mask(self, steps: int) -> NDArray[np.bool_]:
         """(T,) bool: the edited steps."""
@@ -87,16 +87,16 @@ class Edit:
         return (index >= self.first) & (index < self.to)
 
     def __str__(self) -> str:
-        parts = [str(self.recipe)] if self.recipe else []
+        parts = [str(self.faults)] if self.faults else []
         parts += [f"beta of {name} {beta:g}" for name, beta in self.weights.items()]
         return f"{', '.join(parts) or 'nothing'} over steps {self.first} to {self.to - 1}"
 
     def to_json(self) -> dict[str, Any]:
-        """``from``, ``to``, ``recipe`` and ``weights`` as JSON values."""
+        """``from``, ``to``, ``faults`` and ``weights`` as JSON values."""
         return {
             "from": self.first,
             "to": self.to,
-            "recipe": self.recipe.to_json(),
+            "faults": self.faults.to_json(),
             "weights": dict(self.weights),
         }
 
@@ -158,7 +158,7 @@ class Replay:
             self.steps.append(step)
             if progress is not None:
                 progress((t + 1) / len(trace))
-        same = ("data_hash", "episode_index", "seed", "recipe", "settings")
+        same = ("data_hash", "episode_index", "seed", "faults", "settings")
         self._given = {name: getattr(trace, name) for name in same}
         self.original = assemble(checkpoint, trace.episode, self.start, self.evidence, self.steps, **self._given)
         self.exact = all(_equal(getattr(trace, name), getattr(self.original, name)) for name in ARRAYS)
@@ -179,7 +179,7 @@ class Replay:
         """The trace of the edited run: from the belief before step ``edit.first``, with the original's random numbers.
 
         A filter draws as many numbers at a step whatever it observes, so every step draws what it drew before, and an
-        edit that changes nothing gives the original in every bit. The trace's recipe is the original's followed by the
+        edit that changes nothing gives the original in every bit. The trace's faults is the original's followed by the
         edit's, whose draws depend on the episode as the original saw it; its settings keep the ``edits``.
 
         Raises BadInput where a sensor or modality does not exist, weights are given to a filter without a weight model,
@@ -189,9 +189,9 @@ class Replay:
         if edit.to > len(self.beliefs):
             raise BadInput(f"step {edit.to} is beyond this trace, which ends after step {len(self.beliefs) - 1}")
         filter_, original = self.checkpoint.filter, self.original
-        episode = edit.faults.apply(original.episode, original.seed)
+        episode = edit.timed_faults.apply(original.episode, original.seed)
         evidence = self.evidence
-        if edit.recipe:
+        if edit.faults:
             evidence = filter_.encode(Steps.of(filter_.task, [episode]).episode(0))
         edits = [*original.settings.get("edits", []), edit.to_json()]
         for one in edits:
@@ -202,7 +202,7 @@ class Replay:
             belief, step = filter_.step(belief, evidence[t], generator)
             steps.append(step)
         changed = self._given | {
-            "recipe": original.recipe + edit.faults,
+            "faults": original.faults + edit.timed_faults,
             "settings": {**original.settings, "edits": edits},
         }
         return assemble(self.checkpoint, episode, self.start, evidence, steps, **changed)

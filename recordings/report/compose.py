@@ -279,7 +279,7 @@ def manifest(report: Report, folder: Path) -> dict[str, Any]:
                 "steps": len(trace),
                 "data_hash": trace.data_hash,
                 "seed": trace.seed,
-                "recipe": trace.recipe.to_json(),
+                "faults": trace.faults.to_json(),
                 "settings": dict(trace.settings),
             }
             for source, trace in zip(report.sources or ({},) * len(report.traces), report.traces, strict=True)

@@ -157,7 +157,7 @@ def _header(report: Report, summary: Section) -> str:
         "Task": first.episode.task,
         "Modalities": ", ".join(first.modalities) or "not told apart",
         "Episodes": f"{episodes} ({steps} steps in all, {first.episode.dt:g} s each)",
-        "Sensors": "; ".join(dict.fromkeys(str(trace.recipe) or "as they are" for trace in report.traces)),
+        "Sensors": "; ".join(dict.fromkeys(str(trace.faults) or "as they are" for trace in report.traces)),
     }
     if first.particles is not None:
         facts["Particles"] = str(first.particles.shape[1])
@@ -221,8 +221,8 @@ def _provenance(report: Report) -> str:
     seeds = dict.fromkeys(str(trace.seed) for trace in report.traces)
     facts["Seed"] = ", ".join(seeds)
     facts["Versions"] = ", ".join(f"{name} {version}" for name, version in report.versions.items())
-    columns = ("episode", "steps", "recipe", "SHA-256 of the episode")
-    rows = tuple((t.episode_index, len(t), str(t.recipe) or "none", t.data_hash) for t in report.traces)
+    columns = ("episode", "steps", "faults", "SHA-256 of the episode")
+    rows = tuple((t.episode_index, len(t), str(t.faults) or "none", t.data_hash) for t in report.traces)
     commands = f"<pre>{_text(chr(10).join(report.commands))}</pre>" if report.commands else ""
     return (
         f'<section id="reproduce"><h2>To make it again</h2>{_facts(facts)}{commands}'

@@ -283,7 +283,7 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
     length = f"{steps} steps" if steps >= 0 else "a live run, in steps"
     begins = "It starts at the true state" if knows_truth(trace) else "The true state is not known"
-    broken = f"\nIts sensors are broken: `{trace.recipe}`.\n" if trace.recipe else ""
+    broken = f"\nIts sensors are broken: `{trace.faults}`.\n" if trace.faults else ""
     text = f"""# {task.name}, episode {trace.episode_index}, {trace.filter}
 
 {KINDS[trace.kind]} estimates {components} from {senses}: {length} of

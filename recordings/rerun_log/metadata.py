@@ -20,7 +20,7 @@ import pyarrow as pa
 from rerun.chunk import RrdReader
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, HEADER, PROPERTIES
+from beliefscope.recordings.schema import APPLICATION, EARLIER_PROPERTIES, FORMAT_VERSION, HEADER, PROPERTIES
 
 MEMORY = 4 * 2**30  # bytes of addresses, of which Rerun's libraries alone take 1.7 GB
 SECONDS = 120  # of CPU: some 10 GB
@@ -80,8 +80,8 @@ def reading(path: str | Path) -> Iterator[RrdReader]:
 
 
 def properties_of(batch: pa.RecordBatch) -> dict[str, Any]:
-    """Those of ours that a chunk of a recording's header holds."""
-    return {name: _first(batch, name) for name in batch.schema.names if name in PROPERTIES}
+    """Properties of this schema, and of earlier ones, in a chunk of a recording's header."""
+    return {name: _first(batch, name) for name in batch.schema.names if name in (*PROPERTIES, *EARLIER_PROPERTIES)}
 
 
 def _first(batch: pa.RecordBatch, name: str) -> Any:

@@ -8,7 +8,7 @@ import pytest
 
 pytestmark = pytest.mark.browser
 
-READY = "() => document.querySelector('#compare .result').dataset.state === 'ready'"
+FAULT_PRESETS = "() => document.querySelector('#compare .result').dataset.state === 'ready'"
 RUN = "?filter=crossmodal-ekf&episode=9&step=45"
 
 
@@ -31,10 +31,10 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     assert [form.locator(f"[name={name}]").input_value() for name in ("from", "last")] == ["45", "55"]
     form.get_by_role("button", name="Run beside").click()
     assert "Nothing is edited yet" in form.locator(".wrong").text_content()
-    form.locator("[name=faults]").select_option("blackout=0.8")
+    form.locator("[name=edit_faults]").select_option("blackout=0.8")
     form.get_by_role("button", name="Run beside").click()
-    page.until(READY)
-    assert page.state["against"] == "from=45&to=56&recipe=blackout=0.8"
+    page.until(FAULT_PRESETS)
+    assert page.state["against"] == "from=45&to=56&faults=blackout=0.8"
     assert "over steps 45 to 55" in verdict(page)
     assert apart(page) > 0.0  # at the last edited step
     assert page.page.locator("#against-key").text_content().strip() == "edited"
@@ -45,7 +45,7 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     page.until("() => location.search.includes('against=') && location.search.includes('step=44')")
 
     second = open_page("?" + page.page.url.partition("?")[2], viewport={"width": 1440, "height": 900})
-    second.until(READY)
+    second.until(FAULT_PRESETS)
     assert second.state == page.state
     assert verdict(second) == verdict(page)
     second.picture("compare-edit")
@@ -55,13 +55,13 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     assert page.state["against"] == ""
     assert page.page.locator("#against-key").is_hidden()
     keyboard.press("Control+Shift+Z")
-    page.until(READY)
+    page.until(FAULT_PRESETS)
     assert page.state["against"] == second.state["against"]
 
 
 def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
     page = open_page(f"{RUN}&tab=compare&against=filter%3Dcrossmodal-pf", color_scheme="dark")
-    page.until(READY)
+    page.until(FAULT_PRESETS)
     both = ["crossmodal-ekf", "crossmodal-pf"]
     assert all(name in verdict(page) for name in both)
     assert page.page.locator("#against-key").text_content().strip() == "crossmodal-pf"

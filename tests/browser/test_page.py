@@ -138,7 +138,7 @@ def test_a_slice_at_another_angle_changes_the_maps(open_page: Any) -> None:
 def test_black_pictures_are_named(open_page: Any) -> None:
     page = open_page("?step=20")
     assert not page.page.locator("#black-key").is_visible()
-    page.page.locator("#recipe").select_option("blackout=0.8")
+    page.page.locator("#faults").select_option("blackout=0.8")
     page.until("() => !document.querySelector('#black-key').hidden")
     for _ in range(30):
         if page.page.locator(".black-out").is_visible():
@@ -150,37 +150,37 @@ def test_black_pictures_are_named(open_page: Any) -> None:
     page.picture("black-out")
 
 
-def test_a_ready_recipe_breaks_a_sensor(open_page: Any) -> None:
+def test_a_ready_faults_breaks_a_sensor(open_page: Any) -> None:
     page = open_page("?step=40")
     page.settle(40)
     before, picture = page.maps(), page.page.evaluate(PICTURE)
-    names = page.page.locator("#recipe option").all_text_contents()
+    names = page.page.locator("#faults option").all_text_contents()
     assert names[0] == "as recorded"
     assert {"40 % black pictures", "image frozen", "force drifting", "contact flipped", "haptics dropped"} <= {*names}
-    page.page.locator("#recipe").select_option("image_frozen=20")
+    page.page.locator("#faults").select_option("image_frozen=20")
     wait_until(lambda: page.page.evaluate(PICTURE) != picture and page.maps()[0] != before[0])
-    page.until("() => location.search.includes('recipe=image_frozen%3D20')")
-    page.page.locator("#recipe").select_option("")
+    page.until("() => location.search.includes('faults=image_frozen%3D20')")
+    page.page.locator("#faults").select_option("")
     wait_until(lambda: page.page.evaluate(PICTURE) == picture and page.maps() == before)
-    page.until("() => !location.search.includes('recipe')")
+    page.until("() => !location.search.includes('faults')")
 
 
-def test_any_recipe_can_be_typed_and_a_bad_one_leaves_the_view(open_page: Any) -> None:
+def test_any_faults_can_be_typed_and_a_bad_one_leaves_the_view(open_page: Any) -> None:
     own = "blackout=0.5,force_bias:x=5:from=20"
-    page = open_page("?step=40&recipe=image_patch%3D16%3Ax%3D0%3Ay%3D0")
+    page = open_page("?step=40&faults=image_patch%3D16%3Ax%3D0%3Ay%3D0")
     page.settle(40)
-    recipe = page.page.locator("#recipe")
-    assert recipe.input_value() == "image_patch=16:x=0:y=0"
+    faults = page.page.locator("#faults")
+    assert faults.input_value() == "image_patch=16:x=0:y=0"
     before = page.maps()
-    recipe.select_option("other")
-    sheet, text = page.page.locator("#faults"), page.page.locator("#faults input")
+    faults.select_option("other")
+    sheet, text = page.page.locator("#fault-dialog"), page.page.locator("#fault-dialog input")
     assert text.input_value() == "image_patch=16:x=0:y=0"
     assert sheet.locator("tr").count() == 15
     text.fill("blackout=1.5,force_bias:x=5")
     text.press("Enter")
-    page.until("() => document.querySelector('#faults .wrong').textContent.includes(\"'probability' is 1.5\")")
-    page.picture("recipe-wrong")
-    assert page.state["recipe"] == "image_patch=16:x=0:y=0"
+    page.until("() => document.querySelector('#fault-dialog .wrong').textContent.includes(\"'probability' is 1.5\")")
+    page.picture("faults-wrong")
+    assert page.state["faults"] == "image_patch=16:x=0:y=0"
     assert page.maps() == before
     text.fill("blackout=0.5")
     sheet.get_by_role("button", name="force_bias").click()
@@ -189,15 +189,15 @@ def test_any_recipe_can_be_typed_and_a_bad_one_leaves_the_view(open_page: Any) -
     sheet.get_by_role("button", name="Apply").click()
     wait_until(lambda: page.maps() != before)
     assert not sheet.is_visible()
-    assert recipe.input_value() == page.state["recipe"] == own
+    assert faults.input_value() == page.state["faults"] == own
     page.until("() => location.search.includes('force_bias')")
     second = open_page("?" + page.page.url.partition("?")[2])
     assert second.state == page.state
     wait_until(lambda: second.maps() == page.maps())
-    second.page.locator("#recipe").select_option("other")
+    second.page.locator("#faults").select_option("other")
     second.page.keyboard.press("Escape")
     assert second.state == page.state
-    page.picture("recipe-own")
+    page.picture("faults-own")
     refused(page)
 
 
@@ -223,7 +223,7 @@ def test_a_link_opens_the_same_moment(open_page: Any) -> None:
 
 
 def test_a_bad_link_says_what_is_wrong(open_page: Any) -> None:
-    page = open_page("?filter=nope&episode=999&step=5000&component=elbow&recipe=blakout")
+    page = open_page("?filter=nope&episode=999&step=5000&component=elbow&faults=blakout")
     said = page.page.locator("#messages").text_content()
     for part in (
         "filter “nope”",
@@ -236,7 +236,7 @@ def test_a_bad_link_says_what_is_wrong(open_page: Any) -> None:
     ):
         assert part in said
     assert 0 < page.state["step"] < 5000
-    assert page.state["recipe"] == ""
+    assert page.state["faults"] == ""
     refused(page)
     page.page.locator("#messages button").first.click()
     page.picture("bad-link")

@@ -45,14 +45,14 @@ def test_a_bar_leads_to_the_worst_moment(open_page: Any) -> None:
     assert focused.startswith("crossmodal-ekf, 40 % black")
     page.page.keyboard.press("Enter")
     page.until("() => document.querySelector('#failures').dataset.state === 'ready'", 120.0)
-    address = f"{page.url}api/failures/door/crossmodal-ekf?recipe=blackout%3D0.4&among=held-out"
+    address = f"{page.url}api/failures/door/crossmodal-ekf?faults=blackout%3D0.4&among=held-out"
     scores = {one["name"]: one for one in page.page.request.get(address).json()["scores"]}
     worst = scores["angle"]["moments"][0]
     page.until(f"() => beliefscope.state().step === {worst['step']}")
     wanted = {
         "tab": "failures",
         "filter": "crossmodal-ekf",
-        "recipe": "blackout=0.4",
+        "faults": "blackout=0.4",
         "by": "angle",
         "component": "angle",
     }

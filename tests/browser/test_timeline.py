@@ -19,7 +19,7 @@ OTHER = """async () => {
   const api = await import('/static/data/api.js');
   const { task: name, data, episode } = beliefscope.state();
   const task = (await api.catalog()).tasks.find((t) => t.name === name);
-  const selection = { task: name, filter: 'unimodal-ekf', data, episode, recipe: '' };
+  const selection = { task: name, filter: 'unimodal-ekf', data, episode, faults: '' };
   const other = await api.loadTrace(task, selection, () => {}, new AbortController().signal);
   beliefscope.timeline.against(other, 'unimodal-ekf');
 }"""

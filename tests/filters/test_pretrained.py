@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoint
 from beliefscope.filters.evaluate import evaluate
@@ -61,21 +61,21 @@ def test_recorded_metrics_are_those_of_these_weights(checkpoint: Checkpoint, hel
     assert again.rmse["angle_deg"] == pytest.approx(recorded["rmse"]["angle_deg"], rel=0.5)
 
 
-@pytest.mark.parametrize("recipe", ["", "blackout=0.4", "blackout=0.8"])
+@pytest.mark.parametrize("faults", ["", "blackout=0.4", "blackout=0.8"])
 def test_fused_is_no_worse_than_the_better_modality(
-    checkpoint: Checkpoint, held_out: list[Episode], recipe: str
+    checkpoint: Checkpoint, held_out: list[Episode], faults: str
 ) -> None:
     """By more than 5 %, which 14 episodes cannot tell apart; on what moves, with most pictures black, it is better."""
-    fused = evaluate(checkpoint.filter, held_out, recipe=Recipe.parse(recipe)).rmse
+    fused = evaluate(checkpoint.filter, held_out, faults=Faults.parse(faults)).rmse
     for name in checkpoint.filter.names:
-        alone = evaluate(checkpoint.filter, held_out, recipe=Recipe.parse(recipe), only=name).rmse
-        assert fused["angle_deg"] < (1.0 if "0.8" in recipe else 1.05) * alone["angle_deg"]
+        alone = evaluate(checkpoint.filter, held_out, faults=Faults.parse(faults), only=name).rmse
+        assert fused["angle_deg"] < (1.0 if "0.8" in faults else 1.05) * alone["angle_deg"]
         assert fused["position_cm"] < 1.05 * alone["position_cm"]
 
 
 def test_blackout_moves_beta_away_from_the_image(checkpoint: Checkpoint, held_out: list[Episode]) -> None:
     """On what moves, the angle: of the hinge, which stands still, an EKF remembers what the picture said."""
-    traces = [trace(checkpoint, e, particles=50, recipe=Recipe.parse("blackout=0.5")) for e in held_out[:6]]
+    traces = [trace(checkpoint, e, particles=50, faults=Faults.parse("blackout=0.5")) for e in held_out[:6]]
     pictures = np.concatenate([t.episode.observations["image"] for t in traces])
     beta = np.concatenate([t.weights[..., -1] for t in traces if t.weights is not None])
     black = ~pictures.any(axis=(1, 2))

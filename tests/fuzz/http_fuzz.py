@@ -23,7 +23,7 @@ from starlette.testclient import TestClient, WebSocketTestSession
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.trace_store import Settings
 from beliefscope.app.server.main import create_app
-from beliefscope.datasets.faults.recipe import READY
+from beliefscope.datasets.faults.injection import FAULT_PRESETS
 from beliefscope.filters.finetuning.finetune import FineTune
 from beliefscope.inspect.catalog import DIAGNOSTICS
 
@@ -76,8 +76,8 @@ def description(client: TestClient) -> dict[str, Any]:
         "filter": [one["name"] for task in catalog for one in task["filters"]],
         "data": [one["name"] for task in catalog for one in task["data"]],
         "episode": [0, 1],
-        "recipe": [*READY.values(), *map(str, mutate.NUMBERS), *(f"blackout={text}" for text in texts)],
-        "against": ["recipe=blackout", "filter=small", "from=2&to=5&recipe=blackout", "from=2&to=4&weights=image=1"],
+        "faults": [*FAULT_PRESETS.values(), *map(str, mutate.NUMBERS), *(f"blackout={text}" for text in texts)],
+        "against": ["faults=blackout", "filter=small", "from=2&to=5&faults=blackout", "from=2&to=4&weights=image=1"],
         "name": list(DIAGNOSTICS),
     }
     for path in document["paths"].values():
@@ -169,7 +169,7 @@ CURSOR: dict[str, Any] = {
     "step": 3,
     "angle": None,
     "size": 41,
-    "recipe": "",
+    "faults": "",
     "data": "",
     "against": "",
     "scene": False,
@@ -183,7 +183,7 @@ VALUES = st.recursive(
     | st.integers()
     | st.floats()
     | st.text()
-    | st.sampled_from([*mutate.NUMBERS, *mutate.TEXTS, *READY.values()]),
+    | st.sampled_from([*mutate.NUMBERS, *mutate.TEXTS, *FAULT_PRESETS.values()]),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
     max_leaves=12,
 )

@@ -28,7 +28,7 @@ from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.runs import kept_filters
 from beliefscope.app.runs.trace_store import Library, Settings
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import READY, Recipe
+from beliefscope.datasets.faults.injection import FAULT_PRESETS, Faults
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
@@ -281,17 +281,17 @@ def server(folder: Path) -> Settings:
     return Settings(folder / "workspace", data, checkpoints, particles=7)
 
 
-# Recipes: text and JSON.
+# Fault injections: text and JSON.
 
 
-def make_recipe(path: Path) -> None:
-    path.write_text(",".join(READY.values()))
+def make_faults(path: Path) -> None:
+    path.write_text(",".join(FAULT_PRESETS.values()))
 
 
-def spoil_recipe(path: Path, rng: Random) -> None:
-    text = ",".join(rng.sample(list(READY.values()), rng.randint(1, 3)))
+def spoil_faults(path: Path, rng: Random) -> None:
+    text = ",".join(rng.sample(list(FAULT_PRESETS.values()), rng.randint(1, 3)))
     if rng.random() < 0.5:
-        text = mutate.spoiled_json(json.dumps(Recipe.parse(text).to_json()).encode(), rng).decode(errors="replace")
+        text = mutate.spoiled_json(json.dumps(Faults.parse(text).to_json()).encode(), rng).decode(errors="replace")
     else:
         for _ in range(rng.randint(1, 3)):
             at = rng.randrange(len(text) + 1)
@@ -300,12 +300,12 @@ def spoil_recipe(path: Path, rng: Random) -> None:
     path.write_bytes(text.encode(errors="surrogatepass"))
 
 
-def read_recipe(path: Path) -> None:
-    recipe = Recipe.parse(path.read_bytes().decode(errors="surrogatepass"))
-    can_be_shown(recipe.to_json())
-    broken = recipe.apply(episodes()[0])
+def read_faults(path: Path) -> None:
+    faults = Faults.parse(path.read_bytes().decode(errors="surrogatepass"))
+    can_be_shown(faults.to_json())
+    broken = faults.apply(episodes()[0])
     assert np.isfinite(broken.observations["force"]).all()
-    assert Recipe.parse(str(recipe)) == recipe == Recipe.of(recipe.to_json())
+    assert Faults.parse(str(faults)) == faults == Faults.of(faults.to_json())
 
 
 CHECKPOINT, TRACE = "beliefscope", "beliefscope-trace"
@@ -338,7 +338,7 @@ READERS: dict[str, Reader] = {
         partial(read_trace, read_recording),
         ".rrd",
     ),
-    "recipe": Reader(make_recipe, spoil_recipe, read_recipe),
+    "faults": Reader(make_faults, spoil_faults, read_faults),
     "study": Reader(make_cell, rewritten(mutate.spoiled_json), read_cell, ".json"),
     "partial": Reader(make_partial, _with_header("kept"), read_partial),
     "job": Reader(make_job, rewritten(mutate.spoiled_json), read_job, ".json"),

@@ -13,7 +13,7 @@ import torch
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import WHOLE, Recipe
+from beliefscope.datasets.faults.injection import WHOLE, Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -94,35 +94,35 @@ def test_particle_weights_explain_the_estimate_and_the_ancestors(traced: Trace) 
 def test_a_broken_episode_is_kept_as_the_filter_saw_it(
     checkpoint: Checkpoint, episode: Episode, traced: Trace, tmp_path: Path
 ) -> None:
-    recipe = Recipe.parse("blackout,force_noise=3,contact_flipped:from=20")
-    broken = trace(checkpoint, episode, seed=7, particles=100, recipe=recipe)
+    faults = Faults.parse("blackout,force_noise=3,contact_flipped:from=20")
+    broken = trace(checkpoint, episode, seed=7, particles=100, faults=faults)
     assert not broken.episode.observations["image"].any()
-    assert broken.episode.digest() == recipe.apply(episode, 7).digest() != episode.digest()
+    assert broken.episode.digest() == faults.apply(episode, 7).digest() != episode.digest()
     assert broken.data_hash == episode.digest()
     np.testing.assert_array_equal(broken.start_mean, traced.start_mean)
     assert not np.array_equal(broken.estimate_mean, traced.estimate_mean)
     assert np.array_equal(broken.episode.states, traced.episode.states)
     save_trace(broken, tmp_path / "run.trace")
-    assert load_trace(tmp_path / "run.trace").recipe == recipe
-    assert traced.recipe == WHOLE
+    assert load_trace(tmp_path / "run.trace").faults == faults
+    assert traced.faults == WHOLE
 
 
-@pytest.mark.parametrize(("chance", "recipe"), [(0.0, ""), (0.4, "blackout=0.4")])
-def test_a_trace_from_before_there_were_recipes(
-    traced: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chance: float, recipe: str
+@pytest.mark.parametrize(("chance", "faults"), [(0.0, ""), (0.4, "blackout=0.4")])
+def test_a_trace_from_before_there_were_faults(
+    traced: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chance: float, faults: str
 ) -> None:
     older = replace(traced, settings={"particles": 100, "blackout": chance})
     real = json.dumps
 
-    def without_recipe(header: Any, **options: Any) -> str:
-        return real({key: value for key, value in header.items() if key != "recipe"}, **options)
+    def without_faults(header: Any, **options: Any) -> str:
+        return real({key: value for key, value in header.items() if key != "faults"}, **options)
 
     with monkeypatch.context() as before:
-        before.setattr(json, "dumps", without_recipe)
+        before.setattr(json, "dumps", without_faults)
         save_trace(older, tmp_path / "old.trace")
-    assert b'"recipe' not in (tmp_path / "old.trace").read_bytes()
+    assert b'"faults' not in (tmp_path / "old.trace").read_bytes()
     again = load_trace(tmp_path / "old.trace")
-    assert again.recipe == Recipe.parse(recipe)
+    assert again.faults == Faults.parse(faults)
     np.testing.assert_array_equal(again.estimate_mean, traced.estimate_mean)
 
 
@@ -130,7 +130,7 @@ def test_a_running_filter_needs_sense(checkpoint: Checkpoint, episode: Episode) 
     with pytest.raises(BadInput, match="particles must be at least 1, not 0"):
         trace(checkpoint, episode, particles=0)
     with pytest.raises(BadInput, match=r"modality of task 'door' 'touch' does not exist"):
-        trace(checkpoint, episode, recipe=Recipe.parse("drop=touch"))
+        trace(checkpoint, episode, faults=Faults.parse("drop=touch"))
 
 
 def test_bad_trace_files(traced: Trace, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
@@ -80,7 +80,7 @@ def make_trace(kind: str, steps: int = 40, particles: int = 30, seed: int = 0) -
         "data_hash": episode.digest(),
         "episode_index": 3,
         "seed": 11,
-        "recipe": Recipe.parse("blackout=0.4,force_bias:x=5:from=3"),
+        "faults": Faults.parse("blackout=0.4,force_bias:x=5:from=3"),
         "settings": {"particles": particles, "versions": {"torch": "2"}},
     }
     if kind == "ekf":

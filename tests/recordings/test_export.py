@@ -17,7 +17,7 @@ import pytest
 
 from beliefscope.app.cli.main import main
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import quick
@@ -33,8 +33,8 @@ Compare = Callable[[Trace, Trace], None]
 def run(request: pytest.FixtureRequest) -> Trace:
     task, name = request.param.split()
     with open_dataset(sample_path(task)) as data:
-        recipe = Recipe.parse("blackout=0.3")
-        return trace(load_checkpoint(shipped(task, name)), data[9], 9, particles=40, recipe=recipe)
+        faults = Faults.parse("blackout=0.3")
+        return trace(load_checkpoint(shipped(task, name)), data[9], 9, particles=40, faults=faults)
 
 
 def array_of(made: Trace, name: str) -> Any:

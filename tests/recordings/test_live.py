@@ -21,7 +21,7 @@ from rerun.chunk import RrdReader
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.inspect.trace import Trace, begin, load_trace, trace
@@ -35,7 +35,7 @@ from beliefscope.recordings.write import write_recording
 Compare = Callable[[Trace, Trace], None]
 Run = Callable[[str], tuple[int, str, str]]
 HOUSEKEEPING = ("rerun.controls.RowId", "log_time", "log_tick", "start_time")
-BLACK = Recipe.parse("blackout=0.4")
+BLACK = Faults.parse("blackout=0.4")
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "04_own_filter.py"
 
 

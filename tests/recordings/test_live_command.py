@@ -22,7 +22,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "04_own_filter.py"
 
 
 def test_it_runs_what_trace_does(run: Run, assert_same: Compare, tmp_path: Path) -> None:
-    line = "door --filter crossmodal-ekf --recipe blackout=0.4 --seed 5"
+    line = "door --filter crossmodal-ekf --faults blackout=0.4 --seed 5"
     code, out, err = run(f"live {line} --rate 0 --workspace {tmp_path} --json -")
     said = json.loads(out)
     assert code == 0, err

@@ -11,7 +11,7 @@ import pytest
 import rerun as rr
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings import write
 from beliefscope.recordings.read import read_recording
@@ -73,15 +73,15 @@ def test_a_recording_of_an_older_format(new_trace: Callable[..., Trace], assert_
     assert_same(read_recording(Path(__file__).with_name("format1.rrd")), new_trace("pf", steps=5, particles=4))
 
 
-@pytest.mark.parametrize(("chance", "recipe"), [(0.0, ""), (0.4, "blackout=0.4")])
-def test_a_recording_from_before_there_were_recipes(
-    new_trace: Callable[..., Trace], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chance: float, recipe: str
+@pytest.mark.parametrize(("chance", "faults"), [(0.0, ""), (0.4, "blackout=0.4")])
+def test_a_recording_from_before_there_were_faults(
+    new_trace: Callable[..., Trace], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chance: float, faults: str
 ) -> None:
     trace = replace(new_trace("ekf"), settings={"blackout": chance})
     values = rr.AnyValues
-    monkeypatch.setattr(rr, "AnyValues", lambda recipe, **others: values(**others))
+    monkeypatch.setattr(rr, "AnyValues", lambda faults, **others: values(**others))
     again = read_recording(write.write_recording(trace, tmp_path / "old.rrd"))
-    assert again.recipe == Recipe.parse(recipe)
+    assert again.faults == Faults.parse(faults)
     np.testing.assert_array_equal(again.estimate_mean, trace.estimate_mean)
 
 

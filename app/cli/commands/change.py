@@ -32,7 +32,7 @@ SliceTexts = Annotated[
     typer.Option(
         "--slice",
         metavar="SLICE",
-        help="Look at this one too: NAME:recipe=FAULTS:contact=yes:only=MODALITY, all but the name as needed. "
+        help="Look at this one too: NAME:faults=FAULTS:contact=yes:only=MODALITY, all but the name as needed. "
         "May be given several times.",
     ),
 ]
@@ -66,7 +66,7 @@ def change(
       beliefscope change crossmodal-ekf child.safetensors
       beliefscope change unimodal-ekf crossmodal-ekf --task push
       beliefscope change parent.safetensors child.safetensors --data door.h5 -o report
-      beliefscope change crossmodal-pf child.safetensors --slice black-in-contact:recipe=blackout=1:contact=yes
+      beliefscope change crossmodal-pf child.safetensors --slice black-in-contact:faults=blackout=1:contact=yes
     """
     from beliefscope.app.protocol.permalinks import beside, moment_link
     from beliefscope.app.runs.catalog import served_names
@@ -88,7 +88,7 @@ def change(
     first, name = (named.get(str(Path(text)), text) for text in (before, after))
     weighed = pair[1].filter.architecture.fusion == "crossmodal"
     links = [
-        beside(moment_link(task, name, data_name, m.episode, m.step, m.recipe), m, first, weighed)
+        beside(moment_link(task, name, data_name, m.episode, m.step, m.faults), m, first, weighed)
         for m in found.moments
     ]
     document = found.to_dict() | {

@@ -11,17 +11,17 @@ from beliefscope.app.cli import output as console
 from beliefscope.app.cli.options import (
     DataPath,
     EpisodeIndex,
+    FaultsText,
     FilterName,
     Json,
     Particles,
-    RecipeText,
     Seed,
     SkipBad,
     TaskName,
     check,
     checkpoint,
+    faults,
     one_episode,
-    recipe,
     whole,
 )
 from beliefscope.datasets.errors import BadInput
@@ -35,7 +35,7 @@ def counterfactual(
     data: DataPath = None,
     skip_bad: SkipBad = False,
     episode: EpisodeIndex = None,
-    recipe_: RecipeText = "",
+    faults_: FaultsText = "",
     weights: Annotated[
         str,
         typer.Option(
@@ -63,9 +63,9 @@ def counterfactual(
 
     \b
     Examples:
-      beliefscope counterfactual door --filter crossmodal-pf --recipe blackout --from 40 --to 60
+      beliefscope counterfactual door --filter crossmodal-pf --faults blackout --from 40 --to 60
       beliefscope counterfactual door --filter crossmodal-ekf --weights image=0.1 --from 40 --to 60 -o weights.svg
-      beliefscope counterfactual push --filter crossmodal-pf --recipe force_bias=5 --from 20 --to 50 --trace off.trace
+      beliefscope counterfactual push --filter crossmodal-pf --faults force_bias=5 --from 20 --to 50 --trace off.trace
     """
     from beliefscope.inspect.compare.counterfactual import compare
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
@@ -77,9 +77,9 @@ def counterfactual(
     if output is not None:
         figure_format(output)
     loaded = checkpoint(task, filter_)
-    edit = Edit(first, to, recipe(recipe_, loaded.task), betas(weights))
-    if not edit.recipe and not edit.weights:
-        raise BadInput("nothing is edited: give --recipe, --weights or both")
+    edit = Edit(first, to, faults(faults_, loaded.task), betas(weights))
+    if not edit.faults and not edit.weights:
+        raise BadInput("nothing is edited: give --faults, --weights or both")
     shown, index = one_episode(loaded.task, data, skip_bad, episode)
     with console.progress("Filtering") as advance:
         made = trace(loaded, shown, index, seed, particles)

@@ -10,18 +10,18 @@ import typer
 from beliefscope.app.cli import output
 from beliefscope.app.cli.options import (
     DataPath,
+    FaultsText,
     FilterName,
     Json,
     Particles,
-    RecipeText,
     Seed,
     SkipBad,
     TaskName,
     check,
     checkpoint,
     dataset,
-    recipe,
-    recipe_text,
+    faults,
+    faults_text,
 )
 from beliefscope.datasets.errors import BadInput
 
@@ -31,7 +31,7 @@ def evaluate(
     filter_: FilterName,
     data: DataPath = None,
     skip_bad: SkipBad = False,
-    recipe_: RecipeText = "",
+    faults_: FaultsText = "",
     only: Annotated[
         str | None,
         typer.Option("--only", metavar="MODALITY", help="Let one modality decide alone, whatever the weights say."),
@@ -50,23 +50,23 @@ def evaluate(
     \b
     Examples:
       beliefscope evaluate door --filter crossmodal-pf
-      beliefscope evaluate door --filter crossmodal-pf --recipe blackout=0.8 --json -
+      beliefscope evaluate door --filter crossmodal-pf --faults blackout=0.8 --json -
       beliefscope evaluate push-real --filter crossmodal-pf --data mit_push/val
-      beliefscope evaluate door --filter crossmodal-pf --recipe delay=haptics:steps=5 --only haptics
+      beliefscope evaluate door --filter crossmodal-pf --faults delay=haptics:steps=5 --only haptics
     """
     from beliefscope.filters.evaluate import evaluate as measure
     from beliefscope.filters.external.load import Foreign
 
     check(None, json)
-    text, alone = without_only(recipe_text(recipe_))
+    text, alone = without_only(faults_text(faults_))
     tested = checkpoint(task, filter_)
-    broken, only = recipe(text, tested.task), only or alone
+    broken, only = faults(text, tested.task), only or alone
     with dataset(tested.task, data, skip_bad) as episodes, output.progress("Evaluating") as advance:
         held_out = episodes.held_out()
         metrics = measure(
             tested if isinstance(tested, Foreign) else tested.filter,
             [episodes[i] for i in held_out],
-            recipe=broken,
+            faults=broken,
             only=only,
             particles=particles,
             seed=seed,
@@ -79,7 +79,7 @@ def evaluate(
         "checkpoint_hash": tested.hash,
         "data_hash": data_hash,
         "episodes": len(held_out),
-        "recipe": broken.to_json(),
+        "faults": broken.to_json(),
         "only": only,
         "particles": particles if tested.kind == "pf" else None,
         "seed": seed,
@@ -93,7 +93,7 @@ def evaluate(
 
 
 def without_only(text: str) -> tuple[str, str | None]:
-    """A recipe, and the modality of ``--only``, which older scripts name in the recipe: ``{"only": "image"}``."""
+    """A faults, and the modality of ``--only``, which older scripts name in the faults: ``{"only": "image"}``."""
     try:
         value = json_format.loads(text)
     except (ValueError, RecursionError):
@@ -102,5 +102,5 @@ def without_only(text: str) -> tuple[str, str | None]:
         return text, None
     only = value.pop("only")
     if not isinstance(only, str):
-        raise BadInput(f"recipe's 'only' is {only!r}, not a modality's name")
+        raise BadInput(f"faults's 'only' is {only!r}, not a modality's name")
     return json_format.dumps(value), only

@@ -10,18 +10,18 @@ import typer
 from beliefscope.app.cli import output
 from beliefscope.app.cli.options import (
     DataPath,
+    FaultsText,
     FilterName,
     Json,
     Particles,
-    RecipeText,
     Seed,
     SkipBad,
     TaskName,
     check,
     checkpoint,
     dataset,
+    faults,
     is_path,
-    recipe,
     serving,
     whole,
 )
@@ -32,7 +32,7 @@ def failures(
     filter_: FilterName,
     data: DataPath = None,
     skip_bad: SkipBad = False,
-    recipe_: RecipeText = "",
+    faults_: FaultsText = "",
     by: Annotated[
         str,
         typer.Option(
@@ -64,7 +64,7 @@ def failures(
     Examples:
       beliefscope failures door --filter crossmodal-ekf
       beliefscope failures push --filter crossmodal-pf --by disagreement --group "contact made"
-      beliefscope failures push --filter crossmodal-pf --recipe blackout=0.4 --url http://127.0.0.1:8000
+      beliefscope failures push --filter crossmodal-pf --faults blackout=0.4 --url http://127.0.0.1:8000
       beliefscope failures door --filter mine.safetensors --data door.h5 --by angle --top 5 --json -
     """
     from beliefscope.app.protocol.permalinks import moment_link
@@ -78,11 +78,11 @@ def failures(
     if group is not None and group not in GROUPS:
         raise one_of("group", group, GROUPS)
     tested = checkpoint(task, filter_)
-    broken = recipe(recipe_, tested.task)
+    broken = faults(faults_, tested.task)
     with dataset(tested.task, data, skip_bad) as episodes, output.progress("Filtering") as advance:
         indices = range(len(episodes)) if every else episodes.held_out()
         found = find_failures(
-            tested, episodes, indices, by=by, recipe=broken, seed=seed, particles=particles, progress=advance
+            tested, episodes, indices, by=by, faults=broken, seed=seed, particles=particles, progress=advance
         )
     files = [filter_] if is_path(filter_) else []
     named, data_name = served_names(files, data)

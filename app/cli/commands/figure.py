@@ -11,10 +11,10 @@ from beliefscope.app.cli import output as console
 from beliefscope.app.cli.options import (
     DataPath,
     EpisodeIndex,
+    FaultsText,
     FilterName,
     Json,
     Particles,
-    RecipeText,
     Seed,
     SkipBad,
     TaskName,
@@ -47,7 +47,7 @@ def figure(
             "giving it twice.",
         ),
     ] = None,
-    recipe_: RecipeText = "",
+    faults_: FaultsText = "",
     particles: Particles = 300,
     seed: Seed = 0,
     json: Json = None,
@@ -72,7 +72,7 @@ def figure(
     figure_format(output)
     if kind == "weights" and steps:
         raise BadInput(f"--step {steps[0]}: the weights are drawn over all steps; only maps have a step")
-    loaded, made = one_run(task, filter_, data, skip_bad, episode, recipe_, particles, seed)
+    loaded, made = one_run(task, filter_, data, skip_bad, episode, faults_, particles, seed)
     document: dict[str, Any] = {"figure": kind}
     if kind == "maps":
         if why := no_maps(loaded, made):

@@ -21,7 +21,7 @@ from beliefscope.app.cli.options import (
     check,
     checkpoint,
     dataset,
-    recipe,
+    faults,
     size,
     whole,
 )
@@ -52,13 +52,13 @@ def finetune(
             "--slice",
             metavar="SLICE",
             help="What to learn: 'contact', 'no contact', 'blackout 0.8', 'haptics alone', or one of your own, "
-            "NAME:recipe=FAULTS:contact=yes:only=MODALITY. May be given several times.",
+            "NAME:faults=FAULTS:contact=yes:only=MODALITY. May be given several times.",
         ),
     ] = None,
-    recipes: Annotated[
+    fault_sets: Annotated[
         list[str] | None,
         typer.Option(
-            "--recipe",
+            "--faults",
             metavar="FAULTS",
             help="A slice of all steps with sensors broken like this. May be given several times.",
         ),
@@ -118,11 +118,11 @@ def finetune(
     \b
     Examples:
       beliefscope finetune push --filter crossmodal-ekf --slice 'blackout 0.8' -o child.safetensors
-      beliefscope finetune mine.safetensors --train haptics-only --recipe blackout=0.95 -o child.safetensors
+      beliefscope finetune mine.safetensors --train haptics-only --faults blackout=0.95 -o child.safetensors
       beliefscope finetune door --filter crossmodal-pf --freeze dynamics --slice contact -o child.safetensors
       beliefscope finetune door --filter crossmodal-ekf --train noise-only --rate 0.003 -o child.safetensors
     """
-    from beliefscope.datasets.faults.recipe import Recipe
+    from beliefscope.datasets.faults.injection import Faults
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.finetuning.batch_mix import Moment
     from beliefscope.filters.finetuning.finetune import FineTune
@@ -138,8 +138,8 @@ def finetune(
         raise BadInput(f"--filter is missing: say which filter of task {target!r} to fine-tune")
     parent = load_checkpoint(Path(target)) if filter_ is None else checkpoint(target, filter_)
     chosen: list[Slice] = [Slice.parse(text, slices_of(parent.task)) for text in slice_ or ()]
-    for text in recipes or ():
-        broken: Recipe = recipe(text, parent.task)
+    for text in fault_sets or ():
+        broken: Faults = faults(text, parent.task)
         chosen.append(Slice(str(broken).replace("=", " ").replace(":", " "), broken))
     base, own = rates(rate or ())
     settings = FineTune(

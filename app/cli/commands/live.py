@@ -18,24 +18,24 @@ from beliefscope.app.cli.commands.serve import check_workspace
 from beliefscope.app.cli.options import (
     DataPath,
     EpisodeIndex,
+    FaultsText,
     FilterName,
     Json,
     Particles,
-    RecipeText,
     Seed,
     SkipBad,
     TaskName,
     check,
     checkpoint,
+    faults,
     one_episode,
-    recipe,
     size,
 )
 from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
-    from beliefscope.datasets.faults.recipe import Recipe
+    from beliefscope.datasets.faults.injection import Faults
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.recordings.live import LiveRecorder
 
@@ -46,7 +46,7 @@ def live(
     data: DataPath = None,
     skip_bad: SkipBad = False,
     episode: EpisodeIndex = None,
-    recipe_: RecipeText = "",
+    faults_: FaultsText = "",
     particles: Particles = 300,
     seed: Seed = 0,
     rate: Annotated[
@@ -69,7 +69,7 @@ def live(
     \b
     Examples:
       beliefscope live door --filter crossmodal-pf
-      beliefscope live door --filter crossmodal-ekf --recipe blackout=0.8 --rate 50 --workspace runs
+      beliefscope live door --filter crossmodal-ekf --faults blackout=0.8 --rate 50 --workspace runs
       beliefscope live door --filter examples/04_own_filter.py:build --name mine
     """
     check(None, json)
@@ -78,7 +78,7 @@ def live(
         raise BadInput(f"--rate {rate:g}: steps a second, or 0 for as fast as it can")
     check_workspace(workspace)
     loaded = checkpoint(task, filter_)
-    broken = recipe(recipe_, loaded.task)
+    broken = faults(faults_, loaded.task)
     shown, index = one_episode(loaded.task, data, skip_bad, episode)
     name = name or f"{loaded.task.name}-{loaded.name}-episode{index}"
     every = 1.0 / shown.dt if rate is None else rate
@@ -127,7 +127,7 @@ def _begun(
     index: int,
     seed: int,
     particles: int,
-    broken: Recipe,
+    broken: Faults,
     name: str,
     folder: Path,
 ) -> tuple[LiveRecorder, Iterator[None]]:
@@ -152,7 +152,7 @@ def _begun(
 
     if isinstance(loaded, Foreign):
         where |= {"filter": loaded.name, "checkpoint_hash": loaded.hash, "data_hash": episode.digest(), "seed": seed}
-        where |= {"recipe": broken, "episode_index": index}
+        where |= {"faults": broken, "episode_index": index}
         where |= {"settings": {"torch": torch.__version__, "source": loaded.source}}
         seen = broken.apply(episode, seed)
         taken = loaded.live(seen, seed)

@@ -46,7 +46,7 @@ def record(
     Examples:
       beliefscope record door --filter crossmodal-ekf --episode 9 --maps 5 -o run.rrd
       beliefscope record door --filter crossmodal-pf --maps 1 --map-size 41 -o every.rrd
-      beliefscope record door --filter crossmodal-pf --recipe image_frozen=20 -o frozen.rrd
+      beliefscope record door --filter crossmodal-pf --faults image_frozen=20 -o frozen.rrd
     """
     from beliefscope.inspect.catalog import quick
     from beliefscope.inspect.likelihood import MapEngine, no_maps

@@ -165,7 +165,7 @@ def _links(
 
     def link(index: int, step: int) -> str:
         trace = traces[index]
-        asked = moment_link(task, filter_name, data_name, trace.episode_index, step, str(trace.recipe))
+        asked = moment_link(task, filter_name, data_name, trace.episode_index, step, str(trace.faults))
         return base + asked if index in known else ""
 
     served = serving(files, data, first.seed)
@@ -184,7 +184,7 @@ def trace_command(trace: Trace, file: str, filter_: str, data: Path | None) -> s
     if trace.settings.get("edits"):
         return f"# {file} was edited by hand: its settings are in manifest.json"
     given = ["--data", str(data)] if data else []
-    given += ["--recipe", str(trace.recipe)] if trace.recipe else []
+    given += ["--faults", str(trace.faults)] if trace.faults else []
     particles = trace.settings.get("particles", 300)
     given += ["--particles", str(particles)] if particles != 300 else []
     words = ["beliefscope", "trace", trace.episode.task, "--filter", filter_ or trace.filter]

@@ -31,7 +31,7 @@ def trace(
     \b
     Examples:
       beliefscope trace door --filter crossmodal-pf --episode 9 -o run.trace
-      beliefscope trace door --filter crossmodal-pf --recipe force_bias:x=5:from=20 -o biased.trace
+      beliefscope trace door --filter crossmodal-pf --faults force_bias:x=5:from=20 -o biased.trace
     """
     from beliefscope.inspect.trace import save_trace
 

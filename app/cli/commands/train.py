@@ -13,14 +13,14 @@ import typer
 from beliefscope.app.cli import output as console
 from beliefscope.app.cli.options import (
     DataPath,
+    FaultsText,
     Json,
-    RecipeText,
     Seed,
     SkipBad,
     TaskName,
     check,
     dataset,
-    recipe,
+    faults,
     size,
 )
 from beliefscope.datasets.errors import BadInput, one_of
@@ -55,7 +55,7 @@ def train(
             help="Chances of a black picture, one of which is drawn for each training window.",
         ),
     ] = "0,0.4,0.8",
-    recipe_: RecipeText = "",
+    faults_: FaultsText = "",
     seed: Seed = 0,
     log: Annotated[
         Path | None,
@@ -67,17 +67,17 @@ def train(
 
     In the paper's order: dynamics, each modality's model, each modality alone through the filter, the weight model
     alone, everything together. Uses a CUDA GPU where there is one. The checkpoint tells how it was made and how
-    well it does on episodes it has not seen. With a recipe it also trains on a broken copy of each training episode.
+    well it does on episodes it has not seen. With a faults it also trains on a broken copy of each training episode.
     What is finished lies in CHECKPOINT.partial: the same command, run again after a kill, goes on from there.
 
     \b
     Examples:
       beliefscope train door --filter crossmodal-pf -o mine.safetensors
       beliefscope train door --filter crossmodal-ekf --data door.h5 --preset full -o mine.safetensors
-      beliefscope train door --filter crossmodal-pf --recipe force_bias:x=5,force_noise=3 -o hardened.safetensors
+      beliefscope train door --filter crossmodal-pf --faults force_bias:x=5,force_noise=3 -o hardened.safetensors
     """
     from beliefscope.datasets.catalog import load_task
-    from beliefscope.datasets.faults.recipe import broken_copies
+    from beliefscope.datasets.faults.injection import broken_copies
     from beliefscope.filters.catalog import architecture
     from beliefscope.filters.checkpoint import save_checkpoint
     from beliefscope.filters.training.stages import BLACKOUTS
@@ -93,9 +93,9 @@ def train(
         raise one_of("preset", preset, PLANS)
     # Where on this machine the data lie is no part of the record; their hash is.
     given = "" if data is None else f" --data {data.name}"
-    broken = recipe(recipe_, load_task(task))
+    broken = faults(faults_, load_task(task))
     partial = output.with_name(f"{output.name}.partial")
-    given += f" --recipe {broken}" if broken else ""
+    given += f" --faults {broken}" if broken else ""
     given += "" if black == BLACKOUTS else f" --blackouts {blackouts}"
     with dataset(load_task(task), data, skip_bad) as episodes, console.bars() as move, losses(log) as write:
 
@@ -117,7 +117,7 @@ def train(
             resumed=lambda stage: console.say(f"goes on after stage {stage!r}, from {partial.name}"),
             partial=partial,
         )
-    record = trained.record | {"recipe": broken.to_json()}
+    record = trained.record | {"faults": broken.to_json()}
     checkpoint_hash = save_checkpoint(trained.filter, filter_, record, output)
     document = {
         "task": task,

@@ -61,9 +61,9 @@ async function start() {
     throw new api.ServerError('There is nothing to show: no task has both episodes and a trained filter.');
   }
   const { state, problems } = resolve(location.search, catalog);
-  if (state.recipe) await api.check({ ...state, against: '' }).catch((error) => {
-    problems.push(`The link asks for sensors broken by “${state.recipe}”: ${error.message}`);
-    state.recipe = '';
+  if (state.faults) await api.check({ ...state, against: '' }).catch((error) => {
+    problems.push(`The link asks for sensors broken by “${state.faults}”: ${error.message}`);
+    state.faults = '';
   });
   messages.say('link', problems.join('\n'));
   new Page(catalog, new Store(state), live);
@@ -79,7 +79,7 @@ class Page {
 
   constructor(catalog, store, live) {
     [this.#catalog, this.#store] = [catalog, store];
-    const sheet = new FaultSheet($('#faults'), catalog.faults);
+    const sheet = new FaultSheet($('#fault-dialog'), catalog.faults);
     const listed = pickers(catalog, store, sheet);
     this.undo = new Undo(store);
     this.theme = new Theme((dark) => this.#recolour(dark));
@@ -164,11 +164,11 @@ class Page {
   /** The state has changed: whatever depends on it is drawn in this frame. */
   #follow(state, changed) {
     const any = (...names) => names.some((name) => changed.has(name));
-    if (any('task', 'filter', 'data', 'episode', 'recipe')) this.#load();
+    if (any('task', 'filter', 'data', 'episode', 'faults')) this.#load();
     if (any('tab')) this.#showTab(state.tab);
     if (any('diagnostic', 'options', 'over')) this.diagnostics.choose();
     if (any('against') && this.#trace) this.compare.choose();
-    if (any('task', 'filter', 'data', 'recipe', 'among')) this.failures.load();
+    if (any('task', 'filter', 'data', 'faults', 'among')) this.failures.load();
     else if (any('by', 'group', 'list')) this.failures.draw();
     if (any('task', 'filter', 'run')) this.finetune.load();
     if (any('playing')) this.#showPlaying(state.playing);
@@ -179,7 +179,7 @@ class Page {
 
   /** Loads the trace that the state names and shows it in every panel. */
   async #load() {
-    const { task: name, filter, data, episode, recipe } = this.#store.state;
+    const { task: name, filter, data, episode, faults } = this.#store.state;
     this.#loading.abort();
     const loading = (this.#loading = new AbortController());
     [this.#trace, this.#failed] = [null, false];
@@ -189,7 +189,7 @@ class Page {
     const progress = (share) => (clearTimeout(patience), wait(share));
     try {
       const task = this.#catalog.tasks.find((t) => t.name === name);
-      const selection = { task: name, filter, data, episode, recipe };
+      const selection = { task: name, filter, data, episode, faults };
       const trace = await api.loadTrace(task, selection, progress, loading.signal);
       clearTimeout(patience);
       this.#show(trace);

@@ -7,7 +7,7 @@ import { spoken } from './units.js';
  * @typedef {object} State
  * @property {string} task @property {string} filter @property {string} data set of episodes
  * @property {number} episode index in it
- * @property {string} recipe how the sensors are broken, as text (docs/data.md); empty where they are not
+ * @property {string} faults how the sensors are broken, as text (docs/data.md); empty where they are not
  * @property {string} against what differs in the other run that this one is compared with (docs/api.md); empty without one
  * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
  * @property {'scene' | 'rerun' | 'diagnostics' | 'failures' | 'compare' | 'finetune' | 'study' | 'recordings'} tab
@@ -35,7 +35,7 @@ const CHOICES = { height: ['floor', 'belief'], tint: ['weight', 'share'], tab: [
 const FLOOR = 'fused'; // the map on the scene's floor where none is chosen
 const WORST = 'error'; // the measure that ranks failures where none is chosen
 /** Of the state: another one is another place in the browser's history. */
-const PLACES = ['task', 'filter', 'data', 'episode', 'recipe', 'against', 'tab', 'diagnostic', 'run', 'study'];
+const PLACES = ['task', 'filter', 'data', 'episode', 'faults', 'against', 'tab', 'diagnostic', 'run', 'study'];
 const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
 
 /** Holds the state; tells listeners once a frame what has changed. */
@@ -100,9 +100,9 @@ export class Store {
 
 /** @param {State} state @returns {string} what follows the `?` says all of it that a link should keep. */
 export function address(state) {
-  const { task, filter, data, episode, recipe, step, angle, tab, component, weights, track, window, diagnostic, options, over, by, group } = state;
+  const { task, filter, data, episode, faults, step, angle, tab, component, weights, track, window, diagnostic, options, over, by, group } = state;
   const kept = { task, filter, data, episode, step, component, weights, track, tab };
-  if (recipe) kept.recipe = recipe;
+  if (faults) kept.faults = faults;
   if (state.against) kept.against = state.against;
   if (window) kept.window = window;
   if (diagnostic) kept.diagnostic = diagnostic;
@@ -140,7 +140,7 @@ export function resolve(search, catalog) {
     filter: pickOf('filter', task.filters.filter(({ live }) => !live || live === data.name), data.live?.filter).name,
     data: data.name,
     episode: number(asked, 'episode', data.first, data.episodes.map((e) => e.index), problems),
-    recipe: asked.get('recipe')?.trim() ?? '',
+    faults: asked.get('faults')?.trim() ?? '',
     against: asked.get('against') ?? '',
     step: number(asked, 'step', 0, null, problems),
     angle: asked.has('angle') && Number.isFinite(Number(asked.get('angle'))) ? Number(asked.get('angle')) : null,

@@ -1,6 +1,6 @@
 /** Undo and redo of what is looked at: an edit that was tried is taken back, with the moment that was shown. */
 
-const UNDONE = ['task', 'filter', 'data', 'episode', 'recipe', 'against'];
+const UNDONE = ['task', 'filter', 'data', 'episode', 'faults', 'against'];
 const ALONG = ['step', 'angle', 'component']; // come back with them
 const KEPT = 100;
 

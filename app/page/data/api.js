@@ -11,11 +11,11 @@ import { Trace } from './trace.js';
  * @property {{x: string, y: string, half_width: number}} map
  * @property {{name: string, kind: string, checkpoint_hash: string, live?: string}[]} filters `live`: known only by the live run of that name
  * @property {{name: string, first: number, episodes: Summary[], live?: import('../tabs/live_runs.js').Run}[]} data sets of episodes; the index to begin with
- * @property {{name: string, recipe: string}[]} recipes that are ready to be picked
+ * @property {{name: string, faults: string}[]} fault_presets
  * @typedef {{name: string, default: number | string | null, unit: string, meaning: string}} Parameter
  * @typedef {{fault: string, meaning: string, parameters: Parameter[]}} Fault
  * @typedef {{version: string, tasks: Task[], faults: Fault[], problems?: string[]}} Catalog
- * @typedef {{task: string, filter: string, data: string, episode: number, recipe: string, against?: string}} Selection names of what is looked at;
+ * @typedef {{task: string, filter: string, data: string, episode: number, faults: string, against?: string}} Selection names of what is looked at;
  *   `against` makes it the other run that it is compared with, by what differs
  * @typedef {{name: string, url: string, bytes: number, seconds: number | null}} Recording seconds: null if it was there
  */
@@ -52,15 +52,15 @@ export const liveRuns = async () => (await ask('/api/live')).json();
 /** @param {boolean} dark @returns {Promise<{view: string, scene: string, socket: string}>} */
 export const openView = async (dark) => (await post('/api/views', { dark })).json();
 
-/** Raises ServerError where there is no such trace: an unknown name, or a recipe that cannot be. @param {Selection} selection */
+/** Raises ServerError where there is no such trace: an unknown name, or a faults that cannot be. @param {Selection} selection */
 export const check = (selection) => ask(traceUrl(selection));
 
-const traceUrl = ({ task, filter, data, episode, recipe, against }, part = '') =>
-  `/api/trace/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}${part}?${new URLSearchParams({ data, recipe, ...(against && { against }) })}`;
+const traceUrl = ({ task, filter, data, episode, faults, against }, part = '') =>
+  `/api/trace/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}${part}?${new URLSearchParams({ data, faults, ...(against && { against }) })}`;
 
 /** A run and the other one side by side. @param {Selection} selection with `against` @returns {Promise<Found & {names: [string, string]}>} */
-export const comparison = ({ task, filter, data, episode, recipe, against }, signal) =>
-  whole(`/api/compare/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, recipe, against })}`, signal);
+export const comparison = ({ task, filter, data, episode, faults, against }, signal) =>
+  whole(`/api/compare/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, faults, against })}`, signal);
 
 /**
  * A trace with all its numbers and pictures; the server computes it first if need be.
@@ -93,8 +93,8 @@ export async function loadTrace(task, selection, progress, signal) {
  * @typedef {{verdict: string, trajectories: number, tables: object[], curves: object[], bands: object, plots: object[], pictures: object[]}} Found
  */
 
-const diagnosticUrl = ({ task, filter, data, episode, recipe }, name, query = {}) =>
-  `/api/diagnostics/${name ? `${encodeURIComponent(name)}/` : ''}${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, recipe, ...query })}`;
+const diagnosticUrl = ({ task, filter, data, episode, faults }, name, query = {}) =>
+  `/api/diagnostics/${name ? `${encodeURIComponent(name)}/` : ''}${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, faults, ...query })}`;
 
 /** All diagnostics, and why those that do not apply do not. @returns {Promise<Entry[]>} */
 export const diagnostics = (selection, signal) => whole(diagnosticUrl(selection), signal);
@@ -124,8 +124,8 @@ async function whole(url, signal) {
  * @property {{index: number, steps: number, rmse: number, worst: number, worst_step: number, error: number[], contact: boolean[]}[]} episodes
  */
 
-const failuresUrl = ({ task, filter, data, recipe, among }) =>
-  `/api/failures/${encodeURIComponent(task)}/${encodeURIComponent(filter)}?${new URLSearchParams({ data, recipe, among })}`;
+const failuresUrl = ({ task, filter, data, faults, among }) =>
+  `/api/failures/${encodeURIComponent(task)}/${encodeURIComponent(filter)}?${new URLSearchParams({ data, faults, among })}`;
 
 /** Where a filter fails; or the job that looks for it, null where nobody asked for it. @returns {Promise<Failures | {job: Job | null}>} */
 export const failures = (asked, signal) => whole(failuresUrl(asked), signal);
@@ -162,8 +162,8 @@ export const job = async (id) => (await ask(`/api/jobs/${id}`)).json();
 export const cancel = async (id) => (await ask(`/api/jobs/${id}`, { method: 'DELETE' })).json();
 
 /** Has a report of a run made. The job's link is where it lies. @param {{moments: number[], every: boolean, pdf: boolean, title: string}} wanted @returns {Promise<{job: Job}>} */
-export const report = async ({ task, filter, episode, data, recipe }, wanted) =>
-  (await post(`/api/reports/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, recipe })}`, wanted)).json();
+export const report = async ({ task, filter, episode, data, faults }, wanted) =>
+  (await post(`/api/reports/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, faults })}`, wanted)).json();
 
 /** What is asked for to record a trace, with maps at even steps. @param {Trace} trace @param {boolean} automatic whether it is to be looked at only */
 export const recorded = (trace, automatic = false) => ({ ...trace.selection, maps: Math.ceil(trace.steps / RECORDED_MAPS), automatic });

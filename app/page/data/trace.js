@@ -76,7 +76,7 @@ export class Trace {
     return source === FUSED && !this.fuses ? 'estimate' : source;
   }
 
-  /** Whether another trace is of the same episode, step by step; filter and recipe may differ. */
+  /** Whether another trace is of the same episode, step by step; filter and faults may differ. */
   alongside({ selection, steps }) {
     return steps === this.steps && ['task', 'data', 'episode'].every((key) => selection[key] === this.selection[key]);
   }

@@ -52,9 +52,9 @@ function named({ trace, maps }, layer) {
 }
 
 function described({ trace, maps, title }) {
-  const { task, filter, data, episode, recipe } = trace.selection;
+  const { task, filter, data, episode, faults } = trace.selection;
   const angle = maps.angle === null ? '' : `, cut at ${fixed((maps.angle * 180) / Math.PI, 1)}°`;
-  return `${task}, ${filter}, ${data} episode ${episode}, ${recipe ? `sensors ${recipe}, ` : ''}step ${maps.step}${angle}: ${title}`;
+  return `${task}, ${filter}, ${data} episode ${episode}, ${faults ? `sensors ${faults}, ` : ''}step ${maps.step}${angle}: ${title}`;
 }
 
 /** A cell a row. @returns {string} */

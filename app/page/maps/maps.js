@@ -77,7 +77,7 @@ export class Heatmaps {
     if (!pin || !this.#trace || this.#pinned || this.#fetched === pin) return;
     this.#fetched = pin;
     const { step, angle = null, episode, ...named } = Object.fromEntries(new URLSearchParams(pin));
-    const selection = { recipe: '', ...named, task, episode: Number(episode) };
+    const selection = { faults: '', ...named, task, episode: Number(episode) };
     const maps = await this.#fetch({ ...selection, step: Number(step), angle: angle && Number(angle) });
     if (this.#store.state.pin !== pin || this.#pinned) return;
     if (comparable(maps, this.#maps)) this.#keep({ maps, selection });
@@ -330,8 +330,8 @@ function fits({ half_width, peak, numbers }) {
 }
 
 /** A moment of the page's task in words of an address. */
-function moment({ filter, data, episode, recipe }, step, angle) {
-  const told = { filter, data, episode, step, ...(recipe && { recipe }), ...(angle !== null && { angle: angle.toFixed(4) }) };
+function moment({ filter, data, episode, faults }, step, angle) {
+  const told = { filter, data, episode, step, ...(faults && { faults }), ...(angle !== null && { angle: angle.toFixed(4) }) };
   return String(new URLSearchParams(told));
 }
 

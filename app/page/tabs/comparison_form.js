@@ -1,19 +1,19 @@
 /** The form that says what the other run is: another filter, other sensors, or an edit of this run over some steps. */
 
 import { choice } from '../widgets/pickers.js';
-import { recipePicker } from '../widgets/fault_dialog.js';
+import { faultPicker } from '../widgets/fault_dialog.js';
 import { fixed, sentence } from '../core/units.js';
 
-const KINDS = [['filter', 'another filter'], ['recipe', 'other sensors'], ['edit', 'an edit of some steps']];
+const KINDS = [['filter', 'another filter'], ['faults', 'other sensors'], ['edit', 'an edit of some steps']];
 const FIRST_SPAN = 20; // steps of an edit, until somebody chooses others
 
 /** `a=1&b=2`, as an address has it, with as few signs escaped as can be. */
 const joined = (pairs) => pairs.map(([key, value]) => `${key}=${String(value).replace(/[%&+#]/g, encodeURIComponent)}`).join('&');
 
-/** What an other run is: `filter`, `recipe` or `edit`. @param {string} against as in the state */
+/** What an other run is: `filter`, `faults` or `edit`. @param {string} against as in the state */
 const kindOf = (against) => {
   const asked = new URLSearchParams(against);
-  return asked.has('from') ? 'edit' : asked.has('recipe') && !asked.has('filter') ? 'recipe' : 'filter';
+  return asked.has('from') ? 'edit' : asked.has('faults') && !asked.has('filter') ? 'faults' : 'filter';
 };
 
 export class Edit {
@@ -22,12 +22,12 @@ export class Edit {
   #catalog;
   #trace = null;
   #kind = 'filter';
-  #recipe = '';
   #faults = '';
+  #editFaults = '';
   /** @type {Map<string, number>} modality to beta, those set by hand, the newest last */
   #held = new Map();
-  #showRecipe;
   #showFaults;
+  #showEditFaults;
 
   /**
    * @param {HTMLFormElement} form @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
@@ -36,16 +36,16 @@ export class Edit {
    */
   constructor(form, catalog, store, sheet, check) {
     [this.#form, this.#catalog, this.#store] = [form, catalog, store];
-    const pick = (name, set, of) => recipePicker(form.elements[name], sheet, { ...of, choose: (recipe) => (set(recipe), this.#tell('')) });
-    this.#showRecipe = pick('recipe', (recipe) => (this.#recipe = recipe), {
+    const pick = (name, set, of) => faultPicker(form.elements[name], sheet, { ...of, choose: (faults) => (set(faults), this.#tell('')) });
+    this.#showFaults = pick('faults', (faults) => (this.#faults = faults), {
       none: 'as recorded',
-      chosen: () => this.#recipe,
-      check: (recipe) => recipe && check(joined([['recipe', recipe]])),
-    });
-    this.#showFaults = pick('faults', (recipe) => (this.#faults = recipe), {
-      none: 'as they are',
       chosen: () => this.#faults,
-      check: (recipe) => recipe && check(joined([...this.#span, ['recipe', recipe]])),
+      check: (faults) => faults && check(joined([['faults', faults]])),
+    });
+    this.#showEditFaults = pick('edit_faults', (faults) => (this.#editFaults = faults), {
+      none: 'as they are',
+      chosen: () => this.#editFaults,
+      check: (faults) => faults && check(joined([...this.#span, ['faults', faults]])),
     });
     form.addEventListener('submit', (event) => (event.preventDefault(), this.#run()));
     form.addEventListener('input', () => this.#tell(''));
@@ -69,8 +69,8 @@ export class Edit {
     if (against) this.#read(against);
     else if (!others.length && this.#kind === 'filter') this.#kind = 'edit';
     this.#form.querySelector('.clear').disabled = !against;
-    this.#showRecipe(task.recipes);
-    this.#showFaults(task.recipes);
+    this.#showFaults(task.fault_presets);
+    this.#showEditFaults(task.fault_presets);
     this.#buildBetas();
     this.#showKind(others);
   }
@@ -92,10 +92,10 @@ export class Edit {
     this.#kind = kindOf(against);
     const { filter } = this.#form.elements;
     if ([...filter.options].some(({ value }) => value === asked.get('filter'))) filter.value = asked.get('filter');
-    if (this.#kind === 'recipe') this.#recipe = asked.get('recipe');
+    if (this.#kind === 'faults') this.#faults = asked.get('faults');
     if (this.#kind !== 'edit') return;
     this.#setSpan(Number(asked.get('from')), Number(asked.get('to')) - 1);
-    this.#faults = asked.get('recipe') ?? '';
+    this.#editFaults = asked.get('faults') ?? '';
     const pairs = (asked.get('weights') ?? '').split(',').filter(Boolean).map((part) => part.split('='));
     this.#held = new Map(pairs.map(([name, beta]) => [name, Number(beta)]));
   }
@@ -123,13 +123,13 @@ export class Edit {
   #text() {
     const { filter, from, last } = this.#form.elements;
     if (this.#kind === 'filter') return filter.value ? joined([['filter', filter.value]]) : this.#tell('There is no other filter of this task.');
-    if (this.#kind === 'recipe') {
-      return this.#recipe === this.#store.state.recipe ? this.#tell('This run has these sensors. Choose others.') : joined([['recipe', this.#recipe]]);
+    if (this.#kind === 'faults') {
+      return this.#faults === this.#store.state.faults ? this.#tell('This run has these sensors. Choose others.') : joined([['faults', this.#faults]]);
     }
     if (!(from.valueAsNumber <= last.valueAsNumber)) return this.#tell('The last step of the edit comes before its first.');
     const weights = [...this.#held].map(([name, beta]) => `${name}=${beta}`).join(',');
-    if (!this.#faults && !weights) return this.#tell('Nothing is edited yet: choose how the sensors are broken, or move a weight.');
-    return joined([...this.#span, ...(this.#faults ? [['recipe', this.#faults]] : []), ...(weights ? [['weights', weights]] : [])]);
+    if (!this.#editFaults && !weights) return this.#tell('Nothing is edited yet: choose how the sensors are broken, or move a weight.');
+    return joined([...this.#span, ...(this.#editFaults ? [['faults', this.#editFaults]] : []), ...(weights ? [['weights', weights]] : [])]);
   }
 
   #tell(line) {

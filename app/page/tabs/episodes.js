@@ -81,8 +81,8 @@ export class Episodes {
   }
 
   #draw() {
-    const { task, data, filter, recipe, among } = this.#store.state;
-    const shown = JSON.stringify([task, data, filter, recipe, among, this.#score?.name, Boolean(this.#found), this.#sort]);
+    const { task, data, filter, faults, among } = this.#store.state;
+    const shown = JSON.stringify([task, data, filter, faults, among, this.#score?.name, Boolean(this.#found), this.#sort]);
     if (shown === this.#shown) return;
     this.#shown = shown;
     const focused = this.#host.contains(document.activeElement) ? document.activeElement.dataset.column : undefined;

@@ -73,7 +73,7 @@ export class Failures {
     });
   }
 
-  /** Another task, filter, data set or recipe, or other episodes of it: asks what is known. */
+  /** Another task, filter, data set or faults, or other episodes of it: asks what is known. */
   async load() {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
@@ -148,8 +148,8 @@ export class Failures {
   }
 
   get #key() {
-    const { task, filter, data, recipe, among } = this.#store.state;
-    return JSON.stringify([task, filter, data, recipe, among]);
+    const { task, filter, data, faults, among } = this.#store.state;
+    return JSON.stringify([task, filter, data, faults, among]);
   }
 
   /** Whether it is of a live run: one episode. */

@@ -6,7 +6,7 @@ import { Figures } from '../widgets/figures.js';
 import { told, underWay } from '../widgets/jobs.js';
 import { ModuleTree } from './module_tree.js';
 import { say } from '../widgets/panel_state.js';
-import { recipePicker } from '../widgets/fault_dialog.js';
+import { faultPicker } from '../widgets/fault_dialog.js';
 import { address } from '../core/state.js';
 import { fixed, sentence, spoken } from '../core/units.js';
 
@@ -29,7 +29,7 @@ const FORM = `
     <ul class="tree" aria-label="Modules"></ul>
     <div class="row">
       <label title="A part of what the filter meets, by its name; what it is stands beside it">Learn from <select name="slice"></select></label>
-      <label>Sensors <select name="recipe"></select></label>
+      <label>Sensors <select name="faults"></select></label>
       <label title="Which steps of an episode count">Steps <select name="contact"></select></label>
       <label title="What the filter is given: all, or one alone">Modalities <select name="only"></select></label>
     </div>
@@ -59,11 +59,11 @@ export class Finetune {
   #descent;
   #live;
   #report;
-  #showRecipes;
+  #showFaults;
   #offer = null;
   #run = null;
   #heard = '';
-  #recipe = '';
+  #faults = '';
   #open = false;
   #loaded = '';
   #loading = new AbortController();
@@ -81,11 +81,11 @@ export class Finetune {
     this.#report = new Figures(this.#part('.report'), store);
     this.#part('.numbers').append(...NUMBERS.map(number));
     fill(this.#field('contact'), STEPS);
-    this.#showRecipes = recipePicker(this.#field('recipe'), sheet, {
+    this.#showFaults = faultPicker(this.#field('faults'), sheet, {
       none: 'as recorded',
-      chosen: () => this.#recipe,
-      choose: (recipe) => ((this.#recipe = recipe), (this.#field('slice').value = OWN)),
-      check: (recipe) => api.check({ ...store.state, recipe, against: '' }),
+      chosen: () => this.#faults,
+      choose: (faults) => ((this.#faults = faults), (this.#field('slice').value = OWN)),
+      check: (faults) => api.check({ ...store.state, faults, against: '' }),
     });
     for (const name of ['contact', 'only']) this.#field(name).addEventListener('change', () => (this.#field('slice').value = OWN));
     this.#field('preset').addEventListener('change', () => this.#takePreset());
@@ -156,7 +156,7 @@ export class Finetune {
     fill(this.#field('only'), [['', 'all'], ...slices.filter((s) => s.only.length).map((s) => [s.only.join('+'), `only ${s.only.join(' + ')}`])]);
     fill(this.#field('slice'), [...slices.map(({ name }) => [name, name]), ['', 'nothing but nominal data'], [OWN, 'as chosen here']]);
     this.#field('slice').value = known(slices, DEFAULT.slice) ?? '';
-    this.#showRecipes(task.recipes);
+    this.#showFaults(task.fault_presets);
     for (const [name] of NUMBERS) this.#field(name).value = settings[name];
     const past = this.#part('.past');
     past.hidden = !runs.length;
@@ -181,9 +181,9 @@ export class Finetune {
     const name = this.#field('slice').value;
     if (name === OWN) return;
     const slice = this.#offer.slices.find((one) => one.name === name);
-    const recipe = slice?.text.match(/recipe=(.*?)(?=$|:contact=|:only=)/)?.[1] ?? '';
-    this.#recipe = recipe;
-    this.#showRecipes(this.#catalog.tasks.find((task) => task.name === this.#store.state.task).recipes);
+    const faults = slice?.text.match(/faults=(.*?)(?=$|:contact=|:only=)/)?.[1] ?? '';
+    this.#faults = faults;
+    this.#showFaults(this.#catalog.tasks.find((task) => task.name === this.#store.state.task).fault_presets);
     this.#field('contact').value = slice?.contact === true ? 'yes' : slice?.contact === false ? 'no' : '';
     this.#field('only').value = slice?.only.join('+') ?? '';
   }
@@ -198,7 +198,7 @@ export class Finetune {
     const [contact, only] = [value('contact'), value('only')];
     const named = this.#offer.slices.find((one) => one.name === value('slice'));
     if (named) settings.mix = [{ slice: plain(named), share: 1 }];
-    else if (value('slice') === OWN && (this.#recipe || contact || only)) settings.mix = [{ slice: own(this.#recipe, contact, only), share: 1 }];
+    else if (value('slice') === OWN && (this.#faults || contact || only)) settings.mix = [{ slice: own(this.#faults, contact, only), share: 1 }];
     return settings;
   }
 
@@ -319,12 +319,12 @@ const said = (job) => (job.state === 'cancelled' ? 'Paused. It goes on from its 
 const learned = ({ settings }) => settings.mix.map(({ slice }) => slice.name).join(' and ') || 'nominal data';
 
 /** A slice as the server takes it. */
-const plain = ({ name, recipe, contact, only }) => ({ name, recipe, contact, only });
+const plain = ({ name, faults, contact, only }) => ({ name, faults, contact, only });
 
 /** A slice's text, named after what it is. */
-function own(recipe, contact, only) {
-  const name = [recipe.replace(/[:=]/g, ' ') || 'whole', { yes: 'in contact', no: 'out of contact' }[contact], only && `${only} alone`].filter(Boolean).join(', ');
-  return [name, `recipe=${recipe}`, contact && `contact=${contact}`, only && `only=${only}`].filter(Boolean).join(':');
+function own(faults, contact, only) {
+  const name = [faults.replace(/[:=]/g, ' ') || 'whole', { yes: 'in contact', no: 'out of contact' }[contact], only && `${only} alone`].filter(Boolean).join(', ');
+  return [name, `faults=${faults}`, contact && `contact=${contact}`, only && `only=${only}`].filter(Boolean).join(':');
 }
 
 function number([name, text, step, title]) {

@@ -30,7 +30,7 @@ export function showing(catalog, { task: name, filter, data, episode, steps, sta
   const { map } = catalog.tasks.find((task) => task.name === name);
   const component = now.task === name ? now.component : map.x;
   const running = state === 'running';
-  return { task: name, filter, data, episode, recipe: '', against: '', step: running ? Math.max(0, steps - 1) : 0, angle: null, component, window: '', playing: false, follow: running };
+  return { task: name, filter, data, episode, faults: '', against: '', step: running ? Math.max(0, steps - 1) : 0, angle: null, component, window: '', playing: false, follow: running };
 }
 
 export class Live {

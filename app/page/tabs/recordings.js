@@ -38,7 +38,7 @@ const OF_A_RUN = [
   words('task', 'task', 'What it is of'),
   words('filter', 'filter', 'That made it'),
   { ...words('episode', 'ep.', 'Index of the episode'), number: true },
-  { ...words('recipe', 'sensors', 'How they were broken', ({ task, recipe }) => (task === null ? null : recipe || 'as recorded')), hint: ({ recipe }) => recipe },
+  { ...words('faults', 'sensors', 'How they were broken', ({ task, faults }) => (task === null ? null : faults || 'as recorded')), hint: ({ faults }) => faults },
 ];
 const size = { name: 'bytes', title: 'size', help: 'On the disk', value: (file) => file.bytes, shown: (file) => bytes(file.bytes), number: true };
 const when = (name) => ({ name: 'when', title: 'when', help: 'It was written', value: (file) => Date.parse(file[name]), shown: (file) => moment(new Date(file[name])), hint: (file) => new Date(file[name]).toLocaleString('en-GB'), number: true });
@@ -166,8 +166,8 @@ export class Library {
     button.textContent = this.#automatic ? 'Hide' : 'Show';
   }
 
-  #sought({ name, task, filter, tags = [], recipe, application = '', run }) {
-    const text = [name, task, filter, ...tags, recipe, application, run?.data].join(' ').toLowerCase();
+  #sought({ name, task, filter, tags = [], faults, application = '', run }) {
+    const text = [name, task, filter, ...tags, faults, application, run?.data].join(' ').toLowerCase();
     return this.#part('[type=search]').value.toLowerCase().split(/\s+/).every((word) => text.includes(word));
   }
 
@@ -252,13 +252,13 @@ export class Library {
   }
 
   /** The state that shows a file's run. */
-  #selection({ task, episode, recipe, run }) {
+  #selection({ task, episode, faults, run }) {
     const { state } = this.#store;
     const found = this.#catalog.tasks.find(({ name }) => name === task);
     const set = run.data ?? found.data[0].name;
     const same = state.task === task && state.data === set && state.episode === episode;
     const other = state.task === task ? {} : { component: found.map.x };
-    return { task, filter: run.filter, data: set, episode, recipe, against: '', playing: false, angle: null, step: same ? state.step : 0, ...other };
+    return { task, filter: run.filter, data: set, episode, faults, against: '', playing: false, angle: null, step: same ? state.step : 0, ...other };
   }
 
   #show(files) {
@@ -447,7 +447,7 @@ function apart(one, other) {
 function against(one, other) {
   const differs = {};
   if (one.run.filter !== other.run.filter) differs.filter = other.run.filter;
-  if (one.recipe !== other.recipe) differs.recipe = other.recipe;
+  if (one.faults !== other.faults) differs.faults = other.faults;
   return String(new URLSearchParams(differs));
 }
 

@@ -283,7 +283,7 @@ function moments(state, task, filter, blackout, { key, component }) {
   const data = same ? state.data : task.data[0].name;
   const by = key === 'nees' ? 'nees' : turned ? component : 'error';
   const shown = { component: turned ? component : task.map.x, track: key === 'nees' ? 'nees' : 'error' };
-  return { task: task.name, filter, data, recipe: blackout ? `blackout=${blackout}` : '', against: '', tab: 'failures', list: 'moments', among: 'held-out', by, group: '', ...shown };
+  return { task: task.name, filter, data, faults: blackout ? `blackout=${blackout}` : '', against: '', tab: 'failures', list: 'moments', among: 'held-out', by, group: '', ...shown };
 }
 
 const black = (blackout) => `${percent(blackout)} black`;

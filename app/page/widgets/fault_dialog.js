@@ -1,8 +1,8 @@
-/** How the sensors are broken: recipes that are ready to be picked, and any other in words (docs/data.md). */
+/** Sensor faults: presets, and a dialog for any other fault injection as text (docs/data.md). */
 
 const OTHER = 'other';
 
-/** The sheet in which any recipe can be written. A recipe that the server refuses changes nothing but the sheet. */
+/** The sheet in which any faults can be written. A faults that the server refuses changes nothing but the sheet. */
 export class FaultSheet {
   #sheet;
   #text;
@@ -19,12 +19,12 @@ export class FaultSheet {
   }
 
   /**
-   * @param {string} recipe to begin with @param {(recipe: string) => Promise<unknown>} check raises what is wrong with one
-   * @param {(recipe: string) => void} choose is given the one that is applied
+   * @param {string} faults to begin with @param {(faults: string) => Promise<unknown>} check raises what is wrong with one
+   * @param {(faults: string) => void} choose is given the one that is applied
    */
-  ask(recipe, check, choose) {
+  ask(faults, check, choose) {
     this.#asker = { check, choose };
-    this.#text.value = recipe;
+    this.#text.value = faults;
     this.#tell('');
     this.#sheet.showModal();
     this.#text.focus();
@@ -33,13 +33,13 @@ export class FaultSheet {
   async #take(event) {
     if (event.submitter?.value === 'cancel') return;
     event.preventDefault();
-    const recipe = this.#text.value.trim();
+    const faults = this.#text.value.trim();
     try {
-      await this.#asker.check(recipe);
+      await this.#asker.check(faults);
     } catch (error) {
       return this.#tell(error.message);
     }
-    this.#asker.choose(recipe);
+    this.#asker.choose(faults);
     this.#sheet.close();
   }
 
@@ -49,22 +49,22 @@ export class FaultSheet {
 }
 
 /**
- * A picker of recipes, with the sheet behind its last entry.
+ * Select element with the fault presets; its last entry opens the dialog.
  * @param {HTMLSelectElement} select @param {FaultSheet} sheet
- * @param {object} of @param {string} of.none what no recipe is called @param {() => string} of.chosen
- * @param {(recipe: string) => void} of.choose @param {(recipe: string) => Promise<unknown>} of.check
- * @returns {(ready: {name: string, recipe: string}[]) => void} shows those that are ready, and the chosen one
+ * @param {object} of @param {string} of.none what no faults is called @param {() => string} of.chosen
+ * @param {(faults: string) => void} of.choose @param {(faults: string) => Promise<unknown>} of.check
+ * @returns {(ready: {name: string, faults: string}[]) => void} shows those that are ready, and the chosen one
  */
-export function recipePicker(select, sheet, { none, chosen, choose, check }) {
+export function faultPicker(select, sheet, { none, chosen, choose, check }) {
   let ready = [];
   const show = () => {
-    const recipe = chosen();
-    const own = recipe && !ready.some((r) => r.recipe === recipe) ? [{ name: recipe, recipe }] : [];
-    const all = [{ name: none, recipe: '' }, ...ready, ...own, { name: 'other …', recipe: OTHER }];
-    select.replaceChildren(...all.map((r) => new Option(r.name, r.recipe)));
-    [select.value, select.disabled, select.title] = [recipe, false, `How the sensors are broken${recipe && `: ${recipe}`}`];
+    const faults = chosen();
+    const own = faults && !ready.some((r) => r.faults === faults) ? [{ name: faults, faults }] : [];
+    const all = [{ name: none, faults: '' }, ...ready, ...own, { name: 'other …', faults: OTHER }];
+    select.replaceChildren(...all.map((r) => new Option(r.name, r.faults)));
+    [select.value, select.disabled, select.title] = [faults, false, `How the sensors are broken${faults && `: ${faults}`}`];
   };
-  const take = (recipe) => (choose(recipe), show());
+  const take = (faults) => (choose(faults), show());
   select.addEventListener('change', () => {
     if (select.value !== OTHER) return take(select.value);
     select.value = chosen();

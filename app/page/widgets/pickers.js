@@ -2,7 +2,7 @@
 
 import { check } from '../data/api.js';
 import { showing } from '../tabs/live_runs.js';
-import { recipePicker } from './fault_dialog.js';
+import { faultPicker } from './fault_dialog.js';
 import { SPEEDS } from '../core/state.js';
 import { percent } from '../core/units.js';
 
@@ -20,11 +20,11 @@ export function pickers(catalog, store, sheet) {
   const usable = (set) => current().filters.filter(({ live }) => !live || live === set);
   // Who chooses what this run is compared with sees the two change places.
   const swapped = (key, value) => (store.state.against === `${key}=${value}` ? { against: `${key}=${store.state[key]}` } : {});
-  const showRecipe = recipePicker(document.getElementById('recipe'), sheet, {
+  const showFaults = faultPicker(document.getElementById('faults'), sheet, {
     none: 'as recorded',
-    chosen: () => store.state.recipe,
-    choose: (recipe) => store.set({ recipe, ...swapped('recipe', recipe) }),
-    check: (recipe) => check({ ...store.state, recipe, against: '' }),
+    chosen: () => store.state.faults,
+    choose: (faults) => store.set({ faults, ...swapped('faults', faults) }),
+    check: (faults) => check({ ...store.state, faults, against: '' }),
   });
   fill(speed, SPEEDS.map((s) => [s, `${s}×`]));
   const refill = () => {
@@ -36,10 +36,10 @@ export function pickers(catalog, store, sheet) {
     for (const select of [task, data]) select.parentElement.hidden = select.length < 2;
   };
   task.addEventListener('change', () => {
-    const { name, filters, data: [{ name: data, first }], recipes, map } = named(catalog.tasks, task.value);
+    const { name, filters, data: [{ name: data, first }], fault_presets, map } = named(catalog.tasks, task.value);
     const filter = (named(filters, store.state.filter) ?? filters[0]).name;
-    const recipe = recipes.some((r) => r.recipe === store.state.recipe) ? store.state.recipe : '';
-    store.set({ task: name, filter, data, episode: first, recipe, against: '', step: 0, angle: null, component: map.x, playing: false });
+    const faults = fault_presets.some((r) => r.faults === store.state.faults) ? store.state.faults : '';
+    store.set({ task: name, filter, data, episode: first, faults, against: '', step: 0, angle: null, component: map.x, playing: false });
   });
   data.addEventListener('change', () => {
     const { live, first } = named(current().data, data.value);
@@ -51,7 +51,7 @@ export function pickers(catalog, store, sheet) {
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
   const show = (state, changed = new Set(['task'])) => {
     if (changed.has('task') || changed.has('data')) refill();
-    if (changed.has('task') || changed.has('recipe')) showRecipe(current().recipes);
+    if (changed.has('task') || changed.has('faults')) showFaults(current().fault_presets);
     for (const select of [task, filter, data, episode, speed]) select.value = state[select.id];
   };
   show(store.state);

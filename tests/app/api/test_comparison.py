@@ -17,12 +17,12 @@ from beliefscope.app.server.main import create_app
 from beliefscope.app.views.scene import Scene
 from beliefscope.app.views.scene_belief import OUTLINES
 from beliefscope.app.views.scene_comparison import dashed
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.traces.replay import Edit
 
 ORIGIN = "http://localhost:8000"
 EPISODE = 9
-EDIT = "from=40&to=60&recipe=blackout"
+EDIT = "from=40&to=60&faults=blackout"
 EKF = f"door/crossmodal-ekf/{EPISODE}"
 
 
@@ -71,8 +71,8 @@ def test_an_edit_changes_nothing_before_it(shown: TestClient, filter_: str) -> N
     assert "haptics" in found["verdict"]
 
 
-def test_an_edit_is_the_recipe_over_its_span(shown: TestClient) -> None:
-    whole = estimate(shown, recipe="blackout:from=40:to=60")
+def test_an_edit_is_the_faults_over_its_span(shown: TestClient) -> None:
+    whole = estimate(shown, faults="blackout:from=40:to=60")
     assert np.array_equal(estimate(shown, against=EDIT), whole)
 
 
@@ -89,11 +89,11 @@ def test_weights_by_hand(shown: TestClient) -> None:
     ("against", "query", "names"),
     [
         ("filter=crossmodal-pf", {}, ["crossmodal-ekf", "crossmodal-pf"]),
-        ("recipe=blackout=0.5", {}, ["as recorded", "blackout=0.5"]),
-        ("recipe=", {"recipe": "blackout=0.5"}, ["blackout=0.5", "as recorded"]),
+        ("faults=blackout=0.5", {}, ["as recorded", "blackout=0.5"]),
+        ("faults=", {"faults": "blackout=0.5"}, ["blackout=0.5", "as recorded"]),
         (
-            "filter=crossmodal-pf&recipe=",
-            {"recipe": "blackout"},
+            "filter=crossmodal-pf&faults=",
+            {"faults": "blackout"},
             ["crossmodal-ekf, blackout", "crossmodal-pf, as recorded"],
         ),
     ],
@@ -106,9 +106,9 @@ def test_another_filter_or_other_faults(
     (table,) = found["tables"]
     assert table["columns"][2:4] == names
     other = answered(shown, f"/api/trace/{EKF}", against=against, **query).json()
-    assert [other["filter"], other["recipe"] or "as recorded"] == [
+    assert [other["filter"], other["faults"] or "as recorded"] == [
         "crossmodal-pf" if "filter=" in against else "crossmodal-ekf",
-        "blackout=0.5" if against == "recipe=blackout=0.5" else "as recorded",
+        "blackout=0.5" if against == "faults=blackout=0.5" else "as recorded",
     ]
 
 
@@ -117,16 +117,16 @@ def test_another_filter_or_other_faults(
     [
         ("filter=crossmodal-ekf", "is the run that is shown"),
         ("filter=kalman", "'kalman'"),
-        ("recipe=lightning", "lightning"),
+        ("faults=lightning", "lightning"),
         ("speed=3", "part of the other run"),
         ("from=40&to=60", "nothing is edited"),
-        ("from=40&recipe=blackout", "'to' of the edit"),
-        ("from=60&to=40&recipe=blackout", "has no steps"),
-        ("from=40&to=5000&recipe=blackout", "beyond this trace"),
+        ("from=40&faults=blackout", "'to' of the edit"),
+        ("from=60&to=40&faults=blackout", "has no steps"),
+        ("from=40&to=5000&faults=blackout", "beyond this trace"),
         ("from=40&to=60&weights=touch=1", "touch"),
         ("from=40&to=60&weights=image=2", "from 0 to 1"),
-        ("from=40&to=60&filter=crossmodal-pf&recipe=blackout", "part of an edit"),
-        ("from=40&to=60&recipe=blackout:from=2", "span of its own"),
+        ("from=40&to=60&filter=crossmodal-pf&faults=blackout", "part of an edit"),
+        ("from=40&to=60&faults=blackout:from=2", "span of its own"),
     ],
 )
 def test_what_cannot_be_compared_is_said(shown: TestClient, against: str, said: str) -> None:
@@ -138,9 +138,9 @@ def test_what_cannot_be_compared_is_said(shown: TestClient, against: str, said: 
 
 def test_a_selection_knows_its_other_run() -> None:
     selection = Selection("door", "crossmodal-ekf", EPISODE)
-    edited = selection.against("from=40&to=60&recipe=blackout&weights=image=0.5")
-    assert edited == replace(selection, edit=Edit(40, 60, Recipe.parse("blackout"), {"image": 0.5}))
-    assert len({selection, edited, selection.against("from=40&to=60&recipe=blackout&weights=image=0.6")}) == 3
+    edited = selection.against("from=40&to=60&faults=blackout&weights=image=0.5")
+    assert edited == replace(selection, edit=Edit(40, 60, Faults.parse("blackout"), {"image": 0.5}))
+    assert len({selection, edited, selection.against("from=40&to=60&faults=blackout&weights=image=0.6")}) == 3
 
 
 @pytest.mark.parametrize("shape", OUTLINES)

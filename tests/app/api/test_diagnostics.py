@@ -113,7 +113,7 @@ def test_it_is_computed_once_for_a_trace_and_its_options(shown: TestClient, monk
     assert first.json()["verdict"] == "100 steps"
     assert answered(shown, url("length"), every="2", share="0.5").json()["verdict"] == "50 steps"
     assert answered(shown, url("length"), every="").content == first.content
-    assert answered(shown, url("length"), recipe="blackout=0.5").json()["verdict"] == "100 steps"
+    assert answered(shown, url("length"), faults="blackout=0.5").json()["verdict"] == "100 steps"
     assert asked == [(1, 0.0), (2, 0.5), (1, 0.0)]
     monkeypatch.setattr(diagnostics, "RESULTS_IN_MEMORY", 1)
     answered(shown, url("length"), every="4")

@@ -14,12 +14,12 @@ from starlette.testclient import TestClient
 from beliefscope.app.api.failures import LISTED, document
 from beliefscope.app.runs.trace_store import Library
 from beliefscope.app.server.main import Settings
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.failures.moments import survey_of
 
 PATIENCE = 90.0  # s: a job imports PyTorch first
 URL = "/api/failures/door/crossmodal-ekf"
-RECIPE = "blackout=0.5"
+FAULTS = "blackout=0.5"
 
 
 def surveyed(client: TestClient, **query: str) -> Any:
@@ -36,13 +36,13 @@ def surveyed(client: TestClient, **query: str) -> Any:
 def test_a_survey_is_a_job_and_keeps_no_trace(
     settings: Settings, open_client: Callable[..., TestClient], steps: int
 ) -> None:
-    query = {"among": "all", "recipe": RECIPE}
+    query = {"among": "all", "faults": FAULTS}
     with open_client(settings) as client:
         assert client.get(URL, params=query).json() == {"job": None}
         asked = client.post(URL, params=query)
         assert asked.status_code == 202
         job = asked.json()["job"]
-        assert job["title"] == f"Failures of crossmodal-ekf, door all 2 episodes, {RECIPE}"
+        assert job["title"] == f"Failures of crossmodal-ekf, door all 2 episodes, {FAULTS}"
         assert client.post(URL, params=query).json()["job"]["id"] == job["id"]
         found = surveyed(client, **query)
         opened = dict(parse_qsl(job["link"].removeprefix("?")))
@@ -55,11 +55,11 @@ def test_a_survey_is_a_job_and_keeps_no_trace(
         library.checkpoint("door", "crossmodal-ekf"),
         library.dataset("door", "")[1],
         [0, 1],
-        recipe=Recipe.parse(RECIPE),
+        faults=Faults.parse(FAULTS),
         particles=settings.particles,
     )
     library.close()
-    wanted = {"filter": "crossmodal-ekf", "data": "mine", "recipe": RECIPE, "among": "all"}
+    wanted = {"filter": "crossmodal-ekf", "data": "mine", "faults": FAULTS, "among": "all"}
     assert found == json.loads(json.dumps(wanted | document(survey, "crossmodal-ekf", "mine")))
     assert [(one["index"], one["steps"]) for one in found["episodes"]] == [(0, steps), (1, steps)]
     with open_client(settings) as client:  # another server on the same workspace
@@ -97,7 +97,7 @@ def test_it_ranks_by_every_score_or_says_why_not(client: TestClient) -> None:
         ("/api/failures/window/crossmodal-ekf", {}, 400, "task 'window'"),
         (URL, {"data": "none"}, 400, "data 'none'"),
         (URL, {"among": "some"}, 422, "held-out"),
-        (URL, {"recipe": "darkness"}, 400, "darkness"),
+        (URL, {"faults": "darkness"}, 400, "darkness"),
     ],
 )
 def test_what_cannot_be_looked_through_says_why(

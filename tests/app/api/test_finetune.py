@@ -19,7 +19,7 @@ from beliefscope.filters.checkpoint import load_checkpoint
 PATIENCE = 120.0  # s: a job imports PyTorch first
 URL = "/api/finetune/door/crossmodal-ekf"
 SMALL = {"train": ["haptics-only"], "steps": 4, "check": 2, "length": 8, "windows": 2}
-BLACK = {"slice": {"name": "black", "recipe": [{"fault": "blackout", "probability": 1.0}]}, "share": 1.0}
+BLACK = {"slice": {"name": "black", "faults": [{"fault": "blackout", "probability": 1.0}]}, "share": 1.0}
 
 
 def finished(client: TestClient, run: str) -> Any:

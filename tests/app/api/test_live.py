@@ -302,7 +302,7 @@ def test_failures_of_a_run_that_has_ended_are_those_of_its_episode(
     writer.append(whole)
     writer.finish()
     found = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
-    assert (found["data"], found["steps"], found["recipe"]) == ("live:run", STEPS, "")
+    assert (found["data"], found["steps"], found["faults"]) == ("live:run", STEPS, "")
     by_error = next(score for score in found["scores"] if score["name"] == "error")
     expected = failures_of(Survey.of([whole]), "error").moments
     assert [(m["step"], m["value"]) for m in by_error["moments"]] == [(m.step, m.score) for m in expected]

@@ -90,7 +90,7 @@ def listed(client: TestClient) -> dict[str, dict[str, Any]]:
 
 
 def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str, settings: Settings) -> None:
-    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "recipe": ""}
+    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "faults": ""}
     answer = client.post("/api/recordings", json=wanted)
     assert answer.status_code == 201, answer.text
     made = answer.json()
@@ -122,7 +122,7 @@ def test_a_recording_that_is_there_is_not_written_again(client: TestClient, trac
     again = client.post("/api/recordings", json=wanted)
     assert (again.status_code, again.json()) == (200, first | {"seconds": None})
     assert path.stat().st_mtime_ns == before
-    other = client.post("/api/recordings", json=wanted | {"recipe": "blackout=0.5"})
+    other = client.post("/api/recordings", json=wanted | {"faults": "blackout=0.5"})
     assert other.status_code == 201
     assert other.json()["name"] != first["name"]
 
@@ -163,14 +163,14 @@ def test_a_file_of_ours_is_added_with_all_that_it_says(client: TestClient, own: 
     assert (folder / "theirs (1).rrd").read_bytes() == own
     (found,) = listed(client).values()
     assert answer.json() == found
-    said = {key: found[key] for key in ("name", "task", "filter", "episode", "steps", "recipe", "problem", "why_not")}
+    said = {key: found[key] for key in ("name", "task", "filter", "episode", "steps", "faults", "problem", "why_not")}
     assert said == {
         "name": "theirs (1).rrd",
         "task": "door",
         "filter": "crossmodal-ekf",
         "episode": 1,
         "steps": 40,
-        "recipe": "",
+        "faults": "",
         "problem": "",
         "why_not": "",
     }

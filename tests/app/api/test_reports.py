@@ -22,7 +22,7 @@ def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
     with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
 
         def ask(**wanted: Any) -> Response:
-            params = {"data": "sample", "recipe": "blackout=0.4"}
+            params = {"data": "sample", "faults": "blackout=0.4"}
             return client.post("/api/reports/door/crossmodal-ekf/9", params=params, json=WANTED | wanted)
 
         for wrong, status, said in (
@@ -46,14 +46,14 @@ def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
         assert page.status_code == 200
         assert "attachment" in page.headers["content-disposition"]
         assert f"{ORIGIN}/?task=door&amp;filter=crossmodal-ekf&amp;data=sample&amp;episode=9&amp;step=" in page.text
-        assert "recipe=blackout%3D0.4" in page.text
+        assert "faults=blackout%3D0.4" in page.text
         assert [f"episode=9&amp;step={step}" in page.text for step in (7, 40, 41)] == [True, True, False]
         assert "--moment=7 --moment=40 --title &#x27;Two moments&#x27; -o report" in page.text
         assert ask().json()["job"]["state"] == "done", "what is there is not made again"
         (listed,) = client.get("/api/reports").json()["reports"]
         assert (f"/{job['link']}", "Two moments", None) == (listed["url"], listed["title"], listed["pdf"])
         assert client.get(listed["url"].replace(".html", ".pdf")).status_code == 404
-        said = tuple(listed[key] for key in ("task", "filter", "episode", "recipe"))
+        said = tuple(listed[key] for key in ("task", "filter", "episode", "faults"))
         assert said == ("door", "crossmodal-ekf", 9, "blackout=0.4")
         shown = client.get(listed["url"], params={"shown": "true"})
         assert shown.headers["content-disposition"].startswith("inline")

@@ -50,7 +50,7 @@ def test_what_was_written_to_be_looked_at_goes_again_and_what_is_kept_stays(
     wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
 
     def record(noise: int, automatic: bool = True) -> str:
-        asked = wanted | {"recipe": f"force_noise={noise}", "automatic": automatic}
+        asked = wanted | {"faults": f"force_noise={noise}", "automatic": automatic}
         name: str = client.post(URL, json=asked).json()["name"]
         return name
 

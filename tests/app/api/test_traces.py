@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 
 from beliefscope import __version__
 from beliefscope.app.server.main import Settings
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.trace import load_trace
 
 OpenClient = Callable[..., TestClient]
@@ -96,37 +96,37 @@ def test_a_damaged_trace_file_is_computed_again(traced: str, settings: Settings,
     assert len(file.read_bytes()) == len(whole)
 
 
-def test_the_catalog_has_recipes_that_can_be_asked_for(client: TestClient, traced: str) -> None:
+def test_the_catalog_has_faults_that_can_be_asked_for(client: TestClient, traced: str) -> None:
     tasks = {t["name"]: t for t in client.get("/api/catalog").json()["tasks"]}
-    recipes = {r["name"]: r["recipe"] for r in tasks["door"]["recipes"]}
-    assert recipes["40 % black pictures"] == "blackout=0.4"
-    assert {"force axis stuck", "effector off by 2 cm", "haptics dropped"} <= recipes.keys()
+    fault_sets = {r["name"]: r["faults"] for r in tasks["door"]["fault_presets"]}
+    assert fault_sets["40 % black pictures"] == "blackout=0.4"
+    assert {"force axis stuck", "effector off by 2 cm", "haptics dropped"} <= fault_sets.keys()
     whole = client.get(f"{traced}/images").content
-    for recipe in ("blackout=0.8", '[{"fault": "image_frozen", "from": 20}]'):
-        query = {"recipe": recipe}
+    for faults in ("blackout=0.8", '[{"fault": "image_frozen", "from": 20}]'):
+        query = {"faults": faults}
         while (answer := client.get(traced, params=query)).status_code == 202:
             pass
-        assert answer.json()["recipe"] == str(Recipe.parse(recipe))
+        assert answer.json()["faults"] == str(Faults.parse(faults))
         broken = client.get(f"{traced}/images", params=query).content
         assert len(broken) == len(whole)
         assert broken != whole
-    assert client.get(traced).json()["recipe"] == ""
+    assert client.get(traced).json()["faults"] == ""
     assert client.get(f"{traced}/images").content == whole
 
 
 @pytest.mark.parametrize(
-    ("recipe", "said"),
+    ("faults", "said"),
     [
         ("blakout", "fault 'blakout' does not exist. Available: blackout,"),
         ("blackout=2", "blackout's 'probability' is 2, not a number from 0 to 1"),
         ("drop=touch", "modality of task 'door' 'touch' does not exist. Available: image, haptics."),
-        ("[[", "recipe is not JSON"),
+        ("[[", "faults is not JSON"),
         ("secret.json", "fault 'secret.json' does not exist"),
     ],
 )
-def test_a_bad_recipe_is_one_readable_line(client: TestClient, traced: str, recipe: str, said: str) -> None:
-    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "recipe": recipe}
-    answers = [client.get(traced + part, params={"recipe": recipe}) for part in ("", "/columns", "/images")]
+def test_a_bad_faults_is_one_readable_line(client: TestClient, traced: str, faults: str, said: str) -> None:
+    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "faults": faults}
+    answers = [client.get(traced + part, params={"faults": faults}) for part in ("", "/columns", "/images")]
     for answer in (*answers, client.post("/api/recordings", json=body)):
         assert answer.status_code == 400
         assert said in answer.json()["error"]

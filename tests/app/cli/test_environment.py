@@ -26,7 +26,7 @@ def test_a_reader_that_has_gone_is_told_nothing(unbuffered: str) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
-    ran = subprocess.run([*COMMAND, "recipes"], stdout=writing, stderr=subprocess.PIPE, env=environment, check=False)
+    ran = subprocess.run([*COMMAND, "faults"], stdout=writing, stderr=subprocess.PIPE, env=environment, check=False)
     os.close(writing)
     assert (ran.returncode, ran.stderr) == (1, b"")
 
@@ -34,7 +34,7 @@ def test_a_reader_that_has_gone_is_told_nothing(unbuffered: str) -> None:
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no disk here that is always full")
 def test_a_result_that_cannot_be_written_is_one_line() -> None:
     with open("/dev/full", "w") as full:
-        ran = subprocess.run([*COMMAND, "recipes"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        ran = subprocess.run([*COMMAND, "faults"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert ran.returncode == 1
     assert ran.stderr == "error: OSError: [Errno 28] No space left on device (beliefscope --debug ... shows where)\n"
 

@@ -37,7 +37,7 @@ def line(given: Settings) -> list[object]:
 
 def test_a_document_with_links(run: Run, line: list[object], given: Settings) -> None:
     folder = given.checkpoints["crossmodal-pf"].parent.name
-    code, out, _ = run(*line, "--all", "--by", "angle", "--recipe", "blackout=0.4", "--top", 2, "--json", "-")
+    code, out, _ = run(*line, "--all", "--by", "angle", "--faults", "blackout=0.4", "--top", 2, "--json", "-")
     assert code == 0
     document = json.loads(out)
     assert document["episodes"] == 2
@@ -54,7 +54,7 @@ def test_a_document_with_links(run: Run, line: list[object], given: Settings) ->
         "weights": "raw",
         "track": "error",
         "tab": "scene",
-        "recipe": "blackout=0.4",
+        "faults": "blackout=0.4",
         "by": "angle",
     }
     assert "--data" in document["serve"]
@@ -94,5 +94,5 @@ def test_a_link_keeps_any_name() -> None:
     link = moment_link(DOOR, "my filter*~", "a&b=ü", 3, 4, "blackout=1:from=2,delay=image:steps=3", "regret")
     asked = {key: value for key, (value,) in parse_qs(link.removeprefix("?")).items()}
     assert (asked["filter"], asked["data"]) == ("my filter*~", "a&b=ü")
-    assert asked["recipe"] == "blackout=1:from=2,delay=image:steps=3"
+    assert asked["faults"] == "blackout=1:from=2,delay=image:steps=3"
     assert asked["weights"] == "acting"

@@ -42,7 +42,7 @@ def test_traces_are_those_of_this_process_and_a_killed_one_is_replaced(
     library: Library, tracer: Tracer, settings: Settings
 ) -> None:
     inside = Library(settings)
-    edited = EPISODE.against("from=5&to=10&recipe=blackout")
+    edited = EPISODE.against("from=5&to=10&faults=blackout")
     for selection in (EPISODE, edited):
         # By itself first: it reads the file that the other one writes.
         ours = inside.traced(selection).trace
@@ -81,5 +81,5 @@ def test_what_is_wrong_with_a_run_is_said_and_closing_ends_it(library: Library, 
 
 
 def test_selections_travel() -> None:
-    for selection in (EPISODE, EPISODE.against("from=5&to=10&recipe=blackout&weights=image=0.5")):
+    for selection in (EPISODE, EPISODE.against("from=5&to=10&faults=blackout&weights=image=0.5")):
         assert Selection.of_json(selection.to_json()) == selection

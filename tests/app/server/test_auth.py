@@ -51,19 +51,19 @@ def test_the_page_asks_for_it(client: TestClient) -> None:
     assert answer.headers["content-type"].startswith("text/html")
     assert 'name="token"' in answer.text
     assert "core/main.js" not in answer.text
-    led = client.get("/", params={"task": "push", "recipe": 'a&b="<c>'})  # a link of a report's, for one
-    assert '<a href="/?task=push&amp;recipe=a%26b%3D%22%3Cc%3E">go on</a>' in led.text
+    led = client.get("/", params={"task": "push", "faults": 'a&b="<c>'})  # a link of a report's, for one
+    assert '<a href="/?task=push&amp;faults=a%26b%3D%22%3Cc%3E">go on</a>' in led.text
     assert answer.headers["cache-control"] == "no-store"
 
 
 def test_the_link_becomes_a_cookie_and_the_token_leaves_the_address(client: TestClient) -> None:
-    answer = client.get("/", params={"task": "push", "token": TOKEN, "recipe": "a&b=<c>"})
+    answer = client.get("/", params={"task": "push", "token": TOKEN, "faults": "a&b=<c>"})
     assert answer.status_code == 200
     cookie = answer.headers["set-cookie"]
     assert re.fullmatch(r"beliefscope-8000=[\w-]{40,}; Path=/; HttpOnly; SameSite=Strict", cookie)
     assert TOKEN not in cookie
     assert TOKEN not in answer.text
-    assert "0;url=/?task=push&amp;recipe=a%26b%3D%3Cc%3E" in answer.text
+    assert "0;url=/?task=push&amp;faults=a%26b%3D%3Cc%3E" in answer.text
     assert "<title>Beliefscope" in client.get("/").text
     assert client.get("/api/jobs").json() == []
     again = client.get("/", params={"token": "of the server before", "task": "push"})

@@ -31,7 +31,7 @@ from beliefscope.app.views.scheduler import Desk, Turns
 from beliefscope.app.views.view import AHEAD, Views
 from beliefscope.app.workspace.recording_probe import About, Reader
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 
 PATIENCE = 30.0  # s
 
@@ -45,7 +45,7 @@ def library(settings: Settings) -> Iterator[Library]:
 
 def broken(number: int, filter_: str = "crossmodal-ekf") -> Selection:
     """One of many runs of the same episode."""
-    return Selection("door", filter_, 1, Recipe.parse(f"blackout=0.{number:02d}"))
+    return Selection("door", filter_, 1, Faults.parse(f"blackout=0.{number:02d}"))
 
 
 def opened(library: Library, count: int) -> list[weakref.ref[Traced]]:
@@ -95,14 +95,14 @@ def test_so_many_runs_wait_and_no_more(client: TestClient, monkeypatch: pytest.M
     served: Library = client.app.state.library  # type: ignore[attr-defined]
     go_on = threading.Event()
     served._tracing.submit(go_on.wait, PATIENCE)
-    asked = [client.get("/api/trace/door/crossmodal-ekf/1", params={"recipe": f"blackout=0.{i}"}) for i in range(1, 6)]
+    asked = [client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": f"blackout=0.{i}"}) for i in range(1, 6)]
     assert [answer.status_code for answer in asked] == [202, 202, 202, 429, 429]
     assert "3 runs of filters wait already" in asked[-1].json()["error"]
-    assert client.get("/api/trace/door/crossmodal-ekf/1", params={"recipe": "blackout=0.3"}).status_code == 202
-    assert client.get("/api/trace/door/crossmodal-ekf/1/columns", params={"recipe": "blackout=0.3"}).status_code == 202
+    assert client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": "blackout=0.3"}).status_code == 202
+    assert client.get("/api/trace/door/crossmodal-ekf/1/columns", params={"faults": "blackout=0.3"}).status_code == 202
     go_on.set()
     served.traced(broken(30)).result(PATIENCE)
-    assert client.get("/api/trace/door/crossmodal-ekf/1", params={"recipe": "blackout=0.5"}).status_code in (200, 202)
+    assert client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": "blackout=0.5"}).status_code in (200, 202)
 
 
 def test_recordings_that_are_read_for_long_hold_up_nobody_else(
@@ -188,7 +188,7 @@ def test_a_closed_view_leaves_nothing_behind(open_client: Callable[..., TestClie
         before = threading.active_count()
         for number in range(1, 4):
             view = client.post("/api/views").json()
-            chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "recipe": f"blackout=0.{number:02d}"}
+            chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "faults": f"blackout=0.{number:02d}"}
             with client.websocket_connect(view["socket"]) as socket:
                 socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **chosen})
                 assert len(socket.receive_bytes()) > 0

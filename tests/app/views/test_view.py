@@ -91,10 +91,10 @@ def test_what_lies_deeper_than_can_be_told_is_told_as_if_it_lay_so_deep() -> Non
     assert (cells[1] == 65535).all()  # a flat layer
 
 
-def test_a_recipe_changes_what_the_maps_show(socket: WebSocketTestSession) -> None:
+def test_a_faults_changes_what_the_maps_show(socket: WebSocketTestSession) -> None:
     shown = []
-    for serial, recipe in enumerate(("", "blackout", "")):
-        socket.send_json(cursor(serial=serial, recipe=recipe))
+    for serial, faults in enumerate(("", "blackout", "")):
+        socket.send_json(cursor(serial=serial, faults=faults))
         shown.append(maps(socket)[1])
         assert socket.receive_json()["type"] == "drawn"
     assert np.array_equal(shown[0], shown[2])
@@ -145,9 +145,9 @@ def test_the_newest_cursor_wins(
         (json.dumps(cursor(step=-1)), "cursor needs 'step', an integer from 0; got -1."),
         (json.dumps(cursor(step=1.5)), "cursor needs 'step', an integer from 0; got 1.5."),
         (json.dumps(cursor(step=True)), "cursor needs 'step', an integer from 0; got True."),
-        (json.dumps(cursor(recipe=0.4)), "cursor's 'recipe' is text; got 0.4."),
-        (json.dumps(cursor(recipe="blakout")), "fault 'blakout' does not exist. Available: blackout,"),
-        (json.dumps(cursor(recipe="delay=touch")), "modality of task 'door' 'touch' does not exist."),
+        (json.dumps(cursor(faults=0.4)), "cursor's 'faults' is text; got 0.4."),
+        (json.dumps(cursor(faults="blakout")), "fault 'blakout' does not exist. Available: blackout,"),
+        (json.dumps(cursor(faults="delay=touch")), "modality of task 'door' 'touch' does not exist."),
         (json.dumps(cursor(size=10**6)), "cursor's 'size' is 41 or 135; got 1000000."),
         (json.dumps(cursor(angle="wide")), "cursor's 'angle' is a number of radians or null; got 'wide'."),
         (json.dumps(cursor(angle=float("nan"))), "Not JSON: NaN is no number of JSON."),

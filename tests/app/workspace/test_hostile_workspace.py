@@ -95,8 +95,8 @@ def test_a_record_that_makes_no_sense_is_none(
     workspace: Path, settings: Settings, open_client: Opens, wrong: Any
 ) -> None:
     status = (workspace / "recordings" / "a.rrd").stat()
-    about = dict.fromkeys(("application", "title", "entities", "rows", "task", "filter", "recipe", "problem"), wrong)
-    run = [{"episode": wrong, "recipe": wrong}]
+    about = dict.fromkeys(("application", "title", "entities", "rows", "task", "filter", "faults", "problem"), wrong)
+    run = [{"episode": wrong, "faults": wrong}]
     records = {
         "recordings/.about/a.rrd.json": {"bytes": status.st_size, "modified": status.st_mtime_ns, "about": about},
         f"reports/{REPORT.format(0)}/manifest.json": {
@@ -113,7 +113,7 @@ def test_a_record_that_makes_no_sense_is_none(
         path.write_text(said if isinstance(said, str) and said.isascii() else json.dumps(said))
     good = workspace / "reports" / REPORT.format(2)
     good.mkdir()
-    traces = [{"episode": 2, "recipe": []}]
+    traces = [{"episode": 2, "faults": []}]
     fine = {"title": "fine", "made": "2026", "task": "door", "filter": "x", "traces": traces, "files": {}}
     (good / "manifest.json").write_text(json.dumps(fine))
     found = told(open_client, settings, *LISTS)

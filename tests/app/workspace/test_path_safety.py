@@ -123,7 +123,7 @@ def test_nor_out_of_the_page(client: TestClient, outside: Path, path: str) -> No
         assert SECRET.encode() not in told
 
 
-@pytest.mark.parametrize("key", ["recipe", "data", "task", "filter"])
+@pytest.mark.parametrize("key", ["faults", "data", "task", "filter"])
 def test_nor_does_one_in_a_query_or_a_body(client: TestClient, outside: Path, key: str) -> None:
     run = {"task": "door", "filter": "crossmodal-ekf", "episode": 1}
     for name in (str(outside / "secret"), "../secret", f"{outside / 'secret.py'}:TASK", "../secret.py:TASK"):

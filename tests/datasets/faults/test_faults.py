@@ -15,7 +15,7 @@ import beliefscope
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.faults import FAULTS, Fault, parameters
-from beliefscope.datasets.faults.recipe import READY, WHOLE, Recipe, broken_copies, described
+from beliefscope.datasets.faults.injection import FAULT_PRESETS, WHOLE, Faults, broken_copies, described
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.simulate import hand_controls
 from beliefscope.datasets.store import open_dataset, sample_path
@@ -49,7 +49,7 @@ def episode() -> Episode:
 
 
 def broken(text: str, episode: Episode, seed: int = 0) -> Episode:
-    return Recipe.parse(text).apply(episode, seed)
+    return Faults.parse(text).apply(episode, seed)
 
 
 def force(episode: Episode) -> Array:
@@ -90,7 +90,7 @@ def test_the_same_seed_gives_the_same_bits(text: str, episode: Episode) -> None:
     "text", ["blackout=0.5", "image_noise", "image_patch", "force_noise", "contact_flipped=0.5", "drop:probability=0.1"]
 )
 def test_draws_differ_by_seed_episode_and_place(text: str, episode: Episode) -> None:
-    key = Recipe.parse(text).faults[0].keys(DOOR)[0]
+    key = Faults.parse(text).faults[0].keys(DOOR)[0]
     first = broken(text, episode, 0).observations[key]
     assert not np.array_equal(first, broken(text, episode, 1).observations[key])
     other = broken(text, replace(episode, seed=episode.seed + 1)).observations[key]
@@ -224,20 +224,20 @@ def test_faults_act_in_their_order(episode: Episode) -> None:
     back = broken("force_saturation=5,force_bias:x=100", episode)
     assert force(there).max() == 5
     assert force(back).max() > 95
-    both = Recipe.parse("force_bias:x=100") + Recipe.parse("force_saturation=5")
-    assert both == Recipe.parse("force_bias:x=100,force_saturation=5")
+    both = Faults.parse("force_bias:x=100") + Faults.parse("force_saturation=5")
+    assert both == Faults.parse("force_bias:x=100,force_saturation=5")
     assert both.apply(episode).digest() == there.digest()
 
 
 def test_no_fault_is_no_copy(episode: Episode) -> None:
     assert not WHOLE
     assert WHOLE.apply(episode) is episode
-    assert Recipe.parse("") == Recipe.parse(" ") == Recipe.parse("[]") == Recipe.parse("{}") == Recipe.of([]) == WHOLE
+    assert Faults.parse("") == Faults.parse(" ") == Faults.parse("[]") == Faults.parse("{}") == Faults.of([]) == WHOLE
 
 
 def test_copies_of_training_episodes(episode: Episode) -> None:
     some = [replace(episode, split=split) for split in ("train", "val", "test", "train")]
-    copies = broken_copies(Recipe.parse("force_bias:x=5"), some, 0)
+    copies = broken_copies(Faults.parse("force_bias:x=5"), some, 0)
     assert [copy.split for copy in copies] == ["train", "train"]
     assert all(force(copy)[:, 0].mean() > force(episode)[:, 0].mean() + 4 for copy in copies)
 
@@ -249,30 +249,30 @@ def test_a_fault_prints_and_travels(fault: type[Fault]) -> None:
         "from_": 2,
         "to": 9,
     }
-    for recipe in (Recipe((fault(),)), Recipe((fault(**given), fault()))):
-        assert Recipe.parse(str(recipe)) == recipe
-        assert Recipe.of(json.loads(json.dumps(recipe.to_json()))) == recipe
-        assert Recipe.parse(json.dumps(recipe.to_json())) == recipe
-        assert {recipe: 1}[Recipe.parse(str(recipe))] == 1
-    assert Recipe((fault(**given),)).to_json()[0].items() >= {"fault": fault.name, "from": 2, "to": 9}.items()
+    for faults in (Faults((fault(),)), Faults((fault(**given), fault()))):
+        assert Faults.parse(str(faults)) == faults
+        assert Faults.of(json.loads(json.dumps(faults.to_json()))) == faults
+        assert Faults.parse(json.dumps(faults.to_json())) == faults
+        assert {faults: 1}[Faults.parse(str(faults))] == 1
+    assert Faults((fault(**given),)).to_json()[0].items() >= {"fault": fault.name, "from": 2, "to": 9}.items()
 
 
 def test_short_forms() -> None:
-    asked = Recipe((FAULTS["blackout"](probability=0.4),))
+    asked = Faults((FAULTS["blackout"](probability=0.4),))
     for text in ('{"blackout": 0.4}', '[{"fault": "blackout", "probability": 0.4}]', "blackout:probability=0.4"):
-        assert Recipe.parse(text) == asked
-    assert Recipe.parse(" blackout=0.4 , force_bias:x=5 ") == asked + Recipe.of({"fault": "force_bias", "x": 5})
+        assert Faults.parse(text) == asked
+    assert Faults.parse(" blackout=0.4 , force_bias:x=5 ") == asked + Faults.of({"fault": "force_bias", "x": 5})
     assert str(asked) == "blackout=0.4"
-    assert str(Recipe.parse("force_bias=0:y=2:from=20:to=60")) == "force_bias:y=2:from=20:to=60"
-    assert str(Recipe.parse("delay:steps=3,blackout=1,image_frozen=7")) == "delay=image:steps=3,blackout,image_frozen=7"
+    assert str(Faults.parse("force_bias=0:y=2:from=20:to=60")) == "force_bias:y=2:from=20:to=60"
+    assert str(Faults.parse("delay:steps=3,blackout=1,image_frozen=7")) == "delay=image:steps=3,blackout,image_frozen=7"
     assert asked.to_json() == [{"fault": "blackout", "probability": 0.4}]
 
 
-def test_ready_recipes_are_of_the_door_and_each_does_something(episode: Episode) -> None:
-    for text in READY.values():
-        recipe = Recipe.parse(text)
-        recipe.check(DOOR)
-        assert recipe.apply(episode).digest() != episode.digest()
+def test_ready_faults_are_of_the_door_and_each_does_something(episode: Episode) -> None:
+    for text in FAULT_PRESETS.values():
+        faults = Faults.parse(text)
+        faults.check(DOOR)
+        assert faults.apply(episode).digest() != episode.digest()
 
 
 def test_every_parameter_is_described() -> None:
@@ -309,33 +309,33 @@ BAD = {
     "force_stuck=w": r"axis of force_stuck 'w' does not exist\. Available: x, y, z\.",
     "delay=3": r"delay's 'modality' is 3, not a name",
     "delay:steps=-1": r"delay's 'steps' is -1, not a whole number",
-    "[1]": r"recipe is \[1\], not a list of objects",
-    "[": r"recipe is not JSON: Expecting value",
-    "[" * 100_000: r"recipe is not JSON",
+    "[1]": r"faults is \[1\], not a list of objects",
+    "[": r"faults is not JSON: Expecting value",
+    "[" * 100_000: r"faults is not JSON",
     '{"fault": 3}': r"fault '3' does not exist",
     '{"blackout": "0.4"}': r"blackout's 'probability' is '0\.4', not a number",
     '{"blackout": true}': r"blackout's 'probability' is True, not a number",
     '{"delay": ""}': r"delay's 'modality' is '', not a name",
     '{"delay": "a,b"}': r"delay's 'modality' is 'a,b', not a name",
-    '{"force_bias": 1' + "0" * 500 + "}": r"recipe is not JSON: a number of 501 digits is beyond all floats",
+    '{"force_bias": 1' + "0" * 500 + "}": r"faults is not JSON: a number of 501 digits is beyond all floats",
     "force_bias=1" + "0" * 500: r"force_bias's 'x' is 10+, not a number",
     "delay=\ud800:steps=1": r"delay's 'modality' is '\\ud800', not a name",
 }
 
 
 @pytest.mark.parametrize("text", BAD, ids=lambda text: text[:40])
-def test_a_bad_recipe_is_one_line_that_names_what_exists(text: str) -> None:
+def test_a_bad_faults_is_one_line_that_names_what_exists(text: str) -> None:
     with pytest.raises(BadInput, match=BAD[text]) as caught:
-        Recipe.parse(text)
+        Faults.parse(text)
     assert "\n" not in str(caught.value)
 
 
 def test_a_fault_of_what_a_task_has_not(episode: Episode) -> None:
     with pytest.raises(BadInput, match=r"modality of task 'door' 'touch' does not exist\. Available: image, haptics\."):
-        Recipe.parse("delay=touch").check(DOOR)
+        Faults.parse("delay=touch").check(DOOR)
     blind = replace(DOOR, observations={"force": (3,)})
     with pytest.raises(BadInput, match=r"sensor of task 'door' 'image' does not exist\. Available: force\."):
-        Recipe.parse("force_bias,blackout").check(blind)
+        Faults.parse("force_bias,blackout").check(blind)
     flat = replace(episode, observations=dict(episode.observations) | {"force": np.zeros((100, 2), np.float32)})
     with pytest.raises(BadInput, match=r"force_bias:z=1 is of an axis that the sensor has not\. Available: x, y\."):
         broken("force_bias:z=1", flat)

@@ -12,7 +12,7 @@ import torch
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
 from beliefscope.filters.finetuning.batch_mix import Mix, Moment
@@ -23,7 +23,7 @@ from beliefscope.filters.finetuning.slices import NOMINAL, Slice
 from beliefscope.filters.training import losses
 from beliefscope.filters.training.encoder_cache import numbered, recalling
 
-DARK = Slice("dark", Recipe.parse("blackout=1"), only=("haptics",))
+DARK = Slice("dark", Faults.parse("blackout=1"), only=("haptics",))
 TOUCH = Slice("touch", contact=True)
 SMALL = FineTune(
     train=("haptics-only",), mix=((DARK, 1.0), (TOUCH, 1.0)), length=6, windows=6, steps=4, check=2, particles=10

@@ -10,7 +10,7 @@ import torch
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.faults import FAULTS, parameters
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
@@ -18,14 +18,14 @@ from beliefscope.filters.finetuning.slices import NOMINAL, Slice, slices_of
 from beliefscope.filters.rollout import rollout, start_at_truth
 
 TEXTS = {
-    "black-in-contact:recipe=blackout=1:contact=yes:only=haptics": Slice(
-        "black-in-contact", Recipe.parse("blackout=1"), True, ("haptics",)
+    "black-in-contact:faults=blackout=1:contact=yes:only=haptics": Slice(
+        "black-in-contact", Faults.parse("blackout=1"), True, ("haptics",)
     ),
-    "biased:recipe=force_bias:x=5:from=20,blackout=0.4": Slice(
-        "biased", Recipe.parse("force_bias:x=5:from=20,blackout=0.4")
+    "biased:faults=force_bias:x=5:from=20,blackout=0.4": Slice(
+        "biased", Faults.parse("force_bias:x=5:from=20,blackout=0.4")
     ),
     "both:only=image+haptics:contact=no": Slice("both", contact=False, only=("image", "haptics")),
-    "all:recipe=": Slice("all"),
+    "all:faults=": Slice("all"),
 }
 
 
@@ -39,7 +39,7 @@ def test_a_slice_is_read_from_its_text_and_printed_and_travels_as_json(text: str
 
 def test_no_fault_has_a_parameter_that_a_slice_would_take_for_its_own() -> None:
     names = {key for fault in FAULTS.values() for key in parameters(fault)}
-    assert not names & {"recipe", "contact", "only"}
+    assert not names & {"faults", "contact", "only"}
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_no_fault_has_a_parameter_that_a_slice_would_take_for_its_own() -> None:
         ("a:contact=maybe", "yes or no"),
         ("a:contact=yes:contact=no", "'contact=no'"),
         ("a:where=x", "'where=x'"),
-        ("a:recipe=blackot=1", "blackout"),
+        ("a:faults=blackot=1", "blackout"),
         (":contact=yes", "a slice's name is ''"),
     ],
 )
@@ -72,7 +72,7 @@ def test_a_modality_or_sensor_that_is_not_there_is_refused() -> None:
     with pytest.raises(BadInput, match="Available: image, haptics"):
         Slice("a", only=("touch",)).check(task, ("image", "haptics"))
     with pytest.raises(BadInput):
-        Slice("a", Recipe.parse("delay=sonar:steps=2")).check(task, ("image", "haptics"))
+        Slice("a", Faults.parse("delay=sonar:steps=2")).check(task, ("image", "haptics"))
 
 
 def test_contact_and_the_rest_share_out_all_steps(window: Callable[..., Batch]) -> None:

@@ -17,7 +17,7 @@ import torch
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
@@ -179,17 +179,17 @@ def test_listening_leaves_nothing_behind(data: Dataset) -> None:
 
 
 def test_numbers_are_those_of_evaluate(data: Dataset) -> None:
-    black = Slice("black", Recipe.parse("blackout=0.4"))
+    black = Slice("black", Faults.parse("blackout=0.4"))
     episodes = [data[i] for i in EPISODES[:2]]
     found = change_of(EKF, PF, episodes, slices=[black], particles=20, seed=3)
-    for name, recipe, only in (
-        ("nominal", Recipe(), None),
-        ("black", black.recipe, None),
-        ("haptics alone", Recipe(), "haptics"),
+    for name, faults, only in (
+        ("nominal", Faults(), None),
+        ("black", black.faults, None),
+        ("haptics alone", Faults(), "haptics"),
     ):
         rows = {d.measure: d for d in found.differences if d.slice == name}
         for checkpoint, side in ((EKF, "before"), (PF, "after")):
-            metrics = evaluate(checkpoint.filter, episodes, recipe=recipe, only=only, particles=20, seed=3)
+            metrics = evaluate(checkpoint.filter, episodes, faults=faults, only=only, particles=20, seed=3)
             got = {f"{d.measure}_{d.shown[2]}": d.shown[side == "after"] for d in rows.values() if d.is_error}
             # Doubles here, singles there until the sums.
             assert got == pytest.approx(metrics.rmse, rel=1e-4)

@@ -1,4 +1,4 @@
-"""Editing a run in time: nothing edited gives the same bits, and what an edit does is what a recipe does."""
+"""Editing a run in time: nothing edited gives the same bits, and what an edit does is what a faults does."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.compare.counterfactual import compare
@@ -35,13 +35,13 @@ def test_an_edit_of_nothing_changes_no_bit(replay: Replay, first: int) -> None:
     assert compare(replay.original, again, edit).verdict.endswith("changed nothing.")
 
 
-def test_an_edit_is_the_recipe_over_its_span(replay: Replay) -> None:
-    edit = Edit(40, 60, Recipe.parse("blackout"))
+def test_an_edit_is_the_faults_over_its_span(replay: Replay) -> None:
+    edit = Edit(40, 60, Faults.parse("blackout"))
     edited, original = replay.edited(edit), replay.original
-    recipe = Recipe.parse("blackout:from=40:to=60")
-    whole = trace(replay.checkpoint, original.episode, 9, seed=3, particles=100, recipe=recipe)
+    faults = Faults.parse("blackout:from=40:to=60")
+    whole = trace(replay.checkpoint, original.episode, 9, seed=3, particles=100, faults=faults)
     assert not different(whole, edited)
-    assert edited.recipe == recipe
+    assert edited.faults == faults
     result = compare(original, edited, edit)
     assert not result.distance[:40].any()
     assert result.distance[40:60].all()
@@ -60,7 +60,7 @@ def test_bad_edits(replay: Replay) -> None:
     with pytest.raises(BadInput, match="has no steps"):
         Edit(60, 40)
     with pytest.raises(BadInput, match="span of its own"):
-        Edit(40, 60, Recipe.parse("blackout:from=3"))
+        Edit(40, 60, Faults.parse("blackout:from=3"))
     with pytest.raises(BadInput, match="so is their sum"):
         Edit(40, 60, weights={"image": 1.5})
     with pytest.raises(BadInput, match="beyond this trace"):

@@ -128,7 +128,7 @@ def test_the_command_draws_the_tree_and_exports(run: Run, family: Path, tmp_path
 def test_the_change_command_reports_and_links(run: Run, family: Path, tmp_path: Path) -> None:
     child = family / "z-child.safetensors"
     report = tmp_path / "report"
-    code, out, err = run(f"change crossmodal-ekf {child} --slice late:recipe=delay=image:steps=5 -o {report} --json -")
+    code, out, err = run(f"change crossmodal-ekf {child} --slice late:faults=delay=image:steps=5 -o {report} --json -")
     assert code == 0, err
     document = json.loads(out)
     assert document["child"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.compare.two_runs import Comparison, compare_runs
@@ -19,10 +19,10 @@ from beliefscope.inspect.trace import Trace, trace
 BROKEN = "blackout=0.5"
 
 
-def run(filter_: str, recipe: str = "", episode: int = 9) -> Trace:
+def run(filter_: str, faults: str = "", episode: int = 9) -> Trace:
     checkpoint = load_checkpoint(shipped("door", filter_))
     with open_dataset(sample_path("door")) as data:
-        return trace(checkpoint, data[episode], episode, particles=50, recipe=Recipe.parse(recipe))
+        return trace(checkpoint, data[episode], episode, particles=50, faults=Faults.parse(faults))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -28,12 +28,12 @@ BLACK, SEEN = 15, 20
 """A step with a black picture, and one with a picture, both in contact."""
 
 
-def run(checkpoint: Checkpoint, recipe: str = f"blackout:from={BLACK}:to={BLACK + 2}", particles: int = 40) -> Trace:
+def run(checkpoint: Checkpoint, faults: str = f"blackout:from={BLACK}:to={BLACK + 2}", particles: int = 40) -> Trace:
     with open_dataset(sample_path("door")) as data:
         episode = data[9]
     cut: dict[str, Any] = {name: getattr(episode, name)[:40] for name in ("states", "controls", "contact", "qpos")}
     cut["observations"] = {key: array[:40] for key, array in episode.observations.items()}
-    return trace(checkpoint, replace(episode, **cut), 9, seed=3, particles=particles, recipe=Recipe.parse(recipe))
+    return trace(checkpoint, replace(episode, **cut), 9, seed=3, particles=particles, faults=Faults.parse(faults))
 
 
 @cache

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -48,7 +48,7 @@ def episode(index: int = 9) -> Any:
 def ours(name: str) -> tuple[Checkpoint, Trace]:
     """A shipped filter of the door, and a run with pictures missing."""
     checkpoint = load_checkpoint(shipped("door", name))
-    return checkpoint, trace(checkpoint, episode(), 9, seed=3, particles=60, recipe=Recipe.parse("blackout=0.3"))
+    return checkpoint, trace(checkpoint, episode(), 9, seed=3, particles=60, faults=Faults.parse("blackout=0.3"))
 
 
 def untrained(name: str) -> Checkpoint:
@@ -228,7 +228,7 @@ def test_what_a_joined_model_lacks_is_black_or_the_training_mean(name: str) -> N
     run = trace(checkpoint, base, 9, seed=1, particles=40)
     found = run_subsets(checkpoint, run)
     assert shapley.seen(checkpoint.filter) == ("image", "haptics")
-    black = trace(checkpoint, base, 9, seed=1, particles=40, recipe=Recipe.parse("blackout"))
+    black = trace(checkpoint, base, 9, seed=1, particles=40, faults=Faults.parse("blackout"))
     keys, first = checkpoint.task.modalities["haptics"], 0
     average = dict(base.observations)
     for key in keys:

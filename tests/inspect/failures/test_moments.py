@@ -11,7 +11,7 @@ import pytest
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.weight_audit import position_regret
@@ -80,10 +80,10 @@ def test_broken_sensors_are_found_in_their_episode_and_group(
     checkpoint: Checkpoint, episodes: dict[int, Episode], traces: list[Trace]
 ) -> None:
     index = traces[1].episode_index
-    recipe = Recipe.parse("blackout=1:from=35:to=55")
-    broken = trace(checkpoint, episodes[index], index, particles=50, recipe=recipe)
+    faults = Faults.parse("blackout=1:from=35:to=55")
+    broken = trace(checkpoint, episodes[index], index, particles=50, faults=faults)
     steady = with_contact(broken, np.ones(CUT, dtype=bool))
-    others = [replace(one, recipe=recipe) for k, one in enumerate(traces) if k != 1]
+    others = [replace(one, faults=faults) for k, one in enumerate(traces) if k != 1]
     found = failures_of(Survey.of([steady, *others]))
     worst = found.moments[0]
     assert worst.episode == index

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.recipe import Recipe
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS, quick
@@ -36,7 +36,7 @@ Chunks = dict[str, dict[str, list[Any]]]
 def made(name: str) -> tuple[Trace, Mapping[str, Diagnostic]]:
     checkpoint = load_checkpoint(shipped("door", name))
     with open_dataset(sample_path("door")) as data:
-        run = trace(checkpoint, data[9], 9, particles=50, recipe=Recipe.parse("blackout=0.3"))
+        run = trace(checkpoint, data[9], 9, particles=50, faults=Faults.parse("blackout=0.3"))
     return run, quick(run, checkpoint)
 
 

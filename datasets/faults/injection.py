@@ -1,4 +1,4 @@
-"""Recipes: faults that act one after the other on an episode and leave a broken copy.
+"""Fault injections: faults that act one after the other on an episode and leave a broken copy.
 
 What the sensors report changes, and the controls that follow from it; the truth (states, contact, joint positions)
 never does. In text, ``blackout=0.4,force_bias:x=5:from=20`` is two faults: a value right behind a fault's name is its
@@ -7,7 +7,7 @@ first parameter's, the others are named; commas divide faults.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,13 +24,13 @@ from beliefscope.datasets.task import Task
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Faults:
     """Faults in the order in which they act; ``bool`` says whether there are any, ``+`` joins, ``str`` is its text."""
 
-    faults: tuple[Fault, ...] = ()
+    sequence: tuple[Fault, ...] = ()
 
     @classmethod
-    def of(cls, value: Any) -> Recipe:
+    def of(cls, value: Any) -> Faults:
         """From JSON: a list of ``{"fault": name, ...}``, one such, or ``{name: first parameter's value, ...}``.
 
         Raises BadInput for anything else, and for faults, parameters and values that there are not.
@@ -39,36 +39,39 @@ class Recipe:
             return cls(tuple(_fault(name, {None: first}) for name, first in value.items()))
         listed = [value] if isinstance(value, Mapping) else value
         if not isinstance(listed, list) or not all(isinstance(one, Mapping) and "fault" in one for one in listed):
-            raise BadInput(f'recipe is {value!r}, not a list of objects such as {{"fault": "blackout"}}')
+            raise BadInput(f'faults is {value!r}, not a list of objects such as {{"fault": "blackout"}}')
         return cls(tuple(_fault(one["fault"], {k: v for k, v in one.items() if k != "fault"}) for one in listed))
 
     @classmethod
-    def parse(cls, text: str) -> Recipe:
+    def parse(cls, text: str) -> Faults:
         """From its text, ``blackout=0.4,delay=image:steps=3``, or from JSON as text. Raises BadInput as ``of`` does."""
         if text.lstrip().startswith(("{", "[")):
             try:
                 document = read_json(text)
             except ValueError as error:
-                raise BadInput(f"recipe is not JSON: {error}") from None
+                raise BadInput(f"faults is not JSON: {error}") from None
             return cls.of(document)
         return cls(tuple(_read(part.strip()) for part in text.split(",")) if text.strip() else ())
 
     def to_json(self) -> list[dict[str, Any]]:
-        """``Recipe.of`` makes the same of it."""
-        return [fault.to_json() for fault in self.faults]
+        """``Faults.of`` makes the same of it."""
+        return [fault.to_json() for fault in self.sequence]
 
     def __str__(self) -> str:
-        return ",".join(map(str, self.faults))
+        return ",".join(map(str, self.sequence))
+
+    def __iter__(self) -> Iterator[Fault]:
+        return iter(self.sequence)
 
     def __bool__(self) -> bool:
-        return bool(self.faults)
+        return bool(self.sequence)
 
-    def __add__(self, other: Recipe) -> Recipe:
-        return Recipe(self.faults + other.faults)
+    def __add__(self, other: Faults) -> Faults:
+        return Faults(self.sequence + other.sequence)
 
     def check(self, task: Task) -> None:
         """Raises BadInput for a fault of a sensor that the task has not."""
-        for fault in self.faults:
+        for fault in self.sequence:
             fault.keys(task)
 
     def apply(self, episode: Episode, seed: int = 0) -> Episode:
@@ -76,10 +79,10 @@ class Recipe:
 
         Raises BadInput for a fault of a sensor that the episode's task has not.
         """
-        if not self.faults:
+        if not self.sequence:
             return episode
         task, observations, digest = find_task(episode.task), dict(episode.observations), int(episode.digest()[:16], 16)
-        for place, fault in enumerate(self.faults):
+        for place, fault in enumerate(self.sequence):
             for key in fault.keys(task):
                 if key not in observations:
                     raise one_of("observation of the episode", key, observations)
@@ -89,10 +92,10 @@ class Recipe:
         return replace(episode, observations=observations, controls=_controls(episode, observations))
 
 
-WHOLE = Recipe()
+WHOLE = Faults()
 """No fault."""
 
-READY: dict[str, str] = {
+FAULT_PRESETS: dict[str, str] = {
     "40 % black pictures": "blackout=0.4",
     "80 % black pictures": "blackout=0.8",
     "image frozen": "image_frozen=20",
@@ -111,19 +114,19 @@ READY: dict[str, str] = {
     "haptics 5 steps late": "delay=haptics:steps=5",
     "haptics dropped": "drop=haptics:from=20",
 }
-"""What it is called -> recipe: the ones to try first."""
+"""What it is called -> faults: the ones to try first."""
 
 
 def ready(task: Task) -> dict[str, str]:
-    """Those of ``READY`` that the task has the sensors for."""
+    """Those of ``FAULT_PRESETS`` that the task has the sensors for."""
 
     def fits(text: str) -> bool:
         with suppress(BadInput):
-            Recipe.parse(text).check(task)
+            Faults.parse(text).check(task)
             return True
         return False
 
-    return {name: text for name, text in READY.items() if fits(text)}
+    return {name: text for name, text in FAULT_PRESETS.items() if fits(text)}
 
 
 def described() -> list[dict[str, Any]]:
@@ -141,9 +144,9 @@ def described() -> list[dict[str, Any]]:
     ]
 
 
-def broken_copies(recipe: Recipe, episodes: Iterable[Episode], seed: int) -> list[Episode]:
+def broken_copies(faults: Faults, episodes: Iterable[Episode], seed: int) -> list[Episode]:
     """A broken copy of each training episode."""
-    return [recipe.apply(episode, seed) for episode in episodes if episode.split == "train"]
+    return [faults.apply(episode, seed) for episode in episodes if episode.split == "train"]
 
 
 def _fault(name: Any, given: Mapping[str | None, Any]) -> Fault:
