@@ -1,8 +1,8 @@
-# Everything runs in .venv, which is made when it is missing or when the requirements have changed.
-#   PYTHON=...     the interpreter to make .venv with (3.11 or newer)
-#   PIP_FLAGS=...  more flags for pip, such as another package index
-#   ARGS=...       more arguments for the command: make serve ARGS="--port 9000"
-#   JOBS=...       processes that share the test files among them (2)
+# All commands run in .venv, which is created when it is missing or when the requirements have changed.
+#   PYTHON=...     interpreter for .venv (3.11 or newer)
+#   PIP_FLAGS=...  additional pip options, such as another package index
+#   ARGS=...       additional arguments of the command: make serve ARGS="--port 9000"
+#   JOBS=...       number of test processes (2)
 
 PYTHON    ?= $(shell command -v python3.11 || command -v python3)
 PIP_FLAGS ?=
@@ -11,37 +11,47 @@ JOBS      ?= 2
 
 VENV := .venv
 BIN  := $(VENV)/bin
-# Compiling every module of every package would add half a minute to the first start; Python compiles what it imports.
+# --no-compile: compiling every module of every package adds half a minute; Python compiles modules when they are imported.
 PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_FLAGS)
 
-# A file's tests stay in one process: they share a server, a browser, a small training. tests/conftest.py orders the files.
+# loadfile: the tests of a file share a server, a browser or a training. tests/conftest.py orders the files.
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve test lint check check-all bench lock licences audit clean
+.PHONY: help install serve test test-fast coverage lint lint-page api-types check check-all bench lock licences audit clean
 
 help:
-	@echo "make serve      set up what is missing and serve the page on http://127.0.0.1:8000"
-	@echo "make test       run the tests (those of the page need Chromium and are skipped without it)"
-	@echo "make check      lint, formatting, types and the tests"
-	@echo "make check-all  the same with the tests that take minutes"
-	@echo "make bench      measure the filters, the maps, the recordings and the page"
+	@echo "make serve      install what is missing and serve the page on http://127.0.0.1:8000"
+	@echo "make install    set up .venv with the development tools"
+	@echo "make test-fast  run the tests that need no browser, process or training"
+	@echo "make test       run all tests but the long ones (page tests are skipped without Chromium)"
+	@echo "make check      lint, formatting, types and tests"
+	@echo "make check-all  make check with the long tests"
+	@echo "make lint       check formatting, types, import layers and the page's JavaScript"
+	@echo "make lint-page  check the page's JavaScript (skipped without Node.js and npm)"
+	@echo "make api-types  regenerate the page's types and constants from the server's"
+	@echo "make coverage   run the tests and print the coverage of each module"
+	@echo "make bench      measure filters, maps, recordings and the page"
 	@echo "make lock       pin every package with its hashes in requirements.lock"
-	@echo "make licences   list the licences of all packages, and fail where one is not allowed"
-	@echo "make audit      ask whether any of them has a known weakness (needs the network)"
-	@echo "make install    only set up .venv, with the tools for development"
-	@echo "make clean      remove .venv and what the tools left behind"
+	@echo "make licences   list the licences of all packages; fail if one is not allowed"
+	@echo "make audit      check all packages for known vulnerabilities (needs the network)"
+	@echo "make clean      remove .venv and generated files"
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
-	  echo "Beliefscope needs Python 3.11 or newer; '$(PYTHON)' is not. Name one: make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	  echo "Beliefscope needs Python 3.11 or newer, but '$(PYTHON)' is older or missing. Use: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@echo "Setting up $(VENV): about a minute, and downloads of about 600 MB the first time."
 	@"$(PYTHON)" -m venv $(VENV)
 	@$(PIP) pip
-	@$(PIP) -e .
+	@$(PIP) -e '.[attribution,tensorboard]'
 	@touch $@
 
-$(VENV)/installed-dev: $(VENV)/installed
+$(VENV)/installed-test: $(VENV)/installed
+	@echo "Adding the test tools to $(VENV)."
+	@$(PIP) -e '.[test]'
+	@touch $@
+
+$(VENV)/installed-dev: $(VENV)/installed-test
 	@echo "Adding the tools for development to $(VENV)."
 	@$(PIP) -e '.[dev]'
 	@touch $@
@@ -51,13 +61,38 @@ install: $(VENV)/installed-dev
 serve: $(VENV)/installed
 	@$(BIN)/beliefscope serve $(ARGS)
 
-test: install
+test: $(VENV)/installed-test
 	@$(PYTEST) $(ARGS)
 
-lint: install
+test-fast: $(VENV)/installed-test
+	@$(PYTEST) -m "not slow and not browser and not long" $(ARGS)
+
+coverage: $(VENV)/installed-test
+	@$(PYTEST) -q --cov=app --cov=datasets --cov=filters --cov=inspect --cov=recordings --cov-report=term $(ARGS)
+
+lint: install lint-page
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy src/beliefscope
+	@$(BIN)/lint-imports --no-logo --no-cache
+
+# The page has no build step: the Node.js packages of package.json are development tools only.
+node_modules: package.json package-lock.json
+	@npm ci --silent --no-audit --no-fund
+	@touch $@
+
+lint-page: install
+	@if command -v node >/dev/null && command -v npm >/dev/null; then \
+	  $(MAKE) --no-print-directory node_modules && npm run --silent check && \
+	  $(BIN)/python -m beliefscope.app.protocol.page_constants --check && \
+	  $(BIN)/python -m beliefscope.app.server.openapi > $(VENV)/openapi.json && \
+	  npm run --silent api-types -- --check; \
+	else echo "lint-page skipped: Node.js and npm are not installed."; fi
+
+api-types: install node_modules
+	@$(BIN)/python -m beliefscope.app.protocol.page_constants
+	@$(BIN)/python -m beliefscope.app.server.openapi > $(VENV)/openapi.json
+	@npm run --silent api-types
 
 check: lint test
 
@@ -67,7 +102,7 @@ check-all: lint
 bench: install
 	@$(BIN)/python bench/run.py $(ARGS)
 
-# Tools that stay out of .venv: their own requirements are none of ours.
+# Tools with their own environment, so that their requirements stay out of .venv.
 $(VENV)/tools:
 	@"$(PYTHON)" -m venv $@
 	@$@/bin/python -m pip install -qq $(PIP_FLAGS) uv pip-audit
@@ -84,8 +119,8 @@ licences: install
 audit: $(VENV)/tools
 	@$(VENV)/tools/bin/pip-audit --strict --progress-spinner off -r requirements.lock --require-hashes --disable-pip 2>$(VENV)/audit.log || { \
 	  if grep -qE "Traceback|not be audited" $(VENV)/audit.log; then \
-	    echo "The advisory service was not reached, so nothing is known; $(VENV)/audit.log says more." >&2; \
+	    echo "Advisory service not reachable, nothing checked; see $(VENV)/audit.log." >&2; \
 	  else tail -n 1 $(VENV)/audit.log >&2; fi; exit 1; }
 
 clean:
-	rm -rf $(VENV) build dist src/beliefscope.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) node_modules build dist src/beliefscope.egg-info .pytest_cache .mypy_cache .ruff_cache

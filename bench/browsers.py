@@ -1,4 +1,4 @@
-"""A browser without a browser: asks and scrubs as the page does (socket.js), over real HTTP and real WebSockets."""
+"""Simulated browser: requests and scrubbing as by the page (view_socket.js), over real HTTP and WebSockets."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from websockets.typing import Origin, Subprotocol
 
 COARSE, FINE = 41, 135
 SCENE = f"viser-v{importlib.metadata.version('viser')}"
-AGAIN = 0.15  # s until a trace that is being computed is asked for again
-LOST = 10.0  # s until an answer is taken for lost
+RETRY = 0.15  # s between requests for a trace in progress
+TIMEOUT = 10.0  # s to wait for an answer
 Selection = dict[str, Any]
 """``task``, ``filter``, ``data``, ``episode``, ``faults``."""
 
 
 class Browser:
-    """One page: a view, its socket and its scene's. Never more than one cursor in flight; the newest goes next.
+    """One page: a view, its socket and that of its scene. One cursor is in flight at a time; the newest is sent next.
 
     Attributes:
-        scrubs: s from a wanted step to its maps. scenes: s to its scene. received: bytes over both sockets.
+        scrubs: s from a cursor move to its maps. scenes: s to its scene. received: bytes over both sockets.
     """
 
     def __init__(self, url: str) -> None:
@@ -45,44 +45,44 @@ class Browser:
         self._serial = 0
         self._in_flight: int | None = None
         self._sent: dict[int, tuple[float, int]] = {}
-        self._wanted: tuple[dict[str, Any], float] | None = None
-        self._rested = asyncio.Event()
+        self._next: tuple[dict[str, Any], float] | None = None
+        self._finished = asyncio.Event()
 
     async def open(self, scene: bool = True) -> None:
-        """A new view and its sockets."""
-        view = (await self._ask("POST", "/api/views")).json()
+        """Open a new view and its sockets."""
+        view = (await self._request("POST", "/api/views")).json()
         self._socket = await self._connect(view["socket"])
-        self._tasks = [asyncio.create_task(self._hear(self._socket))]
+        self._tasks = [asyncio.create_task(self._receive(self._socket))]
         if scene:
-            await self._ask("GET", view["scene"])
+            await self._request("GET", view["scene"])
             self._scene = await self._connect(view["scene"].rstrip("/"), SCENE)
-            self._tasks.append(asyncio.create_task(self._watch(self._scene)))
+            self._tasks.append(asyncio.create_task(self._receive_scene(self._scene)))
 
     async def load(self, selection: Selection) -> int:
-        """The trace that is selected, computed if need be, with its columns and pictures; its number of steps."""
+        """Load the selected trace with its columns and images; return its number of steps."""
         path, query = trace_path(selection)
-        while (answer := await self._ask("GET", path, params=query)).status_code == 202:
-            await asyncio.sleep(AGAIN)
+        while (answer := await self._request("GET", path, params=query)).status_code == 202:
+            await asyncio.sleep(RETRY)
         header = answer.json()
         for part in ("columns", *(["images"] if header["pictures"] else [])):
             tag = self._tags.get(f"{path}/{part}?{query}", "")
-            got = await self._ask("GET", f"{path}/{part}", params=query, headers={"If-None-Match": tag})
-            self._tags[f"{path}/{part}?{query}"] = got.headers["etag"]
+            response = await self._request("GET", f"{path}/{part}", params=query, headers={"If-None-Match": tag})
+            self._tags[f"{path}/{part}?{query}"] = response.headers["etag"]
         return int(header["steps"])
 
     async def drag(self, selection: Selection, steps: Iterable[int], rate: float, scene: bool = True) -> None:
-        """A hand moves over the steps, so many a second, and rests: the fine maps come, and the scene."""
-        began, step = time.perf_counter(), 0
-        for moved, step in enumerate(steps, start=1):
-            self._want({**selection, "step": step, "size": COARSE, "scene": scene})
-            await asyncio.sleep(max(0.0, began + moved / rate - time.perf_counter()))
-        self._rested.clear()
-        self._want({**selection, "step": step, "size": FINE, "scene": True})
+        """Move over the steps at a rate per second, then wait for the fine maps and the scene of the last one."""
+        start, step = time.perf_counter(), 0
+        for count, step in enumerate(steps, start=1):
+            self._move({**selection, "step": step, "size": COARSE, "scene": scene})
+            await asyncio.sleep(max(0.0, start + count / rate - time.perf_counter()))
+        self._finished.clear()
+        self._move({**selection, "step": step, "size": FINE, "scene": True})
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._rested.wait(), LOST)
+            await asyncio.wait_for(self._finished.wait(), TIMEOUT)
 
     async def close(self, vanish: bool = False) -> None:
-        """Leaves. Vanish: as a machine that is switched off would, without a word of goodbye."""
+        """Close the view. vanish: abort the connections, as on a power failure."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -93,22 +93,22 @@ class Browser:
                 else:
                     await socket.close()
         self._socket = self._scene = None
-        self._in_flight, self._wanted, self._sent = None, None, {}
+        self._in_flight, self._next, self._sent = None, None, {}
 
     async def end(self) -> None:
         await self.close()
         await self.http.aclose()
 
-    def _want(self, cursor: dict[str, Any]) -> None:
-        self._wanted = cursor, time.perf_counter()
+    def _move(self, cursor: dict[str, Any]) -> None:
+        self._next = cursor, time.perf_counter()
         self._pump()
 
     def _pump(self) -> None:
-        if self._in_flight is not None and time.perf_counter() - self._sent[self._in_flight][0] < LOST:
+        if self._in_flight is not None and time.perf_counter() - self._sent[self._in_flight][0] < TIMEOUT:
             return
-        if self._wanted is None or self._socket is None:
+        if self._next is None or self._socket is None:
             return
-        (cursor, when), self._wanted = self._wanted, None
+        (cursor, when), self._next = self._next, None
         self._serial += 1
         self._in_flight = self._serial
         self._sent[self._serial] = when, cursor["size"]
@@ -121,7 +121,7 @@ class Browser:
             if self._socket is not None:
                 await self._socket.send(json.dumps(message))
 
-    async def _hear(self, socket: ClientConnection) -> None:
+    async def _receive(self, socket: ClientConnection) -> None:
         with contextlib.suppress(ConnectionClosed):
             async for data in socket:
                 now = time.perf_counter()
@@ -145,10 +145,10 @@ class Browser:
                     if size == COARSE:
                         self.scenes.append(now - when)
                     elif serial == self._serial:
-                        self._rested.set()
+                        self._finished.set()
                     self._sent = {key: value for key, value in self._sent.items() if key > serial}
 
-    async def _watch(self, socket: ClientConnection) -> None:
+    async def _receive_scene(self, socket: ClientConnection) -> None:
         with contextlib.suppress(ConnectionClosed):
             async for data in socket:
                 self.received += len(data)
@@ -163,14 +163,14 @@ class Browser:
             proxy=None,
         )
 
-    async def _ask(self, method: str, path: str, **more: Any) -> httpx.Response:
-        answer = await self.http.request(method, path, **more)
+    async def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        answer = await self.http.request(method, path, **options)
         if answer.status_code >= 400:
             raise RuntimeError(f"{method} {path}: {answer.status_code} {answer.text[:200]}")
         return answer
 
 
 def trace_path(selection: Selection) -> tuple[str, dict[str, str]]:
-    """Path and query of a selection's trace."""
+    """Path and query of the trace of a selection."""
     query = {"faults": selection["faults"], "data": selection["data"]}
     return f"/api/trace/{selection['task']}/{selection['filter']}/{selection['episode']}", query

@@ -1,8 +1,8 @@
-"""How fast every filter runs and trains, beside the figures of the paper's published code; memory; what tracing costs.
+"""Speed of every filter in evaluation and training, compared with the paper's published code; memory; tracing overhead.
 
-Speed is per CPU-second of one thread, on pictures of noise and fresh weights, in the door's shapes: 100 steps of one
-trajectory and of 20 at a time (300 particles), and a training step, forward and backward (16 steps of 32 trajectories,
-30 particles). The best of several turns counts: whatever else the machine does only adds.
+Speed is per CPU-second of one thread, with noise images, random weights and the shapes of the door task: 100 steps
+of one trajectory and of 20 at a time (300 particles), and a training step, forward and backward (16 steps of 32
+trajectories, 30 particles). The best of several repetitions counts, because other load only adds time.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ PUBLISHED: dict[str, tuple[Range, Range, Range]] = {
 training step; lowest and highest of several runs. Ratios are to the middle."""
 
 BARS = {2: "6 x, 5 x, 4 x", 1: "3 x, 2 x, 1.5 x"}
-"""By stride of the first convolution: 1 is the published networks, 2 ours. At N = 1, at N = 20, in training."""
+"""Required ratios at N = 1, at N = 20 and in training, by stride of the first convolution; published: 1."""
 
 SIZES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "steps": ((16, 32, 30), (32, 32, 30), (64, 32, 30)),
     "trajectories": ((16, 32, 30), (16, 64, 30), (16, 128, 30)),
     "particles": ((16, 32, 60), (16, 32, 120), (16, 32, 240)),
 }
-"""Axis -> three sizes (T, N, M) that double along it."""
+"""Axis -> three sizes (T, N, M) that double along the axis."""
 
 
 def measure() -> list[Row]:
@@ -55,32 +55,32 @@ def measure() -> list[Row]:
 
 def speed() -> list[Row]:
     rows: list[Row] = []
-    one, twenty, windows = noise(100, 1), noise(100, 20), noise(16, 32)
+    single, batch, windows = noise(100, 1), noise(100, 20), noise(16, 32)
     for stride, bar in BARS.items():
         for name, architecture in filters_of(DOOR).items():
             filter_ = build(replace(architecture, image_stride=stride))
-            single = 100 / cpu_seconds(lambda f=filter_: forward(f, one), 5)
-            many = 2000 / cpu_seconds(lambda f=filter_: forward(f, twenty), 2)
+            single_rate = 100 / cpu_seconds(lambda f=filter_: forward(f, single), 5)
+            batch_rate = 2000 / cpu_seconds(lambda f=filter_: forward(f, batch), 2)
             training = cpu_seconds(lambda f=filter_: backward(f, windows), 3)
-            known = PUBLISHED.get(name)
-            figures = (f"{single:.0f}/s", f"{many:.0f}/s", f"{training:.2f} s")
-            if known is not None:
-                of_one, of_many, of_training = (sum(figure) / 2 for figure in known)
-                ratios = (single / of_one, many / of_many, of_training / training)
+            published = PUBLISHED.get(name)
+            figures = (f"{single_rate:.0f}/s", f"{batch_rate:.0f}/s", f"{training:.2f} s")
+            if published is not None:
+                single_mean, batch_mean, training_mean = (sum(limits) / 2 for limits in published)
+                ratios = (single_rate / single_mean, batch_rate / batch_mean, training_mean / training)
                 figures = tuple(f"{f} {r:.1f} x" for f, r in zip(figures, ratios, strict=True))  # type: ignore[assignment]
-            rows.append((f"{name}, stride {stride}", ", ".join(figures), bar if known else ""))
+            rows.append((f"{name}, stride {stride}", ", ".join(figures), bar if published else ""))
     return rows
 
 
 def noise(steps: int, trajectories: int) -> Batch:
-    """Windows of the door's shapes."""
+    """Random windows with the shapes of the door task."""
     generator = torch.Generator().manual_seed(0)
     shape = (steps, trajectories)
-    pictures = torch.randint(256, (*shape, 32, 32), generator=generator, dtype=torch.uint8)
+    images = torch.randint(256, (*shape, 32, 32), generator=generator, dtype=torch.uint8)
     haptics = torch.randn(*shape, 10, generator=generator)
     states = 0.1 * torch.randn(*shape, 3, generator=generator)
     controls = torch.randn(*shape, 7, generator=generator)
-    observations = {"image": pictures, "haptics": haptics}
+    observations = {"image": images, "haptics": haptics}
     return Batch(observations, controls, states, torch.zeros(shape, dtype=torch.bool), states[0])
 
 
@@ -100,10 +100,10 @@ def backward(filter_: Filter, batch: Batch, particles: int = 30) -> None:
     loss.backward()
 
 
-def cpu_seconds(function: Callable[[], None], turns: int) -> float:
+def cpu_seconds(function: Callable[[], None], repetitions: int) -> float:
     function()
     best = float("inf")
-    for _ in range(turns):
+    for _ in range(repetitions):
         began = time.process_time()
         function()
         best = min(best, time.process_time() - began)
@@ -111,7 +111,7 @@ def cpu_seconds(function: Callable[[], None], turns: int) -> float:
 
 
 def memory() -> list[Row]:
-    """Peak memory of a training step that grows along one axis: its growth doubles where it is linear."""
+    """Peak memory of a training step for sizes doubled along one axis; linear growth gives a ratio of 2."""
     rows: list[Row] = []
     for name in ("crossmodal-ekf", "crossmodal-pf", "lstm"):
         for axis, sizes in SIZES.items():
@@ -119,13 +119,13 @@ def memory() -> list[Row]:
                 continue
             peaks = [peak(name, size) for size in sizes]
             growth = (peaks[2] - peaks[1]) / (peaks[1] - peaks[0])
-            shown = " / ".join(f"{size:.0f}" for size in peaks)
-            rows.append((f"{name}, training, {axis} doubled twice", f"{shown} MB, growth {growth:.2f} x", "2 x"))
+            sizes_mb = " / ".join(f"{size:.0f}" for size in peaks)
+            rows.append((f"{name}, training, {axis} doubled twice", f"{sizes_mb} MB, growth {growth:.2f} x", "2 x"))
     return rows
 
 
 def peak(name: str, size: tuple[int, int, int]) -> float:
-    """MB of tensors that are there at once, at most, during a training step of this size (T, N, M)."""
+    """Peak MB of live tensors during a training step of this size (T, N, M)."""
     steps, trajectories, particles = size
     filter_, batch = build(filters_of(DOOR)[name]), noise(steps, trajectories)
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiled:
@@ -138,11 +138,11 @@ def tracing() -> list[Row]:
     rows: list[Row] = []
     for name in NAMES:
         checkpoint, episode = subject.checkpoint(name), subject.episode()
-        batch = Steps.of(checkpoint.task, [episode]).episode(0)
-        plain, traced, ratio = subject.in_turn(
+        batch = Steps.from_episodes(checkpoint.task, [episode]).episode(0)
+        plain, traced, ratio = subject.alternate(
             lambda c=checkpoint, b=batch: run(c.filter, b, None, 300, 0),
             lambda c=checkpoint, e=episode: trace(c, e),
-            turns=5,
+            repetitions=5,
         )
         rows += [
             (f"{name}, untraced", f"{STEPS / plain:.0f} steps/s", ""),

@@ -1,11 +1,10 @@
-"""``kill -9`` at random moments: of collection, training, fine-tuning, tracing, recording, studies and live runs.
+"""``kill -9`` at random times during collection, training, fine-tuning, tracing, recording, studies and live runs.
 
     python bench/kills.py --kills 200 --seed 0
 
-Each run is killed again and again, at moments drawn over the time that an unbroken one takes, until one comes through.
-After every kill all that lies there must open, and be whole or known to be incomplete; in the end there must be what
-the unbroken run made, bit by bit. The process that is killed is a fork of this one, which has PyTorch in it already.
-Exit code 1 where anything was lost.
+Each run is killed repeatedly, at random times over the duration of an uninterrupted run, until it completes. After
+every kill, all files must be valid or identified as incomplete; the final result must equal that of the uninterrupted
+run, bit by bit. The killed process is a fork of this one, which has imported PyTorch. Exit code 1 if anything is lost.
 """
 
 from __future__ import annotations
@@ -35,60 +34,63 @@ import torch
 from valid_files import episodes
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.injection import WHOLE
+from beliefscope.datasets.faults.injection import NO_FAULTS
 from beliefscope.datasets.simulation.collect import collect
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, write_dataset
 from beliefscope.filters.catalog import architecture
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.finetuning.finetune import FineTune, finetune
+from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.module_selection import digest
+from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.training.plan import PLANS
 from beliefscope.filters.training.study import Cell, run_local
-from beliefscope.filters.training.train import PLANS, train
-from beliefscope.inspect.trace import Trace, arrays_of, begin, load_trace, save_trace, trace
-from beliefscope.inspect.traces.live_file import GrowingReader
+from beliefscope.filters.training.train import train
+from beliefscope.inspect.trace import Trace, arrays_of, load_trace, save_trace, trace
+from beliefscope.inspect.traces.live_file import LiveFileReader
+from beliefscope.inspect.traces.run import start_run
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
 
-MOST_IN_A_ROW = 6  # kills of one run, before it is let through
+MAX_KILLS = 6  # of one run, which then completes
 STEPS = 20  # of an episode
 
 Result = dict[str, Any]
-"""JSON: what must be the same whether a run was killed or not."""
+"""JSON: must be the same for killed and uninterrupted runs."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What is killed.
+    """Process to kill.
 
     Attributes:
-        run: makes its files in a folder, or goes on with what lies there. opens: looks at what a kill left; raises
-            where that is neither whole nor known to be incomplete. result: of a run that came through.
+        run: writes files to a folder, or resumes from existing ones. check: validates the files after a kill; raises if
+            one is invalid and not identified as incomplete. result: result of a completed run.
     """
 
     run: Callable[[Path], None]
-    opens: Callable[[Path], None]
+    check: Callable[[Path], None]
     result: Callable[[Path], Result]
 
 
 @cache
-def parent() -> Checkpoint:
+def base_checkpoint() -> Checkpoint:
     return load_checkpoint(shipped("door", "crossmodal-pf"))
 
 
 @cache
 def traced(seed: int) -> Trace:
-    return trace(parent(), episodes("door", STEPS)[0], seed=seed)
+    return trace(base_checkpoint(), episodes("door", STEPS)[0], seed=seed)
 
 
-def same(one: Trace, other: Trace, steps: int | None = None) -> bool:
-    """Bit by bit, over the first steps of the other."""
-    mine, theirs = arrays_of(one), arrays_of(other)
+def same(first: Trace, second: Trace, steps: int | None = None) -> bool:
+    """Whether the first trace equals the first steps of the second, bit by bit."""
+    left, right = arrays_of(first), arrays_of(second)
     static = ("start_mean", "start_covariance")
-    return mine.keys() == theirs.keys() and all(
-        mine[name].tobytes() == (theirs[name] if name in static else theirs[name][:steps]).tobytes() for name in mine
+    return left.keys() == right.keys() and all(
+        left[name].tobytes() == (right[name] if name in static else right[name][:steps]).tobytes() for name in left
     )
 
 
@@ -107,71 +109,77 @@ def every_file(folder: Path, suffix: str) -> Iterator[Path]:
 # Collection.
 
 
-def collects(folder: Path) -> None:
+def run_collection(folder: Path) -> None:
     collect("push", 4, 12, 7, 1, folder / "push.h5")
 
 
-def collected(folder: Path) -> None:
+def check_collection(folder: Path) -> None:
     for path in every_file(folder, ".h5"):
         with open_dataset(path) as data:
             list(data)
 
 
-# Training, and a child of it.
+# Training and fine-tuning.
 
 
-def trains(folder: Path) -> None:
+def run_training(folder: Path) -> None:
     path = folder / "mine.safetensors"
-    plan = replace(PLANS["smoke"], dynamics=12, models=30, alone=4)
-    made = train(
+    plan = replace(PLANS["smoke"], dynamics=12, models=30, single=4)
+    result = train(
         architecture("door", "haptics-ekf"),
         episodes("door", STEPS),
         data_hash="0",
         plan=plan,
         partial=folder / "partial",
     )
-    save_checkpoint(made.filter, "haptics-ekf", {"metrics": made.record["metrics"]}, path)
+    save_checkpoint(result.filter, "haptics-ekf", {"metrics": result.record["metrics"]}, path)
 
 
-def tunes(folder: Path) -> None:
-    asked = FineTune(train=("haptics-only",), length=8, windows=4, steps=8, check=1, patience=8, particles=8)
-    made = finetune(parent(), episodes("door", STEPS), data_hash="0", settings=asked, partial=folder / "partial")
-    assert made is not None
-    save_checkpoint(made.filter, "child", {"metrics": made.record["metrics"]}, folder / "mine.safetensors")
+def run_finetuning(folder: Path) -> None:
+    settings = FineTune(train=("haptics-only",), length=8, windows=4, steps=8, check=1, patience=8, particles=8)
+    result = finetune(
+        base_checkpoint(), episodes("door", STEPS), data_hash="0", settings=settings, partial=folder / "partial"
+    )
+    assert result is not None
+    save_checkpoint(result.filter, "finetuned", {"metrics": result.record["metrics"]}, folder / "mine.safetensors")
 
 
-def checkpoints(folder: Path) -> None:
+def check_checkpoints(folder: Path) -> None:
     for path in every_file(folder, ".safetensors"):
         if "parts" not in path.parts:
             load_checkpoint(path)
 
 
-def trained(folder: Path) -> Result:
-    made = load_checkpoint(folder / "mine.safetensors")
-    return {"weights": weights(made.filter), "record": dict(made.record)}
+def training_result(folder: Path) -> Result:
+    checkpoint = load_checkpoint(folder / "mine.safetensors")
+    return {"weights": weights(checkpoint.filter), "record": dict(checkpoint.record)}
 
 
 # Traces and recordings.
 
 
-def saves(folder: Path) -> None:
+def run_saving(folder: Path) -> None:
     for seed in (0, 1) * 20:
         save_trace(traced(seed), folder / "run.trace")
 
 
-def saved(folder: Path) -> None:
+def check_traces(folder: Path) -> None:
     for path in every_file(folder, ".trace"):
-        found = load_trace(path)
-        assert same(found, traced(found.seed)), "a trace that was never saved"
+        loaded = load_trace(path)
+        assert same(loaded, traced(loaded.seed)), "unknown trace"
 
 
-def records(folder: Path) -> None:
+def run_recording(folder: Path) -> None:
     write_recording(traced(0), folder / "run.rrd")
 
 
-def recorded(folder: Path) -> None:
+def check_recordings(folder: Path) -> None:
     for path in every_file(folder, ".rrd"):
-        assert same(read_recording(path), traced(0)), "a recording that is not whole"
+        assert same(read_recording(path), traced(0)), "incomplete recording"
+
+
+def recording_result(folder: Path) -> Result:
+    return {"same": same(read_recording(folder / "run.rrd"), traced(0))}
 
 
 # A study.
@@ -185,34 +193,43 @@ def cells(folder: Path) -> list[Cell]:
         return [Cell("door", "haptics-ekf", seed, "smoke", "door", data, opened.hash) for seed in (0, 1)]
 
 
-def studies(folder: Path) -> None:
+def run_study(folder: Path) -> None:
     for _, document in run_local(cells(folder), folder):
         assert "error" not in document, document["error"]
 
 
-def studied(folder: Path) -> Result:
-    found = [cell.finished(folder) for cell in cells(folder)]
+def study_result(folder: Path) -> Result:
+    documents = [cell.finished(folder) for cell in cells(folder)]
     filters = [load_checkpoint(cell.path(folder, ".safetensors")).filter for cell in cells(folder)]
-    return {"metrics": [one and one["metrics"] for one in found], "weights": [weights(one) for one in filters]}
+    return {
+        "metrics": [document and document["metrics"] for document in documents],
+        "weights": [weights(f) for f in filters],
+    }
 
 
 # A live run.
 
 
 @torch.no_grad()
-def lives(folder: Path) -> None:
+def run_live(folder: Path) -> None:
     episode = episodes("door", STEPS)[0]
-    run = begin(parent(), episode, 0, 0, 300, WHOLE)
+    run = start_run(base_checkpoint(), episode, 0, 0, 300, NO_FAULTS)
     number = len(list(folder.glob("*.live")))
     with LiveRecorder(
-        f"run{number}", parent(), folder=folder, start=run.start, like=episode, expected=len(episode), **run.given
+        f"run{number}",
+        base_checkpoint(),
+        folder=folder,
+        start=run.start,
+        like=episode,
+        expected=len(episode),
+        **run.provenance,
     ) as live:
         generator = run.generator()
-        belief = parent().filter.start(run.start, 300, generator)
+        belief = base_checkpoint().filter.start(run.start, 300, generator)
         for t in range(len(episode)):
-            belief, known = parent().filter.step(belief, run.evidence[t], generator)
+            belief, step_trace = base_checkpoint().filter.step(belief, run.evidence[t], generator)
             live.step(
-                known,
+                step_trace,
                 observations={key: array[t] for key, array in run.episode.observations.items()},
                 control=run.episode.controls[t],
                 truth=run.episode.states[t],
@@ -223,54 +240,56 @@ def lives(folder: Path) -> None:
             time.sleep(0.01)
 
 
-def lived(folder: Path) -> None:
+def check_live(folder: Path) -> None:
     for path in every_file(folder, ".live"):
         if path.stat().st_size == 0:
-            continue  # killed between its making and its header
-        reader = GrowingReader(path)
+            continue  # killed before the header was written
+        reader = LiveFileReader(path)
         reader.poll()
-        found = reader.part()
-        assert same(found, traced(0), len(found)), "steps that the filter never took"
+        part = reader.part()
+        assert same(part, traced(0), len(part)), "unknown steps"
         reader.close()
     for path in every_file(folder, ".rrd"):
-        with suppress(BadInput):  # of a run that was cut off there is no whole trace; but its views open
+        with suppress(BadInput):  # an interrupted run has no complete trace, but its views open
             read_recording(path)
 
 
-def the_last(folder: Path) -> Result:
-    path = max(every_file(folder, ".live"), key=lambda one: one.stat().st_mtime_ns)
-    reader = GrowingReader(path)
+def live_result(folder: Path) -> Result:
+    path = max(every_file(folder, ".live"), key=lambda path: path.stat().st_mtime_ns)
+    reader = LiveFileReader(path)
     reader.poll()
     assert reader.finished
-    drawn = read_recording(path.with_suffix(".rrd"))
-    return {"same": same(reader.part(), traced(0)), "recording": same(drawn, traced(0))}
+    recording = read_recording(path.with_suffix(".rrd"))
+    return {"same": same(reader.part(), traced(0)), "recording": same(recording, traced(0))}
 
 
 KINDS: dict[str, Kind] = {
-    "collection": Kind(collects, collected, lambda folder: {"sha": sha(folder / "push.h5")}),
-    "training": Kind(trains, checkpoints, trained),
-    "fine-tuning": Kind(tunes, checkpoints, trained),
-    "saving traces": Kind(saves, saved, lambda folder: {"sha": sha(folder / "run.trace")}),
-    "recording": Kind(records, recorded, lambda folder: {"same": same(read_recording(folder / "run.rrd"), traced(0))}),
-    "study": Kind(studies, checkpoints, studied),
-    "live": Kind(lives, lived, the_last),
+    "collection": Kind(run_collection, check_collection, lambda folder: {"sha": sha(folder / "push.h5")}),
+    "training": Kind(run_training, check_checkpoints, training_result),
+    "fine-tuning": Kind(run_finetuning, check_checkpoints, training_result),
+    "saving traces": Kind(run_saving, check_traces, lambda folder: {"sha": sha(folder / "run.trace")}),
+    "recording": Kind(
+        run_recording, check_recordings, lambda folder: {"same": same(read_recording(folder / "run.rrd"), traced(0))}
+    ),
+    "study": Kind(run_study, check_checkpoints, study_result),
+    "live": Kind(run_live, check_live, live_result),
 }
 
 
 @dataclass
 class Tally:
-    """What came of one kind."""
+    """Counts for one kind."""
 
     runs: int = 0
     kills: int = 0
-    opened: int = 0
-    equal: int = 0
-    temporary: int = 0
+    valid: int = 0
+    identical: int = 0
+    partial: int = 0
     seconds: float = 0.0
 
 
 def forked(work: Callable[[], Any], after: float | None = None) -> tuple[bool, Any]:
-    """Whether it ended by itself, and what it gave as JSON. after: s until it is killed."""
+    """Run in a fork; return whether it completed, and its JSON result. after: s until it is killed."""
     reading, writing = os.pipe()
     pid = os.fork()
     if not pid:
@@ -280,12 +299,12 @@ def forked(work: Callable[[], Any], after: float | None = None) -> tuple[bool, A
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, 1)
             os.dup2(null, 2)
-            said = json.dumps(work())
+            reply = json.dumps(work())
             code = 0
         except BaseException:
-            said = json.dumps({"failed": traceback.format_exc()})
+            reply = json.dumps({"failed": traceback.format_exc()})
         finally:
-            os.write(writing, said.encode()[:60_000])
+            os.write(writing, reply.encode()[:60_000])
             os._exit(code)
     os.close(writing)
     if after is not None:
@@ -293,77 +312,77 @@ def forked(work: Callable[[], Any], after: float | None = None) -> tuple[bool, A
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
     with os.fdopen(reading, "rb") as pipe:
-        said = pipe.read()
+        received = pipe.read()
     killed = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
-    return not killed, json.loads(said) if said and not killed else None
+    return not killed, json.loads(received) if received and not killed else None
 
 
 def kill(kind: Kind, kills: int, rng: random.Random) -> Iterator[Tally | str]:
-    """Kills until there were so many; the tally after each run, and a line for each thing that was lost."""
-    tally, began = Tally(), time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="kills-") as place:
+    """Kill runs until the number is reached; yield the tally after each run, and a line for each loss."""
+    tally, start = Tally(), time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="kills-") as root:
 
         def run(folder: Path) -> Result:
             kind.run(folder)
             return kind.result(folder)
 
-        whole = Path(place) / "whole"
-        whole.mkdir()
-        start = time.monotonic()
-        _, wanted = forked(lambda: run(whole))
-        takes = time.monotonic() - start
-        if "failed" in wanted:
-            yield f"the unbroken run failed: {wanted['failed']}"
+        uninterrupted = Path(root) / "uninterrupted"
+        uninterrupted.mkdir()
+        before = time.monotonic()
+        _, expected = forked(lambda: run(uninterrupted))
+        duration = time.monotonic() - before
+        if "failed" in expected:
+            yield f"the uninterrupted run failed: {expected['failed']}"
             return
         while tally.kills < kills:
-            folder = Path(place) / f"run{tally.runs}"
+            folder = Path(root) / f"run{tally.runs}"
             folder.mkdir()
             tally.runs += 1
-            for attempt in range(MOST_IN_A_ROW + 1):
-                last = attempt == MOST_IN_A_ROW
-                after = None if last else rng.uniform(0.0, takes)
-                done, found = forked(lambda folder=folder: run(folder), after)  # type: ignore[misc]
+            for attempt in range(MAX_KILLS + 1):
+                last = attempt == MAX_KILLS
+                after = None if last else rng.uniform(0.0, duration)
+                done, result = forked(lambda folder=folder: run(folder), after)  # type: ignore[misc]
                 if done:
                     break
                 tally.kills += 1
-                _, said = forked(lambda folder=folder: kind.opens(folder))  # type: ignore[misc]
-                if said is None:
-                    tally.opened += 1
+                _, error = forked(lambda folder=folder: kind.check(folder))  # type: ignore[misc]
+                if error is None:
+                    tally.valid += 1
                 else:
-                    yield f"after a kill: {said['failed']}"
-            tally.temporary += sum(path.is_file() for path in folder.rglob(".*[!k]"))
-            tally.equal += found == wanted
-            if found != wanted:
-                yield f"not as the unbroken run: {str(found)[-1500:]}\nwanted {str(wanted)[:300]}"
-            tally.seconds = time.monotonic() - began
+                    yield f"after a kill: {error['failed']}"
+            tally.partial += sum(path.is_file() for path in folder.rglob(".*[!k]"))
+            tally.identical += result == expected
+            if result != expected:
+                yield f"differs from the uninterrupted run: {str(result)[-1500:]}\nexpected {str(expected)[:300]}"
+            tally.seconds = time.monotonic() - start
             yield tally
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kinds", nargs="*", metavar="kind", help=f"some of: {', '.join(KINDS)}")
-    parser.add_argument("--kills", type=int, default=200, help="in all")
+    parser.add_argument("kinds", nargs="*", metavar="kind", help=f"any of: {', '.join(KINDS)}")
+    parser.add_argument("--kills", type=int, default=200, help="total number")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    if unknown := set(given.kinds) - KINDS.keys():
+    args = parser.parse_args()
+    if unknown := set(args.kinds) - KINDS.keys():
         parser.error(f"kind {min(unknown)!r} does not exist. Available: {', '.join(KINDS)}")
     torch.set_num_threads(1)
     np.seterr(all="ignore")
-    kinds = given.kinds or list(KINDS)
+    kinds = args.kinds or list(KINDS)
     traced(0), traced(1)
-    print("| what was killed | runs | kills | all opened | as unbroken | temporary files left | seconds |")
+    print("| process | runs | kills | files valid | final result identical | partial files | seconds |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
     lost = False
     for name in kinds:
         tally = Tally()
-        for said in kill(KINDS[name], -(-given.kills // len(kinds)), random.Random(f"{given.seed} {name}")):
-            if isinstance(said, Tally):
-                tally = said
+        for item in kill(KINDS[name], -(-args.kills // len(kinds)), random.Random(f"{args.seed} {name}")):
+            if isinstance(item, Tally):
+                tally = item
             else:
                 lost = True
-                print(f"    {name}: {said}", file=sys.stderr, flush=True)
+                print(f"    {name}: {item}", file=sys.stderr, flush=True)
         print(
-            f"| {name} | {tally.runs} | {tally.kills} | {tally.opened} | {tally.equal} | {tally.temporary} "
+            f"| {name} | {tally.runs} | {tally.kills} | {tally.valid} | {tally.identical} | {tally.partial} "
             f"| {tally.seconds:.0f} |",
             flush=True,
         )

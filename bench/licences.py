@@ -1,8 +1,8 @@
-"""Licences of all that an installation brings, the extras included: a table, and whether each is among those allowed.
+"""Licences of all packages of an installation, including extras: a table, and whether each is allowed.
 
     python bench/licences.py
 
-Ends with 1 where one is not. What is installed is asked, so that what only other platforms need is left out.
+Exit code 1 if one is not allowed. Only installed packages are checked, not those of other platforms.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-EXTRAS = ("", "ray", "export", "meshes")
-"""Of our own; ``dev`` stays on the machines of those who work on the project."""
+EXTRAS = ("", "attribution", "tensorboard", "ray", "export", "meshes")
+"""Extras of users; ``test`` and ``dev`` are for developers."""
 
 ALLOWED = {
     "MIT": r"\bmit\b",
@@ -31,61 +31,61 @@ ALLOWED = {
     "Boost": r"\bbsl-1\.0\b",
     "CC0": r"\bcc0\b",
 }
-"""Licence -> how packages' metadata write it. Whoever has the code may use it and pass it on, and ours stays ours."""
+"""Licence -> pattern of its names in package metadata. All allow use and redistribution with this project's licence."""
 
-EXCEPTIONS = {"uplot-python": "LGPL 3: not imported and not changed; what is served out of it, uPlot itself, is MIT"}
-"""Package that is none of these -> why it may be here all the same."""
+EXCEPTIONS = {"uplot-python": "LGPL 3: not imported and not changed; the file served from it, uPlot itself, is MIT"}
+"""Package with another licence -> reason for the exception."""
 
 
 def closure() -> Iterator[str]:
-    """Names of the installed packages that ours needs, directly or not."""
-    waiting, seen = ["beliefscope"], set()
-    while waiting:
-        name = waiting.pop()
-        if name in seen:
+    """Names of the installed direct and indirect requirements."""
+    queue, visited = ["beliefscope"], set()
+    while queue:
+        name = queue.pop()
+        if name in visited:
             continue
-        seen.add(name)
+        visited.add(name)
         try:
-            wanted = importlib.metadata.requires(name) or ()
+            requirements = importlib.metadata.requires(name) or ()
         except importlib.metadata.PackageNotFoundError:
-            continue  # of an extra that is not installed
+            continue  # belongs to an extra that is not installed
         if name != "beliefscope":
             yield name
         extras = EXTRAS if name == "beliefscope" else ("",)
-        for one in map(Requirement, wanted):
-            if one.marker is None or any(one.marker.evaluate({"extra": extra}) for extra in extras):
-                waiting.append(canonicalize_name(one.name))
+        for requirement in map(Requirement, requirements):
+            if requirement.marker is None or any(requirement.marker.evaluate({"extra": extra}) for extra in extras):
+                queue.append(canonicalize_name(requirement.name))
 
 
-def said(name: str) -> str:
-    """What a package's metadata say its licence is, in a line."""
+def licence_of(name: str) -> str:
+    """Licence of a package according to its metadata, in one line."""
     metadata = importlib.metadata.metadata(name)
     if metadata.get("License-Expression"):
         return metadata["License-Expression"]
     classified = [
-        one.rpartition("::")[2].strip() for one in metadata.get_all("Classifier") or () if "License ::" in one
+        line.rpartition("::")[2].strip() for line in metadata.get_all("Classifier") or () if "License ::" in line
     ]
     if classified:
         return ", ".join(classified)
     return (metadata.get("License") or "").strip().partition("\n")[0]
 
 
-def allowed(licence: str) -> bool:
-    """Of ``A OR B`` one is enough, of ``A AND B`` all are needed."""
+def is_allowed(licence: str) -> bool:
+    """Whether a licence expression is allowed: one of ``A OR B``, all of ``A AND B``."""
     parts = re.split(r"\bAND\b|,", licence)
     return all(any(re.search(words, part, re.IGNORECASE) for words in ALLOWED.values()) for part in parts)
 
 
 def main() -> int:
-    refused = 0
+    violations = 0
     for name in sorted(closure()):
-        licence = said(name)
-        fits = allowed(licence) or name in EXCEPTIONS
-        refused += not fits
-        note = EXCEPTIONS.get(name, "" if fits else "<- not allowed")
+        licence = licence_of(name)
+        accepted = is_allowed(licence) or name in EXCEPTIONS
+        violations += not accepted
+        note = EXCEPTIONS.get(name, "" if accepted else "<- not allowed")
         print(f"{name:<28}{importlib.metadata.version(name):<14}{licence}  {note}".rstrip())
-    print(f"\n{refused} not allowed" if refused else "\nAll are allowed.")
-    return int(refused > 0)
+    print(f"\n{violations} not allowed" if violations else "\nAll are allowed.")
+    return int(violations > 0)
 
 
 if __name__ == "__main__":

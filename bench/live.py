@@ -1,8 +1,7 @@
-"""A live run on the page: how long from the moment a filter hands over a step until the page has drawn it.
+"""Latency of a live run on the page, from ``LiveRecorder.step`` to the drawn frame.
 
-A process of its own hands over steps of a door, at the rate of a robot and at twice that, to ``LiveRecorder``; headless
-Chromium follows the newest step with time line, numbers, picture, maps and scene. Each delay ends when a frame with the
-step has been drawn.
+A separate process records steps of a door at the rate of a robot and at twice that; headless Chromium follows the
+newest step with timeline, numbers, image, maps and scene.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from page import browsing, found_chromium
+from page import browsing, find_chromium
 from served import serving
 from subject import Row
 
@@ -31,30 +30,30 @@ from beliefscope.recordings.live import LiveRecorder
 folder, rate, steps = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 with open_dataset(sample_path("door")) as data:
     episode = data[9]
-belief, handed = np.diag([1e-4, 1e-4, 1e-3]), []
+belief, times = np.diag([1e-4, 1e-4, 1e-3]), []
 with LiveRecorder(f"at-{rate:.0f}", task="door", folder=folder, filter="bench") as live:
-    began = time.monotonic()
+    start = time.monotonic()
     for t in range(steps):
-        time.sleep(max(0.0, began + t / rate - time.monotonic()))
+        time.sleep(max(0.0, start + t / rate - time.monotonic()))
         i = t % len(episode)
-        seen = {key: array[i] for key, array in episode.observations.items()}
-        handed.append(time.time())
+        observations = {key: array[i] for key, array in episode.observations.items()}
+        times.append(time.time())
         truth = episode.states[i]
-        live.step((truth + 0.01, belief), seen, episode.controls[i], truth=truth, qpos=episode.qpos[i])
-np.save(f"{folder}/at-{rate:.0f}.npy", np.array(handed))
+        live.step((truth + 0.01, belief), observations, episode.controls[i], truth=truth, qpos=episode.qpos[i])
+np.save(f"{folder}/at-{rate:.0f}.npy", np.array(times))
 """
 
 
-def delays(handed: NDArray[np.float64], drawn: list[dict[str, float]]) -> NDArray[np.float64]:
-    """(N,) ms from each step's handing over to the first frame that showed it or a later one, for steps since then."""
-    shown, at = np.array([d["step"] for d in drawn]), np.array([d["at"] for d in drawn])
-    steps = np.arange(int(shown[0]) + 1, int(shown[-1]) + 1)
-    return at[np.searchsorted(shown, steps)] - 1e3 * handed[steps]
+def delays(step_times: NDArray[np.float64], frames: list[dict[str, float]]) -> NDArray[np.float64]:
+    """(N,) ms from each recorded step to the first frame with this or a later step."""
+    frame_steps, frame_times = np.array([f["step"] for f in frames]), np.array([f["at"] for f in frames])
+    steps = np.arange(int(frame_steps[0]) + 1, int(frame_steps[-1]) + 1)
+    return frame_times[np.searchsorted(frame_steps, steps)] - 1e3 * step_times[steps]
 
 
 def measure() -> list[Row]:
-    """A row for each rate."""
-    if found_chromium() is None:
+    """Return one row per rate."""
+    if find_chromium() is None:
         return [("a live run on the page", "skipped: no Chromium on the path", "")]
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as workspace, serving(workspace=Path(workspace)) as served, browsing() as page:
@@ -65,11 +64,11 @@ def measure() -> list[Row]:
             while not (folder / f"at-{rate:.0f}.live").exists():
                 time.sleep(0.1)
             page.goto(f"{served.url}?task=door&data=live:at-{rate:.0f}")
-            drawn: list[dict[str, float]] = []
+            frames: list[dict[str, float]] = []
             while writer.poll() is None:
                 time.sleep(0.5)
-                drawn = page.evaluate("() => window.beliefscope?.live.latencies ?? []") or drawn
-            late = delays(np.load(folder / f"at-{rate:.0f}.npy"), drawn)
-            middle, most = np.percentile(late, [50, 95])
-            rows.append((f"step handed over to drawn, {rate:.0f} Hz: p50, p95", f"{middle:.0f}, {most:.0f} ms", ""))
+                frames = page.evaluate("() => window.beliefscope?.live.latencies ?? []") or frames
+            latencies = delays(np.load(folder / f"at-{rate:.0f}.npy"), frames)
+            p50, p95 = np.percentile(latencies, [50, 95])
+            rows.append((f"recorded step to drawn frame, {rate:.0f} Hz: p50, p95", f"{p50:.0f}, {p95:.0f} ms", ""))
     return rows

@@ -1,4 +1,4 @@
-"""What much data costs: 600 doors of 800 steps read into memory, and windows cut from them while a filter trains."""
+"""Loading of large data sets: 600 doors of 800 steps read into memory, and windows sampled from them in training."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.batch import Statistics, Steps
 from beliefscope.filters.catalog import architecture, build
+from beliefscope.filters.training.plan import PLANS
 from beliefscope.filters.training.stages import Trainer
-from beliefscope.filters.training.train import PLANS
 
 EPISODES, WRITTEN = 600, 20
-TURNS = 10
+REPETITIONS = 10
 
 
 def measure() -> list[Row]:
-    # In a process of its own, whose peak of memory nothing else has raised.
+    # In a subprocess, for its own peak memory.
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(_measure).result()
 
@@ -38,44 +38,44 @@ def _measure() -> list[Row]:
         with open_dataset(sample_path("door")) as sample:
             short = list(sample)
             write_dataset(path, sample.task, (_long(short, i) for i in range(WRITTEN)))
-        began, before = time.perf_counter(), _peak()
+        start, before = time.perf_counter(), _peak()
         episodes: list[Episode] = []
         for _ in range(EPISODES // WRITTEN):
             with open_dataset(path) as data:
                 episodes += list(data)
                 task = data.task
-        read = time.perf_counter() - began
-        began = time.perf_counter()
-        steps = Steps.of(task, episodes)
-        joining = time.perf_counter() - began
-        few = Steps.of(task, episodes[:10])  # enough for pictures that are looked up
-    pictures = steps.observations["image"]
-    fitting = time.perf_counter()
+        reading = time.perf_counter() - start
+        start = time.perf_counter()
+        steps = Steps.from_episodes(task, episodes)
+        joining = time.perf_counter() - start
+        few = Steps.from_episodes(task, episodes[:10])  # enough for cached images
+    images = steps.observations["image"]
+    start = time.perf_counter()
     Statistics(task).fit(steps)
-    fitting = time.perf_counter() - fitting
+    fitting = time.perf_counter() - start
     rows: list[Row] = [
-        (f"{EPISODES} x {STEPS} steps read from HDF5, checked", f"{read:.1f} s", ""),
-        ("joined to tensors", f"{joining:.1f} s", ""),
-        ("mean and deviation of all", f"{fitting:.1f} s", ""),
-        (f"pictures in memory, {pictures.dtype}", f"{pictures.nbytes / 1e6:.0f} MB", "not as floats"),
-        ("peak of memory above the start", f"{(_peak() - before) / 1e3:.0f} MB", ""),
+        (f"{EPISODES} x {STEPS} steps read from HDF5 and validated", f"{reading:.1f} s", ""),
+        ("converted to tensors", f"{joining:.1f} s", ""),
+        ("mean and standard deviation", f"{fitting:.1f} s", ""),
+        (f"images in memory, {images.dtype}", f"{images.nbytes / 1e6:.0f} MB", "not as floats"),
+        ("peak memory increase", f"{(_peak() - before) / 1e3:.0f} MB", ""),
     ]
     for name in ("crossmodal-ekf", "crossmodal-pf"):
-        for remembered in (False, True):
-            share, step = _loader(few if remembered else steps, name, remembered)
-            what = "pictures remembered" if remembered else "through the encoders"
+        for cached in (False, True):
+            share, step = _loader(few if cached else steps, name, cached)
+            encoding = "images cached" if cached else "images encoded"
             rows.append(
-                (f"{name}, training step, {what}: of {step * 1e3:.0f} ms, windows cut", f"{share:.1%}", "<= 10 %")
+                (f"{name}, training step of {step * 1e3:.0f} ms, {encoding}: sampling", f"{share:.1%}", "<= 10 %")
             )
     return rows
 
 
 def _long(short: list[Episode], number: int) -> Episode:
-    """An episode of 800 steps out of the sample set's of 100."""
+    """An episode of 800 steps, concatenated from episodes of 100."""
     parts = [short[(number + i) % len(short)] for i in range(STEPS // len(short[0]))]
 
-    def joined(of: Callable[[Episode], Any]) -> Any:
-        return np.concatenate([of(part) for part in parts])
+    def joined(get: Callable[[Episode], Any]) -> Any:
+        return np.concatenate([get(part) for part in parts])
 
     return replace(
         parts[0],
@@ -87,27 +87,27 @@ def _long(short: list[Episode], number: int) -> Episode:
     )
 
 
-def _loader(steps: Steps, name: str, remembered: bool) -> tuple[float, float]:
-    """The share of cutting windows in a training step end to end over 16 steps, and the seconds of such a step."""
+def _loader(steps: Steps, name: str, cached: bool) -> tuple[float, float]:
+    """Fraction of sampling in an end-to-end training step of 16 steps, and seconds of such a step."""
     filter_ = build(architecture("door", name))
     filter_.statistics.fit(steps)
     trainer = Trainer(filter_, steps, PLANS["cpu"], seed=0)
-    cut, spent = trainer.sample, [0.0]
+    sample, spent = trainer.sample, [0.0]
 
     def timed(*arguments: Any) -> Any:
-        began = time.perf_counter()
-        batch = cut(*arguments)
-        spent[0] += time.perf_counter() - began
+        start = time.perf_counter()
+        batch = sample(*arguments)
+        spent[0] += time.perf_counter() - start
         return batch
 
     trainer.sample = timed  # type: ignore[method-assign]
     marks: list[tuple[float, float]] = []
     trainer.report = lambda *_: marks.append((time.perf_counter(), spent[0]))
-    trainer.end_to_end("bench", filter_.parameters(), TURNS + 1, 16, 1e-4, remembered=remembered)
-    took = marks[-1][0] - marks[0][0]
-    return (marks[-1][1] - marks[0][1]) / took, took / TURNS
+    trainer.end_to_end("bench", filter_.parameters(), REPETITIONS + 1, 16, 1e-4, cached=cached)
+    duration = marks[-1][0] - marks[0][0]
+    return (marks[-1][1] - marks[0][1]) / duration, duration / REPETITIONS
 
 
 def _peak() -> float:
-    """KB."""
+    """Peak memory, KB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

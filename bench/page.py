@@ -1,4 +1,4 @@
-"""The page in headless Chromium: how soon it shows something, how fast it answers, whether it grows while it plays."""
+"""The page in headless Chromium: first paint, latency, and memory during playback."""
 
 from __future__ import annotations
 
@@ -20,52 +20,52 @@ from beliefscope.datasets.store import write_dataset
 
 KEYS = 200
 VISITS = 5
-SWEEP = 3.0  # s that a drag over the time line takes
+SWEEP = 3.0  # s, duration of a drag over the timeline
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 
 
 @contextmanager
 def browsing() -> Iterator[Any]:
-    """A page in a browser of its own."""
+    """Open a page in a new browser."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=found_chromium(), args=FLAGS)
+        chromium = playwright.chromium.launch(executable_path=find_chromium(), args=FLAGS)
         yield chromium.new_page(viewport={"width": 1440, "height": 900})
         chromium.close()
 
 
-def found_chromium() -> str | None:
+def find_chromium() -> str | None:
     return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 def usable(page: Any) -> float:
-    """Waits until the time line and the first maps are drawn; s from the page's start to that."""
+    """Wait until the timeline and the first maps are drawn; return the seconds since the page started."""
     page.wait_for_function("() => window.beliefscope?.stats.useful", timeout=120_000)
     return float(page.evaluate("window.beliefscope.stats.useful")) / 1e3
 
 
 DRAG = """([seconds, from, to, y]) => new Promise((done) => {
   const [body, cursor] = ['#timeline .body', '#tracks .mark.cursor'].map((part) => document.querySelector(part));
-  const began = performance.now();
+  const start = performance.now();
   const drawn = [];
   let before = '';
-  const share = () => (performance.now() - began) / (1000 * seconds);
-  const hand = setInterval(() => {
+  const share = () => (performance.now() - start) / (1000 * seconds);
+  const timer = setInterval(() => {
     const clientX = from + (to - from) * share();
-    const moved = { pointerId: 1, bubbles: true, buttons: 1, clientX, clientY: y };
-    body.dispatchEvent(new PointerEvent('pointermove', moved));
+    const options = { pointerId: 1, bubbles: true, buttons: 1, clientX, clientY: y };
+    body.dispatchEvent(new PointerEvent('pointermove', options));
   }, 4);
   const frame = (now) => {
     if (cursor.style.transform !== before) drawn.push(now);
     before = cursor.style.transform;
     if (share() < 1) return requestAnimationFrame(frame);
-    clearInterval(hand);
+    clearInterval(timer);
     done(drawn);
   };
   requestAnimationFrame(frame);
 })"""
-"""Moves the hand that holds the cursor much more often than frames come; when frames with a moved cursor came, ms."""
+"""Moves the pointer more often than the frame rate; returns the times of frames with a moved cursor, ms."""
 
 
 def measure() -> list[Row]:
@@ -73,7 +73,7 @@ def measure() -> list[Row]:
         import playwright.sync_api  # noqa: F401
     except ImportError:
         return [("page", "skipped: playwright is not installed", "")]
-    if found_chromium() is None:
+    if find_chromium() is None:
         return [("page", "skipped: no Chromium on the path", "")]
     with browsing() as page, serving() as served:
         rows = paint(page, served.url)
@@ -85,25 +85,25 @@ def measure() -> list[Row]:
 
 
 def paint(page: Any, url: str) -> list[Row]:
-    """Until the page shows what it is for: right after the server listens, and where both are warm."""
+    """Time until the page is usable: with a fresh server, after a reload, and for a new browser."""
     page.goto(url, wait_until="commit")
-    rows = [("from a fresh server's listening to time line and maps", f"{usable(page):.2f} s", "<= 3 s")]
-    page.wait_for_timeout(10_000)  # until the server has prepared the Rerun viewer, once a workspace
-    again, new = [], []
+    rows = [("timeline and maps with a fresh server", f"{usable(page):.2f} s", "<= 3 s")]
+    page.wait_for_timeout(10_000)  # the server prepares the Rerun viewer, once per workspace
+    reloads, visits = [], []
     for _ in range(VISITS):
         page.reload(wait_until="commit")
-        again.append(usable(page))
-        with page.context.browser.new_context(viewport=page.viewport_size) as stranger:
-            other = stranger.new_page()
+        reloads.append(usable(page))
+        with page.context.browser.new_context(viewport=page.viewport_size) as context:
+            other = context.new_page()
             other.goto(url, wait_until="commit")
-            new.append(usable(other))
-    for what, took in (("a reload", again), ("a browser's first visit", new)):
-        rows.append((f"time line and maps after {what}, median of {VISITS}", f"{np.median(took):.2f} s", "<= 1.5 s"))
+            visits.append(usable(other))
+    for case, times in (("a reload", reloads), ("a browser's first visit", visits)):
+        rows.append((f"timeline and maps after {case}, median of {VISITS}", f"{np.median(times):.2f} s", "<= 1.5 s"))
     return rows
 
 
 def keys(page: Any, url: str) -> list[Row]:
-    """From a key to the maps drawn."""
+    """Latency from a key to the drawn maps."""
     page.goto(url)
     usable(page)
     page.wait_for_timeout(3000)
@@ -112,12 +112,12 @@ def keys(page: Any, url: str) -> list[Row]:
         page.keyboard.press("ArrowRight" if number // 40 % 2 == 0 else "ArrowLeft")
         page.wait_for_timeout(60)
     page.wait_for_timeout(500)
-    took = np.array(page.evaluate("window.beliefscope.stats.scrub"))
-    p50, p95 = np.percentile(took, [50, 95])
+    times = np.array(page.evaluate("window.beliefscope.stats.scrub"))
+    p50, p95 = np.percentile(times, [50, 95])
     scenes = page.evaluate("window.beliefscope.stats.scene")
     rows = [
-        (f"key to maps drawn, {len(took)} of {KEYS} keys, p50", f"{p50:.0f} ms", ""),
-        (f"key to maps drawn, {len(took)} of {KEYS} keys, p95", f"{p95:.0f} ms", "<= 50 ms"),
+        (f"key to maps drawn, {len(times)} of {KEYS} keys, p50", f"{p50:.0f} ms", ""),
+        (f"key to maps drawn, {len(times)} of {KEYS} keys, p95", f"{p95:.0f} ms", "<= 50 ms"),
     ]
     if scenes:
         rows.append((f"key to scene sent, {len(scenes)} keys, p95", f"{np.percentile(scenes, 95):.0f} ms", "<= 100 ms"))
@@ -125,7 +125,7 @@ def keys(page: Any, url: str) -> list[Row]:
 
 
 def drag(page: Any, url: str) -> list[Row]:
-    """Over the whole of a long episode."""
+    """Drag over a long episode."""
     page.goto(url + "?data=long")
     usable(page)
     page.wait_for_timeout(2000)
@@ -134,47 +134,53 @@ def drag(page: Any, url: str) -> list[Row]:
     left, right, y = box["x"] + 0.3 * box["width"], box["x"] + 0.95 * box["width"], box["y"] + 60
     page.mouse.move(left, y)
     page.mouse.down()
-    apart = np.diff(page.evaluate(DRAG, [SWEEP, left, right, y]))
+    intervals = np.diff(page.evaluate(DRAG, [SWEEP, left, right, y]))
     page.mouse.up()
     return [
-        (f"dragging over {STEPS} steps, time line drawn", f"{1000 / apart.mean():.0f} /s", ">= 30 /s"),
-        ("dragging, between two drawings, p95", f"{np.percentile(apart, 95):.0f} ms", ""),
+        (f"dragging over {STEPS} steps, timeline updates", f"{1000 / intervals.mean():.0f} /s", ">= 30 /s"),
+        ("dragging, time between updates, p95", f"{np.percentile(intervals, 95):.0f} ms", ""),
     ]
 
 
 def play(minutes: float) -> list[Row]:
-    """What a page that plays, round and round, takes: the script's memory after a collection, nodes, listeners."""
+    """Memory of scripts after garbage collection, nodes and listeners of a playing page."""
     with browsing() as page, serving() as served:
         page.goto(served.url)
         usable(page)
         devtools = page.context.new_cdp_session(page)
         devtools.send("Performance.enable")
-        taken: list[tuple[float, ...]] = []
-        began = time.monotonic()
-        while (passed := time.monotonic() - began) < 60 * minutes:
+        samples: list[tuple[float, ...]] = []
+        start = time.monotonic()
+        while (passed := time.monotonic() - start) < 60 * minutes:
             if not page.evaluate("window.beliefscope.state().playing"):
                 page.keyboard.press("Space")
             page.wait_for_timeout(10_000)
             devtools.send("HeapProfiler.collectGarbage")
             metrics = {m["name"]: m["value"] for m in devtools.send("Performance.getMetrics")["metrics"]}
-            taken.append((passed / 60, metrics["JSHeapUsedSize"] / 1e6, metrics["Nodes"], metrics["JSEventListeners"]))
-    values = np.array(taken)[len(taken) // 4 :]  # what it fills at first is not what it grows by
+            samples.append(
+                (passed / 60, metrics["JSHeapUsedSize"] / 1e6, metrics["Nodes"], metrics["JSEventListeners"])
+            )
+    values = np.array(samples)[len(samples) // 4 :]  # without the warm-up
     rows: list[Row] = []
-    for column, what, unit in ((1, "memory of scripts", "MB"), (2, "nodes", ""), (3, "listeners", "")):
+    for column, quantity, unit in ((1, "memory of scripts", "MB"), (2, "nodes", ""), (3, "listeners", "")):
         rise = np.polyfit(values[:, 0], values[:, column], 1)[0]
         first, last = values[0, column], values[-1, column]
         rows.append(
-            (f"{what} over {minutes:g} min of play", f"{first:.1f} to {last:.1f} {unit}; {rise:+.2f} a minute", "flat")
+            (
+                f"{quantity} over {minutes:g} min of playback",
+                f"{first:.1f} to {last:.1f} {unit}; {rise:+.2f} a minute",
+                "flat",
+            )
         )
     return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--play", type=float, metavar="MINUTES", help="only: what a page takes that plays so long")
-    asked = parser.parse_args()
-    for what, measured, bar in measure() if asked.play is None else play(asked.play):
-        print(f"{what}: {measured}{bar and f' (bar: {bar})'}", flush=True)
+    parser.add_argument("--play", type=float, metavar="MINUTES", help="only measure the memory during playback")
+    args = parser.parse_args()
+    for quantity, measured, bar in measure() if args.play is None else play(args.play):
+        print(f"{quantity}: {measured}{bar and f' (bar: {bar})'}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Recordings: how fast they are written, how large they are, how soon they open, what a long live run costs.
+"""Recordings: writing speed, size, time to open, and memory of long live runs.
 
-python bench/run.py recordings          written fast enough, small enough
-python bench/recordings.py --long       memory and bytes a step of live runs of 10^4 and 10^5 steps
-python bench/recordings.py --open       from a click to the recording in the page's Rerun viewer, in Chromium
+python bench/run.py recordings          writing speed and size
+python bench/recordings.py --long       memory and bytes per step of live runs of 10^4 and 10^5 steps
+python bench/recordings.py --open       time to open in the page's Rerun viewer, in Chromium
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from served import serving
 from subject import NAMES, STEPS, Row
 
 from beliefscope.inspect.likelihood import MapEngine
-from beliefscope.inspect.trace import begin
+from beliefscope.inspect.traces.run import start_run
 from beliefscope.recordings.live import LiveRecorder
 from beliefscope.recordings.write import write_recording
 
 STRIDE = 4
 MAPS = 400
-"""Steps with maps where speed is measured. The others of that recording have none, but their time counts as well."""
+"""Steps with maps in the speed measurement; the time includes the other steps of the recording."""
 
 LONG = (10_000, 100_000)
 
@@ -45,15 +45,15 @@ def measure() -> list[Row]:
             traced = subject.traced(name)
             engine = MapEngine(subject.checkpoint(name), traced)
             write_recording(traced, path)
-            took = median(subject.seconds(lambda t=traced: write_recording(t, path)) for _ in range(5))
+            duration = median(subject.seconds(lambda t=traced: write_recording(t, path)) for _ in range(5))
             size = path.stat().st_size
-            what = f"{STEPS / took:.0f} steps/s, {size / 1e6:.1f} MB, {size / STEPS:.0f} B/step"
-            rows.append((f"{name}, without maps", what, ">= 2000 steps/s"))
+            figures = f"{STEPS / duration:.0f} steps/s, {size / 1e6:.1f} MB, {size / STEPS:.0f} B/step"
+            rows.append((f"{name}, without maps", figures, ">= 2000 steps/s"))
             maps = list(engine.maps(range(0, STEPS, STRIDE)))
-            every = [replace(one, step=step) for step, one in zip(range(MAPS), cycle(maps), strict=False)]
-            what = f"{MAPS / subject.seconds(lambda t=traced, m=every: write_recording(t, path, m)):.0f} steps/s"
+            every = [replace(m, step=step) for step, m in zip(range(MAPS), cycle(maps), strict=False)]
+            figures = f"{MAPS / subject.seconds(lambda t=traced, m=every: write_recording(t, path, m)):.0f} steps/s"
             rows.append(
-                (f"{name}, {len(maps[0].layers)} maps of 135 x 135 a step, made before", what, ">= 200 steps/s")
+                (f"{name}, {len(maps[0].layers)} maps of 135 x 135 per step, precomputed", figures, ">= 200 steps/s")
             )
             write_recording(traced, path, maps)
             size = path.stat().st_size
@@ -63,50 +63,53 @@ def measure() -> list[Row]:
 
 @torch.no_grad()
 def live(name: str, steps: int, folder: Path) -> dict[str, float]:
-    """A live run of so many steps: the first 100 of the subject's over and over, so that only recording is measured."""
+    """A live run of the given number of steps, repeating 100 precomputed steps so that only recording is measured."""
     episode, checkpoint = subject.episode(), subject.checkpoint(name)
-    run = begin(checkpoint, episode, 0, 0, 300, subject.traced(name).faults)
+    run = start_run(checkpoint, episode, 0, 0, 300, subject.traced(name).faults)
     generator, filter_ = run.generator(), checkpoint.filter
-    belief, taken = filter_.start(run.start, 300, generator), []
+    belief, precomputed = filter_.start(run.start, 300, generator), []
     for t in range(100):
-        belief, known = filter_.step(belief, run.evidence[t], generator)
-        taken.append((known, {key: array[t] for key, array in episode.observations.items()}, run.evidence[t]))
-    began = time.perf_counter()
-    with LiveRecorder("long", checkpoint, folder=folder, start=run.start, like=episode, **run.given) as recorder:
+        belief, step_trace = filter_.step(belief, run.evidence[t], generator)
+        precomputed.append(
+            (step_trace, {key: array[t] for key, array in episode.observations.items()}, run.evidence[t])
+        )
+    start = time.perf_counter()
+    with LiveRecorder("long", checkpoint, folder=folder, start=run.start, like=episode, **run.provenance) as recorder:
         for t in range(steps):
-            known, seen, evidence = taken[t % 100]
-            recorder.step(known, seen, episode.controls[t % 100], truth=episode.states[t % 100], evidence=evidence)
-        stepped = time.perf_counter() - began
-    took = time.perf_counter() - began
+            step_trace, observations, evidence = precomputed[t % 100]
+            control, truth = episode.controls[t % 100], episode.states[t % 100]
+            recorder.step(step_trace, observations, control, truth=truth, evidence=evidence)
+        step_seconds = time.perf_counter() - start
+    duration = time.perf_counter() - start
     return {
         "rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "live": recorder.path.stat().st_size / steps,
         "rrd": recorder.path.with_suffix(".rrd").stat().st_size / steps,
-        "rate": steps / took,
-        "step_rate": steps / stepped,
+        "rate": steps / duration,
+        "step_rate": steps / step_seconds,
         "waited": recorder.waited,
         "behind": recorder.behind,
     }
 
 
 def long(names: tuple[str, ...] = NAMES) -> None:
-    """Each run in a process of its own: peak memory is a process's."""
+    """Each run in a subprocess, for its own peak memory."""
     for name in names:
         for steps in LONG:
             with tempfile.TemporaryDirectory() as folder:
                 command = [sys.executable, __file__, "--one", name, str(steps), folder]
-                found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+                result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
             print(
-                f"{name}, {steps} steps: peak {found['rss_mb']:.0f} MB, {found['live']:.0f} B/step in the .live file, "
-                f"{found['rrd']:.0f} B/step in the recording; {found['step_rate']:.0f} steps/s taken, "
-                f"{found['rate']:.0f} steps/s to the end; {found['waited']:.0f} waited for the disk, "
-                f"views at most {found['behind']:.0f} steps behind",
+                f"{name}, {steps} steps: peak {result['rss_mb']:.0f} MB, {result['live']:.0f} B/step in the .live, "
+                f"{result['rrd']:.0f} B/step in the recording; {result['step_rate']:.0f} steps/s accepted, "
+                f"{result['rate']:.0f} steps/s written; {result['waited']:.0f} waits for the disk, "
+                f"views at most {result['behind']:.0f} steps behind",
                 flush=True,
             )
 
 
-def opened() -> None:
-    """Prints how long the page's viewer, once started, takes to open an 800-step recording with maps."""
+def measure_opening() -> None:
+    """Print the time the started viewer of the page takes to open an 800-step recording with maps."""
     name = "crossmodal-pf"
     traced = subject.traced(name)
     with tempfile.TemporaryDirectory() as folder, serving() as served, browsing() as page:
@@ -115,19 +118,19 @@ def opened() -> None:
         page.goto(f"{served.url}?data=sample&tab=rerun")
         page.wait_for_function("() => document.querySelector('#rerun')?.dataset.state === 'ready'", timeout=300_000)
         page.route("**/run.rrd*", lambda route: route.fulfill(path=path, content_type="application/octet-stream"))
-        shown = ", ".join(f"{page.evaluate(OPEN, number):.2f}" for number in range(3))
-        print(f"{name}, {STEPS} steps, maps every {STRIDE}, {path.stat().st_size / 1e6:.1f} MB: open after {shown} s")
+        times = ", ".join(f"{page.evaluate(OPEN, number):.2f}" for number in range(3))
+        print(f"{name}, {STEPS} steps, maps every {STRIDE}, {path.stat().st_size / 1e6:.1f} MB: open after {times} s")
 
 
 OPEN = """async (number) => {
-  const began = performance.now();
+  const start = performance.now();
   beliefscope.rerun.files([{ name: 'run', url: `/run.rrd?${number}` }]);
   do await new Promise(requestAnimationFrame);
   while (document.querySelector('#rerun').dataset.state === 'loading');
-  if (document.querySelector('#rerun').dataset.state !== 'ready') throw new Error('it does not open');
-  return (performance.now() - began) / 1000;
+  if (document.querySelector('#rerun').dataset.state !== 'ready') throw new Error('the recording did not open');
+  return (performance.now() - start) / 1000;
 }"""
-"""s until the viewer has opened the file and drawn a frame."""
+"""Seconds until the viewer has opened the file and drawn a frame."""
 
 
 if __name__ == "__main__":
@@ -135,13 +138,13 @@ if __name__ == "__main__":
     parser.add_argument("--long", action="store_true")
     parser.add_argument("--open", action="store_true")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
+    args = parser.parse_args()
     torch.set_num_threads(1)
-    if asked.one:
-        print(json.dumps(live(asked.one[0], int(asked.one[1]), Path(asked.one[2]))))
-    elif asked.long:
+    if args.one:
+        print(json.dumps(live(args.one[0], int(args.one[1]), Path(args.one[2]))))
+    elif args.long:
         long()
-    elif asked.open:
-        opened()
+    elif args.open:
+        measure_opening()
     else:
         parser.print_help()

@@ -1,7 +1,7 @@
-"""Everything that is timed, in one run: ``python bench/run.py [part ...]``, parts as named below; all by default.
+"""All speed measurements: ``python bench/run.py [part ...]``; default: all parts.
 
-Times on a busy machine wander; what is to be compared stands in one run, and ratios are taken between turns that
-alternate. Nothing here is asserted: the figures are for reading.
+Times vary with other load: compare values of one run only. Ratios are measured between alternating repetitions.
+Nothing is asserted.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ PARTS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="part", help=f"some of: {', '.join(PARTS)}")
-    wanted = parser.parse_args().parts or list(PARTS)
-    unknown = set(wanted) - PARTS.keys()
+    parser.add_argument("parts", nargs="*", metavar="part", help=f"any of: {', '.join(PARTS)}")
+    parts = parser.parse_args().parts or list(PARTS)
+    unknown = set(parts) - PARTS.keys()
     if unknown:
         parser.error(f"part {min(unknown)!r} does not exist. Available: {', '.join(PARTS)}")
     console = Console(width=100)
@@ -47,10 +47,10 @@ def main() -> None:
         f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, "
         f"Python {platform.python_version()}, torch {torch.__version__} on {torch.get_num_threads()} threads"
     )
-    for part in wanted:
-        table = Table("what", "measured", "bar", title=part, title_justify="left", min_width=90)
-        for what, measured, bar in PARTS[part]():
-            table.add_row(what, measured, bar)
+    for part in parts:
+        table = Table("quantity", "measured", "required", title=part, title_justify="left", min_width=90)
+        for quantity, measured, bar in PARTS[part]():
+            table.add_row(quantity, measured, bar)
         console.print(table)
         sys.stdout.flush()
 

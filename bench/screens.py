@@ -1,4 +1,4 @@
-"""Screenshots of every view of the page, to be looked at: several sizes, light and dark, what ships under long names.
+"""Screenshots of every view of the page in several sizes, light and dark, with long file names.
 
 python bench/screens.py FOLDER
 python bench/screens.py FOLDER --view study --view keys --size 1024x768 --theme dark
@@ -23,23 +23,23 @@ SIZES = ("1024x768", "1440x900", "3840x2160")
 THEMES = ("light", "dark")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 LONG = "a-filter-trained-on-the-third-floor-with-the-new-camera-v12b"
-PATIENCE = 120_000  # ms
-REST = 1200  # ms until what moves has come to rest
+TIMEOUT = 120_000  # ms
+SETTLE = 1200  # ms for animations to end
 
 BAD = "?task=door&episode=4711&faults=blakout%3D0.4&filter=crossmodal-fp"
-"""A link that asks for what is not there."""
+"""A link to a selection that does not exist."""
 
 
 def tab(name: str, ready: str = "true", press: str = "") -> Callable[[Page], None]:
-    """Shows a tab, presses the button of that name where it is there, and waits."""
+    """Return a function that opens a tab, presses the named button if visible, and waits."""
 
     def show(page: Page) -> None:
         page.evaluate(f"document.querySelector('#tab-{name}').click()")
-        page.wait_for_timeout(REST)
+        page.wait_for_timeout(SETTLE)
         button = page.locator(f"#{name}").get_by_role("button", name=press, exact=True)
         if press and button.count() and button.first.is_visible():
             button.first.click()
-        page.wait_for_function(f"() => {ready}", timeout=PATIENCE)
+        page.wait_for_function(f"() => {ready}", timeout=TIMEOUT)
 
     return show
 
@@ -54,7 +54,7 @@ def state(panel: str) -> str:
 
 VIEWS: dict[str, Callable[[Page], None]] = {
     "failures": tab("failures", state("#failures"), "Look for failures"),
-    "compare": tab("compare", state("#compare .result"), "Run beside"),
+    "compare": tab("compare", state("#compare .result"), "Compare"),
     "study": tab("study", state("#study")),
     "rerun": tab("rerun", "['ready', 'error'].includes(document.querySelector('#rerun').dataset.state)"),
     "layers": tab("scene", state("#scene"), "Layers…"),
@@ -63,11 +63,11 @@ VIEWS: dict[str, Callable[[Page], None]] = {
     "keys": click("#help"),
     "jobs": click("#jobs-button"),
 }
-"""How a view is come to, beyond its tab; every tab is a view."""
+"""View -> function that opens it; every tab is a view as well."""
 
 
 def close(page: Page) -> None:
-    """Puts away what lies over the page."""
+    """Close dialogs and popovers."""
     page.evaluate(
         "() => { document.querySelector('dialog[open]')?.close();"
         " document.querySelector('[popover]:popover-open')?.hidePopover();"
@@ -75,23 +75,25 @@ def close(page: Page) -> None:
     )
 
 
-def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, wanted: list[str]) -> None:
+def shoot(browser: Any, url: str, folder: Path, size: str, theme: str, views: list[str]) -> None:
     width, height = map(int, size.split("x"))
     page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=theme)
-    page.goto(f"{url}?step=40", timeout=PATIENCE)
-    page.wait_for_function("() => window.beliefscope?.stats.maps?.size === 135", timeout=PATIENCE)
-    tabs = [one.removeprefix("tab-") for one in page.eval_on_selector_all("[role=tab]", "all => all.map((t) => t.id)")]
+    page.goto(f"{url}?step=40", timeout=TIMEOUT)
+    page.wait_for_function("() => window.beliefscope?.stats.maps?.size === 135", timeout=TIMEOUT)
+    tabs = [
+        name.removeprefix("tab-") for name in page.eval_on_selector_all("[role=tab]", "all => all.map((t) => t.id)")
+    ]
     for name in [*tabs, *(name for name in VIEWS if name not in tabs)]:
-        if wanted and name not in wanted:
+        if views and name not in views:
             continue
         VIEWS.get(name, tab(name))(page)
-        page.wait_for_timeout(REST)
-        page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=PATIENCE)
+        page.wait_for_timeout(SETTLE)
+        page.screenshot(path=folder / f"{name}-{size}-{theme}.png", timeout=TIMEOUT)
         close(page)
-    if not wanted or "bad-link" in wanted:
-        page.goto(url + BAD, timeout=PATIENCE)
-        page.wait_for_timeout(2 * REST)
-        page.screenshot(path=folder / f"bad-link-{size}-{theme}.png", timeout=PATIENCE)
+    if not views or "bad-link" in views:
+        page.goto(url + BAD, timeout=TIMEOUT)
+        page.wait_for_timeout(2 * SETTLE)
+        page.screenshot(path=folder / f"bad-link-{size}-{theme}.png", timeout=TIMEOUT)
     page.close()
 
 
@@ -101,24 +103,24 @@ def main() -> None:
     parser.add_argument("--view", action="append", default=[], help="a tab or one of " + ", ".join(VIEWS))
     parser.add_argument("--size", action="append", choices=SIZES)
     parser.add_argument("--theme", action="append", choices=THEMES)
-    parser.add_argument("--url", help="of a server that runs already")
-    asked = parser.parse_args()
-    asked.folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as given, sync_playwright() as playwright:
+    parser.add_argument("--url", help="of a running server")
+    args = parser.parse_args()
+    args.folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as files, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
 
-        def all_of(url: str) -> None:
-            for size in asked.size or SIZES:
-                for theme in asked.theme or THEMES:
-                    shoot(browser, url, asked.folder, size, theme, asked.view)
+        def shoot_all(url: str) -> None:
+            for size in args.size or SIZES:
+                for theme in args.theme or THEMES:
+                    shoot(browser, url, args.folder, size, theme, args.view)
 
-        if asked.url:
-            all_of(asked.url)
+        if args.url:
+            shoot_all(args.url)
             return
-        filter_ = shutil.copy(shipped("door", "crossmodal-pf"), Path(given) / f"{LONG}.safetensors")
-        data = shutil.copy(sample_path("door"), Path(given) / f"{LONG.replace('filter', 'set-of-doors')}.h5")
+        filter_ = shutil.copy(shipped("door", "crossmodal-pf"), Path(files) / f"{LONG}.safetensors")
+        data = shutil.copy(sample_path("door"), Path(files) / f"{LONG.replace('filter', 'set-of-doors')}.h5")
         with serving("--filter", str(filter_), "--data", str(data)) as server:
-            all_of(server.url)
+            shoot_all(server.url)
 
 
 if __name__ == "__main__":

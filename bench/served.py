@@ -1,4 +1,4 @@
-"""The server as a process of its own, as users start it, and what it takes: memory, descriptors, threads, processor."""
+"""The server in a separate process, with its memory, descriptors, threads and CPU time."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Served:
-    """A server that listens. Its figures are read from ``/proc``, so on Linux only."""
+    """A listening server. Its resources are read from ``/proc``, on Linux only."""
 
     url: str
     process: subprocess.Popen[str]
 
     @property
     def memory(self) -> float:
-        """Resident, MB."""
+        """Resident memory, MB."""
         return self._status("VmRSS") / 1e3
 
     @property
@@ -34,8 +34,8 @@ class Served:
         return len(os.listdir(f"/proc/{self.process.pid}/fd"))
 
     @property
-    def processor(self) -> float:
-        """s of processor time that it has had, its jobs left out."""
+    def cpu(self) -> float:
+        """CPU time of the server without its jobs, s."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -45,22 +45,22 @@ class Served:
 
 
 @contextmanager
-def serving(*more: str, workspace: Path | None = None) -> Iterator[Served]:
-    """The installed command on a free port, until the block ends; what it says on stderr goes to ours.
+def serving(*options: str, workspace: Path | None = None) -> Iterator[Served]:
+    """Run the installed command on a free port; stderr is inherited.
 
     Args:
-        more: options of ``beliefscope serve``. workspace: a new one that is thrown away, if None.
+        options: of ``beliefscope serve``. workspace: default: a temporary one.
     """
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "beliefscope", "serve", "--port", "0", "--no-open"]
-        command += ["--workspace", str(workspace or folder), *more]
+        command += ["--workspace", str(workspace or folder), *options]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         try:
             assert process.stdout is not None
-            found = re.search(r"http://\S+", process.stdout.readline())
-            if found is None:
+            match = re.search(r"http://\S+", process.stdout.readline())
+            if match is None:
                 raise RuntimeError("the server ended before it listened")
-            yield Served(found[0], process)
+            yield Served(match[0], process)
         finally:
             process.terminate()
             process.wait(timeout=30)

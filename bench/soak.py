@@ -1,10 +1,10 @@
-"""Hours of use at a low rate, and whether the server's memory and descriptors stay flat.
+"""Hours of use at a low rate: growth of the server's memory and descriptors.
 
     python bench/soak.py --hours 2 --out soak.csv
 
-A few raw browsers select random filters, episodes and faults, scrub, rest, record, ask for jobs and cancel them, and
-leave, politely or not. Every 10 s a line of the CSV tells what the server takes. At the end straight lines are fitted
-to what came after the warm-up.
+A few simulated browsers select random filters, episodes and faults, scrub, rest, record, start and cancel jobs, and
+close their connections or abort them. Every 10 s the server's resources are added to the CSV. At the end straight
+lines are fitted to the samples after the warm-up.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ import numpy as np
 from browsers import Browser, Selection, trace_path
 from served import Served, serving
 
-EVERY = 10.0  # s between two samples
-WARM_UP = 0.25  # of the time
+EVERY = 10.0  # s between samples
+WARM_UP = 0.25  # fraction of the time
 BLOCKS = 10
-COLUMNS = ("hours", "memory_mb", "descriptors", "threads", "views", "processor_s", "scrubs", "p50_ms", "p95_ms", "done")
+COLUMNS = ("hours", "memory_mb", "descriptors", "threads", "views", "cpu_s", "scrubs", "p50_ms", "p95_ms", "actions")
 
 
 class Soak:
-    """The browsers and what they have met.
+    """The browsers, their actions and errors.
 
     Args:
-        rest: mean s that a hand rests between two things it does.
+        rest: mean s between two actions.
     """
 
     def __init__(self, served: Served, rest: float, seed: int) -> None:
         self.served = served
         self.rest = rest
         self.random = random.Random(seed)
-        self.done: dict[str, int] = {}
-        self.wrong: list[str] = []
+        self.actions: dict[str, int] = {}
+        self.errors: list[str] = []
         self.views = 0
         self.browsers: list[Browser] = []
         self.catalog: dict[str, Any] = {}
@@ -54,36 +54,36 @@ class Soak:
             entries = (await http.get("/api/diagnostics")).json()
             self.quick = [entry["name"] for entry in entries if not entry["slow"]]
             self.slow = [entry["name"] for entry in entries if entry["slow"]]
-        living = [asyncio.create_task(self._live()) for _ in range(browsers)]
+        tasks = [asyncio.create_task(self._browse()) for _ in range(browsers)]
         rows = []
-        began = time.monotonic()
+        start = time.monotonic()
         try:
             with out.open("w", newline="") as file:
                 writer = csv.writer(file)
                 writer.writerow(COLUMNS)
-                while (passed := time.monotonic() - began) < 3600 * hours:
+                while (passed := time.monotonic() - start) < 3600 * hours:
                     rows.append(self._sample(passed / 3600))
                     writer.writerow([f"{value:.4g}" if isinstance(value, float) else value for value in rows[-1]])
                     file.flush()
                     await asyncio.sleep(EVERY)
         finally:
-            for task in living:
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(*living, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
         return np.array(rows, dtype=float)
 
     def _sample(self, hours: float) -> tuple[float, ...]:
-        took = [t for browser in self.browsers for t in browser.scrubs]
+        latencies = [t for browser in self.browsers for t in browser.scrubs]
         for browser in self.browsers:
             browser.scrubs.clear()
             browser.scenes.clear()
-        p50, p95 = 1e3 * np.percentile(took, [50, 95]) if took else (np.nan, np.nan)
-        served, done = self.served, sum(self.done.values())
-        use = (served.memory, served.descriptors, served.threads, self.views, served.processor)
-        return (hours, *use, len(took), float(p50), float(p95), done)
+        p50, p95 = 1e3 * np.percentile(latencies, [50, 95]) if latencies else (np.nan, np.nan)
+        served, actions = self.served, sum(self.actions.values())
+        use = (served.memory, served.descriptors, served.threads, self.views, served.cpu)
+        return (hours, *use, len(latencies), float(p50), float(p95), actions)
 
-    async def _live(self) -> None:
-        """One person, who comes and goes."""
+    async def _browse(self) -> None:
+        """Open and close pages in one browser."""
         browser = Browser(self.served.url)
         self.browsers.append(browser)
         try:
@@ -98,7 +98,7 @@ class Soak:
         self.views += 1
         try:
             for _ in range(self.random.randint(1, 3)):
-                await self._look(browser)
+                await self._inspect(browser)
                 await self._pause()
         finally:
             vanish = self.random.random() < 0.3
@@ -106,49 +106,51 @@ class Soak:
             self.views -= 1
             await browser.close(vanish)
 
-    async def _look(self, browser: Browser) -> None:
+    async def _inspect(self, browser: Browser) -> None:
         selection = self._any()
         steps = await browser.load(selection)
-        self._count("looked")
+        self._count("selected")
         for _ in range(self.random.randint(1, 4)):
-            at = self.random.randrange(steps)
-            far = self.random.choice((-1, 1)) * self.random.randint(1, 3)
-            path = [min(max(at + far * i, 0), steps - 1) for i in range(self.random.randint(3, 20))]
+            position = self.random.randrange(steps)
+            stride = self.random.choice((-1, 1)) * self.random.randint(1, 3)
+            path = [min(max(position + stride * i, 0), steps - 1) for i in range(self.random.randint(3, 20))]
             await browser.drag(selection, path, rate=self.random.choice((3.0, 5.0)))
             self._count("dragged")
             await self._pause(0.3)
-        what = self.random.random()
-        where = trace_path(selection)[0].removeprefix("/api/trace")
+        choice = self.random.random()
+        route = trace_path(selection)[0].removeprefix("/api/trace")
         query = trace_path(selection)[1]
-        if what < 0.3:
+        if choice < 0.3:
             name = self.random.choice(self.quick)
-            await self._may(browser, "diagnosed", "GET", f"/api/diagnostics/{name}{where}", params=query)
-        elif what < 0.4:
+            await self._request(browser, "diagnosed", "GET", f"/api/diagnostics/{name}{route}", params=query)
+        elif choice < 0.4:
             body = {**selection, "maps": 50}
-            await self._may(browser, "recorded", "POST", "/api/recordings", json=body)
-        elif what < 0.44:
+            await self._request(browser, "recorded", "POST", "/api/recordings", json=body)
+        elif choice < 0.44:
             name = self.random.choice(self.slow)
-            await self._job(browser, f"/api/diagnostics/{name}{where}", query)
-        elif what < 0.46:
-            await self._job(browser, f"/api/reports{where}", query)
-        elif what < 0.6:
-            await self._may(browser, "listed", "GET", self.random.choice(("/", "/api/catalog", "/api/jobs")))
+            await self._job(browser, f"/api/diagnostics/{name}{route}", query)
+        elif choice < 0.46:
+            await self._job(browser, f"/api/reports{route}", query)
+        elif choice < 0.6:
+            await self._request(browser, "listed", "GET", self.random.choice(("/", "/api/catalog", "/api/jobs")))
 
     async def _job(self, browser: Browser, path: str, query: dict[str, str]) -> None:
-        job = (await self._may(browser, "submitted", "POST", path, params=query) or {}).get("job")
+        job = (await self._request(browser, "submitted", "POST", path, params=query) or {}).get("job")
         if job and self.random.random() < 0.5:
             await self._pause(0.2)
-            await self._may(browser, "cancelled", "DELETE", f"/api/jobs/{job['id']}")
+            await self._request(browser, "cancelled", "DELETE", f"/api/jobs/{job['id']}")
 
-    async def _may(self, browser: Browser, what: str, method: str, path: str, **more: Any) -> dict[str, Any] | None:
-        """Asks for what may be refused (409: it does not apply; 404: forgotten meanwhile)."""
-        answer = await browser.http.request(method, path, **more)
+    async def _request(
+        self, browser: Browser, action: str, method: str, path: str, **options: Any
+    ) -> dict[str, Any] | None:
+        """Send a request that may be refused (409: not applicable; 404: deleted)."""
+        answer = await browser.http.request(method, path, **options)
         if answer.status_code >= 500:
             raise RuntimeError(f"{method} {path}: {answer.status_code} {answer.text[:200]}")
-        self._count(what if answer.status_code < 400 else "refused")
+        self._count(action if answer.status_code < 400 else "refused")
         kind = answer.headers.get("content-type", "")
-        found = answer.json() if kind.startswith("application/json") else None
-        return found if isinstance(found, dict) else None
+        document = answer.json() if kind.startswith("application/json") else None
+        return document if isinstance(document, dict) else None
 
     def _any(self) -> Selection:
         task = self.random.choice(self.catalog["tasks"])
@@ -162,24 +164,24 @@ class Soak:
             "faults": self.random.choice(fault_sets),
         }
 
-    async def _guarded(self, doing: Any) -> None:
+    async def _guarded(self, action: Any) -> None:
         try:
-            await doing
+            await action
         except asyncio.CancelledError:
             raise
         except Exception as error:
-            self.wrong.append(f"{type(error).__name__}: {error}")
-            print(f"wrong: {self.wrong[-1]}", file=sys.stderr, flush=True)
+            self.errors.append(f"{type(error).__name__}: {error}")
+            print(f"error: {self.errors[-1]}", file=sys.stderr, flush=True)
 
     async def _pause(self, share: float = 1.0) -> None:
         await asyncio.sleep(share * self.rest * self.random.expovariate(1.0))
 
-    def _count(self, what: str) -> None:
-        self.done[what] = self.done.get(what, 0) + 1
+    def _count(self, action: str) -> None:
+        self.actions[action] = self.actions.get(action, 0) + 1
 
 
 def slope(hours: np.ndarray[Any, Any], values: np.ndarray[Any, Any]) -> tuple[float, float]:
-    """Of a straight line, by hour, and half of its 95 % interval; blocks of time are taken for independent."""
+    """Slope per hour, and half of its 95 % interval, assuming independent blocks of time."""
     parts = [np.array_split(column, BLOCKS) for column in (hours, values)]
     x, y = ([float(np.mean(block)) for block in blocks] for blocks in parts)
     (rise, _), covariance = np.polyfit(x, y, 1, cov=True)
@@ -190,26 +192,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, default=2.0)
     parser.add_argument("--browsers", type=int, default=4)
-    parser.add_argument("--rest", type=float, default=8.0, help="mean s between two things that a hand does")
+    parser.add_argument("--rest", type=float, default=8.0, help="mean s between two actions")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("soak.csv"))
-    asked = parser.parse_args()
+    args = parser.parse_args()
     with serving() as served:
-        soak = Soak(served, asked.rest, asked.seed)
-        rows = asyncio.run(soak.run(asked.browsers, asked.hours, asked.out))
+        soak = Soak(served, args.rest, args.seed)
+        rows = asyncio.run(soak.run(args.browsers, args.hours, args.out))
         served.process.terminate()
         code = served.process.wait(30)
     settled = rows[rows[:, 0] >= WARM_UP * rows[-1, 0]]
-    print(f"{asked.browsers} browsers, {rows[-1, 0]:.2f} h: {soak.done}; wrong: {len(soak.wrong)}; exit code {code}")
+    print(
+        f"{args.browsers} browsers, {rows[-1, 0]:.2f} h: {soak.actions}; errors: {len(soak.errors)}; exit code {code}"
+    )
     for name, unit in (("memory_mb", "MB"), ("descriptors", ""), ("threads", ""), ("p95_ms", "ms")):
         column = COLUMNS.index(name)
-        there = np.isfinite(settled[:, column])
-        enough = there.sum() >= 3 * BLOCKS
-        rise, width = slope(*settled[there][:, [0, column]].T) if enough else (np.nan, np.nan)
-        first, last = settled[there][0, column], float(np.nanmedian(settled[-30:, column]))
-        line = f"{rise:+.2f} ± {width:.2f} {unit} an hour"
-        print(f"{name}: after the warm-up {first:.0f}, at last {last:.0f} {unit}; {line}")
-    print(f"processor: {(rows[-1, 5] - rows[0, 5]) / (36 * (rows[-1, 0] - rows[0, 0])):.1f} % of a core")
+        valid = np.isfinite(settled[:, column])
+        enough = valid.sum() >= 3 * BLOCKS
+        rise, width = slope(*settled[valid][:, [0, column]].T) if enough else (np.nan, np.nan)
+        first, last = settled[valid][0, column], float(np.nanmedian(settled[-30:, column]))
+        line = f"{rise:+.2f} ± {width:.2f} {unit} per hour"
+        print(f"{name}: after the warm-up {first:.0f}, at the end {last:.0f} {unit}; {line}")
+    print(f"CPU: {(rows[-1, 5] - rows[0, 5]) / (36 * (rows[-1, 0] - rows[0, 0])):.1f} % of a core")
 
 
 if __name__ == "__main__":

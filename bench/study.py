@@ -1,4 +1,4 @@
-"""Holds a study's results against what is expected of the filters, as a Markdown table.
+"""Compare the results of a study with expectations, as a Markdown table.
 
 python bench/study.py filters/pretrained/study.json
 """
@@ -12,40 +12,44 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.filters.training.study import TRIVIAL
+from beliefscope.filters.training.study_table import TRIVIAL
 
 TIMES_BETTER = 5.0
-"""Than the training mean, for what fuses, on the place and with whole pictures."""
+"""Than the training mean: required position error of fusing filters on clean data."""
 
 SHARE_BETTER = 0.2
-"""Than the picture alone, for crossmodal filters, on what moves, with 80 % black pictures."""
+"""Than the image-only filter: required error of crossmodal filters in the moving components, 80 % image blackout."""
 
 TIMES_WORSE = 2.0
-"""Than the best filter, for the LSTM."""
+"""Than the best filter: allowed error of the LSTM."""
 
 
 def main(path: Path) -> None:
     study = json.loads(path.read_text())
     rows = [row for row in study["rows"] if row["seeds"] or row["filter"] == TRIVIAL]
-    print("| task | what is expected | filter | black pictures | expected | measured | |")
+    print("| task | expectation | filter | image blackout | bound | measured | met |")
     print("| --- | --- | --- | ---: | ---: | ---: | --- |")
     for task in dict.fromkeys(row["task"] for row in rows):
         errors = {(row["filter"], row["blackout"]): row["mean"] for row in rows if row["task"] == task}
-        alone = {(row["filter"], row["blackout"]): row.get("alone", {}) for row in rows if row["task"] == task}
+        alone = {
+            (row["filter"], row["blackout"]): row.get("standalone", row.get("alone", {}))
+            for row in rows
+            if row["task"] == task
+        }
         spread = {(row["filter"], row["blackout"]): row["spread"] for row in rows if row["task"] == task}
-        for what, key, name, blackout, bar in expectations(task, errors, alone):
+        for expectation, key, name, blackout, bar in expectations(task, errors, alone):
             measured = errors[name, blackout][key]
-            luck = spread[name, blackout].get(key) or 0.0
-            verdict = "yes" if measured <= bar else "within the spread" if measured - luck <= bar else "**no**"
+            deviation = spread[name, blackout].get(key) or 0.0
+            verdict = "yes" if measured <= bar else "within one std" if measured - deviation <= bar else "**no**"
             print(
-                f"| {task} | {shown(key)}, {what} | {name} | {blackout:.0%} | <= {bar:.3f} "
-                f"| {measured:.3f} ± {luck:.3f} | {verdict} |"
+                f"| {task} | {label(key)}, {expectation} | {name} | {blackout:.0%} | <= {bar:.3f} "
+                f"| {measured:.3f} ± {deviation:.3f} | {verdict} |"
             )
 
 
 Errors = dict[tuple[str, float | None], dict[str, Any]]
 Expectation = tuple[str, str, str, float, float]
-"""What, of which error, filter, chance of a black picture, the highest error that is well."""
+"""Expectation, metric, filter, image blackout, largest allowed error."""
 
 
 def expectations(task: str, errors: Errors, alone: Errors) -> Iterator[Expectation]:
@@ -59,10 +63,10 @@ def expectations(task: str, errors: Errors, alone: Errors) -> Iterator[Expectati
         image = "image-pf" if name.endswith("pf") else "image-ekf"
         for blackout in (0.0, 0.4, 0.8):
             for key in ("position_cm", *angles):
-                best = min(of_one[key] for of_one in alone[name, blackout].values())
-                yield "no worse than the better of its modalities", key, name, blackout, best
+                best = min(metrics[key] for metrics in alone[name, blackout].values())
+                yield "no worse than its better modality", key, name, blackout, best
         if (image, 0.8) in errors:
-            for key in angles or ["position_cm"]:  # what moves
+            for key in angles or ["position_cm"]:  # the moving components
                 bar = (1.0 - SHARE_BETTER) * errors[image, 0.8][key]
                 yield f"{SHARE_BETTER:.0%} better than {image}", key, name, 0.8, bar
     if "lstm" in names:
@@ -71,7 +75,7 @@ def expectations(task: str, errors: Errors, alone: Errors) -> Iterator[Expectati
             yield f"within {TIMES_WORSE:g} x of the best filter", key, "lstm", 0.0, TIMES_WORSE * best
 
 
-def shown(key: str) -> str:
+def label(key: str) -> str:
     name, unit = key.rsplit("_", 1)
     return f"{name} ({unit})"
 

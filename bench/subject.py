@@ -1,4 +1,4 @@
-"""What is timed: the shipped filters on one simulated door episode of 800 steps."""
+"""Benchmark subject: the shipped filters on one simulated door episode of 800 steps."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ STEPS = 800
 NAMES = ("crossmodal-ekf", "crossmodal-pf")
 
 Row = tuple[str, str, str]
-"""What, its figure, its bar."""
+"""Quantity, measured value, requirement."""
 
 
 @cache
 def episode() -> Episode:
-    """The episode of seed 1, index 1: a push, which makes and breaks contact."""
+    """The episode of seed 1, index 1: a push with contact and free motion."""
     simulate = find_task("door").simulate
     assert simulate is not None
     return simulate(1, 1, STEPS)
@@ -43,8 +43,10 @@ def seconds(function: Callable[[], object]) -> float:
     return time.perf_counter() - began
 
 
-def in_turn(first: Callable[[], object], second: Callable[[], object], turns: int) -> tuple[float, float, float]:
-    """Median seconds of both, run in turn after one warm-up each, and the median of second / first pair by pair."""
+def alternate(
+    first: Callable[[], object], second: Callable[[], object], repetitions: int
+) -> tuple[float, float, float]:
+    """Median seconds of both, run alternately after a warm-up, and the median ratio second / first of the pairs."""
     first(), second()
-    pairs = [(seconds(first), seconds(second)) for _ in range(turns)]
+    pairs = [(seconds(first), seconds(second)) for _ in range(repetitions)]
     return median(a for a, _ in pairs), median(b for _, b in pairs), median(b / a for a, b in pairs)

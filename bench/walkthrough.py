@@ -1,4 +1,4 @@
-"""The pictures of README.md and docs/walkthrough.md, and the sentences that the page shows in them.
+"""Take the screenshots of README.md and docs/walkthrough.md, and print the verdicts in them.
 
 python bench/walkthrough.py [FOLDER]    # docs/images by default; needs Chromium and the package's [dev] extra
 """
@@ -17,21 +17,21 @@ from page import FLAGS, serving
 from playwright.sync_api import Page, sync_playwright
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
-MOMENT = {"task": "push", "filter": "crossmodal-ekf", "episode": 79, "step": 68, "component": "x"}
+SELECTION = {"task": "push", "filter": "crossmodal-ekf", "episode": 79, "step": 68, "component": "x"}
 SIZE = {"width": 1440, "height": 900}
-SETTLING = 10.0  # s: drawn without a graphics card, the scene fades in slowly
-PATIENCE = 300.0  # s: integrated gradients take a while on a busy processor
+SETTLING = 10.0  # s: software rendering of the scene is slow
+TIMEOUT = 300.0  # s: integrated gradients are slow on a busy machine
 
-FAULT_PRESETS = "#diagnostics article[data-state=ready] > .verdict"
+READY = "#diagnostics article[data-state=ready] > .verdict"
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture: the page's address beside the moment's, the button to be pressed, where its sentence stands."""
+    """One screenshot: URL parameters added to the common selection, selector of the verdict, button to press."""
 
     name: str
-    asked: dict[str, Any]
-    says: str
+    parameters: dict[str, Any]
+    verdict: str
     press: str = ""
 
 
@@ -51,12 +51,12 @@ SHOTS = (
     ),
     Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Look for failures"),
     Shot("walkthrough-moment", {"tab": "scene"}, "#maps-pairs"),
-    Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, FAULT_PRESETS),
-    Shot("walkthrough-shapley", {"tab": "diagnostics", "diagnostic": "shapley"}, FAULT_PRESETS, "Compute"),
+    Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, READY),
+    Shot("walkthrough-shapley", {"tab": "diagnostics", "diagnostic": "shapley"}, READY, "Compute"),
     Shot(
         "walkthrough-saliency",
         {"tab": "diagnostics", "diagnostic": "saliency", "options": "step=68&target=beta:image"},
-        FAULT_PRESETS,
+        READY,
         "Compute",
     ),
     Shot("walkthrough-edit", {"tab": "compare", "against": "from=30&to=76&weights=haptics=0"}, "#compare .verdict"),
@@ -64,36 +64,37 @@ SHOTS = (
 
 
 def text(page: Page, selector: str) -> str:
-    """What stands there; empty while nothing does."""
-    found = page.locator(selector)
-    return (found.text_content() or "").strip() if found.count() else ""
+    """Text of an element; empty if it does not exist."""
+    element = page.locator(selector)
+    return (element.text_content() or "").strip() if element.count() else ""
 
 
 def take(page: Page, shot: Shot) -> str:
-    """Waits until the shot's sentence is there, pressing its button where it is offered; returns the sentence."""
-    end = time.monotonic() + PATIENCE
+    """Press the button if visible, wait for the verdict, and return it."""
+    end = time.monotonic() + TIMEOUT
     pressed = False
-    while not (said := text(page, shot.says)):
+    while not (verdict := text(page, shot.verdict)):
         button = page.locator(".doing:visible button", has_text=shot.press) if shot.press else None
         if button is not None and not pressed and button.count():
             button.first.click()
             pressed = True
         if time.monotonic() > end:
-            raise TimeoutError(f"{shot.name}: nothing in {shot.says} within {PATIENCE:g} s")
+            raise TimeoutError(f"{shot.name}: nothing in {shot.verdict} within {TIMEOUT:g} s")
         page.wait_for_timeout(200)
-    # The moment's own maps and scene come after what was waited for.
-    drawn = (
-        f"() => beliefscope.stats.maps?.size === 135 && beliefscope.stats.maps.step === {(MOMENT | shot.asked)['step']}"
+    # Maps and scene of the step may arrive after the verdict.
+    step = (SELECTION | shot.parameters)["step"]
+    ready = (
+        f"() => beliefscope.stats.maps?.size === 135 && beliefscope.stats.maps.step === {step}"
         " && (scene.offsetParent === null || scene.dataset.state === 'ready')"
     )
-    while not page.evaluate(drawn):
+    while not page.evaluate(ready):
         page.wait_for_timeout(200)
     page.wait_for_timeout(1000 * SETTLING)
-    return said
+    return verdict
 
 
 def main(folder: Path = IMAGES) -> None:
-    """Takes all pictures."""
+    """Take all screenshots."""
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         sys.exit("Chromium is not installed")
@@ -101,9 +102,9 @@ def main(folder: Path = IMAGES) -> None:
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         for shot in SHOTS:
             page = browser.new_page(viewport=SIZE, color_scheme="light")
-            page.goto(f"{server.url}?{urlencode(MOMENT | shot.asked)}", timeout=1000 * PATIENCE)
+            page.goto(f"{server.url}?{urlencode(SELECTION | shot.parameters)}", timeout=1000 * TIMEOUT)
             print(f"{shot.name}: {take(page, shot)}", flush=True)
-            page.screenshot(path=folder / f"{shot.name}.png", timeout=1000 * PATIENCE)
+            page.screenshot(path=folder / f"{shot.name}.png", timeout=1000 * TIMEOUT)
             page.close()
         browser.close()
 

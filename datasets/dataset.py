@@ -1,4 +1,4 @@
-"""A set of episodes of one task, whatever kind of file it lies in."""
+"""Interface of a dataset: episodes of one task, independent of the file format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SPLITS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class EpisodeSummary:
-    """What a list of episodes shows of one. ``contact_fraction`` is the share of its steps in contact."""
+    """Metadata of an episode. ``contact_fraction`` is its fraction of steps in contact."""
 
     index: int
     steps: int
@@ -28,27 +28,27 @@ class EpisodeSummary:
 
 
 class Dataset(ABC):
-    """``len``, ``[i]``, iteration; a context manager.
+    """Sequence of episodes and context manager.
 
     Attributes:
-        path: file or folder it was opened from. task: what it holds.
-        summaries: one ``EpisodeSummary`` an episode.
-        left_out: one line for each trajectory that could not be used, where leaving out was asked for.
+        path: source file or folder. task: task of the episodes.
+        summaries: one ``EpisodeSummary`` per episode.
+        skipped: one line per unusable trajectory, if skipping was requested.
     """
 
     path: Path
     task: Task
     summaries: tuple[EpisodeSummary, ...]
-    left_out: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
 
     @property
     @abstractmethod
     def hash(self) -> str:
-        """SHA-256 over the episodes' digests, the same however they are stored."""
+        """SHA-256 over the digests of the episodes, independent of the file format."""
 
     @abstractmethod
     def _episode(self, index: int) -> Episode:
-        """Episode of an index that exists; raises BadInput for what is wrong with it."""
+        """Read the episode at a valid index. Raises BadInput for invalid data."""
 
     def __len__(self) -> int:
         return len(self.summaries)
@@ -57,18 +57,18 @@ class Dataset(ABC):
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, index: int) -> Episode:
-        """One episode. Raises BadInput where there is none of that index, or something is wrong with it."""
+        """Read an episode. Raises BadInput for an index out of range or invalid data."""
         if not 0 <= index < len(self):
             raise BadInput(f"Episode {index} is not in {self.path}, which has episodes 0 to {len(self) - 1}.")
         return self._episode(index)
 
     def held_out(self) -> list[int]:
-        """Indices of the episodes kept for tests; where there are none, of those for validation; else of all."""
+        """Indices of the test episodes, else of the validation episodes, else of all episodes."""
         by_split = {split: [s.index for s in self.summaries if s.split == split] for split in ("test", "val")}
         return by_split["test"] or by_split["val"] or list(range(len(self)))
 
-    def close(self) -> None:  # noqa: B027 (nothing to close is not wrong)
-        """Close what is open. Episodes already read stay valid."""
+    def close(self) -> None:  # noqa: B027 (closing is optional)
+        """Close open files. Episodes already read stay valid."""
 
     def __enter__(self) -> Dataset:
         return self

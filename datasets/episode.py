@@ -1,4 +1,4 @@
-"""One recorded trajectory, in NumPy and SI units."""
+"""A recorded trajectory as NumPy arrays in SI units."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ FloatArray = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Episode:
-    """One trajectory of T steps; every array's first axis is time.
+    """A trajectory of T steps. The first axis of every array is time.
 
     Attributes:
-        task: name of the task, a key of ``TASKS``.
+        task: key of ``TASKS``.
         states: (T, n) true state, components as in ``Task.components`` (m, rad), float32.
-        controls: (T, c) control that led from step t-1 to step t, float32.
-        observations: by observation key, (T, ...): what the sensors reported (pictures uint8, else float32).
-        contact: (T,) bool, whether the robot truly touched the object.
-        qpos: (T, nq) joint positions for the replay, float32; nq is 0 where there is no replay.
-        dt: seconds a step.
-        seed: seed from which the episode was made, or -1 for recorded data.
+        controls: (T, c) control applied between steps t-1 and t, float32.
+        observations: observation key -> (T, ...) sensor readings (images uint8, others float32).
+        contact: (T,) bool, ground truth of contact between robot and object.
+        qpos: (T, nq) joint positions for replay, float32; nq is 0 without replay.
+        dt: seconds per step.
+        seed: seed of the simulation, or -1 for recorded data.
         split: ``train``, ``val`` or ``test``.
-        provenance: JSON values: how it was made, and what the replay needs (hinge position, policy, versions).
+        provenance: JSON values: origin and replay parameters (hinge position, policy, versions).
     """
 
     task: str
@@ -45,7 +45,7 @@ class Episode:
         return len(self.states)
 
     def digest(self) -> str:
-        """SHA-256 over the arrays (names, shapes, types and bytes), independent of how they are stored."""
+        """SHA-256 over the names, shapes, types and bytes of the arrays, independent of the file format."""
         arrays = {"states": self.states, "controls": self.controls, "contact": self.contact, "qpos": self.qpos}
         arrays |= {f"observations/{key}": value for key, value in self.observations.items()}
         digest = hashlib.sha256(f"{self.task} {self.dt} {self.seed} {self.split}".encode())

@@ -1,18 +1,18 @@
-"""The one error that is the user's to mend."""
+"""Errors caused by user input."""
 
 
 class BadInput(ValueError):
-    """Something given from outside cannot be used: a name, a file, a shape, a value.
+    """An error the user can fix: an invalid name, file, shape or value.
 
-    The message is one line that says what is wrong, with the value, and what would be right. The command line prints
-    it and exits with 2; the page shows it (4xx, JSON). Bytes of a name that is no text show as ``\\udcff``.
+    The message is one line with the invalid value and the valid ones. The command line prints it and exits with
+    code 2; the page shows it (HTTP 4xx, JSON). Undecodable bytes of a name are shown as ``\\udcff``.
     """
 
     def __init__(self, message: str) -> None:
         super().__init__(message.encode(errors="backslashreplace").decode())
 
 
-def one_of(kind: str, name: str, available: object) -> BadInput:
-    """The error for an unknown name: ``filter 'crosmodal-pf' does not exist. Available: ...``."""
+def unknown_name(kind: str, name: str, available: object) -> BadInput:
+    """Return the error for an unknown name: ``filter 'crosmodal-pf' does not exist. Available: ...``."""
     names = ", ".join(str(a) for a in available)  # type: ignore[attr-defined]
     return BadInput(f"{kind} {name!r} does not exist. Available: {names or 'none'}.")

@@ -1,4 +1,4 @@
-"""What a set of episodes is like, beside what the paper's authors recorded of the same task."""
+"""Statistics of a dataset and the published statistics of the paper's data."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 
 Statistics = Mapping[str, float | list[float]]
-"""Name with its unit -> a number, or one for each of the axes x, y, z. Names are those of ``statistics``."""
+"""Name with unit -> number, or one number for each of the axes x, y, z. For the names see ``statistics``."""
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """The authors' data of one task.
+class ReferenceData:
+    """Published data of a task.
 
     Attributes:
-        episodes, steps: how many trajectories, and how long the longest is.
-        statistics: those that their published code standardises with. Forces and torques have their sensor's axes.
+        episodes: number of trajectories. steps: length of the longest one.
+        statistics: values used for standardization in the published code. Forces and torques have sensor axes.
     """
 
     episodes: int
@@ -29,8 +29,8 @@ class Recorded:
     statistics: Statistics
 
 
-AUTHORS = {
-    "door": Recorded(
+PAPER_DATA = {
+    "door": ReferenceData(
         600,
         800,
         {
@@ -44,7 +44,7 @@ AUTHORS = {
             "torque_std_Nm": [1.9, 4.6, 0.65],
         },
     ),
-    "push": Recorded(
+    "push": ReferenceData(
         1000,
         250,
         {
@@ -59,39 +59,39 @@ AUTHORS = {
 }
 
 
-def scale(task_name: str) -> tuple[int, int]:
-    """Episodes and steps of a collection where nothing else is asked for: the paper's, or 100 of 200 steps."""
-    recorded = AUTHORS.get(task_name)
-    return (100, 200) if recorded is None else (recorded.episodes, recorded.steps)
+def default_size(task_name: str) -> tuple[int, int]:
+    """Default number of episodes and steps of a collection: those of the paper, else 100 and 200."""
+    reference = PAPER_DATA.get(task_name)
+    return (100, 200) if reference is None else (reference.episodes, reference.steps)
 
 
 def statistics(task: Task, episodes: Iterable[Episode]) -> Statistics:
-    """Spread of the state, and of what haptics there are, over all steps of all episodes.
+    """Standard deviations of the state and of the available haptic observations over all steps of all episodes.
 
     Returns:
-        ``contact_fraction``, ``<component>_std_<cm or deg>``, ``effector_std_cm``, ``effector_range_cm`` (largest minus
-        smallest), ``effector_step_std_mm`` (of its way in one step), ``force_std_N``, ``torque_std_Nm``.
+        ``contact_fraction``, ``<component>_std_<cm or deg>``, ``effector_std_cm``, ``effector_range_cm`` (maximum minus
+        minimum), ``effector_step_std_mm`` (of the displacement per step), ``force_std_N``, ``torque_std_Nm``.
     """
-    kept: dict[str, list[NDArray[np.float32]]] = {}
+    columns: dict[str, list[NDArray[np.float32]]] = {}
     for episode in episodes:
-        seen = episode.observations
+        observations = episode.observations
         rows = {"contact": episode.contact[:, None].astype(np.float32), "states": episode.states}
-        rows |= {key: seen[key] for key in ("effector_position", "force", "torque") if key in seen}
-        if "effector_position" in seen:
-            rows["way"] = np.diff(seen["effector_position"], axis=0)
+        rows |= {key: observations[key] for key in ("effector_position", "force", "torque") if key in observations}
+        if "effector_position" in observations:
+            rows["displacement"] = np.diff(observations["effector_position"], axis=0)
         for key, values in rows.items():
-            kept.setdefault(key, []).append(values)
-    joined = {key: np.concatenate(values).astype(np.float64) for key, values in kept.items()}
-    found: dict[str, float | list[float]] = {"contact_fraction": float(joined["contact"].mean())}
+            columns.setdefault(key, []).append(values)
+    joined = {key: np.concatenate(values).astype(np.float64) for key, values in columns.items()}
+    result: dict[str, float | list[float]] = {"contact_fraction": float(joined["contact"].mean())}
     for component, spread in zip(task.components, joined["states"].std(axis=0), strict=True):
         unit, factor = ("cm", 100.0) if component.unit == "m" else ("deg", np.degrees(1.0))
-        found[f"{component.name}_std_{unit}"] = float(factor * spread)
-    if "way" in joined:
+        result[f"{component.name}_std_{unit}"] = float(factor * spread)
+    if "displacement" in joined:
         position = joined["effector_position"]
-        found["effector_std_cm"] = (100.0 * position.std(axis=0)).tolist()
-        found["effector_range_cm"] = (100.0 * np.ptp(position, axis=0)).tolist()
-        found["effector_step_std_mm"] = (1000.0 * joined["way"].std(axis=0)).tolist()
+        result["effector_std_cm"] = (100.0 * position.std(axis=0)).tolist()
+        result["effector_range_cm"] = (100.0 * np.ptp(position, axis=0)).tolist()
+        result["effector_step_std_mm"] = (1000.0 * joined["displacement"].std(axis=0)).tolist()
     for key, unit in (("force", "N"), ("torque", "Nm")):
         if key in joined:
-            found[f"{key}_std_{unit}"] = joined[key].std(axis=0).tolist()
-    return found
+            result[f"{key}_std_{unit}"] = joined[key].std(axis=0).tolist()
+    return result

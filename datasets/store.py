@@ -1,4 +1,4 @@
-"""Episodes in HDF5: written whole or not at all, checked on the way in. The layout is described in docs/data.md."""
+"""Datasets in HDF5: atomic writes and validated reads. The layout is described in docs/data.md."""
 
 from __future__ import annotations
 
@@ -18,12 +18,20 @@ from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.io.atomic_write import unwritable
+from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.io.strict_json import read_json
-from beliefscope.datasets.readers.hdf5_guard import DAMAGE, SHIPPED, Sink, damaged, look_over, open_hdf5, trust
-from beliefscope.datasets.readers.hdf5_limits import check_claim
-from beliefscope.datasets.readers.mit_push import MitPushes, is_mit
-from beliefscope.datasets.readers.paper_authors import AuthorsFiles, is_authors
+from beliefscope.datasets.readers.hdf5_guard import (
+    HDF5_ERRORS,
+    SAMPLES,
+    DeferredErrorFile,
+    mark_readable,
+    open_hdf5,
+    probe,
+    read_error,
+)
+from beliefscope.datasets.readers.hdf5_limits import check_array
+from beliefscope.datasets.readers.mit_push import MitPushDataset, is_mit_push
+from beliefscope.datasets.readers.paper_authors import PaperDataset, is_paper_file
 from beliefscope.datasets.readers.push_real_task import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
 
@@ -34,57 +42,58 @@ T = TypeVar("T")
 
 
 def sample_path(task_name: str) -> Path:
-    """The sample set shipped for a task. Raises BadInput for an unknown task, or one that ships none."""
-    path = SHIPPED / f"{find_task(task_name).name}.h5"
+    """Path of a task's sample dataset. Raises BadInput for an unknown task or one without samples."""
+    path = SAMPLES / f"{find_task(task_name).name}.h5"
     if not path.exists():
         can_simulate = find_task(task_name).simulate is not None
         raise BadInput(
-            f"Task {task_name!r} ships no sample set. Give its data with --data"
-            + (f": beliefscope collect {task_name} makes some." if can_simulate else ".")
+            f"Task {task_name!r} has no sample dataset. Give its data with --data"
+            + (f": beliefscope collect {task_name} simulates some." if can_simulate else ".")
         )
     return path
 
 
 def open_dataset(path: str | Path, task: Task | None = None, skip_bad: bool = False) -> Dataset:
-    """Open episodes for reading, by what is found: a file of ours, or files of others, or a folder of these.
+    """Open a dataset for reading; the format is detected.
 
     Args:
-        path: an HDF5 file of ours; a file or folder (searched to its bottom) of pushes of the MIT data set; a file or
-            folder of the HDF5 files of the paper's authors.
-        task: what they are wanted for, where the files leave a choice: which of the ``push-real`` tasks.
-        skip_bad: leave out trajectories that cannot be used, and say so in ``Dataset.left_out``.
+        path: HDF5 file written by ``write_dataset``; file or folder (searched recursively) of the MIT Push dataset;
+            file or folder of the HDF5 files of the paper's authors.
+        task: which of the ``push-real`` tasks to use for MIT Push files.
+        skip_bad: skip unusable trajectories and list them in ``Dataset.skipped``.
 
     Raises:
-        BadInput: where it is missing, damaged, of no known kind, or nothing in it can be used.
+        BadInput: if the data are missing, damaged, of an unknown format or unusable.
     """
     path = Path(path)
     files = data_files(path)
-    look_over(files)
-    if is_mit(files[0]):
-        wanted = task if task in PUSH_REAL_TASKS else PUSH_REAL
-        return MitPushes(path, files, wanted, skip_bad)
-    if is_authors(files[0]):
-        return AuthorsFiles(path, files, skip_bad)
+    probe(files)
+    if is_mit_push(files[0]):
+        return MitPushDataset(path, files, task if task in PUSH_REAL_TASKS else PUSH_REAL, skip_bad)
+    if is_paper_file(files[0]):
+        return PaperDataset(path, files, skip_bad)
     if path.is_dir():
-        raise BadInput(f"{path} holds sets of episodes, such as {files[0].name}: give one of the files.")
+        raise BadInput(f"{path} contains datasets, such as {files[0].name}: give one of the files.")
     return EpisodeFile(path, skip_bad)
 
 
 def data_files(path: Path) -> list[Path]:
-    """The file itself, or what a folder holds of data. Raises BadInput where there is none."""
+    """The file itself, or the data files of a folder. Raises BadInput if there is none."""
     if not path.exists():
         raise BadInput(f"{path} does not exist.")
     if not path.is_dir():
         return [path]
     files = sorted(file for file in path.rglob("*") if file.suffix in (".json", ".h5", ".hdf5") and file.is_file())
     if not files:
-        raise BadInput(f"Folder {path} holds no data: expected files that end in .json, .h5 or .hdf5.")
+        raise BadInput(f"Folder {path} has no data: expected files that end in .json, .h5 or .hdf5.")
     return files
 
 
 class EpisodeFile(Dataset):
-    """A file of our own layout. Opening reads only attributes; ``[i]`` reads one episode and checks it: its arrays must
-    be of the task's shapes and types, finite, and match their digest."""
+    """A file written by ``write_dataset``. Opening reads only attributes; ``[i]`` reads and validates an episode.
+
+    Its arrays must have the task's shapes and types, be finite and match their digest.
+    """
 
     def __init__(self, path: Path, skip_bad: bool = False) -> None:
         self.path = path
@@ -98,33 +107,33 @@ class EpisodeFile(Dataset):
         except BadInput:
             self.close()
             raise
-        except DAMAGE as error:
+        except HDF5_ERRORS as error:
             self.close()
-            raise damaged(path, error) from None
+            raise read_error(path, error) from None
 
     @property
     def hash(self) -> str:
         return self._hash
 
     def _episode(self, index: int) -> Episode:
-        return self._checked(self._groups[index])
+        return self._read_checked(self._groups[index])
 
-    def _checked(self, group: h5py.Group) -> Episode:
+    def _read_checked(self, group: h5py.Group) -> Episode:
         try:
             return self._read(group)
         except BadInput:
             raise
-        except DAMAGE as error:
-            raise damaged(self.path, error) from None
+        except HDF5_ERRORS as error:
+            raise read_error(self.path, error) from None
 
     def close(self) -> None:
         self._file.close()
 
     def _read_task(self) -> Task:
-        found = self._file.attrs.get("format")
-        if found != FORMAT:
+        format_ = self._file.attrs.get("format")
+        if format_ != FORMAT:
             raise BadInput(
-                f"{self.path} is an HDF5 file, but not a set of episodes: its attribute 'format' is {found!r}, "
+                f"{self.path} is an HDF5 file, but not a dataset: its attribute 'format' is {format_!r}, "
                 f"expected {FORMAT!r}."
             )
         version = self._file.attrs.get("version")
@@ -138,7 +147,7 @@ class EpisodeFile(Dataset):
     def _find_groups(self) -> list[h5py.Group]:
         count = sum(1 for name in self._file if name.startswith("trajectory"))
         if not count:
-            raise BadInput(f"{self.path} holds no trajectory; expected groups 'trajectory0', 'trajectory1', ...")
+            raise BadInput(f"{self.path} has no trajectory; expected groups 'trajectory0', 'trajectory1', ...")
         groups = [self._file.get(f"trajectory{i}") for i in range(count)]
         for i, group in enumerate(groups):
             if not isinstance(group, h5py.Group):
@@ -146,24 +155,23 @@ class EpisodeFile(Dataset):
         return groups
 
     def _usable_groups(self) -> list[h5py.Group]:
-        """Those that can be read to the end; the others are left out."""
-        groups, left_out = [], []
+        """Groups that can be read completely; the others are skipped."""
+        groups, skipped = [], []
         for name in sorted((n for n in self._file if n.startswith("trajectory")), key=lambda n: (len(n), n)):
             try:
                 group = self._file.get(name)
                 if not isinstance(group, h5py.Group):
                     raise BadInput(f"{self.path}: {name} is not a group.")
-                self._checked(group)
-            except (BadInput, *DAMAGE) as error:
-                left_out.append(str(error if isinstance(error, BadInput) else damaged(self.path, error)))
+                self._read_checked(group)
+            except (BadInput, *HDF5_ERRORS) as error:
+                skipped.append(str(error if isinstance(error, BadInput) else read_error(self.path, error)))
                 continue
             groups.append(group)
         if not groups:
             raise BadInput(
-                f"{self.path} holds no trajectory that can be used."
-                + (f" The first: {left_out[0]}" if left_out else "")
+                f"{self.path} has no usable trajectory." + (f" First error: {skipped[0]}" if skipped else "")
             )
-        self.left_out = tuple(left_out)
+        self.skipped = tuple(skipped)
         return groups
 
     def _summary(self, group: h5py.Group, index: int) -> EpisodeSummary:
@@ -175,7 +183,7 @@ class EpisodeFile(Dataset):
             raise BadInput(f"{self._place(group, 'split')} is {split!r}. Available: {', '.join(SPLITS)}.")
         contact = self._attribute(group, "contact_fraction", float)
         if not 0.0 <= contact <= 1.0:
-            raise BadInput(f"{self._place(group, 'contact_fraction')} is {contact}, expected a share from 0 to 1.")
+            raise BadInput(f"{self._place(group, 'contact_fraction')} is {contact}, expected a fraction from 0 to 1.")
         return EpisodeSummary(
             index=index,
             steps=int(states.shape[0]),
@@ -188,7 +196,7 @@ class EpisodeFile(Dataset):
     def _read(self, group: h5py.Group) -> Episode:
         task, summary, provenance = self.task, self._summary(group, 0), self._provenance(group)
         steps, dt = summary.steps, self._attribute(group, "dt", float)
-        # A reader of others' files says in the provenance that theirs have another step.
+        # Converted external files record their own time step in the provenance.
         if not math.isclose(dt, task.dt) and dt != provenance.get("recorded_dt"):
             raise BadInput(f"{self._place(group, 'dt')} is {dt} s; task {task.name!r} has steps of {task.dt} s.")
         episode = Episode(
@@ -209,7 +217,7 @@ class EpisodeFile(Dataset):
             provenance=provenance,
         )
         if episode.digest() != self._attribute(group, "digest", str):
-            raise BadInput(f"{self.path}: the arrays of {group.name[1:]} do not match its digest: they were changed.")
+            raise BadInput(f"{self.path}: the arrays of {group.name[1:]} do not match its digest: they were modified.")
         return episode
 
     def _provenance(self, group: h5py.Group) -> dict[str, Any]:
@@ -239,7 +247,7 @@ class EpisodeFile(Dataset):
         stored = group.get(key)
         if not isinstance(stored, h5py.Dataset):
             raise BadInput(f"{self.path}: {group.name[1:]} has no {key!r}. It has: {', '.join(group) or 'nothing'}.")
-        check_claim(stored, self._place(group, key))
+        check_array(stored, self._place(group, key))
         return stored
 
     def _array(
@@ -262,29 +270,29 @@ class EpisodeFile(Dataset):
 
 
 def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> None:
-    """Write episodes to a new file; what was there is replaced only when all is written.
+    """Write episodes to a file, which is replaced atomically. The same episodes give the same bytes.
 
-    The same episodes give the same bytes. Raises BadInput where the file cannot be written.
+    Raises BadInput if the file cannot be written.
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.")
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with Sink(unfinished, "w+b") as sink:
-            with h5py.File(sink, "w", libver=("v110", "v110")) as file:
+        with DeferredErrorFile(partial, "w+b") as output:
+            with h5py.File(output, "w", libver=("v110", "v110")) as file:
                 file.attrs["format"], file.attrs["version"], file.attrs["task"] = FORMAT, VERSION, task.name
                 for index, episode in enumerate(episodes):
                     _write_episode(file.create_group(f"trajectory{index}"), episode)
-                    sink.check()
-            sink.check()
-        os.replace(unfinished, path)
-        trust(path)
+                    output.check()
+            output.check()
+        os.replace(partial, path)
+        mark_readable(path)
     except OSError as error:
-        unfinished.unlink(missing_ok=True)  # before it is told what is free
-        raise unwritable(path, error) from None
+        partial.unlink(missing_ok=True)  # before the free space is measured
+        raise write_error(path, error) from None
     finally:
-        unfinished.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
 
 
 def _write_episode(group: h5py.Group, episode: Episode) -> None:
@@ -298,10 +306,10 @@ def _write_episode(group: h5py.Group, episode: Episode) -> None:
     arrays["contact"] = episode.contact.astype(np.uint8)
     arrays |= {f"observations/{key}": value for key, value in episode.observations.items()}
     for key, array in arrays.items():
-        # One HDF5 element a step: the shuffle filter then lays the bytes of each pixel or component out over time,
-        # which takes a fifth off the pictures.
+        # One HDF5 element per step: the shuffle filter then orders the bytes of each pixel or component by time,
+        # which makes the images a fifth smaller.
         if not array.size:
-            group.create_dataset(key, data=array)  # no joint positions where there is no replay
+            group.create_dataset(key, data=array)  # no joint positions without replay
             continue
         element = np.dtype((array.dtype, array.shape[1:])) if array.ndim > 1 else array.dtype
         stored = group.create_dataset(

@@ -1,6 +1,6 @@
-"""Ask a filter what it trusts, whether rightly, and whether its covariance is true.
+"""Run all fast diagnostics on a filter under 40 % image blackout.
 
-python examples/01_diagnose.py [DIR]; with a folder, a figure of each answer is written there.
+python examples/01_diagnose.py [DIR]; DIR: folder for the figures.
 """
 
 import sys
@@ -14,19 +14,19 @@ from beliefscope.inspect.diagnostics.plotting import write_figure
 from beliefscope.inspect.trace import trace
 
 checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
-broken = Faults.parse("blackout=0.4")  # four of ten pictures are black
+faults = Faults.parse("blackout=0.4")  # 40 % image blackout
 with open_dataset(sample_path("door")) as data:
-    traces = [trace(checkpoint, data[i], i, faults=broken) for i in data.held_out()[:5]]
+    traces = [trace(checkpoint, data[i], i, faults=faults) for i in data.held_out()[:5]]
 
 for name, entry in DIAGNOSTICS.items():
-    why = entry.refusal(traces[0], checkpoint)
+    refusal = entry.refusal(traces[0], checkpoint)
     print(f"\n{entry.title}. {entry.question}")
-    if why or entry.slow:
-        print(f"  Not asked: {why or 'takes a while'}.")
+    if refusal or entry.slow:
+        print(f"  Skipped: {refusal or 'slow'}.")
         continue
-    found = entry(traces, checkpoint)
-    print(f"  {found.verdict}")
-    print("  Its tables:", ", ".join(table.title for table in found.tables()))
+    diagnostic = entry(traces, checkpoint)
+    print(f"  {diagnostic.verdict}")
+    print("  Tables:", ", ".join(table.title for table in diagnostic.tables()))
     if len(sys.argv) > 1:
-        alone = entry(traces[:1], checkpoint)  # of one trace there are curves over its steps
-        write_figure(alone.plot(), Path(sys.argv[1]) / f"{name}.pdf")
+        single = entry(traces[:1], checkpoint)  # a single trace has curves over its steps
+        write_figure(single.plot(), Path(sys.argv[1]) / f"{name}.pdf")

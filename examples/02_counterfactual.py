@@ -1,6 +1,6 @@
-"""What if? Break a sensor for two seconds, or set beta by hand, and run again.
+"""Counterfactuals: black out the image for two seconds, or override beta, and compare with the original run.
 
-python examples/02_counterfactual.py [FIGURE.pdf]; all edits are compared with one run, by common random numbers.
+python examples/02_counterfactual.py [FIGURE.pdf]; all runs use the same random numbers.
 """
 
 import sys
@@ -19,15 +19,15 @@ with open_dataset(sample_path("push")) as data:
     index = data.held_out()[0]
     replay = Replay(checkpoint, trace(checkpoint, data[index], index))
 
-black = Faults.parse("blackout")
+blackout = Faults.parse("blackout")
 edits = {
-    "the picture is black": Edit(40, 60, black),
-    "the picture is black, and beta still trusts it": Edit(40, 60, black, {"image": 1.0}),
-    "the picture is good, and beta trusts touch alone": Edit(40, 60, weights={"haptics": 1.0}),
+    "image blackout": Edit(40, 60, blackout),
+    "image blackout with all weight on image": Edit(40, 60, blackout, {"image": 1.0}),
+    "clean image with all weight on haptics": Edit(40, 60, weights={"haptics": 1.0}),
 }
-for what, edit in edits.items():
-    found = compare(replay.original, replay.edited(edit), edit)
-    print(f"\nWhat if {what}?\n  {found.verdict}")
+for title, edit in edits.items():
+    difference = compare(replay.original, replay.edited(edit), edit)
+    print(f"\n{title.capitalize()}\n  {difference.verdict}")
 
 if len(sys.argv) > 1:
-    write_figure(found.plot(), Path(sys.argv[1]))
+    write_figure(difference.plot(), Path(sys.argv[1]))

@@ -1,4 +1,4 @@
-"""A filter of your own on the door, in plain PyTorch: no camera, nothing trained, only where the hand goes.
+"""An external filter for the door in plain PyTorch: no camera, no training, only the motion of the hand.
 
 beliefscope evaluate door --filter examples/04_own_filter.py:build
 beliefscope record door --filter examples/04_own_filter.py:build -o own.rrd
@@ -8,16 +8,16 @@ beliefscope serve --filter examples/04_own_filter.py:build
 import torch
 from torch import Tensor, nn
 
-DRIFT = (0.002, 0.002, 0.01)  # m, m, rad a step
-ACROSS = 0.2  # m: how far off the hinge may lie where a pushing hand slides along the bar
-MOVING = 0.002  # m a step
+DRIFT = (0.002, 0.002, 0.01)  # m, m, rad per step
+ACROSS = 0.2  # m: standard deviation of the constraint, as a pushing hand slides along the bar
+MOVING = 0.002  # m per step
 
 
 class HandOnArc(nn.Module):
-    """A Kalman filter over hinge x, hinge y (m) and angle (rad). A hand that holds a door goes round the hinge.
+    """A Kalman filter over hinge x, hinge y (m) and angle (rad). A hand in contact moves on a circle around the hinge.
 
-    The angle grows by ``(r x dp) / |r|^2`` with r from the hinge to the hand, dp its step. The hinge lies on the line
-    through the middle of the step at right angles to it: ``u . hinge = u . p`` with ``u = dp / |dp|``.
+    The angle grows by ``(r x dp) / |r|^2`` with r from the hinge to the hand, dp its motion. The hinge lies on the
+    perpendicular bisector of the motion: ``u . hinge = u . p`` with ``u = dp / |dp|``.
     """
 
     task = "door"

@@ -1,4 +1,4 @@
-"""Episodes as tensors, and the statistics that standardise them."""
+"""Episodes as tensors, and the statistics for standardisation."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 
-SMALLEST_STD = 1e-6
-"""A channel that never moved is divided by 1 instead of by less than this."""
+MIN_STD = 1e-6
+"""A channel with a smaller standard deviation is divided by 1."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """T steps of N trajectories in SI units; pictures stay uint8 until they are encoded.
+    """T steps of N trajectories in SI units; images are uint8 until they are encoded.
 
     Attributes:
-        observations: modality -> (T, N, H, W) uint8, (T, N, d) float32, or (T, N) int64: numbers of pictures that the
-            encoders remember (``Steps.numbered``), -1 for a black one.
+        observations: modality -> (T, N, H, W) uint8, (T, N, d) float32, or (T, N) int64: indices of images in
+            the encoders' tables (``Steps.with_image_indices``), -1 for a blacked-out one.
         controls: (T, N, c). states: (T, N, n). contact: (T, N) bool.
-        previous: (N, n) true state one step before the first (that of step 0 where the trajectory starts there).
+        previous: (N, n) true state one step before the first (of step 0 if the trajectory starts there).
     """
 
     observations: Mapping[str, Tensor]
@@ -40,9 +40,10 @@ class Batch:
 
 @dataclass(frozen=True)
 class Steps:
-    """All steps of a set of episodes end to end, from which windows are cut.
+    """All steps of a set of episodes, concatenated; windows are cut from them.
 
-    Attributes: as in ``Batch`` but (S, ...), S steps in all. first: (E,) index of each episode's step 0. length: (E,).
+    Attributes: as in ``Batch`` but (S, ...), S steps in total.
+        first: (E,) index of each episode's step 0. length: (E,).
     """
 
     observations: Mapping[str, Tensor]
@@ -53,14 +54,14 @@ class Steps:
     length: Tensor
 
     @classmethod
-    def of(cls, task: Task, episodes: Sequence[Episode], device: torch.device | str = "cpu") -> Steps:
-        """Raises BadInput where there is no episode or an array does not have the task's shape."""
+    def from_episodes(cls, task: Task, episodes: Sequence[Episode], device: torch.device | str = "cpu") -> Steps:
+        """Raises BadInput if there is no episode, or an array does not have the task's shape."""
         if not episodes:
-            raise BadInput("no episode to work on: the data set's split is empty")
+            raise BadInput("no episodes: the data set's split is empty")
         for number, episode in enumerate(episodes):
             check_shapes(task, episode, f"episode {number}")
         observations = {
-            modality: _join([_modality(episode, keys) for episode in episodes], device)
+            modality: _join([_modality_array(episode, keys) for episode in episodes], device)
             for modality, keys in task.modalities.items()
         }
         length = torch.tensor([len(episode) for episode in episodes], device=device)
@@ -74,7 +75,7 @@ class Steps:
         )
 
     def windows(self, starts: Tensor, steps: int) -> Batch:
-        """Windows of ``steps`` steps that begin at the given steps (N,), as a Batch."""
+        """Windows of ``steps`` steps that start at the given steps (N,)."""
         index = starts + torch.arange(steps, device=starts.device)[:, None]
         at_start = torch.isin(starts, self.first)
         return Batch(
@@ -86,7 +87,7 @@ class Steps:
         )
 
     def sample(self, count: int, steps: int, generator: torch.Generator) -> Batch:
-        """``count`` windows drawn uniformly over all that fit. Raises BadInput where none does."""
+        """``count`` windows, uniform over all that fit into an episode. Raises BadInput if none does."""
         room = (self.length - steps + 1).clamp_min(0)
         ends = room.cumsum(0)
         if int(ends[-1]) == 0:
@@ -96,19 +97,19 @@ class Steps:
         return self.windows(self.first[episode] + draw - (ends - room)[episode], steps)
 
     def part(self, first: int, last: int) -> Steps:
-        """Episodes ``first`` to ``last - 1``; shares the arrays."""
+        """Episodes ``first`` to ``last - 1``, as views of the same arrays."""
         return replace(self, first=self.first[first:last], length=self.length[first:last])
 
     def rows(self) -> Tensor:
-        """(R,) where these episodes' steps are in the arrays."""
+        """(R,) indices of these episodes' steps in the arrays."""
         spans = zip(self.first.tolist(), self.length.tolist(), strict=True)
         return torch.cat([torch.arange(a, a + n, device=self.first.device) for a, n in spans])
 
-    def numbered(self) -> Steps:
-        """The same steps with each picture replaced by its number, for encoders that remember them."""
-        number = torch.arange(len(self.states), device=self.states.device)
+    def with_image_indices(self) -> Steps:
+        """The same steps with each image replaced by its index, for encoders with a table."""
+        index = torch.arange(len(self.states), device=self.states.device)
         return replace(
-            self, observations={m: number if v.dtype == torch.uint8 else v for m, v in self.observations.items()}
+            self, observations={m: index if v.dtype == torch.uint8 else v for m, v in self.observations.items()}
         )
 
     def episode(self, number: int) -> Batch:
@@ -116,12 +117,13 @@ class Steps:
         return self.windows(self.first[number : number + 1], int(self.length[number]))
 
 
-def sensed(task: Task, observations: Mapping[str, np.ndarray], control: np.ndarray) -> Batch:
-    """One step of one trajectory, T = N = 1, as it comes from a robot: of the truth nothing is known, it is NaN.
+def single_step(task: Task, observations: Mapping[str, np.ndarray], control: np.ndarray) -> Batch:
+    """One step of sensor data from a robot, T = N = 1; the true state is unknown, NaN.
 
-    Args: observations: by the task's keys, each of one step. control: (c,).
+    Args:
+        observations: by the task's keys, each of one step. control: (c,).
 
-    Raises BadInput for what has not the task's shape.
+    Raises BadInput for arrays that do not have the task's shape.
     """
     row = Episode(
         task=task.name,
@@ -133,11 +135,11 @@ def sensed(task: Task, observations: Mapping[str, np.ndarray], control: np.ndarr
         dt=task.dt,
         seed=-1,
     )
-    return Steps.of(task, [row]).episode(0)
+    return Steps.from_episodes(task, [row]).episode(0)
 
 
 def check_shapes(task: Task, episode: Episode, where: str) -> None:
-    """Raises BadInput, naming the array, where an episode does not fit its task."""
+    """Raises BadInput, with the array's name, if an episode does not fit its task."""
     expected: dict[str, tuple[int, ...]] = {"states": (len(task.components),), "controls": (task.control_size,)}
     arrays = {"states": episode.states, "controls": episode.controls}
     expected |= dict(task.observations)
@@ -150,7 +152,7 @@ def check_shapes(task: Task, episode: Episode, where: str) -> None:
             raise BadInput(f"{where}: {key!r} has shape {arrays[key].shape}, not {(len(episode), *shape)}")
 
 
-def _modality(episode: Episode, keys: Sequence[str]) -> np.ndarray:
+def _modality_array(episode: Episode, keys: Sequence[str]) -> np.ndarray:
     arrays = [episode.observations[key] for key in keys]
     return arrays[0] if arrays[0].ndim == 3 else np.concatenate(arrays, axis=1).astype(np.float32)
 
@@ -160,9 +162,9 @@ def _join(arrays: Sequence[np.ndarray], device: torch.device | str) -> Tensor:
 
 
 class Statistics(nn.Module):
-    """Means and standard deviations of the training set, kept as buffers so that they travel with the weights.
+    """Means and standard deviations of the training set, stored as buffers with the weights.
 
-    Vectors are standardised per channel, pictures (0..255) by one mean and deviation for all pixels.
+    Vectors are standardised per channel, images (0..255) with one mean and standard deviation for all pixels.
     """
 
     def __init__(self, task: Task) -> None:
@@ -181,7 +183,7 @@ class Statistics(nn.Module):
         return self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
 
     def fit(self, steps: Steps) -> None:
-        """Takes the statistics of these episodes' steps."""
+        """Computes the statistics of these episodes' steps."""
         rows = steps.rows()
         values = {"state": steps.states, "control": steps.controls, **steps.observations}
         values = {name: array[rows] for name, array in values.items()}
@@ -192,15 +194,15 @@ class Statistics(nn.Module):
             else:
                 average, deviation = array.double().mean(0), array.double().std(0)
             mean.copy_(average)
-            std.copy_(torch.where(deviation > SMALLEST_STD, deviation, torch.ones_like(deviation)))
+            std.copy_(torch.where(deviation > MIN_STD, deviation, torch.ones_like(deviation)))
 
     def standardise(self, name: str, values: Tensor) -> Tensor:
-        """(..., d) in SI units (or 0..255) to zero mean and unit deviation, float32."""
+        """(..., d) in SI units (or 0..255) to zero mean and unit standard deviation, float32."""
         mean, std = self.mean_std(name)
         return (values.to(mean.dtype) - mean) / std
 
     def standardise_observations(self, observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Modality -> standardised observations; numbers of remembered pictures stay numbers."""
+        """Modality -> standardised observations; image indices are unchanged."""
         return {
             m: observations[m] if observations[m].dtype == torch.int64 else self.standardise(m, observations[m])
             for m in self.modalities
@@ -216,45 +218,44 @@ class Statistics(nn.Module):
         return covariance * std * std[:, None]
 
 
-def _gray_mean_std(pictures: Tensor) -> tuple[Tensor, Tensor]:
-    """(1,), (1,) over all pixels, from how often each gray is there: doubles would take eight times the memory."""
-    counts = torch.zeros(256, dtype=torch.float64, device=pictures.device)
-    for part in pictures.split(4096):
+def _gray_mean_std(images: Tensor) -> tuple[Tensor, Tensor]:
+    """(1,), (1,) over all pixels, from a histogram: conversion to float64 would take eight times the memory."""
+    counts = torch.zeros(256, dtype=torch.float64, device=images.device)
+    for part in images.split(4096):
         counts += torch.bincount(part.flatten(), minlength=256)
-    gray = torch.arange(256, dtype=torch.float64, device=pictures.device)
+    gray = torch.arange(256, dtype=torch.float64, device=images.device)
     mean = (counts @ gray) / counts.sum()
     return mean[None], (counts @ (gray - mean).square() / (counts.sum() - 1)).sqrt()[None]
 
 
-def black_out(batch: Batch, probability: Tensor, generator: torch.Generator) -> Batch:
-    """The batch with pictures turned black (all zero), each step on its own.
+def apply_blackout(batch: Batch, probability: Tensor, generator: torch.Generator) -> Batch:
+    """The batch with image blackouts (all pixels zero), independent at each step.
 
     Args:
-        probability: (N,) or () chance of a black picture. generator: on the CPU.
+        probability: (N,) or () of a blackout. generator: on the CPU.
     """
-    black = (torch.rand(batch.states.shape[:2], generator=generator) < probability).to(batch.states.device)
+    blackout = (torch.rand(batch.states.shape[:2], generator=generator) < probability).to(batch.states.device)
     observations = dict(batch.observations)
     for modality, values in observations.items():
         if values.dtype == torch.uint8:
-            observations[modality] = values.masked_fill(black[..., None, None], 0)
+            observations[modality] = values.masked_fill(blackout[..., None, None], 0)
         elif values.dtype == torch.int64:
-            observations[modality] = values.masked_fill(black, -1)
+            observations[modality] = values.masked_fill(blackout, -1)
     return replace(batch, observations=observations)
 
 
-def shift(batch: Batch, task: Task, scale: Tensor, generator: torch.Generator) -> Batch:
-    """The batch with each trajectory moved on the map: object and hand alike, by a normal offset.
+def shift_positions(batch: Batch, task: Task, scale: Tensor, generator: torch.Generator) -> Batch:
+    """The batch with each trajectory shifted on the map, object and end effector together, by a normal offset.
 
-    What the hand feels does not change, so that few places become many. Pictures stay as they are: not for whoever
-    looks at them.
+    This augments positions for models without images: forces do not change, and images are not adapted.
 
     Args:
         scale: (n,) standard deviations, of which the map components' are used. generator: on the CPU.
     """
-    where = list(task.map_indices)
-    offset = torch.randn(batch.states.shape[1], 2, generator=generator).to(scale) * scale[where]
+    on_map = list(task.map_indices)
+    offset = torch.randn(batch.states.shape[1], 2, generator=generator).to(scale) * scale[on_map]
 
-    def moved(values: Tensor, channels: Sequence[int]) -> Tensor:
+    def shifted(values: Tensor, channels: Sequence[int]) -> Tensor:
         values = values.clone()
         values[..., list(channels)] += offset
         return values
@@ -265,14 +266,14 @@ def shift(batch: Batch, task: Task, scale: Tensor, generator: torch.Generator) -
         for key in keys:
             if key in task.positions:
                 channels = [first + channel for channel in task.positions[key]]
-                observations[modality] = moved(observations[modality], channels)
+                observations[modality] = shifted(observations[modality], channels)
             first += task.observations[key][0]
     if "control" in task.positions:
-        controls = moved(controls, task.positions["control"])
+        controls = shifted(controls, task.positions["control"])
     return replace(
         batch,
         observations=observations,
         controls=controls,
-        states=moved(batch.states, where),
-        previous=moved(batch.previous, where),
+        states=shifted(batch.states, on_map),
+        previous=shifted(batch.previous, on_map),
     )

@@ -1,6 +1,6 @@
-"""Beliefs, evidence, and what one step of a filter knew. All in standardised units, batched over N trajectories.
+"""Beliefs, evidence, and the trace of one filter step. All in standardised units, batched over N trajectories.
 
-Steps are pure: ``step(belief, evidence, generator) -> (belief, StepTrace)``. No belief is kept on a module.
+Steps are pure: ``step(belief, evidence, generator) -> (belief, StepTrace)``. Modules store no belief.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Particles:
 
 @dataclass(frozen=True)
 class Recurrent:
-    """hidden (N, L, 2, H): output and cell of each of L layers. mean (N, n): the estimate. There is no covariance."""
+    """hidden (N, L, 2, H): output and cell of each of L layers. mean (N, n): the estimate, without a covariance."""
 
     hidden: Tensor
     mean: Tensor
@@ -54,10 +54,10 @@ def moments(states: Tensor, log_weights: Tensor) -> Gaussian:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the observations and controls say, computed once for all T x N before the time recursion starts.
+    """Encoded observations and controls, computed once for all T x N before the time recursion.
 
-    K is the number of measurement models, u the width of the networks. ``evidence[t]`` is step t; ``evidence[a:b]``
-    a slice.
+    K is the number of measurement models, u the width of the networks. ``evidence[t]`` is step t,
+    ``evidence[a:b]`` a range of steps.
 
     Attributes:
         control: (T, N, u) the controls' part of the dynamics model. LSTM: the encoded controls.
@@ -65,7 +65,7 @@ class Evidence:
             likelihood. LSTM: (T, N, 1, u) observations and controls, encoded and joined.
         noise: EKF, UKF: (T, N, K, n) standard deviations of z, the square root of R's diagonal. Others: None.
         log_weights: (T, N, K, W) log beta, W = n for weights per component, 1 for scalars; None without a weight model.
-        present: (T, N, K) bool, which models' evidence is used; None where all is. See ``of``.
+        present: (T, N, K) bool, which models' evidence is used; None for all. See ``select_models``.
     """
 
     control: Tensor
@@ -90,46 +90,46 @@ class Evidence:
         )
 
     def only(self, k: int) -> Evidence:
-        """The same evidence with beta one-hot on measurement model k: the filter on that modality alone."""
+        """The same evidence with beta one-hot on measurement model k: the filter with only that modality."""
         if self.log_weights is None:
             return self
         log_weights = torch.full_like(self.log_weights, -torch.inf)
         log_weights[..., k, :] = 0.0
         return replace(self, log_weights=log_weights)
 
-    def of(self, present: Tensor) -> Evidence:
-        """The same evidence without some of the models: as if what they see were not there.
+    def select_models(self, present: Tensor) -> Evidence:
+        """The same evidence with only some of the models, as if the other sensors did not exist.
 
-        EKF, UKF: a model that is not present updates nothing, and is left out of the fusion. PF: its likelihood is left
-        out of the mixture. Beta of the others keeps its proportions; one of beta zero counts as not present, alone too.
-        Where no model is present, only the dynamics move the belief.
+        EKF, UKF: an absent model does not update, and is excluded from the fusion. PF: its likelihood is excluded from
+        the mixture. The other models' beta keeps its proportions; a model with beta zero counts as absent. If no model
+        is present, the belief is only predicted.
 
         Args:
-            present: (T, N, K) bool. With N = 1 of the evidence, N may be any number: one trajectory a subset.
+            present: (T, N, K) bool. If the evidence has N = 1, N may be any number: one trajectory per subset.
         """
         n = present.shape[1]
         subset = replace(self._map(lambda tensor: tensor.expand(-1, n, *tensor.shape[2:])), present=present)
         if subset.log_weights is None:
             return subset
-        heard = present & (subset.log_weights > -torch.inf).any(-1)
-        absent = heard.any(-1, keepdim=True) & ~heard
+        used = present & (subset.log_weights > -torch.inf).any(-1)
+        absent = used.any(-1, keepdim=True) & ~used
         log_weights = subset.log_weights.masked_fill(absent.unsqueeze(-1), -torch.inf)
-        return replace(subset, present=heard, log_weights=log_weights)
+        return replace(subset, present=used, log_weights=log_weights)
 
 
 @dataclass(frozen=True)
 class StepTrace:
-    """Everything one step knew and could not be computed later from the rest.
+    """Intermediate results of one step that cannot be recomputed from the others.
 
     Attributes:
-        predicted: belief after the dynamics and before the observation. EKF, UKF: bank (N, K, n); PF: particles with
-            their prior weights; LSTM, which does not predict: the belief before the step.
+        predicted: belief after the prediction, before the update. EKF, UKF: bank (N, K, n); PF: particles with
+            their prior weights; LSTM, which has no prediction: the belief before the step.
         posterior: fused belief after the observation and, for a PF, before resampling. EKF, UKF: Gaussian (N, n).
-        estimate: Gaussian (N, n), (N, n, n): mean and covariance of the posterior, which the filter reports. LSTM: the
+        estimate: Gaussian (N, n), (N, n, n): mean and covariance of the posterior, the filter's output. LSTM: the
             covariance is NaN.
-        modality: EKF, UKF only: each unimodal filter's own posterior, Gaussian (N, K, n).
-        log_likelihood: PF only: (N, K, M) of each predicted particle, not normalised.
-        ancestors: PF only: (N, M) int64, index of the particle each resampled one came from.
+        modality: EKF, UKF only: each unimodal filter's posterior, Gaussian (N, K, n).
+        log_likelihood: PF only: (N, K, M) of each predicted particle, unnormalised.
+        ancestors: PF only: (N, M) int64, index of each resampled particle's ancestor.
     """
 
     predicted: Belief

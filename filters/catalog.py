@@ -1,4 +1,4 @@
-"""The filters by name, for any task. A new one is one line here."""
+"""Registry of the filters, for any task. To add one, add a line here."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.errors import one_of
+from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
@@ -24,7 +24,7 @@ KINDS: dict[Kind, type[Filter]] = {
 }
 
 ANY = ""
-"""Stands for the task, and for the models after its modalities, in what ``FILTERS`` holds."""
+"""Placeholder for the task in ``FILTERS``; the models follow from the task's modalities."""
 
 FILTERS: dict[str, tuple[Literal["each", "all", "one"], Architecture]] = {
     "crossmodal-ekf": ("each", Architecture(ANY, "ekf", "crossmodal", feedback=True)),
@@ -38,12 +38,12 @@ FILTERS: dict[str, tuple[Literal["each", "all", "one"], Architecture]] = {
     "{modality}-pf": ("one", Architecture(ANY, "pf", "none")),
     "lstm": ("all", Architecture(ANY, "lstm", "none")),
 }
-"""Name -> what the measurement models see, and the filter for any task. ``each`` modality has a model, ``all`` share
-one, or there is only ``one`` modality, and such a filter for each of them (``image-pf``, ``haptics-pf``)."""
+"""Name -> measurement models and architecture. ``each``: one model per modality. ``all``: one model of all modalities.
+``one``: a filter per modality, with that modality only (``image-pf``, ``haptics-pf``)."""
 
 
 def filters_of(task: Task) -> dict[str, Architecture]:
-    """All filters of a task by name, with measurement models after its modalities."""
+    """All filters of a task by name, with measurement models named after its modalities."""
     each = tuple(task.modalities)
     models: dict[str, list[tuple[str, ...]]] = {
         "each": [each],
@@ -51,9 +51,9 @@ def filters_of(task: Task) -> dict[str, Architecture]:
         "one": [(modality,) for modality in each],
     }
     return {
-        name.format(modality=chosen[0]): replace(of_any_task, task=task.name, models=chosen)
-        for name, (sees, of_any_task) in FILTERS.items()
-        for chosen in models[sees]
+        name.format(modality=names[0]): replace(template, task=task.name, models=names)
+        for name, (inputs, template) in FILTERS.items()
+        for names in models[inputs]
     }
 
 
@@ -61,12 +61,12 @@ def architecture(task: str, name: str) -> Architecture:
     """The named filter's architecture for a task. Raises BadInput for an unknown name."""
     filters = filters_of(find_task(task))
     if name not in filters:
-        raise one_of("filter", name, filters)
+        raise unknown_name("filter", name, filters)
     return filters[name]
 
 
 def build(architecture: Architecture, seed: int = 0) -> Filter:
-    """A filter with fresh weights; the same for the same seed."""
+    """A filter with initial weights that depend only on the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return KINDS[architecture.kind](architecture)

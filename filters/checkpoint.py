@@ -1,7 +1,7 @@
-"""Checkpoints: safetensors with one JSON document in the header. Never pickle.
+"""Checkpoints: safetensors files with one JSON document in the header. Pickle is never used.
 
 The header's key ``beliefscope`` holds ``{"format", "name", "architecture", "record"}``; the tensors are the
-filter's state dictionary, statistics of the training set included. A checkpoint's hash is the SHA-256 of its file.
+filter's state dictionary, including the statistics of the training set. A checkpoint's hash is the SHA-256 of its file.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from safetensors.torch import save
 from torch.overrides import TorchFunctionMode
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.filter import Architecture, Filter, Kind
+from beliefscope.filters.legacy_names import training_record
 
 FORMAT = 1
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -32,11 +33,12 @@ PRETRAINED = Path(__file__).parent / "pretrained"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained filter and where it came from.
+    """A trained filter and its origin.
 
     Attributes:
-        filter: in evaluation mode, on the CPU. name: of the filter, e.g. ``crossmodal-pf``. hash: SHA-256 of the file.
-        record: JSON: training command, seed, data hash, metrics, versions.
+        filter: in evaluation mode, on the CPU. name: of the filter, such as ``crossmodal-pf``. hash: SHA-256 of the
+            file.
+        record: JSON: training command, seed, data hash, metrics, versions; keys of earlier versions are renamed.
     """
 
     filter: Filter
@@ -54,7 +56,7 @@ class Checkpoint:
 
 
 def save_checkpoint(filter_: Filter, name: str, record: Mapping[str, Any], path: Path) -> str:
-    """Writes the checkpoint atomically and returns its hash. Raises BadInput when the folder does not exist."""
+    """Writes the checkpoint atomically and returns its hash. Raises BadInput if the folder does not exist."""
     header = {
         "format": FORMAT,
         "name": name,
@@ -68,7 +70,7 @@ def save_checkpoint(filter_: Filter, name: str, record: Mapping[str, Any], path:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Reads a checkpoint. Raises BadInput when it is missing, truncated, or not one of ours."""
+    """Reads a checkpoint. Raises BadInput if it is missing, damaged, or not a checkpoint of this package."""
     path = Path(path)
     if not path.is_file():
         raise BadInput(f"checkpoint {str(path)!r} does not exist")
@@ -80,26 +82,28 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise BadInput(f"{str(path)!r} is not a readable safetensors file: {error}") from None
     header = _header(path, metadata)
     architecture = Architecture.from_json(header["architecture"])
-    with torch.device("meta"), _Unfilled():  # takes no memory, whatever sizes the header names
+    with torch.device("meta"), _Uninitialised():  # allocates no memory, whatever the header's sizes
         expected = {key: tuple(value.shape) for key, value in build(architecture).state_dict().items()}
-    found = {key: tuple(value.shape) for key, value in tensors.items()}
-    if expected != found:
-        key = min(expected.items() ^ found.items())[0]
+    shapes = {key: tuple(value.shape) for key, value in tensors.items()}
+    if expected != shapes:
+        key = min(expected.items() ^ shapes.items())[0]
         raise BadInput(
-            f"{str(path)!r}: tensor {key!r} is {found.get(key, 'missing')}, but this architecture has "
+            f"{str(path)!r}: tensor {key!r} is {shapes.get(key, 'missing')}, but this architecture has "
             f"{expected.get(key, 'no such tensor')}"
         )
     for key, value in tensors.items():
         if not (value.is_floating_point() and bool(torch.isfinite(value).all())):
-            raise BadInput(f"{str(path)!r}: tensor {key!r} holds what are no finite numbers ({value.dtype})")
+            raise BadInput(f"{str(path)!r}: tensor {key!r} contains values that are not finite numbers ({value.dtype})")
     filter_ = build(architecture)
     filter_.load_state_dict(tensors)
     filter_.eval().requires_grad_(False)
-    return Checkpoint(filter_, header["name"], hashlib.sha256(path.read_bytes()).hexdigest(), header["record"])
+    return Checkpoint(
+        filter_, header["name"], hashlib.sha256(path.read_bytes()).hexdigest(), training_record(header["record"])
+    )
 
 
-class _Unfilled(TorchFunctionMode):
-    """Modules get no starting weights. On the meta device, drawing them imports PyTorch's compiler: seconds."""
+class _Uninitialised(TorchFunctionMode):
+    """Skips weight initialisation, which on the meta device would import PyTorch's compiler and take seconds."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
@@ -116,29 +120,27 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     except ValueError as error:
         raise BadInput(f"{str(path)!r} has a damaged header: {error}") from None
     if not isinstance(header, dict) or header.get("format") != FORMAT:
-        found = header.get("format") if isinstance(header, dict) else header
-        raise BadInput(f"{str(path)!r} has checkpoint format {found!r}; this version reads format {FORMAT}")
+        version = header.get("format") if isinstance(header, dict) else header
+        raise BadInput(f"{str(path)!r} has checkpoint format {version!r}; this version reads format {FORMAT}")
     missing = {"name", "architecture", "record"} - header.keys()
     if missing:
         raise BadInput(f"{str(path)!r} lacks {', '.join(sorted(missing))} in its header")
-    for name, kind, meant in (
+    for name, kind, expected in (
         ("name", str, "text"),
         ("architecture", dict, "an object"),
         ("record", dict, "an object"),
     ):
         if not isinstance(header[name], kind):
-            raise BadInput(f"{str(path)!r} has the {name} {header[name]!r:.200} in its header, expected {meant}")
+            raise BadInput(f"{str(path)!r} has the {name} {header[name]!r:.200} in its header, expected {expected}")
     return header
 
 
 def shipped(task: str, name: str) -> Path:
-    """The checkpoint that ships for a task and filter. Raises BadInput for an unknown name and where none does."""
+    """Path of the pretrained checkpoint of a task and filter. Raises BadInput if there is none."""
     filters = filters_of(find_task(task))
     if name not in filters:
-        raise one_of("filter", name, filters)
+        raise unknown_name("filter", name, filters)
     path = PRETRAINED / f"{task}-{name}.safetensors"
     if not path.is_file():
-        raise BadInput(
-            f"no trained {name!r} ships for task {task!r}; train one: beliefscope train {task} --filter {name}"
-        )
+        raise BadInput(f"no pretrained {name!r} for task {task!r}; train one: beliefscope train {task} --filter {name}")
     return path

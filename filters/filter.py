@@ -1,4 +1,4 @@
-"""What every filter of this package is: networks that weigh evidence, and a pure step over beliefs."""
+"""Base class of all filters: networks that encode evidence, and a pure step over beliefs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Statistics
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
@@ -23,27 +23,27 @@ from beliefscope.filters.models.resampling import Resampling
 Kind = Literal["ekf", "ukf", "pf", "lstm"]
 Fusion = Literal["crossmodal", "unimodal", "none"]
 
-WIDEST = 4096
-"""Of a layer, and what else counts in a filter: far beyond what a step has time for."""
+MAX_SIZE = 4096
+"""Upper limit of layer widths and other integers of an architecture."""
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """Everything that fixes a filter's modules and equations; travels inside the checkpoint as JSON.
+    """Everything that determines a filter's modules and equations; stored as JSON in the checkpoint.
 
     Attributes:
         task: name in ``TASKS``.
         kind: ``ekf``, ``ukf``, ``pf`` or ``lstm``.
-        fusion: how the measurement models' results are fused: ``crossmodal`` (learned weights beta), ``unimodal``
-            (product of experts for an EKF, sum of likelihoods for a PF), or ``none`` (there is only one).
-        models: one measurement model each: the modalities that it sees, joined by ``+``.
+        fusion: rule that fuses the measurement models' results: ``crossmodal`` (learned weights beta), ``unimodal``
+            (product of experts for an EKF, sum of likelihoods for a PF), or ``none`` (one model).
+        models: for each measurement model its modalities, joined by ``+``.
         units: width of all fully connected layers. image_stride: of the first convolution.
-        pooling: from the last convolution to the first fully connected layer.
-        covariance: EKF, UKF: rule of the fused covariance. feedback: EKF, UKF: hand the fused belief back to every
-            unimodal filter (the paper's text leaves them independent).
-        likelihoods: PF: ``normalised`` over the particles in each model before they are weighed, so that beta is the
-            share a model has in the particle weights; or ``raw``: what finds all states likely outweighs the rest.
-        resampling: PF: how ancestors are drawn. soft_share: ``soft``: share of the weights in what is drawn from, the
+        pooling: between the last convolution and the first fully connected layer.
+        covariance: EKF, UKF: rule of the fused covariance. feedback: EKF, UKF: whether every unimodal
+            filter continues from the fused belief (independent in the paper's text).
+        likelihoods: PF: ``normalised`` over the particles of each model before the fusion, so that beta is a model's
+            share of the particle weights; or ``raw``: a model with higher likelihoods overall dominates.
+        resampling: PF: rule for sampling ancestors. soft_share: ``soft``: share of the weights in the proposal, the
             rest is uniform; in (0, 1].
     """
 
@@ -61,15 +61,15 @@ class Architecture:
     soft_share: float = 0.5
 
     def __post_init__(self) -> None:
-        """Raises BadInput for a choice that does not exist."""
+        """Raises BadInput for an invalid value."""
         for name, kind in get_type_hints(Architecture).items():
             value = getattr(self, name)
             if get_origin(kind) is Literal and value not in get_args(kind):
-                raise one_of(f"{name} of a filter", value, get_args(kind))
+                raise unknown_name(f"{name} of a filter", value, get_args(kind))
             if kind is str and not isinstance(value, str):
                 raise BadInput(f"{name} of a filter is {value!r:.200}, not a name")
-            if kind is int and not (type(value) is int and 1 <= value <= WIDEST):
-                raise BadInput(f"{name} of a filter is {value!r}, not a whole number from 1 to {WIDEST}")
+            if kind is int and not (type(value) is int and 1 <= value <= MAX_SIZE):
+                raise BadInput(f"{name} of a filter is {value!r}, not a whole number from 1 to {MAX_SIZE}")
         if not self.models or not all(isinstance(model, str) for model in self.models):
             raise BadInput(f"models of a filter are {self.models!r}, not names of modalities")
         if not 0.0 < self.soft_share <= 1.0:
@@ -80,7 +80,7 @@ class Architecture:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Architecture:
-        """What is missing takes its default. Raises BadInput for what is unknown, or without task, kind or models."""
+        """Missing values take their default. Raises BadInput for unknown keys, and without task, kind or models."""
         try:
             return cls(**{**values, "models": tuple(values["models"])})
         except (KeyError, TypeError) as error:
@@ -91,8 +91,8 @@ class Filter(nn.Module, ABC):
     """A differentiable filter: ``encode`` once, then ``step`` through time. Standardised units throughout.
 
     Attributes:
-        has_covariance: whether its estimates come with one; else it is NaN.
-        dynamics: of all kinds but the LSTM.
+        has_covariance: whether its estimates have a covariance; else it is NaN.
+        dynamics: the dynamics model; the LSTM has none.
     """
 
     has_covariance = True
@@ -117,8 +117,8 @@ class Filter(nn.Module, ABC):
             raise BadInput(f"Modality {name!r} is not in this filter. Available: {', '.join(self.names)}.")
         return self.names.index(name)
 
-    def weights_part(self, batch: Batch) -> Tensor | None:
-        """(T, N, K, W) log beta, or None where nothing is weighed by a network."""
+    def log_weights(self, batch: Batch) -> Tensor | None:
+        """(T, N, K, W) log beta, or None without a weight model."""
         if self.architecture.fusion != "crossmodal":
             return None
         return self.get_submodule("weight_model")(self.observations(batch))
@@ -129,7 +129,7 @@ class Filter(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, batch: Batch) -> Evidence:
-        """All that can be computed without the belief, for all T x N at once."""
+        """Everything that does not depend on the belief, for all T x N at once."""
 
     @abstractmethod
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
@@ -137,17 +137,17 @@ class Filter(nn.Module, ABC):
 
     @abstractmethod
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
-        """One prediction and update. ``evidence`` is one step's: leading axis N. Draws only from ``generator``."""
+        """One prediction and update. ``evidence`` is of one step: leading axis N. Uses no other random numbers."""
 
     def steps(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> Iterator[StepTrace]:
-        """The traces of all T steps of ``evidence``, each step from the belief that the one before left."""
+        """The traces of all T steps of ``evidence``, each from the belief of the previous one."""
         for t in range(len(evidence)):
             belief, trace = self.step(belief, evidence[t], generator)
             yield trace
 
 
 def encoders(task: Task, modalities: Iterable[str], architecture: Architecture) -> Encoders:
-    """Fresh encoders of these modalities. Raises BadInput for one that the task does not have."""
+    """New encoders of these modalities. Raises BadInput for one that the task does not have."""
     shapes: dict[str, tuple[int, ...]] = {}
     for modality in modalities:
         if modality not in task.modalities:
@@ -159,17 +159,17 @@ def encoders(task: Task, modalities: Iterable[str], architecture: Architecture) 
 
 
 def modality_shape(task: Task, modality: str) -> tuple[int, ...]:
-    """(H, W) of a picture, or (d,) of joined vectors."""
+    """(H, W) of an image, or (d,) of concatenated vectors."""
     keys = [task.observations[key] for key in task.modalities[modality]]
     return keys[0] if len(keys[0]) == 2 else (sum(shape[0] for shape in keys),)
 
 
-LARGEST_LOGIT = 3.0
-"""Bound of the weight model's logits: a weight that reached 0 or 1 would never learn again."""
+MAX_LOGIT = 3.0
+"""Bound of the weight model's logits: a weight of 0 or 1 would have no gradient."""
 
 
 class WeightModel(nn.Module):
-    """Crossmodal weights: every modality through an encoder of its own, joined, to log beta (T, N, K, W).
+    """Crossmodal weights: the joined features of all modalities' encoders to log beta (T, N, K, W).
 
     A softmax over K makes the weights positive and sum to one in each component; bounded logits keep each between
     0.0025 and 0.9975.
@@ -188,5 +188,5 @@ class WeightModel(nn.Module):
 
     def forward(self, observations: Mapping[str, Tensor]) -> Tensor:
         logits = self.output(self.trunk(self.encoders(observations))).unflatten(-1, self.shape)
-        logits = LARGEST_LOGIT * torch.tanh(logits / LARGEST_LOGIT)
+        logits = MAX_LOGIT * torch.tanh(logits / MAX_LOGIT)
         return torch.log_softmax(logits, dim=-2)

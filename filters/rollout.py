@@ -1,4 +1,4 @@
-"""Running a filter through time."""
+"""Running a filter over a sequence of steps."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
 from beliefscope.filters.filter import Filter
 
 START_VARIANCE = 0.1
-"""Of the first belief around the true state, in standardised units, as in the paper's evaluation."""
+"""Variance of the first belief around the true state, in standardised units, as in the paper's evaluation."""
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """estimate: Gaussian (T, N, n), (T, N, n, n), standardised. steps: the T step traces where they were kept."""
+    """estimate: Gaussian (T, N, n), (T, N, n, n), standardised. steps: the T step traces, if kept."""
 
     estimate: Gaussian
     steps: list[StepTrace]
@@ -39,7 +39,7 @@ def rollout(
     keep: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Rollout:
-    """All T steps of ``evidence``. Keeping the step traces changes no number: the same steps are taken either way."""
+    """Runs all T steps of ``evidence``. ``keep`` (the step traces) does not affect the results."""
     belief = filter_.start(start, particles, generator)
     estimates: list[Gaussian] = []
     steps: list[StepTrace] = []

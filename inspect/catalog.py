@@ -1,4 +1,4 @@
-"""The diagnostics that there are. A new one is a module with an ``Entry``, and its line here."""
+"""Catalog of diagnostics. A new diagnostic is a module with an ``Entry`` that is listed here."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ ENTRIES: tuple[Entry, ...] = (
 )
 
 DIAGNOSTICS: dict[str, Entry] = {entry.name: entry for entry in ENTRIES}
-"""By name, in the order in which they are shown."""
+"""Entries by name, in display order."""
 
 
 def quick(trace: Trace, checkpoint: Checkpoint | None = None) -> dict[str, Diagnostic]:
-    """By name, what is made of one trace at once: every diagnostic that is not slow and can be made of it."""
+    """Compute all applicable diagnostics of a trace that are not slow, by name."""
     return {
         name: entry([trace], checkpoint)
         for name, entry in DIAGNOSTICS.items()

@@ -1,10 +1,9 @@
-"""Likelihood maps: how likely each modality finds every position of the map square, at one step."""
+"""Likelihood maps: likelihood of every position of the map square given each modality, at one step."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,112 +13,76 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.load import Foreign
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.fusion import mixture
 from beliefscope.filters.models.pf import ParticleFilter
-from beliefscope.inspect.maps.grid import Cells, one_thread
+from beliefscope.inspect.maps.grid import GridEvaluator, one_thread
+from beliefscope.inspect.maps.likelihood_map import Array, LikelihoodMap
 from beliefscope.inspect.statistics.measures import wrapped
 from beliefscope.inspect.trace import Trace
 
-Array = NDArray[np.float32]
+__all__ = ["COARSE", "FINE", "LARGEST", "LikelihoodMap", "MapEngine", "no_maps"]
 
 COARSE, FINE = 41, 135
-"""Cells along a side of a map that is drawn while a hand moves, or made of every step; and of one to look at."""
+"""Cells per side: maps during scrubbing and of all steps; maps of a single step."""
 
 LARGEST = 1024
-"""Cells along a side that a map may have."""
-
-
-@dataclass(frozen=True)
-class LikelihoodMap:
-    """One map per modality and one fused, over offsets from the true position.
-
-    PF: the measurement models' log-likelihood, and their mixture as it is fused. EKF, UKF: log density of each unimodal
-    posterior and of the fused one.
-
-    Attributes:
-        step: of the trace. angle: value of the one component that is held fixed (rad), NaN where there is none.
-        layers: names: the trace's modalities, then ``fused``; L of them.
-        offsets_x, offsets_y: (S,) m, cell centres, increasing, relative to ``centre``. centre: (2,) m, the true
-            position, or where it is not known the fused estimate.
-        log_likelihood: (L, S, S) natural log, not normalised; [l, iy, ix] belongs to offsets_y[iy], offsets_x[ix].
-    """
-
-    step: int
-    angle: float
-    layers: tuple[str, ...]
-    offsets_x: Array
-    offsets_y: Array
-    centre: Array
-    log_likelihood: Array
-
-    def normalised(self) -> NDArray[np.uint8]:
-        """(L, S, S) uint8: likelihood over its own layer's maximum, times 255, rounded."""
-        peak = self.log_likelihood.max(axis=(1, 2), keepdims=True)
-        return np.rint(255.0 * np.exp(self.log_likelihood - peak)).astype(np.uint8)
-
-    def peaks(self) -> Array:
-        """(L, 2) m: offset (x, y) of each layer's maximum."""
-        flat = self.log_likelihood.reshape(len(self.layers), -1).argmax(axis=1)
-        iy, ix = np.unravel_index(flat, self.log_likelihood.shape[1:])
-        return np.stack([self.offsets_x[ix], self.offsets_y[iy]], axis=1)
+"""Maximum number of cells per side."""
 
 
 def no_maps(checkpoint: Checkpoint, trace: Trace | None = None) -> str | None:
-    """Why a filter has no likelihood maps, in one line; None where it has them.
+    """One-line reason why a filter has no likelihood maps, or None.
 
     Args:
-        trace: of the filter. One from outside has those that follow from its trace: its Gaussians.
+        trace: a trace of the filter; required for an external filter, whose maps are computed from its Gaussians.
     """
-    task, what = checkpoint.task, "has no likelihood maps"
-    if isinstance(checkpoint, Foreign):
-        if why := _nothing_to_map(trace):
-            return f"filter {checkpoint.name!r} {what}: {why}"
+    task, subject = checkpoint.task, "has no likelihood maps"
+    if isinstance(checkpoint, ExternalFilter):
+        if why := _no_gaussians(trace):
+            return f"filter {checkpoint.name!r} {subject}: {why}"
     elif not checkpoint.filter.has_covariance:
         kind = checkpoint.kind.upper()
-        return f"filter {checkpoint.name!r} {what}: an {kind} estimates the state, but not how likely others are"
-    off = [c.name for i, c in enumerate(task.components) if i not in task.map_indices]
-    if len(off) > 1:
-        return f"task {task.name!r} {what}: {', '.join(off)} are off the map; one at most can be held fixed"
+        return f"filter {checkpoint.name!r} {subject}: an {kind} has no likelihood and no covariance"
+    off_map = [c.name for i, c in enumerate(task.components) if i not in task.map_indices]
+    if len(off_map) > 1:
+        return f"task {task.name!r} {subject}: {', '.join(off_map)} are not on the map; at most one can be held fixed"
     return None
 
 
-def _nothing_to_map(trace: Trace | None) -> str | None:
-    """Why there are no Gaussians to draw of a filter from outside."""
+def _no_gaussians(trace: Trace | None) -> str | None:
+    """Reason why an external filter has no Gaussians to draw, or None."""
     if trace is None or not trace.has_covariance:
-        return "it estimates the state, but does not say how likely others are"
+        return "it reports no covariance"
     if trace.log_likelihood is not None or trace.particles is not None:
-        return (
-            "its particles are known, but its measurement model cannot be asked about states that none of them visited"
-        )
-    if trace.modalities and not trace.alone:
-        return "it does not say what each modality alone believes"
+        return "its measurement model is known only at its particles"
+    if trace.modalities and not trace.modalities_with_posterior:
+        return "it reports no unimodal posteriors"
     both = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
-    flat = np.linalg.eigvalsh(both.astype(np.float64)).min(axis=(1, 2)) <= 0.0
-    return f"a covariance of step {int(flat.argmax())} is not positive definite" if flat.any() else None
+    degenerate = np.linalg.eigvalsh(both.astype(np.float64)).min(axis=(1, 2)) <= 0.0
+    return f"a covariance of step {int(degenerate.argmax())} is not positive definite" if degenerate.any() else None
 
 
 class MapEngine:
-    """Maps of one trace, with each thing computed once that several cells or steps share.
+    """Computes the maps of one trace, reusing values that cells or steps share.
 
-    What depends on the observations: for all steps together. What depends on the cells: in ``Cells``.
+    Observations are encoded for all steps at once; ``GridEvaluator`` reuses values that depend on the grid.
     """
 
     def __init__(self, checkpoint: Checkpoint, trace: Trace) -> None:
-        """Raises BadInput where there are none (``no_maps``), and when the trace was made by another checkpoint."""
+        """Raises BadInput if the filter has no maps (``no_maps``), or if the trace is from another checkpoint."""
         if why := no_maps(checkpoint, trace):
             raise BadInput(why)
         if trace.checkpoint_hash != checkpoint.hash:
             raise BadInput(
-                f"the trace was made by checkpoint {trace.checkpoint_hash[:12]}, not by {checkpoint.hash[:12]}"
+                f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}"
             )
         self.checkpoint = checkpoint
         self.trace = trace
         self.task = checkpoint.task
         self.evidence = self._encode()
-        rest = [i for i in range(len(self.task.components)) if i not in self.task.map_indices]
-        self.fixed = rest[0] if rest else None
-        self._cells = self._networks()
+        off_map = [i for i in range(len(self.task.components)) if i not in self.task.map_indices]
+        self.fixed = off_map[0] if off_map else None
+        self._grid = self._grid_evaluator()
         self._anchors = trace.anchors
 
     @torch.no_grad()
@@ -127,22 +90,23 @@ class MapEngine:
         if self.trace.log_likelihood is None:
             return None
         filter_ = self.checkpoint.filter
-        return filter_.encode(Steps.of(self.task, [self.trace.episode]).episode(0))
+        return filter_.encode(Steps.from_episodes(self.task, [self.trace.episode]).episode(0))
 
-    def _networks(self) -> Cells | None:
+    def _grid_evaluator(self) -> GridEvaluator | None:
         if self.evidence is None:
             return None
         filter_ = self.checkpoint.filter
         assert isinstance(filter_, ParticleFilter)
         models = [filter_.measurement_model(name) for name in filter_.names]
-        return Cells(models, self.task.map_indices, filter_.statistics.mean_std("state")[1])
+        return GridEvaluator(models, self.task.map_indices, filter_.statistics.mean_std("state")[1])
 
     @torch.no_grad()
     def map(self, step: int, angle: float | None = None, size: int = FINE) -> LikelihoodMap:
-        """The maps at one step.
+        """Compute the maps of one step.
 
         Args:
-            angle: rad, value of the component off the map; the true one by default. size: cells along a side, S.
+            angle: rad, value of the component that is not on the map; by default the true value.
+            size: cells per side, S.
 
         Raises:
             BadInput: step, angle or size out of range.
@@ -151,11 +115,11 @@ class MapEngine:
         if not 0 <= step < len(trace):
             raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(trace) - 1}")
         if not 2 <= size <= LARGEST:
-            raise BadInput(f"a map has 2 to {LARGEST} cells along a side, not {size}")
+            raise BadInput(f"a map has 2 to {LARGEST} cells per side, not {size}")
         if angle is not None and not math.isfinite(angle):
             raise BadInput(f"angle must be a finite number of rad, not {angle}")
-        about = self._anchors[step]
-        middle, centre = about.astype(np.float64), about[list(self.task.map_indices)]
+        anchor = self._anchors[step]
+        middle, centre = anchor.astype(np.float64), anchor[list(self.task.map_indices)]
         if self.fixed is not None and angle is not None:
             middle[self.fixed] = angle
         with one_thread():
@@ -173,7 +137,7 @@ class MapEngine:
     def maps(
         self, steps: Sequence[int], size: int = FINE, progress: Callable[[float], None] | None = None
     ) -> Iterator[LikelihoodMap]:
-        """The maps at several steps, at the true angle. ``progress`` is called with the share done, 0..1."""
+        """Maps of several steps, at the true angle. ``progress`` is called with the completed fraction, 0..1."""
         for count, step in enumerate(steps, start=1):
             yield self.map(step, size=size)
             if progress is not None:
@@ -185,13 +149,13 @@ class MapEngine:
         return offsets.astype(np.float32)
 
     def _particle_filter(self, step: int, size: int, middle: NDArray[np.float64]) -> Array:
-        """(K + 1, S, S) log-likelihoods of the measurement models and of their mixture."""
+        """(K + 1, S, S) log-likelihoods of the measurement models and of the fused mixture."""
         filter_, trace = self.checkpoint.filter, self.trace
         assert isinstance(filter_, ParticleFilter)
         assert self.evidence is not None
         evidence = self.evidence[step]
-        assert self._cells is not None
-        each = self._cells.log_likelihood(
+        assert self._grid is not None
+        unimodal = self._grid.log_likelihood(
             torch.from_numpy(self._offsets(size)),
             filter_.statistics.standardise("state", torch.from_numpy(middle)),
             tuple(middle.tolist()),
@@ -199,17 +163,17 @@ class MapEngine:
         )
         assert trace.prior_log_weights is not None
         assert trace.log_likelihood is not None
-        prior, of_particles = trace.prior_log_weights[step], trace.log_likelihood[step]
-        scale = filter_.scale(torch.from_numpy(prior)[None], torch.from_numpy(of_particles)[None])[0]
-        # The trace's: they may have been set by hand.
+        prior, particle_likelihood = trace.prior_log_weights[step], trace.log_likelihood[step]
+        scale = filter_.scale(torch.from_numpy(prior)[None], torch.from_numpy(particle_likelihood)[None])[0]
+        # The trace's weights: they may have been edited.
         log_weights = None if trace.weights is None else torch.from_numpy(trace.weights[step]).log()
-        values = torch.cat([each, mixture(each - scale, log_weights).unsqueeze(0)])
+        values = torch.cat([unimodal, mixture(unimodal - scale, log_weights).unsqueeze(0)])
         return values.unflatten(1, (size, size)).numpy()
 
     def _gaussians(self, step: int, size: int, middle: NDArray[np.float64]) -> Array:
-        """(K + 1, S, S) log densities of each unimodal posterior and of the fused one.
+        """(K + 1, S, S) log densities of the unimodal posteriors and of the fused posterior.
 
-        The squared Mahalanobis distance is a sum over columns, over rows, and over their product.
+        The squared Mahalanobis distance is a sum of a term by column, a term by row and their product.
         """
         trace, (ix, iy) = self.trace, self.task.map_indices
         mean = np.concatenate([trace.modality_mean[step], trace.estimate_mean[step][None]]).astype(np.float64)

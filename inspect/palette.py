@@ -1,4 +1,4 @@
-"""The product's colours: one meaning each, in the page, recordings and figures."""
+"""Colours of page, recordings and figures."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ COLOURS: dict[str, str] = {
     "fused": "#D55E00",
     "contact": "#CC79A7",
 }
-"""Okabe and Ito's colours, which people with any colour vision tell apart. One meaning each, all over the product."""
+"""Okabe and Ito's palette, distinguishable with colour vision deficiency. Each colour has one meaning."""
 
 SPARE_COLOURS: tuple[str, ...] = ("#0072B2", "#F0E442", "#999999")
-"""For modalities that ``COLOURS`` does not name, in the order of the trace's modalities."""
+"""Colours of other modalities, in the order of the trace's modalities."""
 
 
 def colour(source: str, modalities: Sequence[str]) -> str:

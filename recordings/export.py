@@ -1,4 +1,4 @@
-"""A trace for other tools: Parquet for pandas and its like, MCAP for Foxglove, npz for NumPy."""
+"""Export of a trace: Parquet for pandas and similar tools, MCAP for Foxglove, npz for NumPy."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
-from beliefscope.inspect.diagnostics.base import as_json
+from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.trace import Trace, arrays_of, header_of
 from beliefscope.recordings.rerun_log.columns import Column, columns
 from beliefscope.recordings.rerun_log.entities import plane_height
 
 NAME = "beliefscope"
-"""Of what is kept beside the numbers: Parquet's and MCAP's metadata, an array of the npz."""
+"""Key of everything but the arrays: in Parquet's and MCAP's metadata, and in the npz."""
 
 
 def export_trace(trace: Trace, path: Path) -> None:
-    """Writes a trace as the path's ending says: ``.parquet``, ``.mcap`` or ``.npz`` (docs/recordings.md).
+    """Write a trace in the format of the path's suffix: ``.parquet``, ``.mcap`` or ``.npz`` (docs/recordings.md).
 
-    Raises BadInput for another ending, a folder that does not exist, and where the package for MCAP is missing.
+    Raises BadInput for another suffix, a missing folder, and if the package for MCAP is not installed.
     """
     write_atomically(path, FORMATS[export_format(path)](trace))
 
 
 def export_format(path: Path) -> str:
-    """``parquet``, ``mcap`` or ``npz``. Raises BadInput for another ending, or where its package is missing."""
+    """``parquet``, ``mcap`` or ``npz``. Raises BadInput for another suffix or if the package is not installed."""
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in FORMATS:
-        raise one_of("format of an export", suffix, FORMATS)
+        raise unknown_name("export format", suffix, FORMATS)
     if suffix == "mcap":
         try:
             import mcap  # noqa: F401
         except ImportError:
-            raise BadInput("an .mcap file needs the package mcap: pip install 'beliefscope[export]'") from None
+            raise BadInput("MCAP export needs the package mcap: pip install 'beliefscope[export]'") from None
     return suffix
 
 
-def about(trace: Trace) -> dict[str, Any]:
-    """All of a trace that is not over its steps, as JSON values."""
+def metadata(trace: Trace) -> dict[str, Any]:
+    """Everything in a trace except arrays over steps, as JSON values."""
     start = {name: as_json(getattr(trace, name)) for name in ("start_mean", "start_covariance")}
     return header_of(trace) | start | {"steps": len(trace)}
 
 
 def as_npz(trace: Trace) -> bytes:
-    """Every array by name, and the rest as JSON in the array ``beliefscope``; ``np.load`` reads it without pickle."""
+    """Every array by name, and the metadata as JSON in the array ``beliefscope``; readable without pickle."""
     data = io.BytesIO()
     arrays: dict[str, Any] = {NAME: np.array(json.dumps(header_of(trace), sort_keys=True)), **arrays_of(trace)}
     np.savez_compressed(data, **arrays)
@@ -62,7 +62,7 @@ def as_npz(trace: Trace) -> bytes:
 
 
 def as_parquet(trace: Trace) -> bytes:
-    """One row a step; a column for each number by component and modality, lists where a step has many of one kind."""
+    """One row per step; one column per number by component and modality, and list columns for larger arrays."""
     steps = np.arange(len(trace))
     fields = [pa.field("step", pa.int64()), pa.field("time", pa.float64(), metadata={"unit": "s"})]
     arrays = [pa.array(steps), pa.array(steps * trace.episode.dt)]
@@ -73,63 +73,62 @@ def as_parquet(trace: Trace) -> bytes:
         arrays.append(values)
         shape = {"shape": ",".join(map(str, column.shape))} if len(column.shape) > 1 else {}
         fields.append(pa.field(column.name, values.type, metadata={"unit": column.unit} | shape))
-    schema = pa.schema(fields, metadata={NAME: json.dumps(about(trace), sort_keys=True)})
+    schema = pa.schema(fields, metadata={NAME: json.dumps(metadata(trace), sort_keys=True)})
     data = io.BytesIO()
     pq.write_table(pa.Table.from_arrays(arrays, schema=schema), data, compression="zstd")
     return data.getvalue()
 
 
 def as_mcap(trace: Trace) -> bytes:
-    """A topic for each array and each observation, JSON messages; pictures and particles as Foxglove's own schemas."""
+    """One topic per array and observation with JSON messages; images and particles in Foxglove's schemas."""
     from mcap.writer import Writer
 
-    data = io.BytesIO()
-    writer = Writer(data)
+    file = io.BytesIO()
+    writer = Writer(file)
     writer.start(library=NAME)
-    writer.add_metadata(NAME, {"trace": json.dumps(about(trace), sort_keys=True)})
+    writer.add_metadata(NAME, {"trace": json.dumps(metadata(trace), sort_keys=True)})
     topics = dict(_topics(trace))
     channels = {}
     for topic, (schema, _) in topics.items():
-        said = json.dumps(schema).encode()
-        number = writer.register_schema(schema["title"], encoding="jsonschema", data=said)
-        channels[topic] = writer.register_channel(topic, "json", number)
+        id = writer.register_schema(schema["title"], encoding="jsonschema", data=json.dumps(schema).encode())
+        channels[topic] = writer.register_channel(topic, "json", id)
     for step in range(len(trace)):
         time = round(step * trace.episode.dt * 1e9)
         for topic, (_, message) in topics.items():
-            said = json.dumps(message(step), allow_nan=False).encode()
-            writer.add_message(channels[topic], log_time=time, data=said, publish_time=time, sequence=step)
+            data = json.dumps(message(step), allow_nan=False).encode()
+            writer.add_message(channels[topic], log_time=time, data=data, publish_time=time, sequence=step)
     writer.finish()
-    return data.getvalue()
+    return file.getvalue()
 
 
 FORMATS: dict[str, Callable[[Trace], bytes]] = {"parquet": as_parquet, "mcap": as_mcap, "npz": as_npz}
-"""Ending of a file -> what is in it."""
+"""Suffix of a file -> its contents."""
 
 Topics = list[tuple[str, tuple[dict[str, Any], Callable[[int], dict[str, Any]]]]]
-"""Topic -> JSON schema and the message of a step."""
+"""Topic -> JSON schema, and the message of a step."""
 
 TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
 BYTES = {"type": "string", "contentEncoding": "base64"}
 FLOAT32 = 7
-"""Foxglove's number for the type, in the fields of a point cloud."""
+"""Foxglove's code of the type in the fields of a point cloud."""
 
 
 def _topics(trace: Trace) -> Topics:
     arrays: dict[str, list[Column]] = {}
-    found: Topics = []
+    topics: Topics = []
     for column in columns(trace):
-        if column.of == "observations" and len(column.shape) == 2 and column.values.dtype == np.uint8:
-            found.append((f"/observations/{column.parts[0]}", _pictures(column, trace)))
+        if column.group == "observations" and len(column.shape) == 2 and column.values.dtype == np.uint8:
+            topics.append((f"/observations/{column.parts[0]}", _images(column, trace)))
         else:
-            arrays.setdefault(f"/{column.of}/{column.parts[0]}", []).append(column)
-    found += [(topic, _numbers(topic, group)) for topic, group in arrays.items()]
+            arrays.setdefault(f"/{column.group}/{column.parts[0]}", []).append(column)
+    topics += [(topic, _numbers(topic, group)) for topic, group in arrays.items()]
     if trace.particles is not None and trace.log_weights is not None:
-        found.append(("/particles", _particles(trace)))
-    return found
+        topics.append(("/particles", _particles(trace)))
+    return topics
 
 
 def _numbers(topic: str, group: list[Column]) -> tuple[dict[str, Any], Callable[[int], dict[str, Any]]]:
-    """``{"image": {"hinge_x": 0.8}}``; ``{"value": ..}`` where nothing is taken apart. What is not finite is null."""
+    """``{"image": {"hinge_x": 0.8}}``, or ``{"value": ..}`` for an array without parts. Non-finite values are null."""
     schema: dict[str, Any] = {"title": f"{NAME}{topic.replace('/', '.')}", "type": "object", "properties": {}}
     values: list[tuple[tuple[str, ...], list[Any]]] = []
     for column in group:
@@ -144,18 +143,18 @@ def _numbers(topic: str, group: list[Column]) -> tuple[dict[str, Any], Callable[
         values.append((path, as_json(column.values)))
 
     def message(step: int) -> dict[str, Any]:
-        said: dict[str, Any] = {}
+        document: dict[str, Any] = {}
         for path, rows in values:
-            inner = said
+            inner = document
             for part in path[:-1]:
                 inner = inner.setdefault(part, {})
             inner[path[-1]] = rows[step]
-        return said
+        return document
 
     return schema, message
 
 
-def _pictures(column: Column, trace: Trace) -> tuple[dict[str, Any], Callable[[int], dict[str, Any]]]:
+def _images(column: Column, trace: Trace) -> tuple[dict[str, Any], Callable[[int], dict[str, Any]]]:
     height, width = column.shape
     numbers = {name: {"type": "integer"} for name in ("width", "height", "step")}
     texts = {name: {"type": "string"} for name in ("frame_id", "encoding")}

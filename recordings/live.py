@@ -1,17 +1,18 @@
-"""Records a filter while it runs: ``NAME.live``, which has every step, and beside it a ``NAME.rrd`` that Rerun opens.
+"""Records a running filter to ``NAME.live``, which has every step, and ``NAME.rrd``, which Rerun opens.
 
-The filter hands over what it knew and goes on. One thread puts that into arrays and into the ``.live`` file; another
-follows that file, as any reader does, and draws its steps into the ``.rrd`` (``recordings.liveviews``). However slow
-drawing is, neither the filter nor the data wait for it.
+``LiveRecorder.step`` only queues a step. One thread converts queued steps to arrays and appends them to the ``.live``
+file; another reads that file and writes the ``.rrd`` (``rerun_log.live_views``). A slow ``.rrd`` delays neither the
+filter nor the ``.live`` file.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import queue
 import threading
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,26 +28,27 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.adapter import Values, checked, derived, named
+from beliefscope.filters.external.adapter import Values, check_values, derived, named_values
 from beliefscope.filters.external.load import model_names
-from beliefscope.inspect.trace import Trace, assemble
-from beliefscope.inspect.traces.foreign import with_unknown
-from beliefscope.inspect.traces.live_file import SUFFIX, GrowingWriter
+from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.external import fill_missing
+from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter
+from beliefscope.inspect.traces.run import assemble_trace
 from beliefscope.recordings.rerun_log.live_views import LiveViews, write_live
 
 FOLDER = Path("workspace/live")
-WAITING = 1000
-"""Steps that may wait for the disk; with 300 particles, 30 MB of them. The filter waits for one more."""
+QUEUE_SIZE = 1000
+"""Steps that may be queued (30 MB with 300 particles) before ``step`` blocks."""
 
 BLOCK = 100
-"""Steps at most that are written at once, where several wait."""
+"""Maximum number of steps written at once."""
 
 
 @dataclass(frozen=True)
 class _Row:
-    """What one step hands over: NumPy arrays of its own, or what no filter changes any more."""
+    """Data of one step: copied NumPy arrays, or tensors that the filter no longer changes."""
 
-    known: StepTrace | Values
+    values: StepTrace | Values
     observations: dict[str, NDArray[Any]]
     control: NDArray[Any]
     truth: NDArray[Any]
@@ -56,26 +58,27 @@ class _Row:
 
 
 class LiveRecorder:
-    """Takes a running filter's steps; as a context, so that what was recorded is whole whatever ends the run.
+    """Records the steps of a running filter. Use as a context manager, so that files are complete on any exit.
 
         with LiveRecorder("run", checkpoint) as live:
             ...
-            belief, known = filter.step(belief, evidence[t], generator)
-            live.step(known, observations, control, evidence=evidence[t])
+            belief, values = filter.step(belief, evidence[t], generator)
+            live.step(values, observations, control, evidence=evidence[t])
 
-    or, for a filter of another kind, by the names of docs/own_filter.md (NumPy or torch, of this one step):
+    or, for an external filter, with the names of docs/own_filter.md (NumPy or torch, one step):
 
         with LiveRecorder("run", task="door") as live:
             ...
             live.step({"estimate_mean": mean, "estimate_covariance": covariance}, observations, control)
 
-    ``step`` raises BadInput for what cannot be recorded only at the first step. From then on it never raises: what goes
-    wrong is warned of once, and raised where the context ends.
+    ``step`` raises BadInput only at the first step. Later errors are warned about once, and raised when the context
+    ends.
 
     Attributes:
-        path: of the ``.live`` file; its ``.rrd`` has the same name. Where the name was taken, with a number behind it.
-        steps: taken. waited: of these, how many found WAITING others before them and had to wait for the disk.
-        lost: steps that could not be kept, because the disk was full or their arrays were not as at the first.
+        path: of the ``.live`` file; the ``.rrd`` has the same name. A number is appended if the name exists.
+        steps: number of recorded steps.
+        waited: number of steps for which ``step`` blocked because the queue was full.
+        lost: number of steps that could not be written: full disk, or arrays unlike those of the first step.
     """
 
     def __init__(
@@ -90,49 +93,49 @@ class LiveRecorder:
         like: Episode | None = None,
         expected: int | None = None,
         views: bool = True,
-        **given: Any,
+        **fields: Any,
     ) -> None:
-        """Writes nothing yet: files come with the first step.
+        """Prepare a recorder; files are created with the first step.
 
         Args:
-            checkpoint: of the filter, where it is one of this project's. task: of any other; its name or
-                ``path/to/file.py:NAME``. modalities: names of the K measurement models, as in docs/own_filter.md.
-            folder: made if missing. A page of ``beliefscope serve --workspace W`` shows those in ``W/live``.
-            start: the belief before step 0, N = 1: of a checkpoint standardised as its ``start`` took it; of another
-                filter in SI units. Without it: unknown, NaN.
-            like: of which this is a run, where it is known: its dt, seed, split and provenance are those of the run.
-            expected: how many steps there will be, for those who watch.
-            views: whether there is to be an ``.rrd`` as well.
-            given: fields of the trace that say where it comes from: filter, seed, faults, data_hash, settings, ...
+            checkpoint: of a Beliefscope filter.
+            task: name or ``path/to/file.py:NAME`` of the task, for any other filter.
+            modalities: names of the K measurement models (docs/own_filter.md).
+            folder: created if missing. ``beliefscope serve --workspace W`` shows runs in ``W/live``.
+            start: belief before step 0, N = 1; standardised for a checkpoint, else in SI units. Default: NaN.
+            like: episode that provides dt, seed, split and provenance of the run.
+            expected: number of steps, for progress display.
+            views: whether to write an ``.rrd`` too.
+            fields: fields of the trace that describe its origin: filter, seed, faults, data_hash, settings, ...
 
         Raises:
-            BadInput: neither a checkpoint nor a task, an unknown task, a name with a folder in it.
+            BadInput: neither a checkpoint nor a task is given, the task is unknown, or the name contains a folder.
         """
         if checkpoint is None and not task:
-            raise BadInput("a live run needs the filter's checkpoint, or the name of the task it is for")
+            raise BadInput("a live run needs the filter's checkpoint or the name of its task")
         if Path(name).name != name or name.startswith("."):
-            raise BadInput(f"live run {name!r}: a name without a folder is wanted; that is given by folder=")
+            raise BadInput(f"live run {name!r}: the name must not contain a folder; use folder=")
         self._task = find_task(task) if checkpoint is None else checkpoint.task
         self._checkpoint, self._modalities, self._start, self._expected = checkpoint, modalities, start, expected
-        self._given = {"settings": {"torch": torch.__version__}} | given
-        self._about: dict[str, Any] = (
+        self._fields = {"settings": {"torch": torch.__version__}} | fields
+        self._origin: dict[str, Any] = (
             {"dt": self._task.dt, "seed": -1, "split": "test", "provenance": {"live": True}}
             if like is None
             else {key: getattr(like, key) for key in ("dt", "seed", "split", "provenance")}
         )
-        self.path = _free(Path(folder), name)
+        self.path = _unused_path(Path(folder), name)
         self.steps = self.waited = self.lost = 0
         self._error: BadInput | None = None
         self._closed = False
-        self._queue: queue.Queue[_Row | None] = queue.Queue(WAITING)
-        self._keeping = threading.Thread(target=self._keep, name="live-data", daemon=True)
+        self._queue: queue.Queue[_Row | None] = queue.Queue(QUEUE_SIZE)
+        self._writing = threading.Thread(target=self._write, name="live-data", daemon=True)
         self._views = LiveViews(self.path) if views else None
-        self._writer: GrowingWriter | None = None
+        self._writer: LiveFileWriter | None = None
         self._sizes = {"n": len(self._task.components)}
 
     def step(
         self,
-        known: StepTrace | Mapping[str, Any] | tuple[Any, Any] | ArrayLike,
+        values: StepTrace | Mapping[str, Any] | tuple[Any, Any] | ArrayLike,
         observations: Mapping[str, ArrayLike],
         control: ArrayLike | None = None,
         *,
@@ -141,26 +144,27 @@ class LiveRecorder:
         qpos: ArrayLike = (),
         evidence: Evidence | None = None,
     ) -> None:
-        """Hands over one step, and returns. All arrays are copied, but those in a StepTrace and its evidence.
+        """Queue one step. Arrays are copied, except those in a StepTrace and its evidence.
 
         Args:
-            known: what the filter's ``step`` gave beside its belief; of another filter the mean, mean and covariance,
-                or a dictionary. N is 1, or not there.
-            observations: by the task's keys, as many as there are. control: (c,).
-            truth: (n,) the true state, where something measures it; NaN else. contact: whether the robot truly touched
-                the object; else what the observation ``contact`` says, where there is one.
+            values: StepTrace returned by the filter's ``step``; for an external filter the mean, (mean, covariance), or
+                a dictionary. The batch axis N = 1 may be missing.
+            observations: by the task's keys; some may be missing.
+            control: (c,).
+            truth: (n,) true state, if measured. Default: NaN.
+            contact: whether the robot truly touches the object. Default: the observation ``contact``, if any.
             qpos: (nq,) joint positions for the replay of the task's simulation.
-            evidence: of a StepTrace, what the filter's ``step`` was given.
+            evidence: input of the filter's ``step`` that returned the StepTrace.
 
-        Raises BadInput at the first step only: for values that no trace has, and for a place that cannot be written.
+        Raises BadInput at the first step only, for invalid values and if the files cannot be created.
         """
-        seen = {key: np.array(value) for key, value in observations.items()}
+        arrays = {key: np.array(value) for key, value in observations.items()}
         row = _Row(
-            known if isinstance(known, StepTrace) else _with_n(named(_tensors(known), "the filter")),
-            {key: value if value.dtype == np.uint8 else value.astype(np.float32) for key, value in seen.items()},
+            values if isinstance(values, StepTrace) else _with_batch_axis(named_values(_tensors(values), "the filter")),
+            {key: value if value.dtype == np.uint8 else value.astype(np.float32) for key, value in arrays.items()},
             np.array(np.zeros(self._task.control_size) if control is None else control, np.float32),
             np.array(np.full(self._sizes["n"], np.nan) if truth is None else truth, np.float32),
-            bool(np.any(seen.get("contact", False))) if contact is None else contact,
+            bool(np.any(arrays.get("contact", False))) if contact is None else contact,
             np.array(qpos, np.float32),
             evidence,
         )
@@ -173,7 +177,7 @@ class LiveRecorder:
 
     @property
     def behind(self) -> int:
-        """The most steps by which the drawing was ever behind the data."""
+        """Maximum number of steps by which the ``.rrd`` lagged behind the data."""
         return 0 if self._views is None else self._views.behind
 
     def __enter__(self) -> Self:
@@ -185,15 +189,15 @@ class LiveRecorder:
             raise self._error
 
     def close(self) -> None:
-        """Writes what still waits, ends the file, and replaces the ``.rrd`` by the one that ``record`` would write."""
+        """Write queued steps, complete the file, and replace the ``.rrd`` by one as written by ``record``."""
         if self._writer is None or self._closed:
             return
         self._closed = True
         self._queue.put(None)
-        self._keeping.join()
+        self._writing.join()
         if self._views is None:
             return
-        self._views.close(draw_rest=self._error is not None)
+        self._views.close(write_rest=self._error is not None)
         if self._error is None:
             try:
                 write_live(self.path, self.path.with_suffix(".rrd"))
@@ -201,36 +205,36 @@ class LiveRecorder:
                 self._error = error
 
     def _begin(self, row: _Row) -> None:
-        """Makes the file with the first step, here and not later: what is wrong is wrong from the start."""
-        if not isinstance(row.known, StepTrace):
-            checked(row.known, (1,), self._sizes, "the filter")
+        """Create the file with the first step, so that errors are raised immediately."""
+        if not isinstance(row.values, StepTrace):
+            check_values(row.values, (1,), self._sizes, "the filter")
         elif self._checkpoint is None or row.evidence is None:
             raise BadInput("a StepTrace is recorded with its filter's checkpoint and the step's evidence")
         first = self._part([row])
         if first.particles is not None:
-            self._given["settings"] = {"particles": first.particles.shape[1]} | dict(self._given["settings"])
-            first = replace(first, settings=self._given["settings"])
-        known = {key: shape for key, shape in self._task.observations.items() if key in row.observations}
-        check_shapes(replace(self._task, observations=known), first.episode, "the first step")
+            self._fields["settings"] = {"particles": first.particles.shape[1]} | dict(self._fields["settings"])
+            first = replace(first, settings=self._fields["settings"])
+        shapes = {key: shape for key, shape in self._task.observations.items() if key in row.observations}
+        check_shapes(replace(self._task, observations=shapes), first.episode, "the first step")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BadInput(f"cannot make folder {str(self.path.parent)!r}: {error.strerror}") from None
-        self._writer = GrowingWriter(self.path, first, self._expected)
+            raise BadInput(f"cannot create folder {str(self.path.parent)!r}: {error.strerror}") from None
+        self._writer = LiveFileWriter(self.path, first, self._expected)
         self._writer.append(first)
-        self._keeping.start()
+        self._writing.start()
         if self._views is not None:
             self._views.start()
 
-    def _keep(self) -> None:
-        """The thread of the data: what waits goes into the file, in larger blocks the more of it there is."""
+    def _write(self) -> None:
+        """Write queued steps to the file, in larger blocks the more are queued."""
         assert self._writer is not None
-        going = True
-        while going:
+        running = True
+        while running:
             rows = [self._queue.get()]
             while len(rows) < BLOCK and not self._queue.empty():
                 rows.append(self._queue.get())
-            going = rows[-1] is not None
+            running = rows[-1] is not None
             block = [row for row in rows if row is not None]
             if block and self._error is None:
                 try:
@@ -253,7 +257,7 @@ class LiveRecorder:
         warnings.warn(f"live run {str(self.path)!r} ends at step {self.steps}: {error}", stacklevel=2)
 
     def _part(self, rows: Sequence[_Row]) -> Trace:
-        """Some steps as a trace: what a filter of ours knew, or what another one said."""
+        """Steps as a trace, of a Beliefscope or an external filter."""
         episode = Episode(
             task=self._task.name,
             states=np.stack([row.truth for row in rows]),
@@ -261,37 +265,39 @@ class LiveRecorder:
             observations={key: np.stack([row.observations[key] for row in rows]) for key in rows[0].observations},
             contact=np.array([row.contact for row in rows]),
             qpos=np.stack([row.qpos for row in rows]),
-            **self._about,
+            **self._origin,
         )
         n = self._sizes["n"]
         unknown = Gaussian(torch.full((1, n), torch.nan), torch.full((1, n, n), torch.nan))
         start = unknown if self._start is None else self._start
-        knew = [row.known for row in rows if isinstance(row.known, StepTrace)]
+        steps = [row.values for row in rows if isinstance(row.values, StepTrace)]
         evidence = [row.evidence for row in rows if row.evidence is not None]
-        if self._checkpoint is not None and len(knew) == len(evidence) == len(rows):
-            return assemble(self._checkpoint, episode, start, _joined(evidence), knew, **self._given)
-        return self._foreign([row.known for row in rows if not isinstance(row.known, StepTrace)], episode, start)
+        if self._checkpoint is not None and len(steps) == len(evidence) == len(rows):
+            return assemble_trace(self._checkpoint, episode, start, _stack_evidence(evidence), steps, **self._fields)
+        return self._external_part(
+            [row.values for row in rows if not isinstance(row.values, StepTrace)], episode, start
+        )
 
-    def _foreign(self, said: Sequence[Values], episode: Episode, start: Gaussian) -> Trace:
-        """What a filter of another kind said at each step, as a trace; without what it said at some of them only."""
+    def _external_part(self, steps: Sequence[Values], episode: Episode, start: Gaussian) -> Trace:
+        """Steps of an external filter as a trace, without values that some of the steps lack."""
         n = self._sizes["n"]
-        always = [name for name in said[0] if all(name in one for one in said)]
-        values = derived({name: _typed(name, torch.cat([one[name] for one in said])) for name in always})
+        common = [name for name in steps[0] if all(name in step for step in steps)]
+        values = derived({name: _typed(name, torch.cat([step[name] for step in steps])) for name in common})
         modalities = model_names(values, 1, self._modalities, self._task)
         arrays = {name: np.ascontiguousarray(value.numpy()) for name, value in values.items()}
-        about: dict[str, Any] = {"filter": "own"} | self._given | with_unknown(arrays, len(modalities))
+        fields: dict[str, Any] = {"filter": "own"} | self._fields | fill_missing(arrays, len(modalities))
         return Trace(
             episode=episode,
             modalities=modalities,
-            kind="foreign",
+            kind="external",
             start_mean=start.mean.reshape(n).float().numpy(),
             start_covariance=start.covariance.reshape(n, n).float().numpy(),
-            **about,
+            **fields,
         )
 
 
-def _free(folder: Path, name: str) -> Path:
-    """The first of NAME, NAME-2, NAME-3, ... that no run has."""
+def _unused_path(folder: Path, name: str) -> Path:
+    """The first unused of NAME, NAME-2, NAME-3, ..."""
     number, path = 1, folder / f"{name}{SUFFIX}"
     while path.exists():
         number += 1
@@ -299,27 +305,27 @@ def _free(folder: Path, name: str) -> Path:
     return path
 
 
-def _tensors(known: Any) -> Any:
-    """NumPy's arrays and numbers as tensors, within a dictionary or a pair as well."""
-    if isinstance(known, Mapping):
-        return {name: _tensors(value) for name, value in known.items()}
-    if isinstance(known, tuple):
-        return tuple(map(_tensors, known))
-    return known if isinstance(known, Tensor) else torch.from_numpy(np.array(known))
+def _tensors(values: Any) -> Any:
+    """NumPy arrays and numbers as tensors, including those in a dictionary or pair."""
+    if isinstance(values, Mapping):
+        return {name: _tensors(value) for name, value in values.items()}
+    if isinstance(values, tuple):
+        return tuple(map(_tensors, values))
+    return values if isinstance(values, Tensor) else torch.from_numpy(np.array(values))
 
 
-def _with_n(values: Values) -> Values:
-    """With the axis N = 1 in front, where it was not there."""
-    there = values["estimate_mean"].ndim > 1
-    return values if there else {name: value[None] for name, value in values.items()}
+def _with_batch_axis(values: Values) -> Values:
+    """Values with the leading batch axis N = 1, added if missing."""
+    present = values["estimate_mean"].ndim > 1
+    return values if present else {name: value[None] for name, value in values.items()}
 
 
 def _typed(name: str, value: Tensor) -> Tensor:
     return value.int() if name == "ancestors" else value.float()
 
 
-def _joined(evidence: Sequence[Evidence]) -> Evidence:
-    """Of T steps, (N, ...) each, as (T, N, ...)."""
-    every = {field.name: [getattr(one, field.name) for one in evidence] for field in fields(Evidence)}
-    joined: dict[str, Any] = {name: torch.stack(values) for name, values in every.items() if values[0] is not None}
-    return Evidence(**({"noise": None, "log_weights": None} | joined))
+def _stack_evidence(evidence: Sequence[Evidence]) -> Evidence:
+    """Evidence of T steps, (N, ...) each, as (T, N, ...)."""
+    lists = {f.name: [getattr(step, f.name) for step in evidence] for f in dataclasses.fields(Evidence)}
+    stacked: dict[str, Any] = {name: torch.stack(values) for name, values in lists.items() if values[0] is not None}
+    return Evidence(**({"noise": None, "log_weights": None} | stacked))

@@ -1,4 +1,4 @@
-"""``.rrd`` -> trace, with Rerun's own reader."""
+"""Reads the trace in a ``.rrd`` recording with Rerun's reader."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.trace import Trace, stored_faults
-from beliefscope.inspect.traces.validate import check_intact
+from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.file import current_array, current_kind, stored_faults
+from beliefscope.inspect.traces.validate import validate_trace
 from beliefscope.recordings.rerun_log.metadata import properties_of, reading
 from beliefscope.recordings.schema import (
     APPLICATION,
@@ -33,28 +34,28 @@ STORED = ["/trace/**", "/observations/**", f"/{HEADER}"]
 
 
 Rows = dict[str, list[tuple[NDArray[np.int64] | None, NDArray[Any]]]]
-"""Stored path -> its chunks: steps (R,), None where static, and values, flattened."""
+"""Stored path -> its chunks: steps (R,), None if static, and flattened values."""
 
 
 def read_recording(path: str | Path) -> Trace:
-    """The trace that a recording was written from: equal numbers, in their own types.
+    """Read the trace in a recording, equal to the recorded one in values and types.
 
-    Of a live run that goes on, or was killed, its complete steps. Rerun cannot read a file whose last message is cut in
-    two; the ``.live`` file beside it can be read then.
+    Of a live run that is in progress or was killed, reads the complete steps. Rerun cannot read a file with an
+    incomplete last message; in that case, read the ``.live`` file.
 
     Raises:
-        BadInput: no such file, not a recording of this project, of a newer format version, or cut off.
+        BadInput: the file does not exist, is not a Beliefscope recording, has a newer format version, or is truncated.
     """
     path = Path(path)
     header, rows = _load(path)
     try:
-        found = _trace(path, header, rows)
-        check_intact(found)
+        trace = _trace(path, header, rows)
+        validate_trace(trace)
     except BadInput as error:
         raise error if str(path) in str(error) else BadInput(f"{path}: {error}") from None
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, MemoryError, RecursionError) as error:
-        raise BadInput(f"{path}: not a whole recording: {' '.join(str(error).split())}") from None
-    return found
+        raise BadInput(f"{path}: not a complete recording: {' '.join(str(error).split())}") from None
+    return trace
 
 
 def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
@@ -62,25 +63,25 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
     if steps == GROWING:
         steps = _complete(path, shapes, rows)
     arrays = {name: _assemble(path, name, rows[name], steps, entry) for name, entry in shapes.items()}
-    made, settings = json.loads(header["episode"]), json.loads(header["settings"])
+    origin, settings = json.loads(header["episode"]), json.loads(header["settings"])
     observations = {
         name.removeprefix("observations/"): array for name, array in arrays.items() if name.startswith("observations/")
     }
-    fields_of = {name.removeprefix("trace/"): a for name, a in arrays.items() if name.startswith("trace/")}
-    of_episode = {field.name for field in fields(Episode)} & fields_of.keys()
+    stored = {current_array(name.removeprefix("trace/")): a for name, a in arrays.items() if name.startswith("trace/")}
+    episode_fields = {field.name for field in fields(Episode)} & stored.keys()
     episode = Episode(
         task=header["task"],
         observations=observations,
         dt=float(header["dt"]),
-        seed=made["seed"],
-        split=made["split"],
-        provenance=made["provenance"],
-        **{name: fields_of[name] for name in of_episode},
+        seed=origin["seed"],
+        split=origin["split"],
+        provenance=origin["provenance"],
+        **{name: stored[name] for name in episode_fields},
     )
     return Trace(
         episode=episode,
         modalities=tuple(json.loads(header["modalities"])),
-        kind=header["kind"],
+        kind=current_kind(header["kind"]),
         filter=header["filter"],
         checkpoint_hash=header["checkpoint_hash"],
         data_hash=header["data_hash"],
@@ -88,19 +89,19 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
         seed=int(header["seed"]),
         faults=stored_faults(_parsed(header, "faults", "recipe") | {"settings": settings}),
         settings=settings,
-        **{name: fields_of[name] for name in fields_of.keys() - of_episode},
+        **{name: stored[name] for name in stored.keys() - episode_fields},
     )
 
 
 def _parsed(header: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """The JSON values of those properties that are there."""
+    """JSON values of the properties that exist."""
     return {name: json.loads(header[name]) for name in names if name in header}
 
 
 def _load(path: Path) -> tuple[dict[str, Any], Rows]:
-    """The header and the stored rows of a file."""
+    """Header and stored rows of a file."""
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; a recording (.rrd) is wanted.")
+        raise BadInput(f"{path}: no such file; expected a recording (.rrd).")
     header: dict[str, Any] = {}
     rows: Rows = defaultdict(list)
     with reading(path) as reader:
@@ -114,17 +115,19 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
                     rows[chunk.entity_path.removeprefix("/")] += _values(batch)
     version = header.get("format_version")
     if version is None:
-        raise BadInput(f"{path}: a Rerun recording, but not one that {APPLICATION} wrote.")
+        raise BadInput(f"{path}: a Rerun recording, but not written by {APPLICATION}.")
     if version != FORMAT_VERSION:
-        by = " ".join(str(header.get("versions", "an unknown version")).split())
-        raise BadInput(f"{path}: recording format {version}, by {by}; this version reads format {FORMAT_VERSION}.")
+        versions = " ".join(str(header.get("versions", "an unknown version")).split())
+        raise BadInput(
+            f"{path}: recording format {version}, written by {versions}; this version reads format {FORMAT_VERSION}."
+        )
     if missing := PROPERTIES.keys() - header.keys() - {"faults"}:
         raise BadInput(f"{path}: the recording lacks the properties {', '.join(sorted(missing))}.")
     return header, rows
 
 
 def _values(batch: pa.RecordBatch) -> list[tuple[NDArray[np.int64] | None, NDArray[Any]]]:
-    """The batch's stored values, if it has any (an entity's looks come in batches of their own)."""
+    """Stored values of the batch, if any (styles are in separate batches)."""
     names = batch.schema.names
     steps = batch.column(STEP).to_numpy() if STEP in names else None
     chunks = []
@@ -138,22 +141,22 @@ def _values(batch: pa.RecordBatch) -> list[tuple[NDArray[np.int64] | None, NDArr
 
 
 def _complete(path: Path, shapes: dict[str, Any], rows: Rows) -> int:
-    """Of a live run that goes on, or was killed: the steps that each path has. Drops those that only some have."""
+    """Number of complete steps of an unfinished live run. Drops rows of incomplete steps."""
     over_steps = [name for name, (shape, _) in shapes.items() if 0 not in shape]
     over_steps = [name for name in over_steps if not rows[name] or any(index is not None for index, _ in rows[name])]
     steps = min(sum(len(index) for index, _ in rows[name] if index is not None) for name in over_steps)
     if not steps:
         raise BadInput(f"{path}: no step is complete.")
     for name in over_steps:
-        whole = [(index, value.reshape(len(index), -1)) for index, value in rows[name] if index is not None]
-        rows[name] = [(index[index < steps], value[index < steps].ravel()) for index, value in whole]
+        chunks = [(index, value.reshape(len(index), -1)) for index, value in rows[name] if index is not None]
+        rows[name] = [(index[index < steps], value[index < steps].ravel()) for index, value in chunks]
     return steps
 
 
 def _assemble(
     path: Path, name: str, rows: list[tuple[NDArray[np.int64] | None, NDArray[Any]]], steps: int, entry: list[Any]
 ) -> NDArray[Any]:
-    """One stored array, its rows in the order of their steps. ``entry`` is its line in the property ``shapes``."""
+    """One stored array with its rows sorted by step. entry: shape and type from the property ``shapes``."""
     shape, dtype = tuple(entry[0]), np.dtype(entry[1])
     if 0 in shape:
         return np.zeros((steps, *shape), dtype)
@@ -162,6 +165,6 @@ def _assemble(
         return rows[0][1].reshape(shape).astype(dtype, copy=False)
     order = np.concatenate([np.zeros(0, np.int64), *indices])
     if not np.array_equal(np.sort(order), np.arange(steps)):
-        raise BadInput(f"{path}: {name} holds {len(order)} of {steps} steps; the recording was cut off.")
+        raise BadInput(f"{path}: {name} has {len(order)} of {steps} steps; the recording is truncated.")
     values = np.concatenate([value for _, value in rows]).reshape(steps, *shape)
     return values[np.argsort(order)].astype(dtype, copy=False)

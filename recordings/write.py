@@ -1,4 +1,4 @@
-"""Trace -> ``.rrd``. The file is complete or not there: it is written under another name and then renamed."""
+"""Writes a trace as a ``.rrd`` recording, atomically: under a temporary name that is renamed at the end."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ import beliefscope
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.io.atomic_write import unwritable
+from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_of
+from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_from_arrays
 from beliefscope.inspect.traces.live_file import STATIC
 from beliefscope.recordings.rerun_log import entities
 from beliefscope.recordings.rerun_log.blueprint import blueprint
@@ -43,8 +43,8 @@ from beliefscope.recordings.rerun_log.maps import map_columns, map_style
 from beliefscope.recordings.schema import APPLICATION, FORMAT_VERSION, GROWING, SCHEMA, TRACE_COMPONENT
 
 STEPS_PER_CHUNK, CHUNKS = 100, 100
-"""Steps at least that are sent at once, and how often at most: Rerun keeps an index in memory
-until the file ends, some 0.4 MB each time."""
+"""Minimum number of steps per chunk, and maximum number of chunks: Rerun keeps an index of about 0.4 MB per chunk in
+memory until the file is complete."""
 
 MAPS_PER_CHUNK = 16
 LAYOUT_STEPS = 1000
@@ -61,22 +61,21 @@ def write_recording(
 
     Args:
         trace: of a task in ``TASKS``.
-        path: of the ``.rrd`` file. A file that is there is replaced once the new one is complete.
-        maps: likelihood maps of steps of this trace, all of one size, each step at most once; they are taken block by
-            block, so they may be made while being written. Kept as 8-bit shares of their layer's maximum: the error
-            is at most 1/510 of it.
-        progress: called with the share that is done, 0 to 1.
-        diagnostics: of this trace, by name: each has a tab of its own. ``catalog.quick`` makes those that apply.
+        path: of the ``.rrd`` file. An existing file is replaced once the new one is complete.
+        maps: likelihood maps of distinct steps of this trace, all of one size; consumed in blocks, so an iterator may
+            compute them on demand. Stored as 8-bit fractions of their layer's maximum, with an error of at most 1/510.
+        progress: called with the completed fraction, 0 to 1.
+        diagnostics: of this trace, by name; each has a tab. ``catalog.quick`` computes the applicable ones.
 
     Returns:
         The path.
 
     Raises:
-        BadInput: the folder does not exist or cannot be written; maps of different sizes or unknown steps; a diagnostic
-            with curves of another number of steps.
+        BadInput: the folder does not exist or is not writable; maps have different sizes or invalid steps; a
+            diagnostic has curves with another number of steps.
     """
     task = find_task(trace.episode.task)
-    report = progress or (lambda share: None)
+    report = progress or (lambda fraction: None)
     blocks = _blocks(maps or (), MAPS_PER_CHUNK)
     first = next(blocks, [])
     layers = first[0].layers if first else ()
@@ -90,8 +89,8 @@ def write_recording(
         for name, diagnostic in diagnostics.items():
             log_diagnostic(stream, diagnostic, name, trace)
         if first:
-            for entity, what in map_style(first[0], trace):
-                stream.log(entity, what, static=True)
+            for entity, style in map_style(first[0], trace):
+                stream.log(entity, style, static=True)
         while first:
             _send_maps(stream, first, trace, task, layers)
             report(0.5 + 0.5 * (first[-1].step + 1) / len(trace))
@@ -104,87 +103,91 @@ def write_recording(
 def new_recording(
     path: Path, sample: Trace, bodies: Bodies, steps: int, layout: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
-    """A stream into a file that is complete at the end, or not there; its header and what is static are sent.
+    """Yields a stream to a file written atomically, after sending header and static entities.
 
     Args:
-        sample: of the trace's steps, spread over all of them (``thinned``). steps: that the whole trace has.
+        sample: steps spread over the whole trace (``thinned``).
+        steps: number of steps of the whole trace.
 
-    Raises BadInput where the folder does not exist or cannot be written.
+    Raises BadInput if the folder does not exist or is not writable.
     """
-    rr.set_strict_mode(True)  # or Rerun turns its errors into warnings and leaves gaps
-    flush_and_cleanup_orphaned_recordings()  # Rerun keeps each stream there was, with two threads, until it is told
+    rr.set_strict_mode(True)  # otherwise Rerun turns errors into warnings and writes incomplete data
+    flush_and_cleanup_orphaned_recordings()  # Rerun keeps every stream and its two threads until this call
     with _complete_or_absent(path) as unfinished:
         stream = rr.RecordingStream(APPLICATION)
-        with let_go(layout):
+        with closing_layout(layout):
             stream.save(unfinished, default_blueprint=layout)
         send_header(stream, sample, bodies, steps)
-        stream.flush()  # so that even a file cut off later says what it is
+        stream.flush()  # so that a truncated file has a header
         yield stream
         _finish(stream, unfinished)
 
 
 @contextmanager
-def let_go(layout: rrb.Blueprint) -> Iterator[None]:
-    """Ends the stream that Rerun makes for a layout and forgets: it holds itself, two threads and what was sent."""
-    made, log = [], layout._log_to_stream
+def closing_layout(layout: rrb.Blueprint) -> Iterator[None]:
+    """Closes the stream that Rerun creates for a layout; otherwise its memory and two threads are never released."""
+    streams, log = [], layout._log_to_stream
 
-    def remembered(stream: rr.RecordingStream) -> None:
-        made.append(stream)
+    def capture(stream: rr.RecordingStream) -> None:
+        streams.append(stream)
         log(stream)
 
-    layout._log_to_stream = remembered  # type: ignore[method-assign]
+    layout._log_to_stream = capture  # type: ignore[method-assign]
     try:
         yield
     finally:
         layout._log_to_stream = log  # type: ignore[method-assign]
-        for stream in made:
+        for stream in streams:
             stream.disconnect()
 
 
 def chunks(steps: int) -> Iterator[tuple[int, int]]:
-    """First step and the one after the last of each part that is sent at once."""
+    """(first, last + 1) steps of each chunk."""
     size = max(STEPS_PER_CHUNK, math.ceil(steps / CHUNKS))
     for first in range(0, steps, size):
         yield first, min(first + size, steps)
 
 
 def thinned(trace: Trace) -> Trace:
-    """Every so many-th of its steps: what the layout and all else that is static is made from, however long it is."""
+    """At most ``LAYOUT_STEPS`` steps of a trace, from which layout and static entities are computed."""
     stride = thinning(len(trace))
-    return trace_of(header_of(trace), {n: a if n in STATIC else a[::stride] for n, a in arrays_of(trace).items()})
+    return trace_from_arrays(
+        header_of(trace), {n: a if n in STATIC else a[::stride] for n, a in arrays_of(trace).items()}
+    )
 
 
 def thinning(steps: int) -> int:
-    """The stride at which a thousand steps or fewer are left."""
+    """Stride that leaves at most ``LAYOUT_STEPS`` steps."""
     return max(1, math.ceil(steps / LAYOUT_STEPS))
 
 
 def stored_arrays(trace: Trace) -> Iterator[tuple[str, bool, NDArray[Any]]]:
-    """(path, whether static, array) of every path under ``trace/`` that this trace has something for."""
-    of_episode = {field.name for field in fields(Episode)}
+    """(path, whether static, array) of every path under ``trace/`` for which the trace has data."""
+    episode_fields = {field.name for field in fields(Episode)}
     for entity in SCHEMA:
         if entity.archetype == "Trace":
             name = entity.path.removeprefix("trace/")
-            array = getattr(trace.episode if name in of_episode else trace, name)
+            array = getattr(trace.episode if name in episode_fields else trace, name)
             if array is not None and (array.size or not len(trace)):
                 yield entity.path, entity.static, array
 
 
-def is_picture(array: NDArray[Any]) -> bool:
-    """Whether an observation (T, ...) is stored as pictures; all others are stored as scalars."""
+def is_image(array: NDArray[Any]) -> bool:
+    """Whether an observation (T, ...) is stored as images; all others are stored as scalars."""
     return array.ndim == 3 and array.dtype == np.uint8
 
 
 def send_header(stream: rr.RecordingStream, trace: Trace, bodies: Bodies, steps: int = GROWING) -> None:
-    """The recording's properties, and all else that is not over steps, of a run that these steps are of.
+    """Send the recording's properties and static entities.
 
     Args:
-        trace: some of its steps. steps: all of them; ``GROWING`` while that is not known.
+        trace: some steps of the run.
+        steps: number of all steps; ``GROWING`` if not known yet.
     """
     _send_properties(stream, trace, steps)
     _send_static(stream, trace, find_task(trace.episode.task), steps)
-    for entity, look in bodies.looks():
-        stream.log(entity, look, static=True)
+    for entity, mesh in bodies.meshes():
+        stream.log(entity, mesh, static=True)
 
 
 def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> None:
@@ -194,14 +197,14 @@ def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> No
     shapes |= {
         f"observations/{key}": [list(array.shape[1:]), array.dtype.str] for key, array in episode.observations.items()
     }
-    # What every trace has is said even where it is empty, so that it is read back as such.
+    # Arrays that every trace has are listed even if empty.
     shapes.setdefault("trace/qpos", [list(episode.qpos.shape[1:]), episode.qpos.dtype.str])
     for name in ("modality_mean", "modality_covariance"):
         array = getattr(trace, name)
         shapes.setdefault(f"trace/{name}", [list(array.shape[1:]), array.dtype.str])
     versions = {name: importlib.metadata.version(name) for name in ("rerun-sdk", "numpy")}
     text = json.dumps
-    said = {
+    properties = {
         "format_version": FORMAT_VERSION,
         "versions": text({"beliefscope": beliefscope.__version__} | versions),
         "task": episode.task,
@@ -219,8 +222,9 @@ def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> No
         "episode": text({"seed": episode.seed, "split": episode.split, "provenance": dict(episode.provenance)}),
         "shapes": text(shapes),
     }
-    # As arrays: an empty text of a name that Rerun has not met before would be left out.
-    stream.send_property("beliefscope", rr.AnyValues(**{name: pa.array([value]) for name, value in said.items()}))
+    # As arrays, because Rerun omits empty strings of new names.
+    values = {name: pa.array([value]) for name, value in properties.items()}
+    stream.send_property("beliefscope", rr.AnyValues(**values))
     stream.send_recording_name(f"{episode.task} {trace.episode_index}, {trace.filter}")
 
 
@@ -229,23 +233,24 @@ def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task, steps: in
         if static:
             stream.log(path, [_values(array)], static=True)
     for key, array in trace.episode.observations.items():
-        if is_picture(array):
+        if is_image(array):
             height, width = array.shape[1:]
             gray = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8")
             stream.log(f"observations/{key}", rr.Image.from_fields(format=gray), static=True)
-    for path, what in entities.style(trace, task):
-        stream.log(path, what, static=True)
+    for path, style in entities.style(trace, task):
+        stream.log(path, style, static=True)
     stream.log("about", entities.about(trace, task, steps), static=True)
 
 
 def send_steps(
     stream: rr.RecordingStream, trace: Trace, task: Task, bodies: Bodies, steps: slice, offset: int = 0
 ) -> None:
-    """Some steps of a trace, stored and drawn.
+    """Send some steps of a trace: stored arrays and display entities.
 
     Args:
-        steps: of the trace, from and to. offset: which step of the run the trace's first is, where it is only a part.
-            A part that is not the run's beginning begins at least one step before ``steps``: what changed is told.
+        steps: range of steps in the trace.
+        offset: step of the run at which the trace begins, if it is only a part of the run. Such a part must include
+            the step before ``steps``, to detect changes of contact.
     """
     times = entities.time_columns(np.arange(steps.start, steps.stop) + offset, trace.episode.dt)
     for path, static, array in stored_arrays(trace):
@@ -256,7 +261,7 @@ def send_steps(
     for key, array in trace.episode.observations.items():
         rows = array[steps]
         columns = (
-            rr.Image.columns(buffer=list(rows.reshape(len(rows), -1))) if is_picture(array) else entities.series(rows)
+            rr.Image.columns(buffer=list(rows.reshape(len(rows), -1))) if is_image(array) else entities.series(rows)
         )
         stream.send_columns(f"observations/{key}", times, columns)
     for path, columns in entities.columns(trace, task, steps):
@@ -271,12 +276,12 @@ def send_steps(
 def _send_maps(
     stream: rr.RecordingStream, maps: list[LikelihoodMap], trace: Trace, task: Task, layers: tuple[str, ...]
 ) -> None:
-    for one in maps:
-        if not 0 <= one.step < len(trace):
-            raise BadInput(f"map of step {one.step}: the trace has steps 0 to {len(trace) - 1}.")
-        if one.layers != layers or one.log_likelihood.shape != maps[0].log_likelihood.shape:
-            raise BadInput(f"map of step {one.step}: all maps of a recording have one size and one set of layers.")
-    times = entities.time_columns(np.array([one.step for one in maps]), trace.episode.dt)
+    for map_ in maps:
+        if not 0 <= map_.step < len(trace):
+            raise BadInput(f"map of step {map_.step}: the trace has steps 0 to {len(trace) - 1}.")
+        if map_.layers != layers or map_.log_likelihood.shape != maps[0].log_likelihood.shape:
+            raise BadInput(f"map of step {map_.step}: all maps of a recording must have the same size and layers.")
+    times = entities.time_columns(np.array([map_.step for map_ in maps]), trace.episode.dt)
     for path, columns in map_columns(maps, trace, task):
         stream.send_columns(path, times, columns)
 
@@ -290,27 +295,27 @@ def _values(array: NDArray[Any]) -> Any:
 
 
 def _blocks(maps: Iterable[LikelihoodMap], size: int) -> Iterator[list[LikelihoodMap]]:
-    rest = iter(maps)
-    while block := list(islice(rest, size)):
+    remaining = iter(maps)
+    while block := list(islice(remaining, size)):
         yield block
 
 
-_CUT_SHORT = ENOSPC, "Rerun could not write the file to its end"  # it does not say why, and there is hardly another
+_TRUNCATED = ENOSPC, "Rerun could not write the complete file"  # Rerun gives no reason; a full disk is the usual one
 
 
 def _finish(stream: rr.RecordingStream, path: Path) -> None:
-    """Writes what is still queued, then asks the file for its footer: Rerun only logs that a disk was full."""
+    """Flush the stream and check the footer of the file, because Rerun only logs write errors."""
     try:
         stream.flush()
         stream.disconnect()
         RrdReader(path).store()
     except (RuntimeError, ValueError):
-        raise OSError(*_CUT_SHORT) from None
+        raise OSError(*_TRUNCATED) from None
 
 
 @contextmanager
 def _complete_or_absent(path: Path) -> Iterator[Path]:
-    """A name in the same folder to write under; renamed to ``path`` at the end, removed if anything goes wrong."""
+    """Yields a temporary path in the same folder; renamed to ``path`` at the end, removed on errors."""
     if not path.parent.is_dir():
         raise BadInput(f"cannot write {path}: the folder {path.parent} does not exist.")
     unfinished = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
@@ -321,10 +326,10 @@ def _complete_or_absent(path: Path) -> Iterator[Path]:
         finally:
             unfinished.unlink(missing_ok=True)
     except OSError as error:
-        raise unwritable(path, error) from None
+        raise write_error(path, error) from None
     except UnicodeEncodeError:
-        raise BadInput(f"cannot write {str(path)!r}: Rerun writes only to files whose names are text") from None
+        raise BadInput(f"cannot write {str(path)!r}: Rerun requires file names that are valid text") from None
     except RuntimeError as error:
-        if "File-writer" not in str(error):  # Rerun's thread, which ends where it cannot write
+        if "File-writer" not in str(error):  # from Rerun's writer thread
             raise
-        raise unwritable(path, OSError(*_CUT_SHORT)) from None
+        raise write_error(path, OSError(*_TRUNCATED)) from None

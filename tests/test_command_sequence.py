@@ -22,7 +22,7 @@ EKF = "door --filter ekf.safetensors"
 
 @pytest.mark.parametrize("task", ["door", "push"])
 def test_collect_shows_the_authors_statistics_beside_its_own(run: Run, folder: Path, task: str) -> None:
-    from beliefscope.datasets.statistics import AUTHORS
+    from beliefscope.datasets.statistics import PAPER_DATA
 
     code, out, _ = run(f"collect {task} --episodes 1 --steps 4 --workers 1 -o one.h5")
     assert code == 0
@@ -30,7 +30,7 @@ def test_collect_shows_the_authors_statistics_beside_its_own(run: Run, folder: P
     assert (empty, title.split()) == ("", ["this", "set", "authors", "ratio"])
     assert head.startswith("one.h5")
     row = next(row for row in rows if row.startswith("contact fraction"))
-    assert row.split()[3] == str(AUTHORS[task].statistics["contact_fraction"])
+    assert row.split()[3] == str(PAPER_DATA[task].statistics["contact_fraction"])
     force = next(row for row in rows if row.startswith("force std, N"))
     assert len(force.split()) == 3 + 3 * 3, "three axes each"
 
@@ -74,10 +74,10 @@ def test_figures_of_the_paper(run: Run, folder: Path) -> None:
     """What is shown is said, the same command gives the same bytes, and --step moves only its own state's map."""
     line = f"figure maps {EKF} --json - -o"
     first, again = (json.loads(run(f"{line} {name}.svg")[1]) for name in ("first", "again"))
-    assert first["shown"] == again["shown"] == {"no contact": 66, "contact": 31}
+    assert first["shown"] == again["shown"] == {"free motion": 66, "contact": 31}
     assert (folder / "first.svg").read_bytes() == (folder / "again.svg").read_bytes()
     moved = json.loads(run(f"{line} moved.pdf --step 20")[1])
-    assert moved["shown"] == {"no contact": 66, "contact": 20}
+    assert moved["shown"] == {"free motion": 66, "contact": 20}
     assert (folder / "moved.pdf").read_bytes().startswith(b"%PDF")
     code, out, _ = run(f"figure weights {EKF} -o weights.png")
     assert (code, out) == (0, "weights.png (0.2 MB): crossmodal-ekf over 100 steps of door episode 9\n")
@@ -119,7 +119,7 @@ def test_one_option_breaks_any_sensor(run: Run, folder: Path) -> None:
     run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
     faults = json.loads(run("faults --json -")[1])
     names = [fault["fault"] for fault in faults["faults"]]
-    assert {"blackout", "force_stuck", "effector_offset", "contact_late", "delay", "drop"} <= set(names)
+    assert {"blackout", "force_stuck", "effector_offset", "contact_delayed", "delay", "drop"} <= set(names)
     text = run("faults")[1]
     assert all(f"\n{name} " in f"\n{text}" for name in names)
     everything = ",".join(names)

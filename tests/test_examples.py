@@ -1,4 +1,4 @@
-"""The examples run and say what they promise. A task from plain arrays goes the whole way with no other change."""
+"""The examples run as documented, including a user-defined task in every part of the program."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from beliefscope.app.cli.main import main
-from beliefscope.app.runs.trace_store import Library, Selection, Settings
+from beliefscope.app.runs.selection import Selection
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets import catalog
 from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.errors import BadInput
@@ -31,19 +33,19 @@ SPEC = f"{EXAMPLE}:TASK"
 
 
 @contextlib.contextmanager
-def fresh() -> Iterator[None]:
-    """As in a new process: tasks that are found meanwhile are forgotten afterwards."""
-    known = dict(TASKS)
+def clean_tasks() -> Iterator[None]:
+    """Remove user-defined tasks at the end, as in a new process."""
+    tasks = dict(TASKS)
     yield
     TASKS.clear()
-    TASKS.update(known)
+    TASKS.update(tasks)
     catalog._FOREIGN.clear()
 
 
 def run(*arguments: object) -> tuple[int, str, str]:
-    """A command line, as in a process of its own: exit code, standard output, standard error."""
+    """Run a command line; return exit code, standard output and standard error."""
     out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, fresh():
+    with pytest.MonkeyPatch.context() as patch, clean_tasks():
         patch.setattr(sys, "argv", ["beliefscope", *map(str, arguments)])
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.raises(SystemExit) as end:
             main()
@@ -58,7 +60,7 @@ def result(*arguments: object) -> Any:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data, a filter, a trace and a recording, each made as a user would."""
+    """Data, a filter, a trace and a recording of the user-defined task."""
     folder = tmp_path_factory.mktemp("own")
     data, trained = folder / "own.h5", folder / "own.safetensors"
     with pytest.MonkeyPatch.context() as patch:
@@ -71,7 +73,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def example(name: str, argument: object, capsys: pytest.CaptureFixture[str]) -> str:
-    """What one of the numbered examples prints."""
+    """Output of a numbered example."""
     path = EXAMPLE.parent / name
     assert len(path.read_text().splitlines()) < 40
     with pytest.MonkeyPatch.context() as patch:
@@ -81,41 +83,41 @@ def example(name: str, argument: object, capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_diagnose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = example("01_diagnose.py", tmp_path, capsys)
-    assert all(f"{entry.title}. {entry.question}\n  " in said for entry in DIAGNOSTICS.values())
-    assert "an oracle would" in said
-    assert "95 % -" in said, "five trajectories give intervals"
+    output = example("01_diagnose.py", tmp_path, capsys)
+    assert all(f"{entry.title}. {entry.question}\n  " in output for entry in DIAGNOSTICS.values())
+    assert "an oracle would" in output
+    assert "95 % -" in output, "five trajectories are enough for intervals"
     assert {path.stem for path in tmp_path.glob("*.pdf")} == {"weights", "consistency", "particles"}
 
 
 def test_counterfactual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = example("02_counterfactual.py", tmp_path / "what.svg", capsys)
-    black, trusted, _ = re.findall(r"the error went from ([\d.]+) to ([\d.]+) cm", said)
-    assert black[0] == trusted[0], "each is compared with the same run"
-    assert float(black[1]) < float(trusted[1]), "trusting a black picture is worse than not"
+    output = example("02_counterfactual.py", tmp_path / "what.svg", capsys)
+    blackout, trusted, _ = re.findall(r"the error went from ([\d.]+) to ([\d.]+) cm", output)
+    assert blackout[0] == trusted[0], "both are compared with the same run"
+    assert float(blackout[1]) < float(trusted[1]), "trusting a blacked out image increases the error"
     assert (tmp_path / "what.svg").read_text().startswith("<?xml")
 
 
 def test_live(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.sleep", lambda seconds: None)
-    said = example("05_live.py", tmp_path, capsys)
-    assert said == f"{tmp_path}/live/example.live: 100 steps, the hinge is at (81.0, -19.8) cm\n"
+    output = example("05_live.py", tmp_path, capsys)
+    assert output == f"{tmp_path}/live/example.live: 100 steps, the hinge is at (81.0, -19.8) cm\n"
     checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
-        whole = trace(checkpoint, data[9])
-    found = load_live(tmp_path / "live" / "example.live")
-    # Each picture on its own adds up in another order than all at once.
-    np.testing.assert_allclose(found.estimate_mean, whole.estimate_mean, atol=1e-5)
+        expected = trace(checkpoint, data[9])
+    result = load_live(tmp_path / "live" / "example.live")
+    # Encoding images one by one changes the order of floating-point sums.
+    np.testing.assert_allclose(result.estimate_mean, expected.estimate_mean, atol=1e-5)
 
 
 def test_example_is_short() -> None:
     assert len(EXAMPLE.read_text().splitlines()) < 60
 
 
-def test_whole_way(folder: Path) -> None:
+def test_user_task_on_the_command_line(folder: Path) -> None:
     measured = result("evaluate", SPEC, "--filter", folder / "own.safetensors", "--data", folder / "own.h5")
     assert set(measured["rmse"]) == {"x_cm", "y_cm", "position_cm"}
-    with fresh():
+    with clean_tasks():
         load_task(SPEC)
         with open_dataset(folder / "own.h5") as data:
             assert measured["data_hash"] == data.hash
@@ -125,32 +127,32 @@ def test_whole_way(folder: Path) -> None:
     assert (folder / "own.rrd").stat().st_size > 10_000
 
 
-def test_page_shows_it(folder: Path, tmp_path: Path) -> None:
-    with fresh():
+def test_user_task_in_the_server(folder: Path, tmp_path: Path) -> None:
+    with clean_tasks():
         load_task(SPEC)
-        library = Library(Settings(tmp_path, {"own": folder / "own.h5"}, {"own": folder / "own.safetensors"}))
+        store = TraceStore(Settings(tmp_path, {"own": folder / "own.h5"}, {"own": folder / "own.safetensors"}))
         try:
-            catalog = library.catalog()
+            catalog = store.catalog()
             assert catalog["problems"] == []
-            shown = catalog["tasks"][0]
-            assert (shown["name"], len(shown["data"][0]["episodes"])) == ("ball", 100)
-            assert [one["name"] for one in shown["filters"]] == ["own"]
-            assert library.default() == Selection("ball", "own", 9, data="own")
-            traced = library.traced(library.default())
-            assert traced.trace.modalities == ("image", "sound")
-            assert len(traced.columns[1]) > 0
-            assert traced.map(3, None, 41).layers == ("image", "sound", "fused")
+            task = catalog["tasks"][0]
+            assert (task["name"], len(task["data"][0]["episodes"])) == ("ball", 100)
+            assert [filter_["name"] for filter_ in task["filters"]] == ["own"]
+            assert store.default_selection() == Selection("ball", "own", 9, data="own")
+            run_ = store.request(store.default_selection())
+            assert run_.trace.modalities == ("image", "sound")
+            assert len(run_.columns[1]) > 0
+            assert run_.map(3, None, 41).layers == ("image", "sound", "fused")
         finally:
-            library.close()
+            store.close()
 
 
-def test_its_filter_says_whose_it_is(folder: Path) -> None:
+def test_filters_of_unknown_tasks_are_rejected(folder: Path) -> None:
     code, _, err = run("evaluate", "door", "--filter", folder / "own.safetensors")
     assert code == 2
     assert "task 'ball' does not exist. Available: door, " in err
-    assert "One of your own is named by its file: path/to/file.py:NAME." in err
+    assert "Give a task of your own as path/to/file.py:NAME." in err
     _, _, err = run("evaluate", SPEC, "--filter", folder / "own.safetensors")
-    assert "Task 'ball' ships no sample set. Give its data with --data." in err
+    assert "Task 'ball' has no sample dataset. Give its data with --data." in err
 
 
 TASK_FILE = """
@@ -169,24 +171,24 @@ TASK = Task(
     ("content", "spec", "message"),
     [
         ("", "nothing.py:TASK", r"nothing\.py does not exist"),
-        ("", "own.py:TASK", r"own\.py holds no task 'TASK'\. Tasks in it: none\."),
-        (TASK_FILE, "own.py:NUMBER", r"own\.py holds no task 'NUMBER'\. Tasks in it: TASK\."),
+        ("", "own.py:TASK", r"own\.py has no task 'TASK'\. Available: none\."),
+        (TASK_FILE, "own.py:NUMBER", r"own\.py has no task 'NUMBER'\. Available: TASK\."),
         ("1 / 0", "own.py:TASK", r"own\.py cannot be run: ZeroDivisionError: division by zero"),
         ("def", "own.py:TASK", r"own\.py cannot be run: SyntaxError"),
         ("", "no.such.module:TASK", r"module 'no\.such\.module' cannot be imported: ModuleNotFoundError: No module"),
-        ("", "json:TASK", r"json holds no task 'TASK'"),
-        (TASK_FILE, "own.py:TASK|door", r"own\.py:TASK is named 'door', which is taken"),
+        ("", "json:TASK", r"json has no task 'TASK'"),
+        (TASK_FILE, "own.py:TASK|door", r"own\.py:TASK is named 'door', which is already used"),
         (TASK_FILE, "own.py:TASK|a b", r"own\.py:TASK is named 'a b', expected a name without spaces"),
-        (TASK_FILE, "own.py:TASK||('touch',)", r"modality 'haptics' has 'touch', which is not among its observations"),
+        (TASK_FILE, "own.py:TASK||('touch',)", r"modality 'haptics' has 'touch', which is not an observation"),
         (
             TASK_FILE,
             "own.py:TASK||('felt', 'image')",
-            r"modality 'haptics' has felt, image, expected one picture or only",
+            r"modality 'haptics' has felt, image, expected one image or only",
         ),
         (TASK_FILE, "own.py:TASK||('felt',)|z", r"component of task 'mine' 'z' does not exist\. Available: x, y"),
     ],
 )
-def test_files_that_are_no_tasks(
+def test_invalid_tasks_are_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, spec: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

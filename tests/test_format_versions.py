@@ -1,4 +1,4 @@
-"""Files of another version of Beliefscope: refused in one line that names both formats, and left as they are."""
+"""Files of other versions of Beliefscope: rejected with both version numbers, and never changed."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from safetensors.numpy import load_file, save
 from starlette.testclient import TestClient
 
 from beliefscope.app.jobs.queue import Job, Jobs
-from beliefscope.app.runs.kept_filters import Child, keep
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.runs.saved_filters import SavedFilter, save_filter
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
@@ -25,8 +25,8 @@ from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import load_trace, save_trace, trace
 
 
-def of_format(path: Path, entry: str, version: int) -> None:
-    """Gives a safetensors file's header another format."""
+def set_format(path: Path, entry: str, version: int) -> None:
+    """Change the format version in the header of a safetensors file."""
     with safe_open(path, "np") as file:
         metadata = file.metadata()
     metadata[entry] = json.dumps(json.loads(metadata[entry]) | {"format": version})
@@ -41,15 +41,15 @@ def episodes(path: Path, version: int) -> None:
 
 def checkpoint(path: Path, version: int) -> None:
     path.write_bytes(shipped("door", "image-ekf").read_bytes())
-    of_format(path, "beliefscope", version)
+    set_format(path, "beliefscope", version)
 
 
 def run(path: Path, version: int) -> None:
     if not path.exists():
         with open_dataset(sample_path("door")) as data:
-            made = trace(load_checkpoint(shipped("door", "image-ekf")), data[0], episode_index=0, seed=0)
-        save_trace(made, path)
-    of_format(path, "beliefscope-trace", version)
+            result = trace(load_checkpoint(shipped("door", "image-ekf")), data[0], episode_index=0, seed=0)
+        save_trace(result, path)
+    set_format(path, "beliefscope-trace", version)
 
 
 FILES: dict[str, tuple[Callable[[Path, int], None], Callable[[Path], Any]]] = {
@@ -60,7 +60,7 @@ FILES: dict[str, tuple[Callable[[Path, int], None], Callable[[Path], Any]]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_another_format_is_refused_by_both_numbers_and_kept(tmp_path: Path, name: str) -> None:
+def test_other_formats_are_rejected_with_both_version_numbers(tmp_path: Path, name: str) -> None:
     write, read = FILES[name]
     path = tmp_path / name
     write(path, 1)
@@ -71,12 +71,12 @@ def test_another_format_is_refused_by_both_numbers_and_kept(tmp_path: Path, name
         with pytest.raises(BadInput, match=rf"(version|format) {version}\b.*reads (version|format) 1"):
             read(path)
         assert path.read_bytes() == before
-        assert [one.name for one in tmp_path.iterdir()] == [name]
+        assert [file.name for file in tmp_path.iterdir()] == [name]
 
 
 @pytest.fixture
-def opened(tmp_path: Path) -> Callable[[], TestClient]:
-    """Of servers on one workspace."""
+def open_server(tmp_path: Path) -> Callable[[], TestClient]:
+    """Opens servers on the same workspace."""
     origin = "http://localhost:8000"
     return lambda: TestClient(
         create_app(Settings(tmp_path / "ws"), warm=False), base_url=origin, headers={"Origin": origin}
@@ -94,18 +94,18 @@ LATER: dict[str, str] = {
     "live/a.live": "of a later version",
     "jobs/0123456789abcdef/job.json": '{"format": 2, "id": "0123456789abcdef"}',
 }
-"""What a later version might leave in a workspace, under names that this one looks at."""
+"""Files of a later version, under names that this version reads."""
 
 
-def test_a_later_workspace_is_shown_as_far_as_it_can_be_and_kept(
-    tmp_path: Path, opened: Callable[[], TestClient]
+def test_a_workspace_of_a_later_version_is_readable_and_kept(
+    tmp_path: Path, open_server: Callable[[], TestClient]
 ) -> None:
     for name, text in LATER.items():
         path = tmp_path / "ws" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    with opened() as client:
-        said = {
+    with open_server() as client:
+        responses = {
             name: client.get(f"/api/{name}")
             for name in (
                 "catalog",
@@ -118,38 +118,38 @@ def test_a_later_workspace_is_shown_as_far_as_it_can_be_and_kept(
                 "live",
             )
         }
-        assert {name: answer.status_code for name, answer in said.items()} == dict.fromkeys(said, 200)
-        assert said["jobs"].json() == []
-        assert said["finetune/door/crossmodal-ekf"].json()["runs"] == []
-        (problem,) = said["studies"].json()["problems"]
+        assert {name: answer.status_code for name, answer in responses.items()} == dict.fromkeys(responses, 200)
+        assert responses["jobs"].json() == []
+        assert responses["finetune/door/crossmodal-ekf"].json()["runs"] == []
+        (problem,) = responses["studies"].json()["problems"]
         assert "my-study/study.json' does not hold a study's results" in problem
-        assert [(one["name"], one["state"]) for one in said["live"].json()["runs"]] == [("a", "damaged")]
-        assert [one["name"] for one in said["recordings"].json()["recordings"]] == ["a.rrd"]
-        library = client.app.state.library  # type: ignore[attr-defined]
-        child = Child("door", "mine", str(shipped("door", "image-ekf")), default=True)
-        with pytest.raises(BadInput, match=r"kept\.json' is damaged or another version's: move it away"):
-            keep(library, child)
+        assert [(run["name"], run["state"]) for run in responses["live"].json()["runs"]] == [("a", "damaged")]
+        assert [file["name"] for file in responses["recordings"].json()["recordings"]] == ["a.rrd"]
+        store = client.app.state.store  # type: ignore[attr-defined]
+        new = SavedFilter("door", "mine", str(shipped("door", "image-ekf")), default=True)
+        with pytest.raises(BadInput, match=r"kept\.json' is damaged or was written by another version: move it away"):
+            save_filter(store, new)
     assert {name: (tmp_path / "ws" / name).read_text() for name in LATER} == LATER
 
 
-def test_a_trace_of_another_version_is_made_anew(tmp_path: Path, opened: Callable[[], TestClient]) -> None:
+def test_traces_of_other_versions_are_computed_again(tmp_path: Path, open_server: Callable[[], TestClient]) -> None:
     def header(client: TestClient) -> dict[str, Any]:
         while (answer := client.get("/api/trace/door/haptics-ekf/9")).status_code == 202:
             time.sleep(0.02)
         assert answer.status_code == 200, answer.text
         return dict(answer.json())
 
-    with opened() as client:
+    with open_server() as client:
         before = header(client)
     (path,) = (tmp_path / "ws" / "traces").iterdir()
-    of_format(path, "beliefscope-trace", 2)
-    with opened() as client:
+    set_format(path, "beliefscope-trace", 2)
+    with open_server() as client:
         assert header(client) == before
     assert len(load_trace(path)) == before["steps"]
 
 
-def test_jobs_of_another_version_are_left_alone(tmp_path: Path) -> None:
-    for id, more in (("0123456789abcdef", {}), ("fedcba9876543210", {"of_a_later_version": 1})):
+def test_jobs_of_other_versions_are_kept(tmp_path: Path) -> None:
+    for id, more in (("0123456789abcdef", {}), ("fedcba9876543210", {"later_field": 1})):
         (tmp_path / id).mkdir()
         (tmp_path / id / "job.json").write_text(json.dumps(asdict(Job(id, "report", id, state="done")) | more))
     later = (tmp_path / "fedcba9876543210" / "job.json").read_bytes()

@@ -57,9 +57,9 @@ def test_all_that_is_required_is_locked() -> None:
 
 
 def test_every_licence_is_allowed() -> None:
-    said = {name: LICENCES["said"](name) for name in LICENCES["closure"]()}
+    said = {name: LICENCES["licence_of"](name) for name in LICENCES["closure"]()}
     assert len(said) > 80
-    refused = {name: text for name, text in said.items() if not LICENCES["allowed"](text)}
+    refused = {name: text for name, text in said.items() if not LICENCES["is_allowed"](text)}
     assert refused.keys() <= LICENCES["EXCEPTIONS"].keys(), refused
     documented = (ROOT / "docs" / "dependencies.md").read_text().split("## Licences")[1]
     assert all(name in documented for name in (*LICENCES["ALLOWED"], *LICENCES["EXCEPTIONS"]))
@@ -79,7 +79,7 @@ def test_every_licence_is_allowed() -> None:
     ],
 )
 def test_what_is_no_such_licence_is_seen(licence: str, fits: bool) -> None:
-    assert LICENCES["allowed"](licence) is fits
+    assert LICENCES["is_allowed"](licence) is fits
 
 
 # As pip-audit speaks: of an index that knows of no advisories it says nothing bad, unless it is told to be strict.

@@ -1,9 +1,9 @@
-"""The shape of the project: which way imports point, what may be imported where."""
+"""Structure of the project. The import layers are checked by import-linter in `make lint` (pyproject.toml)."""
 
 from __future__ import annotations
 
 import ast
-import importlib
+import graphlib
 import re
 import subprocess
 import sys
@@ -14,60 +14,32 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("datasets", "filters", "inspect", "recordings", "app")
-"""In the order in which they may import: each only from those before it."""
-
-HEAVY = {
-    "mujoco": ("datasets",),
-    "h5py": ("datasets",),
-    "torch": ("filters", "inspect", "recordings", "app"),
-    "safetensors": ("filters", "inspect", "recordings", "app"),
-    "rerun": ("recordings",),
-    "pyarrow": ("recordings",),
-    "mcap": ("recordings",),
-    "fastapi": ("app",),
-    "starlette": ("app",),
-    "uvicorn": ("app",),
-    "viser": ("app",),
-    "mjviser": ("app",),
-    "typer": ("app",),
-    "rich": ("app",),
-    "tensorboardX": ("app",),
-    "scipy": ("filters", "inspect"),
-    "ray": ("filters",),
-    "matplotlib": ("inspect", "recordings"),
-    "captum": ("inspect",),
-}
-"""Distribution's top-level module -> folders that may import it."""
-
-MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
-PYTHON_FILES = [*MODULES, *sorted((ROOT / "tests").rglob("*.py")), *sorted((ROOT / "bench").rglob("*.py"))]
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 80
 
 
-def named(path: Path) -> str:
+def modules(*folders: str) -> list[Path]:
+    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def relative(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Full names of the imported modules, wherever in the file they are imported."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{named(path)}:{node.lineno}: relative import"
-            yield node.module or ""
-            # `from beliefscope import app` names the module only in its aliases.
-            yield from (f"{node.module}.{alias.name}" for alias in node.names if node.module == "beliefscope")
+def functions(path: Path) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    nodes = ast.walk(ast.parse(path.read_text()))
+    return (node for node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
 
 
 @pytest.mark.parametrize("folder", [*FOLDERS, "tests"])
-def test_given_folders_are_namespace_packages(folder: str) -> None:
+def test_top_folders_are_namespace_packages(folder: str) -> None:
+    """With an ``__init__.py``, ``inspect/`` would shadow the standard library's module."""
     assert (ROOT / folder).is_dir()
-    found = [named(path) for path in (ROOT / folder).rglob("__init__.py")]
-    assert not found, "with an __init__.py, inspect/ shadows Python's own inspect"
+    assert not (ROOT / folder / "__init__.py").exists()
 
 
 @pytest.mark.parametrize("arguments", [["-c", "{}"], ["-m", "timeit", "-n1", "-r1", "{}"]])
-def test_standard_inspect_survives_the_project_root_on_the_path(arguments: list[str]) -> None:
+def test_standard_inspect_is_importable_from_the_project_root(arguments: list[str]) -> None:
     code = "import inspect, dataclasses; assert inspect.signature and 'site-packages' not in inspect.__file__"
     command = [sys.executable, *(argument.format(code) for argument in arguments)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=60)
@@ -79,41 +51,40 @@ def test_pytest_starts_in_the_project_root() -> None:
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-@pytest.mark.parametrize("path", MODULES, ids=named)
-def test_imports_point_left_and_heavy_ones_stay_in_their_folder(path: Path) -> None:
-    folder = path.relative_to(ROOT).parts[0]
-    allowed = FOLDERS[: FOLDERS.index(folder) + 1]
-    for name in imports(path):
-        top, *rest = name.split(".")
-        if top == "beliefscope" and rest:
-            assert rest[0] in (*allowed, "__version__"), f"{folder} must not import {name}"
-        if top in HEAVY:
-            assert folder in HEAVY[top], f"{name} is imported in {folder}; it belongs in {', '.join(HEAVY[top])}"
+def test_no_module_imports_itself_in_a_circle() -> None:
+    """Also where an import stands in a function or under TYPE_CHECKING."""
+    grimp = pytest.importorskip("grimp", reason="import-linter is not installed (make install)")
+    graph = grimp.build_graph(*(f"beliefscope.{folder}" for folder in FOLDERS), cache_dir=None)
+    imports = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    graphlib.TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle
 
 
-@pytest.mark.parametrize("path", MODULES, ids=named)
-def test_nothing_is_unpickled(path: Path) -> None:
-    assert not {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve"} & set(imports(path))
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Call):
-            called = ast.unparse(node.func)
-            assert called not in ("torch.load", "torch.save", "torch.jit.load"), f"line {node.lineno}: {called}"
-            for keyword in node.keywords:
-                assert keyword.arg != "allow_pickle" or ast.unparse(keyword.value) == "False", f"line {node.lineno}"
+def test_no_object_is_unpickled() -> None:
+    """import-linter forbids pickle itself; these calls would use it indirectly."""
+    offences = []
+    for path in modules(*FOLDERS):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                unsafe = ast.unparse(node.func) in ("torch.load", "torch.save", "torch.jit.load")
+                allowed = [k for k in node.keywords if k.arg == "allow_pickle" and ast.unparse(k.value) != "False"]
+                if unsafe or allowed:
+                    offences.append(f"{relative(path)}:{node.lineno}: {ast.unparse(node.func)}")
+    assert not offences
 
 
-@pytest.mark.parametrize("path", PYTHON_FILES, ids=named)
-def test_files_stay_short(path: Path) -> None:
-    assert len(path.read_text().splitlines()) <= 400, "near 300 lines a file is two files"
+def test_files_are_short() -> None:
+    lengths = {path: len(path.read_text().splitlines()) for path in modules(*FOLDERS, "tests", "bench")}
+    assert not [f"{relative(path)}: {length}" for path, length in lengths.items() if length > MAX_FILE_LINES]
 
 
-@pytest.mark.parametrize("path", MODULES, ids=named)
-def test_all_names_what_exists(path: Path) -> None:
-    module = importlib.import_module("beliefscope." + named(path).removesuffix(".py").replace("/", "."))
-    assert module.__doc__, "a module says what it is for"
-    public = getattr(module, "__all__", [])
-    assert len(set(public)) == len(public)
-    assert not [name for name in public if not hasattr(module, name)]
+def test_functions_are_short() -> None:
+    long = [
+        f"{relative(path)}:{node.lineno}: {node.name} has {(node.end_lineno or node.lineno) - node.lineno + 1} lines"
+        for path in modules(*FOLDERS)
+        for node in functions(path)
+        if (node.end_lineno or node.lineno) - node.lineno >= MAX_FUNCTION_LINES
+    ]
+    assert not long
 
 
 def tracked_files() -> list[Path]:
@@ -123,16 +94,16 @@ def tracked_files() -> list[Path]:
     return [ROOT / name for name in result.stdout.split("\0") if name]
 
 
-def test_no_path_of_one_machine() -> None:
-    """Neither in the files' text nor, for symbolic links, in what they point to."""
+def test_no_absolute_local_path() -> None:
+    """Neither in the text of files nor as the target of symbolic links."""
     homes = "|".join(("home", "Users", "root", "tmp", "work", "mnt", "opt"))
     absolute = re.compile(rf"(?<![\w.:/)\]}}>*-])/(?:{homes})/[\w.-]+|\b[A-Z]:\\\\?Users\b")
     offences = []
     for path in tracked_files():
         if path.is_symlink():
-            assert not path.readlink().is_absolute(), f"{named(path)} points to {path.readlink()}"
+            assert not path.readlink().is_absolute(), f"{relative(path)} points to {path.readlink()}"
         elif path.is_file():
-            text = path.read_bytes()
-            if b"\0" not in text[:8192]:
-                offences += [f"{named(path)}: {m.group()}" for m in absolute.finditer(text.decode())]
+            content = path.read_bytes()
+            if b"\0" not in content[:8192]:
+                offences += [f"{relative(path)}: {m.group()}" for m in absolute.finditer(content.decode())]
     assert not offences

@@ -1,4 +1,4 @@
-"""Which filters of the workspace were made from which, over HTTP (docs/api.md), and one with its ancestors."""
+"""Routes under ``/api/lineage``: which checkpoints were fine-tuned from which."""
 
 from __future__ import annotations
 
@@ -12,72 +12,72 @@ from fastapi import APIRouter, HTTPException
 from fastapi.responses import Response
 
 from beliefscope import __version__
-from beliefscope.app.runs.trace_store import Library
+from beliefscope.app.api.models.training import Lineage as LineageReply
+from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.compare.lineage import Ancestor, Lineage, export, lineage_of
-from beliefscope.inspect.diagnostics.base import as_json
+from beliefscope.inspect.diagnostics.views import as_json
 
 
-def routes(library: Library) -> APIRouter:
-    """Every route under ``/api/lineage``."""
+def routes(store: TraceStore) -> APIRouter:
+    """Create the router."""
     router = APIRouter()
 
-    @router.get("/api/lineage/{task}")
+    @router.get("/api/lineage/{task}", response_model=LineageReply)
     def lineage(task: str) -> dict[str, Any]:
-        shelf = {checkpoint.hash: name for name, checkpoint in library.filters(task).items()}
-        found = _found(library, task)
-        members = [] if found is None else [one for one in found.members.values() if one.task == task]
-        return {"members": [_shown(one, shelf, library) for one in members]}
+        names = {checkpoint.hash: name for name, checkpoint in store.filters(task).items()}
+        members = _lineage(store, task).members.values()
+        return {"members": [_member(member, names, store) for member in members if member.task == task]}
 
-    @router.get("/api/lineage/{task}/{hash}.zip")
+    @router.get("/api/lineage/{task}/{hash}.zip", response_class=Response)
     def archive(task: str, hash: str) -> Response:
-        found = _found(library, task)
-        if found is None or hash not in found.members:
+        lineage = _lineage(store, task)
+        if hash not in lineage.members:
             raise HTTPException(404, f"No checkpoint of task {task!r} has hash {hash!r}.")
-        one = found.members[hash]
-        name = f"{task}-{one.name}-{hash[:12]}"
-        packed = io.BytesIO()
-        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w") as archive:
-            for path in export(found, hash, Path(folder) / name, __version__):
+        name = f"{task}-{lineage.members[hash].name}-{hash[:12]}"
+        content = io.BytesIO()
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(content, "w") as archive:
+            for path in export(lineage, hash, Path(folder) / name, __version__):
                 archive.write(path, f"{name}/{path.name}")
         headers = {"Content-Disposition": f'attachment; filename="{name}.zip"'}
-        return Response(packed.getvalue(), media_type="application/zip", headers=headers)
+        return Response(content.getvalue(), media_type="application/zip", headers=headers)
 
     return router
 
 
-def _found(library: Library, task: str) -> Lineage | None:
-    """Of what was fine-tuned in the workspace and what was given, with their ancestors; None where there is nothing."""
-    library.filters(task)  # or there is no such task
-    given = [path for path in library.settings.checkpoints.values() if isinstance(path, Path)]
+def _lineage(store: TraceStore, task: str) -> Lineage:
+    """The workspace's fine-tuned checkpoints, those given to the server, and their ancestors.
+
+    Raises BadInput for an unknown task.
+    """
+    store.filters(task)
+    paths = [path for path in store.settings.checkpoints.values() if isinstance(path, Path)]
     try:
-        return lineage_of([*sorted(_runs(library).glob("*/child.safetensors")), *given])
-    except BadInput:
-        return None
+        return lineage_of([*FineTuneRuns(store.settings.workspace).checkpoints(), *paths])
+    except BadInput:  # no checkpoint
+        return Lineage({}, ())
 
 
-def _runs(library: Library) -> Path:
-    return library.settings.workspace / "finetune"
-
-
-def _shown(one: Ancestor, shelf: dict[str, str], library: Library) -> dict[str, Any]:
-    """run: of the fine-tuning that made it here. rmse: on whole sensors. before, after: by slice, on test episodes."""
-    made_here = one.path.parent.parent == _runs(library)
-    learned = [part["slice"]["name"] for part in one.settings.get("mix", [])]
-    held_out = one.record.get("held_out", {})
-    errors = {when: {name: said.get("rmse") for name, said in slices.items()} for when, slices in held_out.items()}
-    shown: dict[str, Any] = as_json(
+def _member(checkpoint: Ancestor, names: dict[str, str], store: TraceStore) -> dict[str, Any]:
+    slices = [part["slice"]["name"] for part in checkpoint.settings.get("mix", [])]
+    held_out = checkpoint.record.get("held_out", {})
+    rmse = {
+        when: {name: measures.get("rmse") for name, measures in held_out.get(when, {}).items()}
+        for when in ("before", "after")
+    }
+    is_own = FineTuneRuns(store.settings.workspace).is_own(checkpoint.path)
+    member: dict[str, Any] = as_json(
         {
-            "hash": one.hash,
-            "name": one.name,
-            "shelf": shelf.get(one.hash),
-            "parent": one.parent,
-            "run": one.path.parent.name if made_here else None,
-            "train": one.settings.get("train", []),
-            "learned": learned,
-            "rmse": one.rmse,
-            "before": errors.get("before", {}),
-            "after": errors.get("after", {}),
+            "hash": checkpoint.hash,
+            "name": checkpoint.name,
+            "catalog_name": names.get(checkpoint.hash),
+            "base": checkpoint.base,
+            "run": checkpoint.path.parent.name if is_own else None,
+            "train": checkpoint.settings.get("train", []),
+            "learned": slices,
+            "rmse": checkpoint.rmse,
+            **rmse,
         }
     )
-    return shown
+    return member

@@ -1,7 +1,7 @@
-"""Live runs over HTTP (docs/api.md): which there are, and their steps as they come.
+"""Routes under ``/api/live``: the list of live runs, their steps and their recordings.
 
-A page asks for the steps that it does not have yet, and asks again when it has drawn them: a slow one gets larger
-blocks, and neither the filter nor the server keeps anything for it.
+A page requests the steps it does not have and the next ones once it has drawn them; slow pages get larger blocks.
+Neither the filter nor the server buffers anything for a page.
 """
 
 from __future__ import annotations
@@ -14,122 +14,130 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, HTTPException, WebSocket, WebSocketDisconnect
-from fastapi.responses import StreamingResponse
+from fastapi.responses import Response, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-from beliefscope.app.protocol.messages import closing, columns, pictures
-from beliefscope.app.runs.live_runs import Absent, LiveRuns, Run, called, described
-from beliefscope.app.runs.trace_store import Library
-from beliefscope.app.server.security import kept_file
+from beliefscope.app.api.models.traces import LiveList
+from beliefscope.app.protocol.messages import close_reason, describe_error
+from beliefscope.app.protocol.trace_format import camera_images, columns
+from beliefscope.app.runs.live_runs import LiveRun, LiveRuns, UnavailableFilter, resolve_filter
+from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
 
-BLOCK = 1 << 22  # bytes of the file that one message is made of, at most
-LOOK = 0.02  # s between two looks at a file that a page waits for
-PATIENCE = 1.0  # s after which a page is told that nothing has come
-TAIL = 1 << 18  # bytes of a recording that are sent at once
+MAX_BLOCK = 1 << 22  # bytes of the run's file per message
+POLL_INTERVAL = 0.02  # s between checks of a file
+TIMEOUT = 1.0  # s after which a block without steps is sent
+CHUNK = 1 << 18  # bytes of a recording per read
 
 
-def block(run: Run, first: int) -> bytes:
-    """Steps from ``first`` on, as many as a message should hold.
+class StepsRequest(BaseModel):
+    """Message of the page: the first step it does not have, and the last state it received."""
 
-    Length of the header, JSON header, padding to a multiple of 4, float32 columns, uint8 pictures.
+    model_config = ConfigDict(strict=True)
+    first: NonNegativeInt = Field(alias="from")
+    state: str = ""
+
+
+def block(run: LiveRun, first: int) -> bytes:
+    """Steps from ``first`` on, limited by ``MAX_BLOCK``.
+
+    Header length, JSON header, padding to a multiple of 4, float32 columns, uint8 images.
     """
     steps = run.reader.steps
-    most = max(1, BLOCK // max(1, run.reader.bytes_per_step))
-    part = run.reader.part(min(first, steps), min(first + most, steps))
-    said, buffer = columns(part) if len(part) else ([], b"")
-    seen = pictures(part)
-    head = {
+    limit = max(1, MAX_BLOCK // max(1, run.reader.bytes_per_step))
+    part = run.reader.part(min(first, steps), min(first + limit, steps))
+    descriptions, buffer = columns(part) if len(part) else ([], b"")
+    images = camera_images(part)
+    header = {
         "first": min(first, steps),
         "steps": len(part),
-        "columns": said,
-        "pictures": 0 if seen is None else seen.nbytes,
-        "of": steps,
+        "columns": descriptions,
+        "pictures": 0 if images is None else images.nbytes,
+        "total": steps,
         "written": run.reader.path.stat().st_mtime,
         "state": run.state,
-        "told": run.told,
+        "message": run.message,
     }
-    text = json.dumps(head).encode()
+    text = json.dumps(header).encode()
     padded = len(text).to_bytes(4, "little") + text + b" " * (-len(text) % 4)
-    return padded + buffer + (b"" if seen is None else seen.tobytes())
+    return padded + buffer + (b"" if images is None else images.tobytes())
 
 
-def routes(library: Library) -> APIRouter:
-    """Every route under ``/api/live``."""
+def routes(store: TraceStore) -> APIRouter:
+    """Create the router."""
     router = APIRouter()
-    runs = library.live
+    runs = store.live
 
-    @router.get("/api/live")
+    @router.get("/api/live", response_model=LiveList)
     def list_runs() -> dict[str, Any]:
-        found: list[dict[str, Any]] = []
+        entries: list[dict[str, Any]] = []
         for name in runs.newest():
             try:
                 run = runs[name]
-                shown, checkpoint = called(run, library.filters(run.task.name))
-                lacks_file = isinstance(checkpoint, Absent) and bool(run.like.checkpoint_hash)
-                about = {"filter": shown, "here": not lacks_file, "kind": run.like.kind}
-                found.append(described(run) | about)
+                filter_name, checkpoint = resolve_filter(run, store.filters(run.task.name))
+                unavailable = isinstance(checkpoint, UnavailableFilter) and bool(run.template.checkpoint_hash)
+                entry = {"filter": filter_name, "available": not unavailable, "kind": run.template.kind}
+                entries.append(run.to_json() | entry)
             except BadInput as error:
-                found.append({"name": name, "state": "damaged", "told": str(error)})
-        tasks = {run["task"] for run in found if "task" in run}
-        return {"runs": found, "tasks": [library.described(task) for task in sorted(tasks)]}
+                entries.append({"name": name, "state": "damaged", "message": str(error)})
+        tasks = {entry["task"] for entry in entries if "task" in entry}
+        return {"runs": entries, "tasks": [store.describe_task(task) for task in sorted(tasks)]}
 
     @router.websocket("/api/live/{name}")
     async def follow(websocket: WebSocket, name: str) -> None:
         await websocket.accept()
         try:
             while True:
-                first, state = _asked(await websocket.receive_text())
-                await websocket.send_bytes(await _next(runs, name, first, state))
+                request = _parse_request(await websocket.receive_text())
+                await websocket.send_bytes(await _next_block(runs, name, request))
         except BadInput as error:
-            await websocket.close(4000, closing(str(error)))
-        except (WebSocketDisconnect, KeyError):  # KeyError: a binary message, which has no text
+            await websocket.close(4000, close_reason(str(error)))
+        except (WebSocketDisconnect, KeyError):  # KeyError: a binary message
             return
 
-    @router.get("/api/live/{name}.rrd")
+    @router.get("/api/live/{name}.rrd", response_class=Response)
     async def recording(name: str) -> StreamingResponse:
         run = await asyncio.to_thread(runs.__getitem__, name)
-        end = time.monotonic() + PATIENCE  # it begins a moment after the run
-        while (path := kept_file(runs.folder, f"{run.name}.rrd")) is None and time.monotonic() < end:
-            await asyncio.sleep(LOOK)
+        end = time.monotonic() + TIMEOUT  # the recording is created shortly after the run
+        while (path := file_within(runs.folder, f"{run.name}.rrd")) is None and time.monotonic() < end:
+            await asyncio.sleep(POLL_INTERVAL)
         if path is None:
             raise HTTPException(404, f"Live run {name!r} has no recording.")
-        return StreamingResponse(_tail(run, path), media_type="application/octet-stream")
+        return StreamingResponse(_follow_file(run, path), media_type="application/octet-stream")
 
     return router
 
 
-def _asked(text: str) -> tuple[int, str]:
-    """From which step on, and the state that the page knows."""
+def _parse_request(text: str) -> StepsRequest:
     try:
-        message = read_json(text)
-        first, state = message["from"], message.get("state", "")
-    except (ValueError, TypeError, KeyError, AttributeError):
-        raise BadInput('a page asks for steps as {"from": STEP, "state": what it knows}') from None
-    if isinstance(first, bool) or not isinstance(first, int) or first < 0:
-        raise BadInput(f"steps are asked for from an integer from 0 on, not {first!r}")
-    return first, str(state)
+        return StepsRequest.model_validate(read_json(text))
+    except ValidationError as error:
+        raise BadInput(f"invalid request for steps: {describe_error(error)}") from None
+    except ValueError as error:
+        raise BadInput(f"not JSON: {error}") from None
 
 
-async def _next(runs: LiveRuns, name: str, first: int, state: str) -> bytes:
-    """The next steps, as soon as there are any or the state is another; an empty block where none come for a while."""
+async def _next_block(runs: LiveRuns, name: str, request: StepsRequest) -> bytes:
+    """The requested steps as soon as one exists or the state changes; an empty block after the timeout."""
     run = await asyncio.to_thread(runs.__getitem__, name)
-    end = time.monotonic() + PATIENCE
-    while run.reader.steps <= first and run.state == state and time.monotonic() < end:
-        await asyncio.sleep(LOOK)
-        if run.stirs:
-            await asyncio.to_thread(run.look)
-    return await asyncio.to_thread(block, run, first)
+    end = time.monotonic() + TIMEOUT
+    while run.reader.steps <= request.first and run.state == request.state and time.monotonic() < end:
+        await asyncio.sleep(POLL_INTERVAL)
+        if run.may_have_grown:
+            await asyncio.to_thread(run.poll)
+    return await asyncio.to_thread(block, run, request.first)
 
 
-async def _tail(run: Run, path: Path) -> AsyncIterator[bytes]:
-    """A file as it grows, until its run has ended. Whoever reads slowly is not waited for by anyone."""
+async def _follow_file(run: LiveRun, path: Path) -> AsyncIterator[bytes]:
+    """The content of a growing file until its run has ended."""
     with path.open("rb") as file:
         while True:
-            await asyncio.to_thread(run.look)
+            await asyncio.to_thread(run.poll)
             ended = run.state != "running"  # before the last read
-            while part := await asyncio.to_thread(file.read, TAIL):
-                yield part
+            while chunk := await asyncio.to_thread(file.read, CHUNK):
+                yield chunk
             if ended:
                 return
-            await asyncio.sleep(5 * LOOK)
+            await asyncio.sleep(5 * POLL_INTERVAL)

@@ -1,6 +1,7 @@
-"""Whether this installation can do what it should: each part is tried, not only looked for.
+"""Checks of the installation, run by ``beliefscope doctor``.
 
-A check is a function of the ``Place`` where a server would run, that says what it found. One that raises has failed.
+Each check is a function of the ``Place`` where a server would run, and returns a ``Finding``. A check that raises
+has failed.
 """
 
 from __future__ import annotations
@@ -27,20 +28,21 @@ from packaging.specifiers import SpecifierSet
 from beliefscope import __version__
 from beliefscope.datasets.errors import BadInput
 
-SUMS = "SHA256SUMS"  # as sha256sum writes it
-ENOUGH, LITTLE = 2e9, 2e8  # bytes of free disk: below the first a warning, below the second nothing can be written
+SUMS = "SHA256SUMS"  # in the format of sha256sum
+DISK_WARNING, DISK_FAILURE = 2e9, 2e8  # bytes of free disk space
 EXTRAS = {
-    "ray": "a study on a cluster: pip install 'beliefscope[ray]'",
+    "ray": "studies on a cluster: pip install 'beliefscope[ray]'",
     "mcap": "export for Foxglove: pip install 'beliefscope[export]'",
+    "tensorboardX": "TensorBoard logs: pip install 'beliefscope[tensorboard]'",
 }
-"""Module that may be missing -> what it is for, and how to have it."""
+"""Optional module -> purpose, and how to install it."""
 
 State = Literal["ok", "warning", "failed"]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a server would keep things and listen."""
+    """Workspace and address of a server."""
 
     workspace: Path
     host: str
@@ -49,214 +51,203 @@ class Place:
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found. do: what helps, where it is not ok."""
+    """Result of a check, with advice if it is not ok."""
 
-    says: str
+    message: str
     state: State = "ok"
-    do: str = ""
+    advice: str = ""
 
 
 def python(_: Place) -> Finding:
-    """Version, and where it runs."""
-    says = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-    wanted = SpecifierSet(importlib.metadata.metadata("beliefscope")["Requires-Python"])
-    if platform.python_version() not in wanted:
-        return Finding(says, "failed", f"install Python {wanted}")
+    """Check the Python version and the operating system."""
+    message = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    required = SpecifierSet(importlib.metadata.metadata("beliefscope")["Requires-Python"])
+    if platform.python_version() not in required:
+        return Finding(message, "failed", f"install Python {required}")
     if platform.system() != "Linux":
-        return Finding(says, "warning", "Linux is what Beliefscope is tested on")
-    return Finding(says)
+        return Finding(message, "warning", "Beliefscope is tested on Linux only")
+    return Finding(message)
 
 
 def packages(_: Place) -> Finding:
-    """Every package that is required, at a version that is."""
-    wrong = []
-    wanted = [Requirement(line) for line in importlib.metadata.requires("beliefscope") or ()]
-    needed = [one for one in wanted if one.marker is None or one.marker.evaluate({"extra": ""})]
-    for one in needed:
-        found = _version(one.name)
-        if found is None or not one.specifier.contains(found, prereleases=True):
-            wrong.append(f"{one.name} {found or 'is missing'}, wanted {one.specifier}")
-    if wrong:
-        return Finding("; ".join(wrong), "failed", "pip install -c constraints.txt -e . or reinstall beliefscope")
-    return Finding(f"{len(needed)} required packages fit")
+    """Check the versions of all required packages."""
+    requirements = [Requirement(line) for line in importlib.metadata.requires("beliefscope") or ()]
+    required = [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
+    problems = []
+    for requirement in required:
+        version = _version(requirement.name)
+        if version is None or not requirement.specifier.contains(version, prereleases=True):
+            problems.append(f"{requirement.name} {version or 'is missing'}, required {requirement.specifier}")
+    if problems:
+        return Finding("; ".join(problems), "failed", "pip install -c constraints.txt -e . or reinstall beliefscope")
+    return Finding(f"{len(required)} required packages have supported versions")
 
 
 def torch(_: Place) -> Finding:
-    """That it calculates, with how many threads, and on which devices."""
+    """Check that PyTorch computes correctly; list its threads and devices."""
     import torch as library
 
     eye = library.eye(3, dtype=library.float64)
     if not library.equal(library.linalg.cholesky(4 * eye), 2 * eye):
-        return Finding(f"PyTorch {library.__version__} calculates wrongly", "failed", "reinstall torch")
-    devices = [library.cuda.get_device_name(i) for i in range(library.cuda.device_count())]
-    on = f"CUDA {library.version.cuda}: {', '.join(devices)}" if devices else "no CUDA device, none is needed"
-    return Finding(f"PyTorch {library.__version__}, {library.get_num_threads()} threads, {on}")
+        return Finding(f"PyTorch {library.__version__} computes wrong results", "failed", "reinstall torch")
+    names = [library.cuda.get_device_name(i) for i in range(library.cuda.device_count())]
+    devices = f"CUDA {library.version.cuda}: {', '.join(names)}" if names else "no CUDA device (not required)"
+    return Finding(f"PyTorch {library.__version__}, {library.get_num_threads()} threads, {devices}")
 
 
 def camera(_: Place) -> Finding:
-    """That the simulation runs and draws its pictures without a graphics library."""
+    """Check that the simulation runs and renders without a display."""
     from beliefscope.datasets.simulation.door import DOOR
 
     assert DOOR.simulate is not None
-    started = time.perf_counter()
-    picture = DOOR.simulate(0, 0, 2).observations["image"]
-    seconds = time.perf_counter() - started
-    if picture.std() < 1.0:
-        return Finding("the simulated camera's pictures are empty", "failed", "reinstall mujoco")
+    start = time.perf_counter()
+    image = DOOR.simulate(0, 0, 2).observations["image"]
+    seconds = time.perf_counter() - start
+    if image.std() < 1.0:
+        return Finding("images of the simulated camera are empty", "failed", "reinstall mujoco")
     version = importlib.metadata.version("mujoco")
-    return Finding(f"MuJoCo {version} simulated and drew 2 steps in {seconds:.1f} s, without a display")
+    return Finding(f"MuJoCo {version} simulated and rendered 2 steps in {seconds:.1f} s")
 
 
 def weights(_: Place) -> Finding:
-    """That the filters and episodes that ship are what was shipped."""
+    """Check the hashes of the built-in filters and episodes."""
     from beliefscope.datasets.store import sample_path
     from beliefscope.filters.checkpoint import PRETRAINED
 
     folders = (PRETRAINED, sample_path("door").parent)
-    wrong = [name for folder in folders for name in changed(folder)]
-    if wrong:
-        return Finding(
-            f"{', '.join(wrong)} not as shipped", "failed", "reinstall beliefscope, or check the files out anew"
-        )
-    return Finding(f"{sum(len(sums(folder)) for folder in folders)} shipped files have their hashes")
+    changed = [name for folder in folders for name in changed_files(folder)]
+    if changed:
+        return Finding(f"{', '.join(changed)} missing or modified", "failed", "reinstall beliefscope")
+    return Finding(f"{sum(len(read_sums(folder)) for folder in folders)} built-in files have the expected hashes")
 
 
 def page(_: Place) -> Finding:
-    """That the page is there, and the browser code which is served out of other packages."""
+    """Check that all files of the dashboard exist, including those of other packages."""
     from beliefscope.app.server.main import PAGE
-    from beliefscope.app.server.static_files import named
+    from beliefscope.app.server.static_files import page_files
     from beliefscope.app.server.vendor_files import UPLOT_FILES, installed
     from beliefscope.app.views.embedded_viser import client_page
 
     static = installed("rerun_notebook") / "static"
     files = [
-        *(PAGE / name for name in named(PAGE) if name not in UPLOT_FILES),
+        *(PAGE / name for name in page_files(PAGE) if name not in UPLOT_FILES),
         static / "widget.js",
         static / "re_viewer_bg.wasm",
         *(installed("uplot") / "static" / n for n in UPLOT_FILES),
     ]
     missing = [path.name for path in files if not path.is_file()]
     if missing:
-        return Finding(
-            f"{', '.join(missing)} missing", "failed", "reinstall beliefscope, rerun-notebook and uplot-python"
-        )
+        advice = "reinstall beliefscope, rerun-notebook and uplot-python"
+        return Finding(f"{', '.join(missing)} missing", "failed", advice)
     client_page("/static/scene/viser_frame_throttle.js")
     versions = (f"{name} {importlib.metadata.version(name)}" for name in ("rerun-notebook", "viser", "uplot-python"))
-    return Finding(f"page complete: {', '.join(versions)}")
+    return Finding(f"all files present: {', '.join(versions)}")
 
 
 def port(place: Place) -> Finding:
-    """That a server could listen where it is asked to."""
+    """Check that the address is valid and the port is free."""
     family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
     try:
-        with socket.socket(family) as any_port:
-            any_port.bind((place.host, 0))
+        with socket.socket(family) as probe:
+            probe.bind((place.host, 0))
     except OSError as error:
-        return Finding(f"nothing can listen on {place.host}: {error.strerror}", "failed", "choose another --host")
-    with socket.socket(family) as wanted:
-        wanted.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        return Finding(f"cannot listen on {place.host}: {error.strerror}", "failed", "choose another --host")
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            wanted.bind((place.host, place.port))
+            probe.bind((place.host, place.port))
         except OSError as error:
-            says = f"{place.host} port {place.port}: {error.strerror}"
-            return Finding(says, "warning", "serve with --port 0, or end what listens there")
+            message = f"{place.host} port {place.port}: {error.strerror}"
+            return Finding(message, "warning", "serve with --port 0, or stop the process that uses the port")
     return Finding(f"{place.host} port {place.port} is free")
 
 
 def workspace(place: Place) -> Finding:
-    """That files can be written and renamed there, by no other user, and the disk has room."""
+    """Check that the workspace is writable by this user only, and the free disk space."""
     folder = place.workspace if place.workspace.is_dir() else place.workspace.absolute().parent
     if not folder.is_dir():
-        return Finding(f"{_home(folder)} does not exist", "failed", "make it, or give another --workspace")
+        return Finding(f"{_home(folder)} does not exist", "failed", "create it, or choose another --workspace")
     try:
-        with tempfile.TemporaryDirectory(prefix=".doctor-", dir=folder) as tried:
-            path = Path(tried) / "file"
-            path.write_bytes(b"written")
+        with tempfile.TemporaryDirectory(prefix=".doctor-", dir=folder) as temporary:
+            path = Path(temporary) / "file"
+            path.write_bytes(b"test")
             os.replace(path, path.with_name("renamed"))
     except OSError as error:
-        return Finding(f"{_home(folder)}: {error.strerror}", "failed", "give a --workspace that can be written to")
+        return Finding(f"{_home(folder)}: {error.strerror}", "failed", "choose a writable --workspace")
     free = shutil.disk_usage(folder).free
-    says = f"{_home(place.workspace)} can be written to, {free / 1e9:.1f} GB free"
-    if free < ENOUGH:
-        return Finding(says, "failed" if free < LITTLE else "warning", "free some of the disk, or use another")
+    message = f"{_home(place.workspace)} is writable, {free / 1e9:.1f} GB free"
+    if free < DISK_WARNING:
+        return Finding(message, "failed" if free < DISK_FAILURE else "warning", "free disk space, or use another disk")
     if place.workspace.is_dir() and place.workspace.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return Finding(f"{says}; other users can write to it", "warning", f"chmod go-w {_home(place.workspace)}")
-    return Finding(says)
+        return Finding(f"{message}; writable by other users", "warning", f"chmod go-w {_home(place.workspace)}")
+    return Finding(message)
 
 
 def browser(_: Place) -> Finding:
-    """Whether a Chromium is there for what needs one on this machine."""
+    """Check for a Chromium to print reports."""
     from beliefscope.recordings.report.pdf import browser as find
 
     try:
         return Finding(find())
     except BadInput:
-        do = "install Chromium for report --pdf and the page's tests, or name it in BELIEFSCOPE_CHROMIUM"
-        return Finding("no Chromium on this machine; any browser shows the page", "warning", do)
+        advice = "install Chromium for report --pdf and the dashboard's tests, or set BELIEFSCOPE_CHROMIUM to its path"
+        return Finding("no Chromium found; not required to view the dashboard", "warning", advice)
 
 
 def extras(_: Place) -> Finding:
-    """What may be installed beside."""
-    found = [name for name in EXTRAS if find_spec(name) is not None]
-    missing = [f"{name} not installed ({what})" for name, what in EXTRAS.items() if name not in found]
-    return Finding("; ".join([*(f"{name} {_version(name)}" for name in found), *missing]))
+    """List the optional packages."""
+    present = [name for name in EXTRAS if find_spec(name) is not None]
+    missing = [f"{name} not installed ({purpose})" for name, purpose in EXTRAS.items() if name not in present]
+    return Finding("; ".join([*(f"{name} {_version(name)}" for name in present), *missing]))
 
 
 CHECKS: tuple[Callable[[Place], Finding], ...] = (
-    python,
-    packages,
-    torch,
-    camera,
-    weights,
-    page,
-    port,
-    workspace,
-    browser,
-    extras,
+    *(python, packages, torch, camera, weights),
+    *(page, port, workspace, browser, extras),
 )
 
 
-def examined(place: Place, told: Callable[[str], None] = lambda name: None) -> dict[str, Finding]:
-    """Every check by its name. told: called with each name before it is made."""
-    found = {}
+def run_checks(place: Place) -> dict[str, Finding]:
+    """Run every check; returns findings by name."""
+    findings = {}
     for check in CHECKS:
-        told(check.__name__)
         try:
-            found[check.__name__] = check(place)
+            findings[check.__name__] = check(place)
         except Exception as error:
-            found[check.__name__] = Finding(f"{type(error).__name__}: {error}", "failed", "reinstall beliefscope")
-    return found
+            message = f"{type(error).__name__}: {error}"
+            findings[check.__name__] = Finding(message, "failed", "reinstall beliefscope")
+    return findings
 
 
-def report(found: Mapping[str, Finding]) -> dict[str, Any]:
-    """For bug reports: the findings, and every installed package. Of paths, the home folder is left out."""
-    installed = {one.metadata["Name"]: one.version for one in importlib.metadata.distributions()}
+def report(findings: Mapping[str, Finding]) -> dict[str, Any]:
+    """Findings, system and installed packages for a bug report. Paths are relative to the home folder."""
+    installed = {package.metadata["Name"]: package.version for package in importlib.metadata.distributions()}
     return {
         "beliefscope": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cores": os.cpu_count(),
         "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
-        "checks": {name: asdict(one) for name, one in found.items()},
+        "checks": {name: asdict(finding) for name, finding in findings.items()},
         "packages": dict(sorted(installed.items(), key=lambda item: item[0].lower())),
     }
 
 
-def sums(folder: Path) -> dict[str, str]:
-    """File name -> SHA-256, from the folder's list."""
+def read_sums(folder: Path) -> dict[str, str]:
+    """File name -> SHA-256 in the folder's list."""
     lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
     return {name: digest for digest, name in (line.split(maxsplit=1) for line in lines)}
 
 
-def changed(folder: Path) -> list[str]:
-    """Names of the listed files that are missing or other than listed."""
+def changed_files(folder: Path) -> list[str]:
+    """Names of the listed files that are missing or whose hash differs."""
 
     def digest(name: str) -> str:
         with suppress(OSError):
             return hashlib.sha256((folder / name).read_bytes()).hexdigest()
         return ""
 
-    return [name for name, listed in sums(folder).items() if digest(name) != listed]
+    return [name for name, expected in read_sums(folder).items() if digest(name) != expected]
 
 
 def _version(name: str) -> str | None:

@@ -1,4 +1,4 @@
-"""What the command line says: results to standard output, everything else to standard error."""
+"""Output of the command line: results on standard output, everything else on standard error."""
 
 from __future__ import annotations
 
@@ -6,98 +6,113 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from beliefscope.inspect.diagnostics.views import Table
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """Ends the process with one line on standard error."""
+    """Exit with one line on standard error."""
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(code)
 
 
-def written() -> None:
-    """Has standard output written now, while what goes wrong with it can be told. Raises OSError."""
+def flush() -> None:
+    """Flush standard output while errors can still be reported. Raises OSError."""
     try:
         sys.stdout.flush()
     except OSError:
-        # What is left is dropped: as Python ends it would try again, and fail in its own words.
+        # Discard the rest: otherwise the interpreter retries on exit and prints its own error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise
 
 
-def say(line: str) -> None:
-    """One line beside the result, on standard error."""
+def note(line: str) -> None:
+    """Print one line to standard error."""
     print(line, file=sys.stderr)
 
 
 def result(document: Mapping[str, Any], text: str, destination: str | None) -> None:
-    """A command's result: as text, or as one JSON document where ``destination`` is ``-``; to standard output.
-
-    JSON knows no infinity and no NaN: a number that is not finite is null.
-    """
+    """Print the result of a command: the text, or the JSON document if ``destination`` is ``-``."""
     print(text if destination is None else json.dumps(_finite(document), indent=2, allow_nan=False))
 
 
 def _finite(value: Any) -> Any:
+    """Replace infinite and NaN values by None, because JSON has neither."""
     if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def table(rows: Mapping[str, str]) -> str:
-    """Two columns, the second aligned to the right."""
-    left, right = max(map(len, rows)), max(map(len, rows.values()))
-    return "\n".join(f"{name:<{left}}  {value:>{right}}" for name, value in rows.items())
-
-
 def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int | float | None]]) -> str:
-    """A table under its title; numbers to the right with three digits, unknown ones as ``-``."""
+    """Format a table with a title; numbers are right-aligned with three digits, None is ``-``."""
 
-    def shown(value: str | int | float | None) -> str:
+    def text(value: str | int | float | None) -> str:
         return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
 
-    cells = [list(columns), *([shown(value) for value in row] for row in rows)]
+    cells = [list(columns), *([text(value) for value in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    numeric = [bool(rows) and not any(isinstance(row[i], str) for row in rows) for i in range(len(columns))]
+    alignments = [
+        ">" if rows and not any(isinstance(row[i], str) for row in rows) else "<" for i in range(len(columns))
+    ]
     lines = [
-        "  ".join(
-            f"{cell:{'>' if right else '<'}{width}}" for cell, width, right in zip(row, widths, numeric, strict=True)
-        )
+        "  ".join(f"{cell:{align}{width}}" for cell, width, align in zip(row, widths, alignments, strict=True))
         for row in cells
     ]
     return "\n".join([title, *(f"  {line.rstrip()}" for line in lines)])
 
 
+def grids(tables: Iterable[Table]) -> list[str]:
+    """Format several tables."""
+    return [grid(table.title, table.columns, table.rows) for table in tables]
+
+
+def render(*items: RenderableType) -> str:
+    """Render rich tables or trees as plain text without a width limit."""
+    from rich.console import Console
+
+    console = Console(width=1000, color_system=None)
+    with console.capture() as capture:
+        console.print(*items, sep="\n")
+    return "\n".join(line.rstrip() for line in capture.get().strip("\n").splitlines())
+
+
 @contextmanager
 def progress(label: str) -> Iterator[Callable[[float], None]]:
-    """One bar on standard error, moved by what is yielded: called with the share done, 0..1."""
-    with bars() as move:
-        yield lambda share: move(label, share, "")
+    """Show a progress bar on standard error; yields a function that sets the completed fraction."""
+    with bars() as update:
+        yield lambda fraction: update(label, fraction, "")
 
 
 @contextmanager
 def bars() -> Iterator[Callable[[str, float, str], None]]:
-    """Bars on standard error, each there from its first move on; yields (label, share done, note) -> None."""
+    """Show progress bars on standard error; yields (label, completed fraction, note) -> None.
+
+    A bar appears with its first update.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     view = Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
-    known: dict[str, TaskID] = {}
+    tasks: dict[str, TaskID] = {}
 
-    def move(label: str, share: float, note: str) -> None:
-        if label not in known:
-            known[label] = view.add_task(label, total=1.0, note=note)
+    def update(label: str, fraction: float, note: str) -> None:
+        if label not in tasks:
+            tasks[label] = view.add_task(label, total=1.0, note=note)
             view.start()
-        view.update(known[label], completed=share, note=note)
+        view.update(tasks[label], completed=fraction, note=note)
 
     try:
-        yield move
+        yield update
     finally:
-        # A view that was never started would still end with an empty line.
-        if known:
+        # Stopping a view that was never started prints an empty line.
+        if tasks:
             view.stop()

@@ -1,6 +1,6 @@
-"""Long work, each in a process of its own: queued, watched, cancelled, and its result kept in the workspace.
+"""Queue of long tasks, each in a process of its own: progress, cancellation and results in the workspace.
 
-A job is a function of ours, named in ``KINDS``, with JSON arguments and a JSON result (``app/jobs/worker.py`` runs it).
+A job is a function listed in ``KINDS``, with JSON arguments and a JSON result; ``app/jobs/worker.py`` runs it.
 Its folder ``jobs/ID`` holds ``job.json``, ``arguments.json``, ``log.txt`` and, once it is done, ``result.json``.
 """
 
@@ -21,54 +21,50 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, HTTPException
-from fastapi.responses import FileResponse, JSONResponse, Response
-from pydantic import TypeAdapter
+from pydantic import AliasChoices, ConfigDict, Field, TypeAdapter, with_config
 
 from beliefscope import __version__
-from beliefscope.app.jobs.worker import how_it_ended
-from beliefscope.app.server.security import kept_file
+from beliefscope.app.runs.errors import QueueFull
+from beliefscope.app.runs.subprocesses import exit_description
 from beliefscope.app.workspace.json_files import read_record
-from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.io.atomic_write import unwritable, write_atomically
+from beliefscope.app.workspace.paths import file_within
+from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.io.atomic_write import write_atomically, write_error
 
 KINDS: dict[str, str] = {
-    "diagnostic": "beliefscope.app.api.diagnostics:work",
-    "failures": "beliefscope.app.api.failures:work",
-    "finetune": "beliefscope.app.api.finetune:work",
-    "reading": "beliefscope.app.api.recordings:work",
-    "recording": "beliefscope.app.api.recordings:write",
-    "report": "beliefscope.app.api.reports:work",
-    "study": "beliefscope.app.api.studies:work",
+    "diagnostic": "beliefscope.app.jobs.diagnostic:run",
+    "failures": "beliefscope.app.jobs.failures:run",
+    "finetune": "beliefscope.app.jobs.finetune:run",
+    "reading": "beliefscope.app.jobs.recording:open_run",
+    "recording": "beliefscope.app.jobs.recording:record",
+    "report": "beliefscope.app.jobs.report:run",
+    "study": "beliefscope.app.jobs.study:run",
 }
-"""Kind of job -> ``module:function`` of (arguments, report) -> result; ``report(share done, what it is doing)``."""
+"""Kind of job -> ``module:function`` of (arguments, report) -> result; see ``worker.Report``."""
 
-AT_ONCE, WAITING, KEPT = 2, 16, 100  # running, queued, and finished jobs that are remembered
-GRACE = 3.0  # s that a process has to end before it is killed
+MAX_RUNNING, MAX_WAITING, MAX_ENDED = 2, 16, 100  # jobs; the oldest ended ones are deleted
+GRACE = 3.0  # s between SIGTERM and SIGKILL
 LOG_TAIL = 8000  # bytes
 
 State = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
-UNDER_WAY = ("waiting", "running")
+ACTIVE = ("waiting", "running")
 WORKER = "beliefscope.app.jobs.worker"
 
 log = logging.getLogger("beliefscope.app")
 
 
-class QueueFull(BadInput):
-    """So many jobs wait already that another one is not taken."""
-
-
+@with_config(ConfigDict(json_schema_serialization_defaults_required=True))
 @dataclass(frozen=True)
 class Job:
-    """One job as it is now.
+    """State of one job.
 
     Attributes:
-        id: hash of its kind and of all that its result depends on. title: for people.
-        progress: 0..1. message: what it is doing, in a line. error: why it ended without a result, in a line.
-        asked, started, ended: s since 1970; None where it has not come to that.
-        server: process id of the server that has it. link: from the page's root to its result: ``?...``, or a file.
+        id: hash of the kind and of everything the result depends on. title: shown to users.
+        progress: 0..1. message: current activity, one line. error: why there is no result, one line.
+        submitted, started, ended: s since 1970; None if that has not happened.
+        server: process id of the server that runs the job. link: page address of the result (``?...``) or its file.
     """
 
     id: str
@@ -78,64 +74,80 @@ class Job:
     progress: float = 0.0
     message: str = ""
     error: str = ""
-    asked: float = 0.0
+    # Files of earlier versions name it "asked".
+    submitted: Annotated[float, Field(validation_alias=AliasChoices("submitted", "asked"))] = 0.0
     started: float | None = None
     ended: float | None = None
     server: int = 0
     link: str = ""
+
+    @property
+    def active(self) -> bool:
+        """Whether the job waits or runs."""
+        return self.state in ACTIVE
 
 
 RECORD = TypeAdapter(Job)
 
 
 class Jobs:
-    """The jobs of one server, and those that earlier ones left in its workspace. Methods may be called from any thread.
+    """The jobs of one server, including ended ones of earlier servers. Thread-safe.
 
     Args:
-        folder: where they are kept; made when the first one is asked for.
-        kinds: as ``KINDS``. at_once, waiting: how many run and how many wait at most.
+        folder: of the job folders; created on first use.
+        kinds: see ``KINDS``. max_running, max_waiting: limits.
     """
 
     def __init__(
-        self, folder: Path, kinds: Mapping[str, str] = KINDS, at_once: int = AT_ONCE, waiting: int = WAITING
+        self,
+        folder: Path,
+        kinds: Mapping[str, str] = KINDS,
+        max_running: int = MAX_RUNNING,
+        max_waiting: int = MAX_WAITING,
     ) -> None:
-        self._folder, self._kinds, self._at_once, self._waiting = folder, kinds, at_once, waiting
+        self._folder, self._kinds, self._max_running, self._max_waiting = folder, kinds, max_running, max_waiting
         self._lock = threading.RLock()
         self._queue: deque[str] = deque()
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._attending: dict[str, threading.Thread] = {}
-        self._stopped: dict[str, State] = {}  # whose process was told to end, and what it is then
+        self._watchers: dict[str, threading.Thread] = {}
+        self._stopping: dict[str, State] = {}  # job being stopped -> its final state
         self._closing = False
         self._jobs: dict[str, Job] = {}
-        for job in sorted(_read_all(folder), key=lambda job: job.asked):
-            unfinished = job.state in UNDER_WAY
-            self._put(replace(job, state="interrupted", error="the server stopped") if unfinished else job, unfinished)
+        for job in sorted(_read_jobs(folder), key=lambda job: job.submitted):
+            if job.active:
+                self._put(replace(job, state="interrupted", error="the server stopped"))
+            else:
+                self._jobs[job.id] = job
 
     def all(self) -> list[Job]:
-        """All of them, the newest first."""
+        """All jobs, newest first."""
         with self._lock:
-            return sorted(self._jobs.values(), key=lambda job: -job.asked)
+            return sorted(self._jobs.values(), key=lambda job: -job.submitted)
 
     def __getitem__(self, id: str) -> Job:
-        """Raises KeyError for one that is not there."""
+        """The job with this id. Raises KeyError if there is none."""
         with self._lock:
             return self._jobs[id]
 
     def find(self, kind: str, key: str) -> Job | None:
-        """The job that was asked for with this kind and key, if any was."""
+        """The job submitted with this kind and key, if any."""
         with self._lock:
             return self._jobs.get(_id(kind, key))
 
     def log(self, id: str) -> str:
-        """The end of what it printed."""
+        """The last lines of the job's output."""
         with suppress(OSError), (self._folder / id / "log.txt").open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - LOG_TAIL))
             return file.read().decode(errors="replace")
         return ""
 
     def result(self, id: str) -> Path | None:
-        """Where its result is, JSON; None where there is none, or a link to what lies elsewhere."""
-        return kept_file(self._folder, f"{id}/result.json")
+        """Path of the job's result (JSON), or None if there is none."""
+        return file_within(self._folder, f"{id}/result.json")
+
+    def finished_result(self, job: Job | None) -> Path | None:
+        """Path of the result of a job that is done, else None."""
+        return self.result(job.id) if job is not None and job.state == "done" else None
 
     def submit(
         self,
@@ -144,49 +156,45 @@ class Jobs:
         arguments: Mapping[str, Any],
         key: str,
         link: str = "",
-        there: bool = True,
+        output_exists: bool = True,
     ) -> Job:
-        """Has it done; one that is under way, or done with what it made still there, is not done again.
+        """Queue a job, or return the existing one with the same kind and key if it is active or done.
 
         Args:
-            arguments: JSON, handed to the kind's function. key: hash of all that the result depends on.
-            link: to see the result on the page, from its ``?`` on. there: whether what it made besides still is.
+            arguments: JSON, passed to the kind's function. key: identifies everything the result depends on.
+            link: page address of the result. output_exists: False if files that the job wrote have been deleted.
 
         Raises BadInput for an unknown kind, and QueueFull.
         """
         if kind not in self._kinds:
-            raise one_of("kind of job", kind, self._kinds)
+            raise unknown_name("kind of job", kind, self._kinds)
         id = _id(kind, key)
         with self._lock:
-            known = self._jobs.get(id)
-            if known is not None and known.state in UNDER_WAY:
-                return known
-            if known is not None and known.state == "done" and there and self.result(id):
-                return known
+            existing = self._jobs.get(id)
+            if existing is not None and (existing.active or (output_exists and self.finished_result(existing))):
+                return existing
             if self._closing:
                 raise BadInput("the server is stopping")
-            if len(self._queue) >= self._waiting:
-                raise QueueFull(f"{len(self._queue)} jobs wait already, no more are taken: cancel one, or wait")
+            if len(self._queue) >= self._max_waiting:
+                raise QueueFull(f"{len(self._queue)} jobs are already waiting; cancel one or try again later")
             folder = self._folder / id
             shutil.rmtree(folder, ignore_errors=True)
             try:
                 folder.mkdir(parents=True)
             except OSError as error:
-                raise unwritable(folder, error) from None
+                raise write_error(folder, error) from None
             write_atomically(folder / "arguments.json", json.dumps(arguments).encode())
-            # A clock that was set back must not put what is asked for now behind what was.
-            asked = max([time.time(), *(job.asked + 1e-3 for job in self._jobs.values())])
-            self._put(Job(id, kind, title, asked=asked, server=os.getpid(), link=link))
+            # Keeps the order if the clock was set back.
+            submitted = max([time.time(), *(job.submitted + 1e-3 for job in self._jobs.values())])
+            self._put(Job(id, kind, title, submitted=submitted, server=os.getpid(), link=link))
             self._queue.append(id)
-            self._start()
-            self._tidy()
+            self._start_waiting()
+            for job in [job for job in self.all() if not job.active][MAX_ENDED:]:
+                self._delete(job.id)
             return self._jobs[id]
 
     def cancel(self, id: str) -> Job:
-        """Ends it, or takes it out of the queue; one that has ended is forgotten with its files.
-
-        Raises KeyError for one that is not there.
-        """
+        """Cancel an active job; delete an ended one with its files. Raises KeyError for an unknown id."""
         with self._lock:
             job = self._jobs[id]
             if job.state == "waiting":
@@ -195,12 +203,12 @@ class Jobs:
             elif job.state == "running":
                 self._stop(id, "cancelled")
             else:
-                self._forget(id)
+                self._delete(id)
                 return job
             return self._jobs[id]
 
     def close(self) -> None:
-        """Ends what runs; that and what waits is interrupted."""
+        """Stop all active jobs; their state becomes ``interrupted``."""
         with self._lock:
             self._closing = True
             for id in self._queue:
@@ -208,171 +216,115 @@ class Jobs:
             self._queue.clear()
             for id in list(self._processes):
                 self._stop(id, "interrupted")
-            attending = list(self._attending.values())
-        for thread in attending:
+            watchers = list(self._watchers.values())
+        for thread in watchers:
             thread.join(2 * GRACE)
 
-    def _put(self, job: Job, write: bool = True) -> None:
+    def _put(self, job: Job) -> None:
         self._jobs[job.id] = job
-        if write:
-            try:
-                write_atomically(self._folder / job.id / "job.json", json.dumps(asdict(job)).encode())
-            except BadInput as error:  # a full disk, or a folder that is gone: only a later server misses it
-                log.warning("Job %s is not kept: %s", job.id, error)
+        try:
+            write_atomically(self._folder / job.id / "job.json", json.dumps(asdict(job)).encode())
+        except BadInput as error:  # a full disk or a deleted folder: only a later server misses the job
+            log.warning("job %s cannot be saved: %s", job.id, error)
 
-    def _forget(self, id: str) -> None:
+    def _delete(self, id: str) -> None:
         del self._jobs[id]
         shutil.rmtree(self._folder / id, ignore_errors=True)
 
-    def _tidy(self) -> None:
-        for job in [job for job in self.all() if job.state not in UNDER_WAY][KEPT:]:
-            self._forget(job.id)
-
-    def _start(self) -> None:
-        while self._queue and len(self._processes) < self._at_once:
+    def _start_waiting(self) -> None:
+        while self._queue and len(self._processes) < self._max_running:
             id = self._queue.popleft()
             job = self._jobs[id]
             try:
-                process = self._processes[id] = self._process(job)
-            except OSError as error:  # its folder is gone, or there is no memory for a process, or no descriptor
-                why = f"it could not be started: {error.strerror or error}"
-                self._put(replace(job, state="failed", error=why, ended=max(time.time(), job.asked)))
+                process = self._processes[id] = self._start_process(job)
+            except OSError as error:  # deleted folder, or no memory or file descriptors left
+                message = f"it could not be started: {error.strerror or error}"
+                self._put(replace(job, state="failed", error=message, ended=max(time.time(), job.submitted)))
                 continue
-            self._put(replace(job, state="running", started=max(time.time(), job.asked)))
-            log.info("job began", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
-            self._attending[id] = threading.Thread(target=self._attend, args=(id, process), name=f"job {id}")
-            self._attending[id].start()
+            self._put(replace(job, state="running", started=max(time.time(), job.submitted)))
+            log.info("job started", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
+            self._watchers[id] = threading.Thread(target=self._watch, args=(id, process), name=f"job {id}")
+            self._watchers[id].start()
 
-    def _process(self, job: Job) -> subprocess.Popen[bytes]:
-        # A session of its own: Ctrl-C in the terminal is for the server, and what a job starts ends with it.
-        with (self._folder / job.id / "log.txt").open("wb") as said:
+    def _start_process(self, job: Job) -> subprocess.Popen[bytes]:
+        # A session of its own: Ctrl-C in the terminal stops the server only, and the job's subprocesses end with it.
+        with (self._folder / job.id / "log.txt").open("wb") as output:
             return subprocess.Popen(
-                [
-                    sys.executable,
-                    "-P",
-                    "-m",
-                    WORKER,
-                    self._kinds[job.kind],
-                    self._folder / job.id,
-                ],
-                stdin=subprocess.PIPE,  # when it closes, its server is gone
+                [sys.executable, "-P", "-m", WORKER, self._kinds[job.kind], self._folder / job.id],
+                stdin=subprocess.PIPE,  # closes when the server ends
                 stdout=subprocess.PIPE,
-                stderr=said,
+                stderr=output,
                 start_new_session=True,
                 env=os.environ | {"OMP_NUM_THREADS": "1"},
             )
 
-    def _attend(self, id: str, process: subprocess.Popen[bytes]) -> None:
-        hearing = threading.Thread(target=self._hear, args=(id, process), name=f"hearing {id}")
-        hearing.start()
+    def _watch(self, id: str, process: subprocess.Popen[bytes]) -> None:
+        reader = threading.Thread(target=self._read_reports, args=(id, process), name=f"reports of job {id}")
+        reader.start()
         code = process.wait()
-        _signal(process, signal.SIGKILL)  # whatever it started
-        hearing.join()
+        _signal_group(process, signal.SIGKILL)  # remaining subprocesses
+        reader.join()
         assert process.stdin is not None
         process.stdin.close()
         with self._lock:
-            del self._processes[id], self._attending[id]
+            del self._processes[id], self._watchers[id]
             job = self._jobs[id]
             job = replace(job, ended=max(time.time(), job.started or 0.0))
-            stopped = self._stopped.pop(id, None)
+            stopped = self._stopping.pop(id, None)
             if code == 0 and self.result(id):
                 job = replace(job, state="done", progress=1.0, message="", error="")
             elif stopped:
-                error = "cancelled" if stopped == "cancelled" else "the server stopped"
-                job = replace(job, state=stopped, error=error)
+                job = replace(job, state=stopped, error="cancelled" if stopped == "cancelled" else "the server stopped")
             else:
-                job = replace(job, state="failed", error=job.error or self._why(id, code))
+                job = replace(job, state="failed", error=job.error or self._exit_reason(id, code))
             self._put(job)
-            told = {"job": id, "kind": job.kind, "state": job.state, "seconds": _seconds(job), "error": job.error}
-            log.log(logging.WARNING if job.state == "failed" else logging.INFO, "job ended", extra={"event": told})
+            seconds = round((job.ended or 0.0) - (job.started or 0.0), 1)
+            event = {"job": id, "kind": job.kind, "state": job.state, "seconds": seconds, "error": job.error}
+            log.log(logging.WARNING if job.state == "failed" else logging.INFO, "job ended", extra={"event": event})
             if not self._closing:
-                self._start()
+                self._start_waiting()
 
-    def _hear(self, id: str, process: subprocess.Popen[bytes]) -> None:
-        """Takes what the process reports, JSON lines of a job's fields, until it ends."""
+    def _read_reports(self, id: str, process: subprocess.Popen[bytes]) -> None:
+        """Apply the process's reports (JSON lines of job fields) until it ends."""
         assert process.stdout is not None
         with process.stdout as lines:
             for line in lines:
-                # The last line of a process that was killed may be half a line.
+                # The last line of a killed process may be incomplete.
                 with suppress(ValueError), self._lock:
-                    self._put(replace(self._jobs[id], **json.loads(line)), write=False)
+                    self._jobs[id] = replace(self._jobs[id], **json.loads(line))
 
-    def _why(self, id: str, code: int) -> str:
-        """What is known of a process that ended without saying why."""
-        last = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "")
-        how = f"its process {how_it_ended(code)}"
-        return f"{how}; it said last: {last.strip()}" if last else how
+    def _exit_reason(self, id: str, code: int) -> str:
+        """Describe the end of a process that reported no error."""
+        last_line = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "").strip()
+        reason = f"its process {exit_description(code)}"
+        return f"{reason}; last output: {last_line}" if last_line else reason
 
-    def _stop(self, id: str, then: State) -> None:
-        if id in self._stopped:
+    def _stop(self, id: str, state: State) -> None:
+        if id in self._stopping:
             return
-        self._stopped[id] = then
+        self._stopping[id] = state
         process = self._processes[id]
-        _signal(process, signal.SIGTERM)
-        threading.Thread(target=_end, args=(process,), name=f"ending {id}", daemon=True).start()
-
-
-def routes(jobs: Jobs) -> APIRouter:
-    """Every route under ``/api/jobs``."""
-    router = APIRouter()
-
-    def known(id: str) -> Job:
-        try:
-            return jobs[id]
-        except KeyError:
-            raise HTTPException(404, f"Job {id!r} does not exist.") from None
-
-    @router.get("/api/jobs")
-    def list_jobs() -> list[Job]:
-        return jobs.all()
-
-    @router.get("/api/jobs/{id}")
-    def one_job(id: str) -> dict[str, Any]:
-        return asdict(known(id)) | {"log": jobs.log(id)}
-
-    @router.delete("/api/jobs/{id}")
-    def cancel(id: str) -> Job:
-        known(id)
-        return jobs.cancel(id)
-
-    @router.get("/api/jobs/{id}/result")
-    def result(id: str) -> Response:
-        job = known(id)
-        path = jobs.result(id)
-        if job.state != "done" or path is None:
-            raise HTTPException(404, f"Job {id!r} has no result: it is {job.state}{job.error and f', {job.error}'}.")
-        return FileResponse(path, media_type="application/json")
-
-    return router
-
-
-def under_way(job: Job | None) -> JSONResponse:
-    """The answer where a job has to end first; None where nobody asked for it."""
-    return JSONResponse({"job": None if job is None else asdict(job)}, status_code=202)
-
-
-def _seconds(job: Job) -> float:
-    """How long it ran."""
-    return round((job.ended or 0.0) - (job.started or 0.0), 1)
+        _signal_group(process, signal.SIGTERM)
+        threading.Thread(target=_kill_after_grace, args=(process,), name=f"stopping job {id}", daemon=True).start()
 
 
 def _id(kind: str, key: str) -> str:
     return hashlib.sha256(repr((kind, key, __version__)).encode()).hexdigest()[:16]
 
 
-def _read_all(folder: Path) -> list[Job]:
-    """The jobs that lie there, but for those that another running server has under way."""
-    found = []
+def _read_jobs(folder: Path) -> list[Job]:
+    """The stored jobs, except those that are active in another server."""
+    jobs = []
     for path in folder.glob("*/job.json"):
-        # A file that cannot be read, or is of another version, is no job of ours.
+        # Skips files that are damaged or of another version.
         with suppress(OSError, ValueError, TypeError):
             job = read_record(RECORD, path)
-            if job.id == path.parent.name and not (job.state in UNDER_WAY and _lives_elsewhere(job.server)):
-                found.append(job)
-    return found
+            if job.id == path.parent.name and not (job.active and _is_other_process(job.server)):
+                jobs.append(job)
+    return jobs
 
 
-def _lives_elsewhere(pid: int) -> bool:
+def _is_other_process(pid: int) -> bool:
     if pid <= 0 or pid == os.getpid():
         return False
     try:
@@ -384,14 +336,14 @@ def _lives_elsewhere(pid: int) -> bool:
     return True
 
 
-def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
-    """To the process and all that it started."""
+def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    """Signal the process and its subprocesses."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, number)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def _kill_after_grace(process: subprocess.Popen[bytes]) -> None:
     with suppress(subprocess.TimeoutExpired):
         process.wait(GRACE)
         return
-    _signal(process, signal.SIGKILL)
+    _signal_group(process, signal.SIGKILL)

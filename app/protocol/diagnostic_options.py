@@ -1,4 +1,4 @@
-"""What a diagnostic can be asked with: its options as JSON, and from the texts of an address or a command line."""
+"""Options of diagnostics: their description as JSON, and their values from query strings or a command line."""
 
 from __future__ import annotations
 
@@ -8,50 +8,45 @@ from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.inspect.diagnostics.base import Entry
 
 
-def described(entry: Entry) -> dict[str, Any]:
-    """An entry as JSON; an option's default is text, empty where there is none to be shown."""
+def describe_entry(entry: Entry) -> dict[str, Any]:
+    """An entry as JSON; the default of an option is text, empty if there is none."""
     parameters = inspect.signature(entry.run).parameters
     options = [
-        {"name": name, "meaning": meaning, "default": _shown(parameters[name].default)}
+        {"name": name, "meaning": meaning, "default": _default_text(parameters[name].default)}
         for name, meaning in entry.options.items()
     ]
-    return {
-        "name": entry.name,
-        "title": entry.title,
-        "question": entry.question,
-        "slow": entry.slow,
-        "options": options,
-    }
+    return {name: getattr(entry, name) for name in ("name", "title", "question", "slow")} | {"options": options}
 
 
-def parse(entry: Entry, texts: Mapping[str, str]) -> dict[str, Any]:
-    """The entry's options from texts, as the types that its function takes; an empty one is its default.
+def parse_options(entry: Entry, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Convert texts to the types of the entry's options; an empty text selects the default.
 
-    Raises BadInput for an option that the entry does not have, and for a text that its type does not take.
+    Raises BadInput for an unknown option or an invalid value.
     """
     hints = get_type_hints(entry.run)
     options: dict[str, Any] = {}
     for name, text in texts.items():
         if name not in entry.options:
-            raise one_of(f"option of {entry.name}", name, entry.options)
+            raise unknown_name(f"option of {entry.name}", name, entry.options)
         if not text:
             continue
         try:
             options[name] = TypeAdapter(hints.get(name, str)).validate_strings(text)
         except ValidationError as error:
-            said = error.errors()[0]["msg"]
-            raise BadInput(f"{entry.name}'s {name!r} is {text!r}: {said}. It is {entry.options[name]}.") from None
+            reason = error.errors()[0]["msg"]
+            meaning = entry.options[name]
+            raise BadInput(f"option {name!r} of {entry.name} ({meaning}) is {text!r}: {reason}.") from None
     return options
 
 
-def says_how_far(entry: Entry) -> bool:
-    """Whether it takes ``progress``, a function that is told the share done."""
+def takes_progress(entry: Entry) -> bool:
+    """Whether the entry's function has the argument ``progress``, a callback for the share done."""
     return "progress" in inspect.signature(entry.run).parameters
 
 
-def _shown(default: Any) -> str:
+def _default_text(default: Any) -> str:
     return "" if default in (None, inspect.Parameter.empty) else str(default)

@@ -1,4 +1,4 @@
-"""Answers that a browser keeps: each with a tag that says what is in it."""
+"""Responses with an ETag, for browser caches."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import Response
 
-ASK_AGAIN = "no-cache"
-FOREVER = "public, max-age=31536000, immutable"
+REVALIDATE = "no-cache"
+IMMUTABLE = "public, max-age=31536000, immutable"
 
 
 def tagged(
-    request: Request, tag: str, content: Callable[[], bytes], media_type: str, kept: str = ASK_AGAIN
+    request: Request, tag: str, content: Callable[[], bytes], media_type: str, cache_control: str = REVALIDATE
 ) -> Response:
-    """The content with its ETag, or 304 where the browser has it already. Kept: its ``cache-control``."""
-    headers = {"etag": f'"{tag}"', "cache-control": kept}
+    """The content with its ETag, or 304 if the browser's copy is current."""
+    headers = {"etag": f'"{tag}"', "cache-control": cache_control}
     if headers["etag"] in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=headers)
     return Response(content(), media_type=media_type, headers=headers)
 
 
-def tagged_json(request: Request, shown: Any) -> Response:
-    """The same of a JSON value, whose tag is its hash."""
-    body = json.dumps(shown).encode()
+def tagged_json(request: Request, value: Any) -> Response:
+    """A JSON value tagged with its hash."""
+    body = json.dumps(value).encode()
     return tagged(request, hashlib.sha256(body).hexdigest()[:24], lambda: body, "application/json")

@@ -1,8 +1,8 @@
-"""Filters run in a process of its own: the server answers meanwhile, and outlives whatever becomes of it.
+"""Worker process that runs filters, so that the server stays responsive and survives a crash.
 
     python -m beliefscope.app.runs.trace_worker
 
-Standard input has one run to be made a line, JSON; standard output tells how far each one is, and how it ended.
+Standard input carries one request a line, JSON; standard output carries progress and the outcome of each.
 """
 
 from __future__ import annotations
@@ -12,19 +12,29 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
-from concurrent.futures import wait
+import time
+from contextlib import closing, suppress
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
-from beliefscope.app.jobs.worker import NICENESS, PAUSE, how_it_ended, own_output
+from beliefscope.app.runs.filter_runner import FilterRunner, Progress, RunRequest
+from beliefscope.app.runs.subprocesses import NICENESS, REPORT_INTERVAL, exit_description, redirect_stdout
+from beliefscope.datasets.catalog import find_task, load_task
+from beliefscope.datasets.dataset import Dataset
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
+from beliefscope.filters.external.load import load_external
+from beliefscope.inspect.trace import save_trace
+from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileReader
 
 
-class Tracer:
-    """The process, kept between runs: reading PyTorch takes it seconds. Another takes its place when it has died.
+class TraceWorker:
+    """The worker process, reused between runs because starting it takes seconds. A dead one is replaced.
 
-    ``run`` is for one thread at a time; ``close`` may be called from any other.
+    Call ``run`` from one thread at a time; ``close`` may be called from any thread.
     """
 
     def __init__(self) -> None:
@@ -34,11 +44,11 @@ class Tracer:
 
     @property
     def started(self) -> bool:
-        """Whether there is the process, or was."""
+        """Whether the process has been started."""
         return self._process is not None
 
     def start(self) -> None:
-        """Starts the process if there is none; it gets itself ready while others work."""
+        """Start the process, unless it is running. Does not wait until it is ready."""
         with self._lock:
             if self._closed:
                 raise RuntimeError("the server is stopping")
@@ -49,46 +59,42 @@ class Tracer:
                     stdout=subprocess.PIPE,
                     text=True,
                     bufsize=1,
-                    start_new_session=True,  # Ctrl-C in the terminal is for the server
+                    start_new_session=True,  # Ctrl+C in the terminal stops the server only
                 )
 
-    def run(
-        self, settings: Mapping[str, Any], selection: Mapping[str, Any], path: Path, progress: Callable[[float], None]
-    ) -> None:
-        """Runs a filter; its trace is the file then.
+    def run(self, request: RunRequest, progress: Progress) -> None:
+        """Run a filter and write its trace to ``request.output``. An exception of ``progress`` kills the process.
 
-        Args:
-            settings, selection: as ``to_json`` gives them. progress: called with the share done; what it raises ends
-                the run.
-
-        Raises BadInput as tracing does, and RuntimeError for anything else that came between, also the process's end.
+        Raises:
+            BadInput: the request does not fit the filter.
+            RuntimeError: any other failure, such as the death of the process.
         """
         self.start()
         process = self._process
         assert process is not None
         assert process.stdin is not None
         assert process.stdout is not None
-        ended = None
+        outcome = None
         try:
-            process.stdin.write(json.dumps({"settings": settings, "selection": selection, "path": str(path)}) + "\n")
+            process.stdin.write(json.dumps(request.to_json()) + "\n")
             for line in process.stdout:
-                said = json.loads(line)
-                if "progress" not in said:
-                    ended = said
+                message = json.loads(line)
+                if "progress" not in message:
+                    outcome = message
                     break
-                progress(said["progress"])
+                progress(message["progress"])
         except OSError:
-            pass  # it has died
+            pass  # the process has died
         except BaseException:
             process.kill()
             raise
-        if ended is None:
-            raise RuntimeError(f"the filter could not be run: its process {how_it_ended(process.wait())}")
-        if ended["error"] is not None:
-            raise (BadInput if ended["bad"] else RuntimeError)(ended["error"])
+        if outcome is None:
+            raise RuntimeError(f"the filter could not be run: its process {exit_description(process.wait())}")
+        if outcome["error"] is not None:
+            raise (BadInput if outcome["bad_input"] else RuntimeError)(outcome["error"])
 
     def close(self) -> None:
-        """Ends the process, also in the midst of a run."""
+        """End the process, also during a run."""
         with self._lock:
             self._closed = True
             if self._process is not None:
@@ -96,36 +102,58 @@ class Tracer:
                 self._process.wait()
 
 
-def main() -> None:
-    """Makes runs until standard input ends."""
-    from beliefscope.app.runs.trace_store import Library, Selection, Settings
-    from beliefscope.inspect.trace import save_trace
+@lru_cache(maxsize=8)
+def _checkpoint(source: str, external_task: str) -> Checkpoint:
+    return load_external(source, external_task) if external_task else load_checkpoint(Path(source))
 
+
+@lru_cache(maxsize=8)
+def _dataset(path: str, task: str) -> Dataset:
+    return open_dataset(path, find_task(task))
+
+
+_load_user_task = cache(load_task)
+
+
+def _episode(request: RunRequest) -> Episode:
+    if request.data.endswith(SUFFIX):
+        with closing(LiveFileReader(Path(request.data))) as reader:
+            with suppress(BadInput):  # of a damaged file, the steps before the damage are used
+                reader.poll()
+            return reader.part().episode
+    return _dataset(request.data, request.selection.task)[request.selection.episode]
+
+
+def _execute(request: RunRequest, runner: FilterRunner, output: TextIO) -> None:
+    last_report = time.monotonic()
+
+    def progress(fraction: float) -> None:
+        nonlocal last_report
+        if time.monotonic() - last_report >= REPORT_INTERVAL:
+            last_report = time.monotonic()
+            output.write(json.dumps({"progress": fraction}) + "\n")
+
+    for task in request.user_tasks:
+        _load_user_task(task)
+    trace = runner.run(request, _checkpoint(request.checkpoint, request.external_task), _episode(request), progress)
+    if request.output != request.original:
+        save_trace(trace, Path(request.output))
+
+
+def main() -> None:
+    """Carry out requests until standard input ends."""
     os.nice(NICENESS)
-    told = own_output()
-    library, shown = None, None
+    output, runner = redirect_stdout(), FilterRunner()
     for line in sys.stdin:
-        order = json.loads(line)
-        error, bad = None, False
+        outcome: dict[str, Any] = {"error": None, "bad_input": False}
         try:
-            if library is None or order["settings"] != shown:
-                if library is not None:
-                    library.close()
-                library, shown = Library(Settings.of_json(order["settings"])), order["settings"]
-            traced = library.traced(Selection.of_json(order["selection"]))
-            while wait([traced.done], PAUSE).not_done:
-                told.write(json.dumps({"progress": traced.progress}) + "\n")
-            path = Path(order["path"])
-            trace = traced.trace
-            if not path.exists():  # of an edit, or of a run that was in memory when somebody deleted its file
-                path.parent.mkdir(parents=True, exist_ok=True)
-                save_trace(trace, path)
-        except BadInput as problem:
-            error, bad = str(problem), True
-        except Exception as problem:
-            error = f"{type(problem).__name__}: {problem}"
-        told.write(json.dumps({"error": error, "bad": bad}) + "\n")
-    os._exit(0)  # nothing is left to be done, and nobody to wait for it
+            _execute(RunRequest.from_json(json.loads(line)), runner, output)
+        except BadInput as error:
+            outcome = {"error": str(error), "bad_input": True}
+        except Exception as error:
+            outcome["error"] = f"{type(error).__name__}: {error}"
+        output.write(json.dumps(outcome) + "\n")
+    os._exit(0)  # faster than the regular shutdown of PyTorch
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Who is let in where the server is not one person's alone: a token, told once as a link, and what it opens.
+"""Authentication with a token, for servers that others can reach.
 
-A script brings it in the header ``Authorization: Bearer TOKEN`` of each request, a browser once, as ``/?token=TOKEN``,
-the link that ``serve`` prints. The browser is given a cookie for it and sent on to the address without the token, so
-that it stays in no bookmark or Referer. The cookie is of this run of the server alone.
+A script sends the token in the header ``Authorization: Bearer TOKEN`` of each request. A browser sends it once, as
+``/?token=TOKEN``, the link that ``serve`` prints. It receives a cookie and is redirected to the address without the
+token, which thus appears in no bookmark or Referer. The cookie is valid until the server stops.
 """
 
 from __future__ import annotations
@@ -21,54 +21,54 @@ from urllib.parse import parse_qsl, urlencode
 from beliefscope.datasets.errors import BadInput
 
 VARIABLE = "BELIEFSCOPE_TOKEN"
-SHORTEST = 16  # characters of a token of the user's own
-BEYOND_GUESSING = 32  # characters of a token that nobody need be kept from guessing, as ours is
-TRIES, PERIOD = 10, 60.0  # wrong tokens from one address in so many s, after which it has to wait
-ADDRESSES = 1000  # whose wrong tokens are remembered
+MIN_LENGTH = 16  # characters of a user-defined token
+SAFE_LENGTH = 32  # characters of a token that cannot be guessed; generated tokens have more
+MAX_ATTEMPTS, PERIOD = 10, 60.0  # wrong tokens per address and s
+MAX_ADDRESSES = 1000  # for which wrong tokens are counted
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 EVERYWHERE = frozenset({"0.0.0.0", "::"})
 
 
 @dataclass(frozen=True)
 class Access:
-    """What whoever asks has to bring, and what they may do.
+    """Access to a server.
 
     Attributes:
-        token: what has to be brought; nothing where it is empty. read_only: nothing can be changed, only looked at.
+        token: required of all clients; empty for none. read_only: whether changes are refused.
     """
 
     token: str = field(default="", repr=False)
     read_only: bool = False
 
     def link(self, url: str) -> str:
-        """The address that opens the page of this server, whose address this is."""
+        """The link that opens the page of the server at ``url``."""
         return f"{url}?{urlencode({'token': self.token})}" if self.token else url
 
 
 OPEN = Access()
-"""Whoever can reach the server may do everything: right for one person's machine."""
+"""No restrictions, for a server on the loopback interface."""
 
 
-def token_for(host: str, demanded: bool, environment: Mapping[str, str]) -> str:
-    """The token of a server that listens on ``host``; empty for the loopback interface where none is demanded.
+def token_for(host: str, required: bool, environment: Mapping[str, str]) -> str:
+    """The token of a server on ``host``; empty for the loopback interface if none is required.
 
-    Raises BadInput for one in the environment that could be guessed.
+    Raises BadInput for a token in the environment that is too short.
     """
-    given = environment.get(VARIABLE, "")
-    if given and (len(given) < SHORTEST or not given.isprintable() or not given.isascii() or " " in given):
-        raise BadInput(f"{VARIABLE} has {len(given)} characters, expected {SHORTEST} or more, ASCII and without spaces")
-    if given or (host in LOOPBACK and not demanded):
-        return given
+    token = environment.get(VARIABLE, "")
+    if token and (len(token) < MIN_LENGTH or not token.isprintable() or not token.isascii() or " " in token):
+        raise BadInput(f"{VARIABLE} has {len(token)} characters; expected at least {MIN_LENGTH}, ASCII, without spaces")
+    if token or (host in LOOPBACK and not required):
+        return token
     return secrets.token_urlsafe(32)
 
 
-def names_of(host: str) -> tuple[str, ...]:
-    """Names by which a server that listens on ``host`` is reached, the one to be printed first."""
+def host_names(host: str) -> tuple[str, ...]:
+    """Names of a server that listens on ``host``; the first one is printed."""
     return (socket.gethostname(), host) if host in EVERYWHERE else (host,)
 
 
 def is_address(host: str) -> bool:
-    """Whether it is an IP address, with or without brackets, and no name that someone's DNS could turn elsewhere."""
+    """Whether the host is an IP address, with or without brackets; unlike names, those cannot be rebound by DNS."""
     try:
         ipaddress.ip_address(host.removeprefix("[").removesuffix("]"))
     except ValueError:
@@ -76,98 +76,96 @@ def is_address(host: str) -> bool:
     return True
 
 
-class TooMany(Exception):
-    """From this address there were too many wrong tokens. Holds the s that it has to wait."""
+class TooManyAttempts(Exception):
+    """Too many wrong tokens from one address. Argument: s to wait."""
 
 
 class SignIn:
-    """Tells who brings the token, or had brought it.
+    """Checks tokens and cookies.
 
     Args:
-        token: not empty. clock: monotonic s.
+        token: not empty. clock: in s, monotonic.
     """
 
     def __init__(self, token: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._token = token.encode()
         self._cookie = secrets.token_urlsafe(32)
         self._clock = clock
-        self._wrong: OrderedDict[str, deque[float]] = OrderedDict()
+        self._attempts: OrderedDict[str, deque[float]] = OrderedDict()
 
-    def remembers(self, host: str, cookies: str) -> bool:
-        """Whether a browser that calls the server ``host`` sends the cookie it was given."""
-        # Not http.cookies: it drops all of them where another server of this host has set one that it cannot read.
+    def has_cookie(self, host: str, cookies: str) -> bool:
+        """Whether the cookies of a request to ``host`` contain the valid one."""
+        # Not http.cookies, which drops all cookies if one, possibly of another server, is malformed.
         pairs = (part.strip().partition("=") for part in cookies.split(";"))
-        found = {name: value for name, _, value in pairs}.get(_cookie_name(host), "")
-        return hmac.compare_digest(found.encode(), self._cookie.encode())
+        value = {name: value for name, _, value in pairs}.get(_cookie_name(host), "")
+        return hmac.compare_digest(value.encode(), self._cookie.encode())
 
-    def accepts(self, brought: str, address: str) -> bool:
-        """Whether this is the token. Raises TooMany where ``address`` brought wrong ones too often.
+    def accepts(self, token: str, address: str) -> bool:
+        """Whether the token is correct. Raises TooManyAttempts after too many wrong ones from ``address``.
 
-        Then a right one that could be guessed is not taken either. One beyond guessing is: whoever shares an address,
-        behind a proxy or on this machine, cannot lock out its owner.
+        The limit applies to short tokens only: clients that share the owner's address cannot lock the owner out of a
+        server whose token cannot be guessed.
         """
-        right = hmac.compare_digest(brought.encode(), self._token)
-        if right and len(self._token) >= BEYOND_GUESSING:
+        correct = hmac.compare_digest(token.encode(), self._token)
+        if correct and len(self._token) >= SAFE_LENGTH:
             return True
-        wrong = self._wrong.get(address, ())
-        recent = [when for when in wrong if when > self._clock() - PERIOD]
-        if len(recent) >= TRIES:
-            raise TooMany(recent[0] + PERIOD - self._clock())
-        if right:
-            self._wrong.pop(address, None)
+        recent = [when for when in self._attempts.get(address, ()) if when > self._clock() - PERIOD]
+        if len(recent) >= MAX_ATTEMPTS:
+            raise TooManyAttempts(recent[0] + PERIOD - self._clock())
+        if correct:
+            self._attempts.pop(address, None)
             return True
-        self._wrong.setdefault(address, deque(maxlen=TRIES)).append(self._clock())
-        self._wrong.move_to_end(address)
-        while len(self._wrong) > ADDRESSES:
-            self._wrong.popitem(last=False)
+        self._attempts.setdefault(address, deque(maxlen=MAX_ATTEMPTS)).append(self._clock())
+        self._attempts.move_to_end(address)
+        while len(self._attempts) > MAX_ADDRESSES:
+            self._attempts.popitem(last=False)
         return False
 
     def cookie(self, host: str) -> str:
-        """``Set-Cookie`` for who called the server ``host``: hidden from scripts, and not for other sites."""
+        """``Set-Cookie`` header for a request to ``host``; hidden from scripts and from other sites."""
         return f"{_cookie_name(host)}={self._cookie}; Path=/; HttpOnly; SameSite=Strict"
 
 
 def _cookie_name(host: str) -> str:
-    # Browsers keep cookies by host alone: servers on several ports of one machine would take each other's.
+    # Browsers ignore the port of cookies; without it in the name, servers on one machine would overwrite each other's.
     port = host.rpartition(":")[2] if ":" in host and not host.endswith("]") else "80"
     return f"beliefscope-{port}"
 
 
-def token_in(query: str) -> str:
-    """The token in an address's query; empty where there is none."""
+def token_from_query(query: str) -> str:
+    """The token in a query string, or empty."""
     return dict(parse_qsl(query, keep_blank_values=True)).get("token", "")
 
 
-def without_token(query: str) -> str:
-    """The page's address with the rest of the query."""
+def address_without_token(query: str) -> str:
+    """The page's address with the query string except the token."""
     rest = [(key, value) for key, value in parse_qsl(query, keep_blank_values=True) if key != "token"]
     return "/?" + urlencode(rest) if rest else "/"
 
 
-def onward_page(address: str) -> str:
-    """HTML that leads on to an address of ours.
+def redirect_page(address: str) -> str:
+    """HTML that redirects to an address of this server.
 
-    Not a redirect: where the link stands on another site, the browser would follow one without the cookie, which is
-    strictly for our own pages.
+    Not an HTTP redirect: if the link is on another site, the browser would follow that without the SameSite cookie.
     """
     return _PAGE.format(
         head=f'<meta http-equiv="refresh" content="0;url={escape(address)}">',
-        body=f'<p>Signed in. <a href="{escape(address)}">Go on</a></p>',
+        body=f'<p>Signed in. <a href="{escape(address)}">Continue</a></p>',
     )
 
 
 def sign_in_page(problem: str, address: str) -> str:
-    """HTML that asks for the token, and leads on to an address of ours.
+    """HTML form for the token, with a link to an address of this server.
 
-    A browser that has the cookie leaves it out where a link of another page led to us, of a shown report for one;
-    from here it sends it.
+    Browsers do not send the SameSite cookie when they follow a link from another page, such as a displayed report;
+    from this page they do.
     """
     return _PAGE.format(
         head="",
         body=f"<p>{escape(problem)}</p>"
         '<form action="/" method="get"><label>Token <input name="token" type="password" autocomplete="off" required '
         'autofocus></label> <button type="submit">Sign in</button></form>'
-        f'<p>If you are signed in already and a link led here: <a href="{escape(address)}">go on</a>.</p>',
+        f'<p>Already signed in? <a href="{escape(address)}">Continue</a>.</p>',
     )
 
 

@@ -1,9 +1,8 @@
-"""The guard around the whole server: who may talk to it, and what a page from it may do. docs/security.md says why.
+"""Access control and security headers for all requests; docs/security.md explains the reasons.
 
-By default the server is one person's, on the loopback interface, yet any web page that this person visits can send
-requests there. So the Host must be a name we answer to (against DNS rebinding), whatever can change something must come
-from our own page (Origin), and the browser is told to keep our pages to themselves (headers). Where others can reach
-the server, each request must also show that its sender had the token (``app/server/auth.py``).
+A server on the loopback interface can receive requests from any web page that its user visits. Therefore the Host must
+be known (against DNS rebinding), requests that can change something need the server's own Origin, and headers restrict
+the use of responses. If others can reach the server, requests must also be authenticated (``app/server/auth.py``).
 """
 
 from __future__ import annotations
@@ -16,66 +15,76 @@ import secrets
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from pathlib import Path
 
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from beliefscope.app.protocol.messages import READ_ONLY
 from beliefscope.app.server.auth import (
     LOOPBACK,
     OPEN,
     Access,
     SignIn,
-    TooMany,
+    TooManyAttempts,
+    address_without_token,
     is_address,
-    onward_page,
+    redirect_page,
     sign_in_page,
-    token_in,
-    without_token,
+    token_from_query,
 )
 
 HOST = re.compile(r"(?P<name>\[[^\[\]]*\]|[^:\[\]]*)(:\d{0,5})?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 WITHOUT_TOKEN = frozenset({"/healthz"})
-VIEWING = frozenset({"POST /api/views", "POST /api/recordings"})
-"""What is asked for by who only looks: a view, and the recording that the Rerun viewer shows, if it is there."""
-READ_ONLY = "This server is read-only: it shows, and nothing on it can be changed."
+READ_ONLY_ALLOWED = frozenset({"POST /api/views", "POST /api/recordings"})
+"""Allowed on read-only servers: opening a view, and looking up the recording for the Rerun viewer."""
 
-MAX_BODY = 1 << 20  # bytes of a request that is not an upload
+MAX_BODY = 1 << 20  # bytes, except uploads
 UPLOAD = re.compile(r"PUT /api/recordings/.*")
-"""What sends files, of which the route itself keeps count."""
-PATIENCE = 30.0  # s that the next part of a body may take
+"""Uploads; the route checks their size."""
+BODY_TIMEOUT = 30.0  # s between two chunks of a body
 
 PAGE_POLICY = (
     "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; connect-src 'self'; worker-src 'self' blob:; frame-src 'self'; "
     "frame-ancestors 'none'; object-src 'none'; base-uri 'none'; form-action 'self'"
 )
-# viser's client is one HTML file whose script unpacks itself, and whose socket lives in a worker made from a blob.
+# viser's client is one HTML file with a self-extracting script; its socket runs in a worker created from a blob.
 SCENE_POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; "
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
     "connect-src 'self' data: blob:; worker-src 'self' blob: data:; frame-src 'none'; "
     "frame-ancestors 'self'; object-src 'none'; base-uri 'none'; form-action 'none'"
 )
-# Numbers, scripts and files: where a browser is led to show one as a page, it is an inert one.
+# For data, scripts and files: displayed as a page, they are inert.
 DATA_POLICY = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; sandbox"
-UNUSED = ("accelerometer", "camera", "display-capture", "geolocation", "gyroscope", "hid", "magnetometer", "microphone")
+UNUSED_FEATURES = (
+    "accelerometer",
+    "camera",
+    "display-capture",
+    "geolocation",
+    "gyroscope",
+    "hid",
+    "magnetometer",
+    "microphone",
+)
 HEADERS = {
     b"x-content-type-options": b"nosniff",
     b"referrer-policy": b"no-referrer",
     b"cross-origin-opener-policy": b"same-origin",
     b"cross-origin-resource-policy": b"same-origin",
     b"origin-agent-cluster": b"?1",
-    b"permissions-policy": ", ".join(f"{name}=()" for name in (*UNUSED, "midi", "payment", "serial", "usb")).encode(),
-    b"cache-control": b"no-cache",  # revalidate by ETag, unless the answer says otherwise
+    b"permissions-policy": ", ".join(
+        f"{name}=()" for name in (*UNUSED_FEATURES, "midi", "payment", "serial", "usb")
+    ).encode(),
+    b"cache-control": b"no-cache",  # revalidate by ETag; responses may override this
 }
 log = logging.getLogger("beliefscope.app")
 
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer of the guard's own. page: HTML instead of the reason as JSON."""
+    """A response of the guard. page: HTML instead of the reason as JSON."""
 
     status: int
     reason: str
@@ -84,13 +93,11 @@ class Reply:
 
 
 class Guard:
-    """ASGI application that lets through what is allowed and adds the security headers to every answer.
+    """ASGI middleware that checks all requests and WebSockets and adds security headers to all responses.
 
     Args:
-        app: the application behind the guard; its WebSockets are guarded too.
-        hosts: names answered to beside the loopback's, without port (any port is allowed: think of ``ssh -L``).
-        access: what has to be brought, and whether anything may be changed. With a token, a Host may also be any IP
-            address: none can be rebound, and all of the machine's are meant.
+        hosts: allowed host names in addition to the loopback's, with any port (``ssh -L`` changes it).
+        access: required token and permissions. With a token, the Host may also be any IP address.
     """
 
     def __init__(self, app: ASGIApp, hosts: Iterable[str] = (), access: Access = OPEN) -> None:
@@ -103,85 +110,80 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        answer = _Answer(scope, send)
+        response = _Response(scope, send)
         reply = self.reply(scope)
         if reply is not None:
             if reply.status >= 400:
-                about = {"status": reply.status, "path": scope["path"], "client": _address(scope)}
-                log.warning("refused: %s", reply.reason, extra={"event": about})
-            await _answer(scope, receive, answer.send, reply)
+                event = {"status": reply.status, "path": scope["path"], "client": _address(scope)}
+                log.warning("refused: %s", reply.reason, extra={"event": event})
+            await _send_reply(scope, receive, response.send, reply)
             return
         try:
-            await self.app(scope, _bounded(scope, receive), answer.send)
+            await self.app(scope, _limit_body(scope, receive), response.send)
         except Exception as error:
-            mark = secrets.token_hex(4)
-            log.exception("failed: %s", error, extra={"event": {"error": mark, "path": scope["path"]}})
-            if answer.begun or scope["type"] == "websocket":
+            id = secrets.token_hex(4)
+            log.exception("failed: %s", error, extra={"event": {"error": id, "path": scope["path"]}})
+            if response.started or scope["type"] == "websocket":
                 raise
-            await _answer(scope, receive, answer.send, Reply(500, f"{error or type(error).__name__} (error {mark})"))
+            await _send_reply(
+                scope, receive, response.send, Reply(500, f"{error or type(error).__name__} (error {id})")
+            )
 
     def reply(self, scope: Scope) -> Reply | None:
-        """Why this request is not passed on, or None."""
+        """The response to a refused request, or None if it is allowed."""
         headers = [(name.lower(), value.decode("latin-1").strip()) for name, value in scope["headers"]]
         hosts = [value.lower() for name, value in headers if name == b"host"]
         if len(hosts) != 1:
             return Reply(403, "The request must have one Host header.")
         host = hosts[0]
-        known = ", ".join(sorted(self.hosts))
         if _name(host) not in self.hosts and not (self.sign_in and is_address(_name(host))):
-            return Reply(403, f"Host {host!r} is not answered here. Allowed: {known} (any port).")
-        if scope["type"] == "http" and _from_elsewhere(headers):
-            return Reply(403, "A page of another site asked for this. It may lead here, but use nothing.")
+            allowed = ", ".join(sorted(self.hosts))
+            return Reply(403, f"Host {host!r} is not allowed. Allowed: {allowed} (any port).")
+        if scope["type"] == "http" and _is_cross_site(headers):
+            return Reply(403, "The request comes from a page of another site.")
         bearer = next(filter(None, (_bearer(value) for name, value in headers if name == b"authorization")), "")
         if self.sign_in and scope["path"] not in WITHOUT_TOKEN:
             cookies = "; ".join(value for name, value in headers if name == b"cookie")
-            reply = self._unknown(self.sign_in, scope, host, bearer, cookies)
+            reply = self._authenticate(self.sign_in, scope, host, bearer, cookies)
             if reply is not None:
                 return reply
         if scope["type"] == "http" and scope["method"] in SAFE_METHODS:
             return None
         origins = [value.lower() for name, value in headers if name == b"origin"]
-        # A browser sends no Authorization of itself: what has the token there and no Origin is a script.
-        by_script = self.sign_in is not None and bearer and not origins
-        if origins not in ([f"http://{host}"], [f"https://{host}"]) and not by_script:
-            shown = ", ".join(origins) or "none"
-            return Reply(403, f"Origin must be this server's own, http://{host}; the request's is {shown}.")
-        if self.read_only and scope["type"] == "http" and f"{scope['method']} {scope['path']}" not in VIEWING:
+        # Browsers do not send Authorization by themselves, so this request comes from a script.
+        is_script = self.sign_in is not None and bearer and not origins
+        if origins not in ([f"http://{host}"], [f"https://{host}"]) and not is_script:
+            origin = ", ".join(origins) or "none"
+            return Reply(403, f"Origin must be http://{host}; the request has {origin}.")
+        if self.read_only and scope["type"] == "http" and f"{scope['method']} {scope['path']}" not in READ_ONLY_ALLOWED:
             return Reply(403, READ_ONLY)
         return None
 
-    def _unknown(self, sign_in: SignIn, scope: Scope, host: str, bearer: str, cookies: str) -> Reply | None:
-        """How who shows no sign of having had the token is answered; who brings it to the page is given the cookie."""
-        opens = scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and scope["path"] == "/"
+    def _authenticate(self, sign_in: SignIn, scope: Scope, host: str, bearer: str, cookies: str) -> Reply | None:
+        """The response to an unauthenticated request, or the cookie for a valid token; None if authenticated."""
+        is_page = scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and scope["path"] == "/"
         query = scope.get("query_string", b"").decode("latin-1")
-        brought = bearer or (token_in(query) if opens else "")
-        stay = {"cache-control": "no-store"}
+        token = bearer or (token_from_query(query) if is_page else "")
+        uncached = {"cache-control": "no-store"}
         try:
-            if not brought or not sign_in.accepts(brought, _address(scope)):
-                if not bearer and sign_in.remembers(host, cookies):
-                    return Reply(303, "", {"location": without_token(query)}) if brought else None
-                reason = "The token is not right." if brought else "This server asks for a token."
-                reason += " Open the link that `beliefscope serve` printed, or give the token as it prints it."
-                asks = stay | {"www-authenticate": "Bearer"}
-                return Reply(401, reason, asks, sign_in_page(reason, without_token(query)) if opens else "")
-        except TooMany as error:
+            if not token or not sign_in.accepts(token, _address(scope)):
+                if not bearer and sign_in.has_cookie(host, cookies):
+                    return Reply(303, "", {"location": address_without_token(query)}) if token else None
+                reason = "The token is wrong." if token else "This server requires a token."
+                reason += " Open the link that `beliefscope serve` printed, or enter the token."
+                challenge = uncached | {"www-authenticate": "Bearer"}
+                return Reply(
+                    401, reason, challenge, sign_in_page(reason, address_without_token(query)) if is_page else ""
+                )
+        except TooManyAttempts as error:
             wait = f"{max(1.0, error.args[0]):.0f}"
-            reason = f"Too many wrong tokens came from this address; try again in {wait} s."
-            page = sign_in_page(reason, without_token(query)) if opens else ""
-            return Reply(429, reason, stay | {"retry-after": wait}, page)
+            reason = f"Too many wrong tokens from this address; try again in {wait} s."
+            page = sign_in_page(reason, address_without_token(query)) if is_page else ""
+            return Reply(429, reason, uncached | {"retry-after": wait}, page)
         if bearer:
             return None
-        onward = onward_page(without_token(query))
-        return Reply(200, "", stay | {"set-cookie": sign_in.cookie(host)}, onward)
-
-
-def kept_file(folder: Path, name: str) -> Path | None:
-    """A file in the folder, by its path from there; None where there is none, or a name or link leads out of it."""
-    try:
-        path = (folder / name).resolve(strict=True)
-    except (OSError, ValueError, RuntimeError):  # not there; a null byte; links in a circle
-        return None
-    return path if path.is_file() and path.is_relative_to(folder.resolve()) else None
+        page = redirect_page(address_without_token(query))
+        return Reply(200, "", uncached | {"set-cookie": sign_in.cookie(host)}, page)
 
 
 def _bearer(authorization: str) -> str:
@@ -195,54 +197,54 @@ def _address(scope: Scope) -> str:
 
 
 def _name(host: str) -> str:
-    """``localhost:8000`` -> ``localhost``; ``[::1]:8000`` -> ``[::1]``; what is not like these as it is."""
-    found = HOST.fullmatch(host)
-    return found["name"] if found else host
+    """Without the port: ``localhost:8000`` -> ``localhost``; ``[::1]:8000`` -> ``[::1]``."""
+    match = HOST.fullmatch(host)
+    return match["name"] if match else host
 
 
-def _from_elsewhere(headers: Iterable[tuple[bytes, str]]) -> bool:
-    """Whether a browser asks for a page of another site, or of another server of this machine, and not for its user.
+def _is_cross_site(headers: Iterable[tuple[bytes, str]]) -> bool:
+    """Whether a page of another site or port sends the request, other than a link that the user follows.
 
-    What is asked for is computed and kept, though such a page could not read it. Browsers say so on the loopback
-    interface and over https; elsewhere the cookie, which they do not send then, is what guards.
+    Such a page cannot read the response, but the request would still consume resources. Browsers send these headers on
+    the loopback interface and over https; elsewhere the SameSite cookie protects.
     """
-    said = dict(headers)
-    leads = (said.get(b"sec-fetch-mode"), said.get(b"sec-fetch-dest")) == ("navigate", "document")
-    return said.get(b"sec-fetch-site") in ("cross-site", "same-site") and not leads
+    values = dict(headers)
+    is_link = (values.get(b"sec-fetch-mode"), values.get(b"sec-fetch-dest")) == ("navigate", "document")
+    return values.get(b"sec-fetch-site") in ("cross-site", "same-site") and not is_link
 
 
 def _bracketed(host: str) -> str:
     return f"[{host}]" if ":" in host and not host.startswith("[") else host
 
 
-def _bounded(scope: Scope, receive: Receive) -> Receive:
-    """Takes a body of so many bytes, each part of it in so many seconds. Raises HTTPException for more."""
+def _limit_body(scope: Scope, receive: Receive) -> Receive:
+    """Limit the size of a body and the time between its chunks. Raises HTTPException."""
     if scope["type"] != "http":
         return receive
     upload = UPLOAD.fullmatch(f"{scope['method']} {scope['path']}")
     size, more = 0, True
 
-    async def bounded() -> Message:
+    async def limited() -> Message:
         nonlocal size, more
         if not more:
-            return await receive()  # until the browser goes
+            return await receive()  # returns when the client disconnects
         try:
-            message = await asyncio.wait_for(receive(), PATIENCE)
+            message = await asyncio.wait_for(receive(), BODY_TIMEOUT)
         except TimeoutError:
-            raise HTTPException(408, f"The request's body did not come within {PATIENCE:.0f} s.") from None
+            raise HTTPException(408, f"The request body was not received within {BODY_TIMEOUT:.0f} s.") from None
         size, more = size + len(message.get("body", b"")), bool(message.get("more_body", False))
         if size > MAX_BODY and not upload:
-            raise HTTPException(413, f"The request's body is larger than {MAX_BODY} bytes.")
+            raise HTTPException(413, f"The request body is larger than {MAX_BODY} bytes.")
         return message
 
-    return bounded
+    return limited
 
 
-class _Answer:
-    """What is sent, with the security headers; ``begun`` once anything was."""
+class _Response:
+    """Adds security headers to a response. started: whether anything has been sent."""
 
     def __init__(self, scope: Scope, send: Send) -> None:
-        self.begun = False
+        self.started = False
         self._send = send
         scene = scope["path"].startswith("/scene/")
         policy = SCENE_POLICY if scene else PAGE_POLICY if scope["path"] == "/" else DATA_POLICY
@@ -250,7 +252,7 @@ class _Answer:
         self._extra = HEADERS | {b"content-security-policy": policy.encode(), b"x-frame-options": framed}
 
     async def send(self, message: Message) -> None:
-        self.begun = True
+        self.started = True
         if message["type"] in ("http.response.start", "websocket.http.response.start"):
             present = list(message.get("headers", ()))
             names = {name.lower() for name, _ in present}
@@ -258,11 +260,11 @@ class _Answer:
         await self._send(message)
 
 
-async def _answer(scope: Scope, receive: Receive, send: Send, reply: Reply) -> None:
+async def _send_reply(scope: Scope, receive: Receive, send: Send, reply: Reply) -> None:
     body = reply.page.encode() if reply.page else json.dumps({"error": reply.reason}).encode()
     kind = "text/html; charset=utf-8" if reply.page else "application/json"
-    said = {"content-type": kind, "content-length": str(len(body)), **reply.headers}
-    headers = [(name.encode(), value.encode("latin-1")) for name, value in said.items()]
+    values = {"content-type": kind, "content-length": str(len(body)), **reply.headers}
+    headers = [(name.encode(), value.encode("latin-1")) for name, value in values.items()]
     prefix = ""
     if scope["type"] == "websocket":
         await receive()

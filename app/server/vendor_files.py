@@ -1,7 +1,7 @@
-"""Other projects' browser code, served from their installed wheels: Rerun's viewer and uPlot. Nothing is copied.
+"""Browser code of other projects (Rerun's viewer and uPlot), served from their installed wheels.
 
-Rerun's viewer is 67 MB of WebAssembly, a third of it function names for debuggers. It is served without them, and
-brotli-compressed once the first start has had the seconds that takes; both are kept in the workspace.
+Rerun's viewer is 67 MB of WebAssembly, of which a third are function names for debuggers. It is served without them
+and, once that is ready, brotli-compressed; both files are cached in the workspace.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from starlette.responses import FileResponse, Response
 from beliefscope.datasets.io.atomic_write import write_atomically
 
 UPLOT_FILES = ("uPlot.iife.js", "uPlot.min.css")
-# widget.js is made for notebooks and keeps its viewer class to itself.
+# widget.js is written for notebooks and does not export its viewer class.
 EXPORT = b"\nexport { WebViewer };\n"
-# The viewer asks without cookies, and a server with a token answers nothing then.
-FETCH = b"""const fetch = (asked, ...more) =>
-  globalThis.fetch(asked instanceof Request ? new Request(asked, { credentials: "same-origin" }) : asked, ...more);
+# The viewer omits cookies, which a server with a token requires.
+FETCH = b"""const fetch = (input, ...options) =>
+  globalThis.fetch(input instanceof Request ? new Request(input, { credentials: "same-origin" }) : input, ...options);
 """
-COMPRESSED_AT_ONCE = 1 << 20  # bytes between two looks at whether the server is being stopped
+CHUNK = 1 << 20  # bytes compressed between checks of the stop condition
 
 
 class RerunViewer:
     """Rerun's web viewer as files under ``cache``.
 
     Args:
-        cache: folder for the prepared files; made when needed. Two servers may share it.
+        cache: folder for the prepared files, created if missing. Several servers may share it.
     """
 
     def __init__(self, cache: Path) -> None:
@@ -47,26 +47,26 @@ class RerunViewer:
         self._lock = threading.Lock()
 
     def script(self) -> bytes:
-        """The viewer's module, which exports ``WebViewer`` and loads ``re_viewer_bg.wasm`` from beside itself."""
+        """The viewer's module, which exports ``WebViewer`` and loads ``re_viewer_bg.wasm`` from the same folder."""
         return FETCH + self._widget.read_bytes() + EXPORT
 
-    def prepare(self, given_up: Callable[[], bool] = lambda: False) -> None:
-        """Make the compressed file if it is missing: about 5 s of one core, once. Ends early when ``given_up``."""
+    def prepare(self, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Create the compressed file if it is missing, which takes about 5 s. Returns early when ``stopped``."""
         plain = self._stripped()
         if self._compressed.exists():
             return
         compressor, data, parts = brotli.Compressor(quality=5), plain.read_bytes(), []
-        for start in range(0, len(data), COMPRESSED_AT_ONCE):
-            if given_up():
+        for start in range(0, len(data), CHUNK):
+            if stopped():
                 return
-            parts.append(compressor.process(data[start : start + COMPRESSED_AT_ONCE]))
+            parts.append(compressor.process(data[start : start + CHUNK]))
         write_atomically(self._compressed, b"".join([*parts, compressor.finish()]))
 
     def wasm(self, request: Request) -> Response:
-        """The stripped module, compressed where the browser can and the file is ready. Blocks to strip it once."""
+        """The stripped module, compressed if the browser accepts that and the file is ready."""
         plain = self._stripped()
         headers = {"vary": "accept-encoding", "rerun-final-length": str(plain.stat().st_size)}
-        if "br" in _accepted(request) and self._compressed.exists():
+        if "br" in _accepted_encodings(request) and self._compressed.exists():
             return cached_file(request, self._compressed, "application/wasm", headers | {"content-encoding": "br"})
         return cached_file(request, plain, "application/wasm", headers)
 
@@ -78,7 +78,7 @@ class RerunViewer:
 
 
 def installed(package: str) -> Path:
-    """Folder of an installed package, found without importing it."""
+    """Folder of an installed package, located without importing it."""
     spec = importlib.util.find_spec(package)
     if spec is None or spec.origin is None:
         raise RuntimeError(f"The package {package!r} is not installed; reinstall beliefscope.")
@@ -86,26 +86,26 @@ def installed(package: str) -> Path:
 
 
 def without_names(module: bytes) -> bytes:
-    """A WebAssembly module without its ``name`` section (function names, for debuggers only).
+    """A WebAssembly module without its ``name`` section, which contains function names for debuggers.
 
-    A module is an 8-byte preamble and sections: one byte of kind, the size as LEB128, the content. Kind 0 is a custom
-    section, whose content begins with its name. Raises ValueError if ``module`` is not WebAssembly.
+    A module is an 8-byte preamble and sections: a byte of kind, the size as LEB128, the content. The content of kind 0,
+    a custom section, begins with its name. Raises ValueError if ``module`` is not WebAssembly.
     """
     if module[:4] != b"\0asm":
         raise ValueError("Not a WebAssembly module.")
-    kept, start = [module[:8]], 8
+    sections, start = [module[:8]], 8
     while start < len(module):
         size, content = _leb128(module, start + 1)
         end = content + size
         length, name = _leb128(module, content) if module[start] == 0 else (0, content)
         if module[name : name + length] != b"name":
-            kept.append(module[start:end])
+            sections.append(module[start:end])
         start = end
-    return b"".join(kept)
+    return b"".join(sections)
 
 
 def cached_file(request: Request, path: Path, media_type: str, headers: Mapping[str, str]) -> Response:
-    """A file with an ETag (path, size and time of change), or 304 where the browser has it already."""
+    """A file with an ETag (name, size and time of modification), or 304 if the browser's copy is current."""
     status = path.stat()
     key = f"{path.name} {status.st_size} {status.st_mtime_ns}"
     tag = f'"{hashlib.sha256(key.encode()).hexdigest()[:24]}"'
@@ -126,5 +126,5 @@ def _leb128(data: bytes, start: int) -> tuple[int, int]:
             return value, start
 
 
-def _accepted(request: Request) -> set[str]:
+def _accepted_encodings(request: Request) -> set[str]:
     return {part.partition(";")[0].strip() for part in request.headers.get("accept-encoding", "").split(",")}

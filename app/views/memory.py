@@ -1,4 +1,4 @@
-"""The process's memory: what is let go of goes back to the system, so that hours of use leave nothing behind."""
+"""Memory management of the server process, so that memory use stays constant over hours."""
 
 from __future__ import annotations
 
@@ -6,29 +6,26 @@ import ctypes
 import gc
 from contextlib import suppress
 
-_ARENA_MAX, _HEAPS = -8, 2
+_M_ARENA_MAX, _MAX_ARENAS = -8, 2
 
 
-def few_heaps() -> None:
-    """glibc gives every few threads a heap of their own; what is freed in one is of no use to the others.
+def limit_malloc_arenas() -> None:
+    """Limit the number of glibc heaps, because threads cannot reuse memory that was freed in another heap.
 
-    To be called before there are threads. Elsewhere than on glibc nothing happens.
+    Call this before any thread starts. Has no effect without glibc.
     """
     with suppress(OSError, AttributeError):
-        ctypes.CDLL("libc.so.6").mallopt(_ARENA_MAX, _HEAPS)
+        ctypes.CDLL("libc.so.6").mallopt(_M_ARENA_MAX, _MAX_ARENAS)
 
 
-def settle() -> None:
-    """What is there by now stays: ``give_back`` need not look through it each time."""
+def freeze_heap() -> None:
+    """Exclude all current objects from later garbage collections."""
     gc.collect()
     gc.freeze()
 
 
-def give_back() -> None:
-    """Collects garbage, which is all that finds a closed scene: viser's handles and its server know each other.
-
-    Takes some 10 ms.
-    """
+def release_memory() -> None:
+    """Collect garbage, which includes closed scenes, and return free memory to the system. Takes about 10 ms."""
     gc.collect()
     with suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)

@@ -1,6 +1,6 @@
-"""What is drawn in the 3D scene: the replay, and what the filter believes, at one step of a trace.
+"""The replay and the filter's belief at one step of a trace, as nodes of the 3D scene.
 
-Axes: x away from the robot, y to its left, z up, m. Colours are the recordings' (``recordings.schema``).
+Axes: x away from the robot, y to its left, z up, in m. Colors are those of the recordings (``recordings.schema``).
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import numpy as np
 from viser import ViserServer
 
 from beliefscope.app.protocol.map_format import particles
-from beliefscope.app.protocol.messages import Look, layers
-from beliefscope.app.runs.trace_store import Traced
+from beliefscope.app.protocol.messages import SceneLayers, Viewpoint
+from beliefscope.app.protocol.trace_format import scene_layers
+from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.scene_context import (
-    SMALL,
+    SMALL_LABEL,
     UP,
     Array,
-    Force,
-    Ground,
-    Sight,
-    Stage,
-    add_plane,
-    add_replay,
+    CameraView,
+    FloorMap,
+    ForceArrow,
+    RobotScene,
+    add_grid,
     extent,
     rgb,
 )
@@ -33,163 +33,163 @@ from beliefscope.inspect.likelihood import LikelihoodMap, no_maps
 from beliefscope.inspect.statistics.measures import contours
 from beliefscope.inspect.trace import Trace
 
-SIGMAS = 2.0
+SIGMAS = 2.0  # size of the contours
 POLE_RADIUS = 0.005  # m
-POLE_STEP = 0.06  # m that one pole ends above the next, so that their labels do not meet
-BELIEF_ABOVE = 0.10  # m from the anchor to the plane on which particles and contours are drawn
-NARROWEST = 1e-6  # m, half an axis of a contour
-DISC_STEP = 0.002  # m from one contour down to the next
-FLOOR_MAP = 0.003  # m above the floor, and below the contours where they lie on it
-PALE = 130.0  # gray of a particle without weight
-FAINT = 0.25  # of its hue that one keeps where the hue tells its modalities
-EYE = np.array([-0.28, -1.32, 1.22])  # m from what the camera looks at, for what is 1 m high
-OVER = np.array([0.0, -0.04, 3.6])  # the eye over the belief, in half widths of a map: x to the right, as on the page
-AWAY = np.array([-0.6, -1.6, 0.4])  # the eye that sees the camera, in its distances from what it looks at
-BARE_EYE = np.array([-0.5, -1.2, 1.1])  # from the middle of a bare plane, in its sides
+POLE_STEP = 0.06  # m, height difference between poles, so that their labels do not overlap
+BELIEF_HEIGHT = 0.10  # m from the anchor to the plane of particles and contours
+MIN_AXIS = 1e-6  # m, half axis of a contour
+DISC_SPACING = 0.002  # m between contours; discs in the same plane would flicker
+FLOOR_MAP_HEIGHT = 0.003  # m above the floor
+GRAY_LEVEL = 130.0  # gray value of a particle without weight
+MIN_STRENGTH = 0.25  # least color strength of particles colored by modality
+EYE = np.array([-0.28, -1.32, 1.22])  # m, initial viewpoint relative to an object of 1 m height
+EYE_ABOVE = np.array([0.0, -0.04, 3.6])  # viewpoint above the belief in half widths of a map, with x to the right
+EYE_CAMERA = np.array([-0.6, -1.6, 0.4])  # viewpoint that shows the camera, in its distances from its target
+EYE_GRID = np.array([-0.5, -1.2, 1.1])  # initial viewpoint without a robot, in side lengths of the grid
 
-# A unit disc in the plane z = 0: its rim, then its centre; and the triangles between.
+# A unit disc in the plane z = 0: vertices on its rim, then its center; and the triangles between them.
 ANGLES = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
 DISC = np.append(np.stack([np.cos(ANGLES), np.sin(ANGLES), 0.0 * ANGLES], axis=1), [[0.0, 0.0, 0.0]], axis=0)
 FAN = np.array([(64, i, (i + 1) % 64) for i in range(64)])
-# Corners of the unit box are numbered by their three bits; an edge joins two that differ in one bit.
+# The bits of a corner's number are its coordinates in the unit box; an edge joins two corners that differ in one bit.
 BOX = np.array([[bit >> axis & 1 for axis in range(3)] for bit in range(8)], np.float32) - 0.5
 EDGES = np.array([(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1])
 _RIM = np.stack([DISC[:-1], np.roll(DISC[:-1], -1, axis=0)], axis=1) / 2.0
-OUTLINES = {
+OUTLINE_EDGES = {
     "box": BOX[EDGES],
     "cylinder": np.concatenate([_RIM + 0.5 * UP, _RIM - 0.5 * UP, _RIM[::16, :1] + np.array([0.5 * UP, -0.5 * UP])]),
 }
-"""Shape of a ghost -> (E, 2, 3) its edges, for size 1."""
+"""Shape of an outline -> (E, 2, 3) its edges, at size 1."""
 
 
-class Drawing:
-    """The nodes of one trace in viser's scene, and where they are at each step.
+class BeliefScene:
+    """Scene nodes of one trace.
 
     Attributes:
-        viewpoints: of ``VIEWPOINTS`` those that there are: where the eye is (3,) and what it looks at (3,), m.
+        viewpoints: available viewpoints -> position (3,) of the eye and the point (3,) that it faces, m.
     """
 
-    def __init__(self, server: ViserServer, traced: Traced, trace: Trace, look: Look) -> None:
-        """Trace: of the traced run, or of a part of it, whose steps ``move`` counts then."""
+    def __init__(self, server: ViserServer, run: TracedRun, trace: Trace, layers: SceneLayers) -> None:
+        """trace: of the whole run or a part of it, to which the steps of ``move`` refer."""
         self._server = server
-        self._task = task = traced.checkpoint.task
-        self._plane = list(task.map_indices)
-        self._take(trace)
-        there = layers(task, trace, no_maps(traced.checkpoint, trace))
-        scene = server.scene
-        scene.set_up_direction("+z")
-        scene.world_axes.visible = False
-        scene.configure_default_lights(cast_shadow=False)
+        self._task = run.checkpoint.task
+        self._plane = list(self._task.map_indices)
+        self._layers = layers
+        self._robot: RobotScene | None = None
+        self._discs: Any = None
+        self._particles: Any = None
+        self._force: ForceArrow | None = None
+        self._floor_map: FloorMap | None = None
+        self._camera: CameraView | None = None
+        self.set_trace(trace)
+        server.scene.set_up_direction("+z")
+        server.scene.world_axes.visible = False
+        server.scene.configure_default_lights(cast_shadow=False)
+        paths = {"replay": "/bodies", "objects": "/objects", "estimates": "/estimates", "force": "/force"}
         self._roots: dict[str, list[Any]] = {
-            layer: [scene.add_frame(f"/{name}", show_axes=False)]
-            for layer, name in (
-                ("replay", "bodies"),
-                ("objects", "objects"),
-                ("estimates", "estimates"),
-                ("force", "force"),
-            )
+            layer: [server.scene.add_frame(path, show_axes=False)] for layer, path in paths.items()
         }
-        self._robot = self._stage = None
         if self._replay is not None:
-            self._stage = Stage(server, self._replay.model)
-            self._robot = add_replay(server, self._replay)
-            self._roots["replay"].append(self._robot.fixed_bodies_frame)
+            self._robot = RobotScene(server, self._replay)
+            self._roots["replay"].append(self._robot.fixed_bodies)
         else:
-            add_plane(server, task, trace)
-        self._above = BELIEF_ABOVE if self._ghost is not None else 0.0
+            add_grid(server, self._task, trace)
+        self._above = BELIEF_HEIGHT if self._outline is not None else 0.0
         self._level = float(self._anchors[0, 0, 2]) + self._above
-        self._markers = [self._add_marker(i, name) for i, (name, _, _) in enumerate(self._believed)]
-        self._outlines = self._add_outlines()
-        self._discs = self._particles = self._force = self._ground = self._sight = None
-        if "contours" in there:
-            self._discs = self._add_discs()
-            self._roots["contours"] = [self._discs]
-        self._look = look
-        if "particles" in there:
-            self._particles = self._add_particles()
-            self._roots["particles"] = [self._particles]
-        if "force" in there:
-            self._force = Force(server, trace)
-        if "map" in there:
-            # Below all contours; where the belief lies on the floor itself, that is below the floor.
-            below = self._level - 2.0 * DISC_STEP * len(self._believed)
-            self._ground = Ground(server, trace, {"floor": FLOOR_MAP if self._above else below, "belief": below})
-        if "camera" in there:
-            self._sight = Sight(server, task, trace)
-        if np.isnan(trace.episode.states).any():  # nobody knows the truth: it would hide behind the estimate
-            for node in (*self._markers[0], *([self._outlines[0]] if self._outlines else [])):
+        self._markers = [self._add_marker(i, name) for i, (name, _, _) in enumerate(self._estimates)]
+        self._outline_frames = self._add_outlines()
+        self._add_layers(set(scene_layers(self._task, trace, no_maps(run.checkpoint, trace))))
+        if np.isnan(trace.episode.states).any():  # unknown true state
+            for node in (*self._markers[0], *([self._outline_frames[0]] if self._outline_frames else [])):
                 node.visible = False
-        self.look(look)
+        self.set_layers(layers)
         self.viewpoints = self._viewpoints()
-        camera = server.initial_camera  # a browser that has moved its own keeps it
+        camera = server.initial_camera
         camera.position, camera.look_at = self.viewpoints["first"]
         camera.fov = np.deg2rad(45.0)
 
-    def turn_to(self, trace: Trace) -> None:
-        """Another part of the run that is drawn: its steps are those of ``move`` from now on."""
-        self._take(trace)
-        for part in (self._force, self._sight):
-            if part is not None:
-                part.take(trace)
-
-    def _take(self, trace: Trace) -> None:
-        """Where everything is at each step of a trace."""
+    def set_trace(self, trace: Trace) -> None:
+        """Use another part of the run: later steps of ``move`` refer to it."""
         self._trace = trace
         self._replay = replay(self._task, trace.episode)
-        self._believed = list(_believed(trace))
-        states = np.stack([mean for _, mean, _ in self._believed], axis=1)  # (T, S, n)
-        self._ghost = None if self._task.ghost is None else self._task.ghost(states)
+        self._estimates = list(_estimates(trace))
+        states = np.stack([mean for _, mean, _ in self._estimates], axis=1)  # (T, S, n)
+        self._outline = None if self._task.outline is None else self._task.outline(states)
         flat = np.concatenate([states[..., self._plane], np.zeros_like(states[..., :1])], axis=-1)
-        self._anchors = flat if self._ghost is None else self._ghost.anchor  # (T, S, 3)
+        self._anchors = flat if self._outline is None else self._outline.anchor  # (T, S, 3)
+        for part in (self._force, self._camera):
+            if part is not None:
+                part.set_trace(trace)
 
-    def look(self, look: Look) -> None:
-        """Show and hide, from the next ``move`` on."""
-        self._look = look
+    def set_layers(self, layers: SceneLayers) -> None:
+        """Show and hide layers. Their appearance changes with the next ``move``."""
+        self._layers = layers
         for layer, roots in self._roots.items():
             for root in roots:
-                root.visible = layer not in look.hidden
-        if self._stage is not None:
-            self._stage.see_through(self._ground is not None and "map" not in look.hidden and look.height == "floor")
+                root.visible = layer not in layers.hidden
+        if self._robot is not None:
+            map_on_floor = self._floor_map is not None and "map" not in layers.hidden and layers.height == "floor"
+            self._robot.set_translucent(map_on_floor)
 
     def move(self, step: int, maps: LikelihoodMap | None) -> None:
-        """Put every node where it belongs at a step. Maps: of the step, where there are any."""
-        if self._robot is not None and self._stage is not None and self._replay is not None:
-            positions, rotations = self._replay.positions[step], self._replay.rotations[step]
-            self._robot.update_from_arrays(positions[None], rotations[None])
-            self._stage.move(positions, rotations)
+        """Draw a step. maps: likelihood maps of the step."""
+        if self._robot is not None and self._replay is not None:
+            self._robot.move(self._replay.positions[step], self._replay.rotations[step])
         for i, (pole, label) in enumerate(self._markers):
             foot = np.array([*self._anchors[step, i, :2], 0.0])
             pole.position = foot + pole.height / 2.0 * UP
             label.position = foot + pole.height * UP
         if self._discs is not None:
-            pose = self._contours(step)
+            pose = self._disc_poses(step)
             self._discs.batched_positions, self._discs.batched_wxyzs, self._discs.batched_scales = pose
-        for i, outline in self._outlines.items():
-            assert self._ghost is not None
-            outline.position, outline.wxyz = self._ghost.position[step, i], self._ghost.wxyz[step, i]
+        for i, frame in self._outline_frames.items():
+            assert self._outline is not None
+            frame.position, frame.wxyz = self._outline.position[step, i], self._outline.wxyz[step, i]
         if self._particles is not None:
-            self._particles.points, self._particles.colors = self._cloud(step)
+            self._particles.points, self._particles.colors = self._particle_cloud(step)
         if self._force is not None:
             self._force.show(step)
-        if self._ground is not None:
-            self._ground.show(maps, self._look)
-        if self._sight is not None:
-            self._sight.show(step, self._look)
+        if self._floor_map is not None:
+            self._floor_map.show(maps, self._layers)
+        if self._camera is not None:
+            self._camera.show(step, self._layers)
+
+    def _add_layers(self, available: set[str]) -> None:
+        """Add the layers that depend on the filter and the data set."""
+        if "contours" in available:
+            self._discs = self._add_discs()
+            self._roots["contours"] = [self._discs]
+        if "particles" in available:
+            points, colors = self._particle_cloud(0)
+            self._particles = self._server.scene.add_point_cloud(
+                "/particles", points, colors, point_size=0.006, point_shape="circle", precision="float32"
+            )
+            self._roots["particles"] = [self._particles]
+        if "force" in available:
+            self._force = ForceArrow(self._server, self._trace)
+        if "map" in available:
+            # Below all contours; without an outline, the belief lies on the floor and the map below it.
+            below = self._level - 2.0 * DISC_SPACING * len(self._estimates)
+            floor = below if self._outline is None else FLOOR_MAP_HEIGHT
+            self._floor_map = FloorMap(self._server, self._trace, {"floor": floor, "belief": below})
+        if "camera" in available:
+            self._camera = CameraView(self._server, self._task, self._trace)
 
     def _add_marker(self, index: int, name: str) -> tuple[Any, Any]:
+        """Pole and label of an estimate."""
         trace, scene = self._trace, self._server.scene
-        height = float(self._anchors[0, index, 2]) + self._above + POLE_STEP * (len(self._believed) - index)
+        height = float(self._anchors[0, index, 2]) + self._above + POLE_STEP * (len(self._estimates) - index)
         pole = scene.add_cylinder(
             f"/estimates/{name}/pole", POLE_RADIUS, height, color=rgb(name, trace), cast_shadow=False
         )
-        called = "estimate" if name == "fused" and len(trace.modalities) < 2 else name
-        label = scene.add_label(f"/estimates/{name}/label", called, anchor="bottom-center", **SMALL)
+        text = "estimate" if name == "fused" and len(trace.modalities) < 2 else name
+        label = scene.add_label(f"/estimates/{name}/label", text, anchor="bottom-center", **SMALL_LABEL)
         return pole, label
 
     def _add_discs(self) -> Any:
-        """The 2 sigma contours as discs: instances of one mesh, because a line whose points change is compiled anew."""
-        names = [name for name, _, _ in self._believed[1:]]
-        positions, wxyzs, scales = self._contours(0)
+        """Contours as discs: instances of one mesh, because viser recompiles lines whose points change."""
+        names = [name for name, _, _ in self._estimates[1:]]
+        positions, wxyzs, scales = self._disc_poses(0)
         return self._server.scene.add_batched_meshes_simple(
             "/contours",
             DISC,
@@ -206,38 +206,32 @@ class Drawing:
         )
 
     def _add_outlines(self) -> dict[int, Any]:
-        """The edges of the true and of the estimated object; the estimated one is filled with a breath of colour."""
-        if self._ghost is None:
+        """Edges of the true and the estimated object; the estimated one is filled with a transparent color."""
+        if self._outline is None:
             return {}
-        size = np.asarray(self._ghost.size, np.float32)
-        outlines = {}
-        for i, (name, _, _) in enumerate(self._believed[:2]):
-            hue = rgb(name, self._trace)
-            outlines[i] = self._server.scene.add_frame(f"/objects/{name}", show_axes=False)
+        size = np.asarray(self._outline.size, np.float32)
+        frames = {}
+        for i, (name, _, _) in enumerate(self._estimates[:2]):
+            color = rgb(name, self._trace)
+            frames[i] = self._server.scene.add_frame(f"/objects/{name}", show_axes=False)
             self._server.scene.add_line_segments(
                 f"/objects/{name}/edges",
-                (OUTLINES[self._ghost.shape] * (size + 0.004)).astype(np.float32),
-                hue,
+                (OUTLINE_EDGES[self._outline.shape] * (size + 0.004)).astype(np.float32),
+                color,
                 thickness=2.0,
                 thickness_units="screen",
             )
             if name == "fused":
-                fill, x, z = f"/objects/{name}/{self._ghost.shape}", float(size[0]), float(size[2])
-                look: dict[str, Any] = {"opacity": 0.25, "cast_shadow": False, "receive_shadow": False}
-                if self._ghost.shape == "cylinder":
-                    self._server.scene.add_cylinder(fill, x / 2, z, color=hue, **look)
+                path, x, z = f"/objects/{name}/{self._outline.shape}", float(size[0]), float(size[2])
+                style: dict[str, Any] = {"opacity": 0.25, "cast_shadow": False, "receive_shadow": False}
+                if self._outline.shape == "cylinder":
+                    self._server.scene.add_cylinder(path, x / 2, z, color=color, **style)
                 else:
-                    self._server.scene.add_box(fill, hue, tuple(size), **look)
-        return outlines
+                    self._server.scene.add_box(path, color, tuple(size), **style)
+        return frames
 
-    def _add_particles(self) -> Any:
-        points, colours = self._cloud(0)
-        return self._server.scene.add_point_cloud(
-            "/particles", points, colours, point_size=0.006, point_shape="circle", precision="float32"
-        )
-
-    def _cloud(self, step: int) -> tuple[Array, Array]:
-        """(M, 3) points on the belief's plane; (M, 3) colours from gray (no weight) to the greatest weight's."""
+    def _particle_cloud(self, step: int) -> tuple[Array, Array]:
+        """(M, 3) points in the belief's plane; (M, 3) colors, from gray at weight 0 to full color at the maximum."""
         trace = self._trace
         assert trace.particles is not None
         assert trace.log_weights is not None
@@ -245,68 +239,70 @@ class Drawing:
         points[:, :2] = trace.particles[step][:, self._plane]
         weights = trace.log_weights[step]
         strength = np.sqrt(np.exp(weights - weights.max()))[:, None]
-        hue = np.array(rgb("fused", trace), np.float32)
-        shares = modality_shares(trace, step, self._task) if self._look.tint == "share" else None
+        color = np.array(rgb("fused", trace), np.float32)
+        shares = modality_shares(trace, step, self._task) if self._layers.tint == "share" else None
         if shares is not None:
-            hue = shares.T @ np.array([rgb(name, trace) for name in trace.modalities], np.float32)
-            strength = FAINT + (1.0 - FAINT) * strength
-        return points, np.rint(PALE + strength * (hue - PALE)).astype(np.uint8)
+            color = shares.T @ np.array([rgb(name, trace) for name in trace.modalities], np.float32)
+            strength = MIN_STRENGTH + (1.0 - MIN_STRENGTH) * strength
+        return points, np.rint(GRAY_LEVEL + strength * (color - GRAY_LEVEL)).astype(np.uint8)
 
-    def _contours(self, step: int) -> tuple[Array, Array, Array]:
-        """Positions (S, 3), orientations (S, 4) and scales (S, 3) of the unit disc for each source but the truth."""
-        plane = np.ix_(range(len(self._believed) - 1), self._plane)
-        means = np.stack([mean[step] for _, mean, _ in self._believed[1:]])[plane]
-        covariances = np.stack([covariance[step] for _, _, covariance in self._believed[1:]])
+    def _disc_poses(self, step: int) -> tuple[Array, Array, Array]:
+        """Positions (S, 3), orientations (S, 4) and scales (S, 3) of the discs of all estimates except the truth."""
+        plane = np.ix_(range(len(self._estimates) - 1), self._plane)
+        means = np.stack([mean[step] for _, mean, _ in self._estimates[1:]])[plane]
+        covariances = np.stack([covariance[step] for _, _, covariance in self._estimates[1:]])
         axes, turn = contours(covariances[:, self._plane][:, :, self._plane])
         count = len(means)
-        # Apart, the fused one on top: discs in one plane would flicker.
-        levels = self._level - DISC_STEP * np.arange(1, count + 1)
+        levels = self._level - DISC_SPACING * np.arange(1, count + 1)
         zero = np.zeros(count)
         wxyz = np.stack([np.cos(turn / 2.0), zero, zero, np.sin(turn / 2.0)], axis=1)
-        scales = np.concatenate([SIGMAS * np.maximum(axes, NARROWEST), np.ones((count, 1))], axis=1)
+        scales = np.concatenate([SIGMAS * np.maximum(axes, MIN_AXIS), np.ones((count, 1))], axis=1)
         return np.column_stack([means, levels]), wxyz, scales
 
-    def _viewpoints(self) -> dict[str, tuple[Array, Array]]:
-        """By their names, where the eye is (3,) and what it looks at (3,), m, world."""
-        at, eye = self._anchors[:, 0].mean(axis=0), EYE
-        # A robot is about a meter long; without one, all there is lies around the belief.
+    def _viewpoints(self) -> dict[Viewpoint, tuple[Array, Array]]:
+        target = self._anchors[:, 0].mean(axis=0)
+        # The bodies of a scene with a robot extend over about a meter.
         if self._replay is None or np.ptp(self._replay.positions[:, 1:], axis=(0, 1)).max() < 0.5:
             low, high, _ = extent(self._task, self._trace)
-            tall = 0.0 if self._ghost is None or self._replay is not None else float(max(self._ghost.size))
-            at = np.array([*(low + high) / 2.0, tall / 3.0])
-            # Beside a replay's objects the masts of the estimates stand half a meter high.
-            eye = BARE_EYE * (max((high - low).max(), 1.2 * tall) if self._replay is None else 0.5)
+            height = 0.0 if self._outline is None or self._replay is not None else float(max(self._outline.size))
+            target = np.array([*(low + high) / 2.0, height / 3.0])
+            # With a replay, the poles of the estimates are half a meter high.
+            eye = EYE_GRID * (max((high - low).max(), 1.2 * height) if self._replay is None else 0.5)
         else:
-            eye = EYE * (0.6 + 0.4 * min(1.0, at[2]))
-            at = at * [0.62, 0.3, 0.68] + [0.0, 0.0, 0.2 * max(0.0, 1.0 - at[2])]
-        over = np.array([*self._anchors[:, 0, :2].mean(axis=0), self._level])
-        # A trifle to the side: straight from above, which way is up would be up to chance.
-        found = {"first": (at + eye, at), "above": (over + OVER * self._task.map_half_width, over)}
-        if self._sight is not None:
-            middle = (self._sight.position + self._sight.target) / 2.0
-            away = np.linalg.norm(self._sight.position - self._sight.target)
-            found["camera"] = middle + away * AWAY, middle
-        return found
+            eye = EYE * (0.6 + 0.4 * min(1.0, target[2]))
+            target = target * [0.62, 0.3, 0.68] + [0.0, 0.0, 0.2 * max(0.0, 1.0 - target[2])]
+        center = np.array([*self._anchors[:, 0, :2].mean(axis=0), self._level])
+        # Not vertically above, where the up direction of the view would be undefined.
+        viewpoints: dict[Viewpoint, tuple[Array, Array]] = {
+            "first": (target + eye, target),
+            "above": (center + EYE_ABOVE * self._task.map_half_width, center),
+        }
+        if self._camera is not None:
+            middle = (self._camera.position + self._camera.target) / 2.0
+            distance = np.linalg.norm(self._camera.position - self._camera.target)
+            viewpoints["camera"] = middle + distance * EYE_CAMERA, middle
+        return viewpoints
 
 
-def _believed(trace: Trace) -> Iterator[tuple[str, Array, Array]]:
-    """(name, states (T, n), covariances (T, n, n)): the truth, the fused estimate, each modality's if it is another."""
+def _estimates(trace: Trace) -> Iterator[tuple[str, Array, Array]]:
+    """(name, states (T, n), covariances (T, n, n)) of the truth, the fused estimate and the unimodal updates."""
     yield "truth", trace.anchors, np.zeros_like(trace.estimate_covariance)
     yield "fused", trace.estimate_mean, trace.estimate_covariance
-    if len(trace.alone) > 1:
-        for k, name in enumerate(trace.alone):
+    if len(trace.modalities_with_posterior) > 1:
+        for k, name in enumerate(trace.modalities_with_posterior):
             yield name, trace.modality_mean[:, k], trace.modality_covariance[:, k]
 
 
 def modality_shares(trace: Trace, step: int, task: Task) -> Array | None:
-    """(K, M) share of each modality in each particle's weight: ``acting_k w_k / sum_j acting_j w_j``.
+    """(K, M) share of each modality in each particle's weight: ``e_k w_k / sum_j e_j w_j``.
 
-    w_k are the particles' weights as modality k alone sets them, each summing to one. So the shares' mean under the
-    fused weights is ``acting``. None where modalities are not told apart.
+    e_k are the effective weights and w_k the particle weights of a unimodal update, which sum to one. So the mean of
+    the shares under the fused weights is the effective weight. None if the filter has no separate modalities.
     """
     cloud = particles(trace, step, task)
-    if cloud is None or trace.acting is None:
+    if cloud is None or trace.effective_weights is None:
         return None
-    joint = trace.acting[step] * cloud[1][:-1]  # acting of particle filters is (K, 1)
+    joint = trace.effective_weights[step] * cloud[1][:-1]  # effective weights of particle filters are (K, 1)
     total = joint.sum(axis=0)
-    return np.where(total > 0.0, joint / np.maximum(total, np.finfo(np.float32).tiny), trace.acting[step])
+    shares = joint / np.maximum(total, np.finfo(np.float32).tiny)
+    return np.where(total > 0.0, shares, trace.effective_weights[step])

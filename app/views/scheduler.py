@@ -1,4 +1,4 @@
-"""Short work of many askers on a few threads: what is due first is done first."""
+"""Scheduling of short computations for many clients on a few threads."""
 
 from __future__ import annotations
 
@@ -16,130 +16,131 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class _Task:
-    due: float
-    needs: frozenset[Hashable]
+    deadline: float
+    resources: frozenset[Hashable]
     work: Callable[[], Any]
-    answer: asyncio.Future[Any]
+    future: asyncio.Future[Any]
 
 
-class Desk:
-    """Threads that take work by its due time, and never two pieces at once that need the same thing.
+class DeadlineExecutor:
+    """Thread pool that runs the task with the earliest deadline first.
 
-    Each asker has one piece here at most, by its own waiting for the answer, so nobody can crowd out the others, and
-    the queue is as long as there are askers. Few threads, because more of them only wait for one another: for Python's
-    lock, and for a processor. The threads start with the first piece of work.
+    Two tasks that need the same resource never run at the same time. Each client awaits its task before it submits the
+    next one, so the queue holds at most one task per client. Threads start with the first tasks.
 
     Args:
-        threads: as many as there are processors, at most four, by default.
+        threads: number of threads; by default one per processor, between 2 and 4, because more would only compete for
+            Python's global lock.
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        self._count = threads or min(4, max(2, os.cpu_count() or 2))
+        self._max_threads = threads or min(4, max(2, os.cpu_count() or 2))
         self._threads: list[threading.Thread] = []
-        self._changed = threading.Condition()
-        self._asked: set[_Task] = set()  # and not answered
-        self._waiting: list[_Task] = []  # those of them that nobody has begun
-        self._taken: set[Hashable] = set()
+        self._condition = threading.Condition()
+        self._pending: set[_Task] = set()  # waiting or running
+        self._waiting: list[_Task] = []
+        self._busy: set[Hashable] = set()  # resources of running tasks
         self._closed = False
 
-    async def do(self, work: Callable[[], T], within: float, needs: frozenset[Hashable] = frozenset()) -> T:
-        """What the work returns, or raises.
+    async def run(self, work: Callable[[], T], within: float, resources: frozenset[Hashable] = frozenset()) -> T:
+        """Run ``work`` in a thread and return its result. A cancelled task is removed, unless it has started.
 
         Args:
-            within: s from now until when it is due: the more patient wait for those that are not.
-            needs: things of which nobody else's work may have any at the same time.
+            within: deadline, in s from now.
+            resources: used exclusively while the task runs.
 
-        An asker that is cancelled takes its work back, unless it has begun. Raises RuntimeError once it is closed.
+        Raises:
+            RuntimeError: the executor is closed.
         """
         loop = asyncio.get_running_loop()
-        task = _Task(time.monotonic() + within, needs, work, loop.create_future())
-        with self._changed:
+        task = _Task(time.monotonic() + within, resources, work, loop.create_future())
+        with self._condition:
             if self._closed:
                 raise RuntimeError("the server is stopping")
             self._waiting.append(task)
-            self._asked.add(task)
-            if len(self._threads) < self._count:
-                self._threads.append(threading.Thread(target=self._serve, name="desk", daemon=True))
+            self._pending.add(task)
+            if len(self._threads) < self._max_threads:
+                self._threads.append(threading.Thread(target=self._work, name="deadline-executor", daemon=True))
                 self._threads[-1].start()
-            self._changed.notify()
+            self._condition.notify()
         try:
-            return await task.answer
+            return await task.future
         finally:
-            with self._changed:
-                self._asked.remove(task)
+            with self._condition:
+                self._pending.remove(task)
                 if task in self._waiting:
                     self._waiting.remove(task)
 
-    def late(self) -> float:
-        """s since when what is asked for was due, begun or not; 0 where nothing is late."""
-        with self._changed:
-            return max([0.0, *(time.monotonic() - task.due for task in self._asked)])
+    def overdue(self) -> float:
+        """Time in s since the earliest deadline of all pending tasks; 0 if none has passed."""
+        with self._condition:
+            return max([0.0, *(time.monotonic() - task.deadline for task in self._pending)])
 
     def close(self) -> None:
-        """Ends the threads after what they are doing. Blocks."""
-        with self._changed:
+        """Discard waiting tasks and end the threads after their current ones. Blocks."""
+        with self._condition:
             self._closed = True
             self._waiting.clear()
-            self._changed.notify_all()
+            self._condition.notify_all()
         for thread in self._threads:
             thread.join()
 
-    def _serve(self) -> None:
-        while (task := self._take()) is not None:
-            found, error = None, None
+    def _work(self) -> None:
+        while (task := self._next()) is not None:
+            result, error = None, None
             try:
-                found = task.work()
-            except BaseException as problem:
-                error = problem
-            with self._changed:
-                self._taken -= task.needs
-                self._changed.notify_all()
-            _tell(task.answer, found, error)
-            del task, found, error  # or the last one's trace stays in memory while nobody asks
+                result = task.work()
+            except BaseException as exception:
+                error = exception
+            with self._condition:
+                self._busy -= task.resources
+                self._condition.notify_all()
+            _resolve(task.future, result, error)
+            del task, result, error  # an idle thread must not keep the last trace in memory
 
-    def _take(self) -> _Task | None:
-        """The next piece of work; None once it is closed."""
-        with self._changed:
+    def _next(self) -> _Task | None:
+        """Wait for the next task; None once the executor is closed."""
+        with self._condition:
             while not self._closed:
-                free = [task for task in self._waiting if not task.needs & self._taken]
-                if free:
-                    task = min(free, key=lambda one: one.due)
+                runnable = [task for task in self._waiting if not task.resources & self._busy]
+                if runnable:
+                    task = min(runnable, key=lambda task: task.deadline)
                     self._waiting.remove(task)
-                    self._taken |= task.needs
+                    self._busy |= task.resources
                     return task
-                self._changed.wait()
+                self._condition.wait()
         return None
 
 
-class Turns:
-    """Lets one asker in at a time (``async with``), in the order in which they came, with a rest after each.
+class FairLock:
+    """Asynchronous lock that is granted in order of arrival and stays locked for a pause after each use.
 
     Args:
-        rest: s for each s that it was in. longest: s.
+        pause: in s for each s that the lock was held. max_pause: in s.
     """
 
-    def __init__(self, rest: float = 2.0, longest: float = 0.1) -> None:
-        self._rest, self._longest = rest, longest
+    def __init__(self, pause: float = 2.0, max_pause: float = 0.1) -> None:
+        self._pause, self._max_pause = pause, max_pause
         self._lock = asyncio.Lock()
-        self._began = 0.0
+        self._acquired = 0.0
 
     async def __aenter__(self) -> None:
         await self._lock.acquire()
-        self._began = time.monotonic()
+        self._acquired = time.monotonic()
 
     async def __aexit__(self, *_: object) -> None:
-        rest = min(self._rest * (time.monotonic() - self._began), self._longest)
-        asyncio.get_running_loop().call_later(rest, self._lock.release)
+        pause = min(self._pause * (time.monotonic() - self._acquired), self._max_pause)
+        asyncio.get_running_loop().call_later(pause, self._lock.release)
 
 
-def _tell(answer: asyncio.Future[Any], found: Any, error: BaseException | None) -> None:
-    def tell() -> None:
-        if answer.done():
+def _resolve(future: asyncio.Future[Any], result: Any, error: BaseException | None) -> None:
+    def resolve() -> None:
+        if future.done():
             return
         if error is None:
-            answer.set_result(found)
+            future.set_result(result)
         else:
-            answer.set_exception(error)
+            future.set_exception(error)
 
-    with suppress(RuntimeError):  # the server's loop has ended
-        answer.get_loop().call_soon_threadsafe(tell)
+    with suppress(RuntimeError):  # the event loop is closed
+        future.get_loop().call_soon_threadsafe(resolve)

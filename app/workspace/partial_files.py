@@ -1,4 +1,4 @@
-"""What a kill leaves in a workspace of a file that was being written: a hidden file that ends in ``.part``."""
+"""Partial files of interrupted writes: hidden files that end in ``.part``."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ from contextlib import suppress
 from pathlib import Path
 
 FOLDERS = ("cache", "finetune", "jobs", "live", "recordings", "reports", "traces")
-"""Of a workspace, that are ours with all that is in them. Beside them there may be anything."""
+"""Folders of a workspace that belong to Beliefscope. The workspace may contain other files."""
 
-ABANDONED = 3600.0
-"""s without a byte, after which nobody is writing any more."""
+MAX_AGE = 3600.0  # s since the last write
 
 
-def sweep(workspace: Path) -> None:
-    """Deletes them. Links are not followed, and what cannot be deleted stays."""
-    for found in (workspace.glob(".*.part"), *((workspace / name).rglob(".*.part") for name in FOLDERS)):
-        for path in found:
+def delete_abandoned_parts(workspace: Path) -> None:
+    """Delete partial files that are not being written any more. Ignores links and files that cannot be deleted."""
+    for paths in (workspace.glob(".*.part"), *((workspace / name).rglob(".*.part") for name in FOLDERS)):
+        for path in paths:
             with suppress(OSError):
-                if path.lstat().st_mtime < time.time() - ABANDONED:
+                if path.lstat().st_mtime < time.time() - MAX_AGE:
                     path.unlink()

@@ -1,4 +1,4 @@
-"""What a recording says of itself: all that lists, finds and opens it. Read in a process of its own."""
+"""Metadata of a recording, read in a subprocess."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from beliefscope.inspect.trace import stored_faults
+from beliefscope.inspect.traces.file import stored_faults
 from beliefscope.recordings.schema import GROWING
 
-PATIENCE = 300.0  # s that a file is read for at most
+TIMEOUT = 300.0  # s per file
 
 
 @dataclass(frozen=True)
-class About:
-    """What a recording says of itself: all that lists, finds and opens it.
+class RecordingInfo:
+    """Metadata of a recording.
 
     Attributes:
-        application, title: as the file has them. entities, rows: how many.
-        problem: why no run can be read out of it; empty where one can. Of a file that Rerun cannot read either,
-            ``application`` is empty.
-        task ... data_hash: of the trace, where it is one of ours; ``faults`` as text, ``steps`` None of a live run.
-        edited: whether some steps of the run were changed by hand.
+        application, title: stored in the file; ``application`` is empty if Rerun cannot read it.
+        entities, rows: their numbers.
+        problem: reason why no run can be read from the file; empty if one can.
+        task ... data_hash: fields of the trace of a Beliefscope recording; ``steps`` is None for a live run.
+        edited: whether the run has interventions.
     """
 
     application: str = ""
@@ -47,46 +47,46 @@ class About:
     data_hash: str = ""
 
     @classmethod
-    def of(cls, described: Mapping[str, Any], path: Path) -> About:
-        """Of what ``recordings.describe`` says. What should be ours and cannot be understood is a problem."""
-        if "error" in described:
-            return cls(problem=described["error"].removeprefix(f"{path}: "))
-        said = {key: described[key] for key in ("application", "title", "entities", "rows", "problem")}
-        properties = described["properties"]
-        if not properties or said["problem"]:
-            return cls(**said)
+    def from_json(cls, description: Mapping[str, Any], path: Path) -> RecordingInfo:
+        """From the output of ``recordings.rerun_log.metadata``. Invalid properties become a ``problem``."""
+        if "error" in description:
+            return cls(problem=description["error"].removeprefix(f"{path}: "))
+        general = {key: description[key] for key in ("application", "title", "entities", "rows", "problem")}
+        properties = description["properties"]
+        if not properties or general["problem"]:
+            return cls(**general)
         try:
             settings = json.loads(properties["settings"])
-            stored = properties.get("faults", properties.get("recipe"))
+            faults = properties.get("faults", properties.get("recipe"))  # earlier versions: recipe
             return cls(
-                **said,
+                **general,
                 task=str(properties["task"]),
                 filter=str(properties["filter"]),
                 episode=int(properties["episode_index"]),
                 steps=None if properties["steps"] == GROWING else int(properties["steps"]),
                 seed=int(properties["seed"]),
-                faults=str(stored_faults({"settings": settings, "faults": json.loads(stored or "null")})),
+                faults=str(stored_faults({"settings": settings, "faults": json.loads(faults or "null")})),
                 particles=None if settings.get("particles") is None else int(settings["particles"]),
                 edited=bool(settings.get("edits")),
                 checkpoint_hash=str(properties["checkpoint_hash"]),
                 data_hash=str(properties["data_hash"]),
             )
         except (LookupError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-            return cls(**said | {"problem": f"It says that it is ours, but not of what: {error}."})
+            return cls(**general | {"problem": f"The properties of this Beliefscope recording are invalid: {error}."})
 
 
-class Reader:
-    """Reads files one at a time. A file made to do harm ends its process, by a crash or at its limits, and no more."""
+class RecordingProbe:
+    """Reads one file at a time in a subprocess, which contains crashes and excessive use of time and memory."""
 
     def __init__(self) -> None:
-        self._one = threading.Lock()
+        self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._closing = False
 
-    def __call__(self, path: Path) -> About:
-        """Raises CancelledError where it is closed."""
+    def __call__(self, path: Path) -> RecordingInfo:
+        """Read the metadata of a file. Raises CancelledError if the probe is closed."""
         command = [sys.executable, "-P", "-m", "beliefscope.recordings.rerun_log.metadata", str(path)]
-        with self._one:
+        with self._lock:
             if self._closing:
                 raise CancelledError
             self._process = subprocess.Popen(
@@ -94,19 +94,19 @@ class Reader:
             )
             with self._process as process:
                 try:
-                    said = process.communicate(timeout=PATIENCE)[0]
+                    output = process.communicate(timeout=TIMEOUT)[0]
                 except subprocess.TimeoutExpired:
                     process.kill()
-                    said = b""
+                    output = b""
             self._process = None
         if self._closing:
             raise CancelledError
-        if process.returncode or not said:
-            return About(problem="Reading it failed, or took more time or memory than a recording may.")
-        return About.of(json.loads(said), path)
+        if process.returncode or not output:
+            return RecordingInfo(problem="Reading the file failed or exceeded the limits of time or memory.")
+        return RecordingInfo.from_json(json.loads(output), path)
 
     def close(self) -> None:
-        """Gives up what is being read."""
+        """Stop reading."""
         self._closing = True
         if process := self._process:
             process.kill()

@@ -1,4 +1,4 @@
-"""What was deleted and can be had back: files and folders of a workspace, each in a folder under `.deleted`."""
+"""Trash of a folder: deleted files and folders that can be restored, each in its own folder under ``.deleted``."""
 
 from __future__ import annotations
 
@@ -13,25 +13,24 @@ from pathlib import Path
 
 from beliefscope.datasets.errors import BadInput
 
-DAYS = 14
-"""For which it is kept."""
+RETENTION_DAYS = 14
 
 ID = re.compile(r"(?P<milliseconds>[0-9a-f]{1,16})-[0-9a-f]{8}")
-ABOUT = ".about"
-"""Name in the folder of what belongs to the deleted file and has no name of its own."""
+METADATA = ".about"
+"""Name under which the metadata of a deleted file is stored."""
 
 
-class Gone(BadInput):
-    """What is named is not there, or no longer."""
+class NotFound(BadInput):
+    """The file does not exist, or no longer."""
 
 
-class Taken(BadInput):
-    """The name is another's."""
+class NameTaken(BadInput):
+    """Another file has the name."""
 
 
 @dataclass(frozen=True)
-class Deleted:
-    """One that was. bytes: of all its files. deleted: s since 1970."""
+class DeletedFile:
+    """A file or folder in the trash. bytes: total size. deleted: time in s since 1970."""
 
     id: str
     name: str
@@ -40,81 +39,76 @@ class Deleted:
 
 
 class Trash:
-    """The deleted files of one folder. Whoever calls sees to it that nobody else does meanwhile."""
+    """The deleted files of one folder. Not thread-safe."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder / ".deleted"
 
-    def put(self, path: Path, about: Path | None = None) -> str:
-        """Takes a file or folder out of its own, and what belongs to it; gives what it is asked back by.
-
-        Raises Gone where it is not there.
-        """
+    def put(self, path: Path, metadata: Path | None = None) -> str:
+        """Move a file or folder and its metadata into the trash; return an id. Raises NotFound."""
         id = f"{time.time_ns() // 10**6:x}-{secrets.token_hex(4)}"
-        place = self._folder / id
-        place.mkdir(parents=True)
+        entry = self._folder / id
+        entry.mkdir(parents=True)
         try:
-            os.rename(path, place / path.name)
+            os.rename(path, entry / path.name)
         except FileNotFoundError:
-            place.rmdir()
-            raise Gone(f"{path.name!r} is no longer there.") from None
-        if about is not None:
+            entry.rmdir()
+            raise NotFound(f"{path.name!r} does not exist any more.") from None
+        if metadata is not None:
             with suppress(FileNotFoundError):
-                os.rename(about, place / ABOUT)
+                os.rename(metadata, entry / METADATA)
         return id
 
-    def restore(self, id: str, folder: Path, about: Path | None = None) -> Path:
-        """Puts it back into the folder, and what belongs to it into the other. Raises Gone, and Taken for its name."""
-        found = self._named(id)
-        if found is None:
-            raise Gone(f"Deleted file {id!r} is no longer there to be had back.")
-        target = folder / found.name
+    def restore(self, id: str, folder: Path, metadata_folder: Path | None = None) -> Path:
+        """Move a file back into ``folder``, and its metadata into the other one. Raises NotFound or NameTaken."""
+        path = self._path(id)
+        if path is None:
+            raise NotFound(f"Deleted file {id!r} does not exist any more.")
+        target = folder / path.name
         if os.path.lexists(target):
-            raise Taken(f"Another {found.name!r} is there by now: rename that one first.")
-        if about is not None:
+            raise NameTaken(f"A file {path.name!r} already exists: rename it first.")
+        if metadata_folder is not None:
             with suppress(FileNotFoundError):
-                os.replace(found.parent / ABOUT, about / f"{found.name}.json")
-        os.rename(found, target)
-        shutil.rmtree(found.parent, ignore_errors=True)
+                os.replace(path.parent / METADATA, metadata_folder / f"{path.name}.json")
+        os.rename(path, target)
+        shutil.rmtree(path.parent, ignore_errors=True)
         return target
 
-    def all(self) -> list[Deleted]:
-        """The last deleted first; those whose time is over are gone."""
-        kept = []
+    def list_deleted(self) -> list[DeletedFile]:
+        """The files in the trash, most recent first. Deletes expired ones."""
+        files = []
         for id in self._ids():
-            when, found = int(id.partition("-")[0], 16) / 1e3, self._named(id)
-            if found is None or when < time.time() - DAYS * 86400:
-                self._drop(id)
+            deleted, path = int(id.partition("-")[0], 16) / 1e3, self._path(id)
+            if path is None or deleted < time.time() - RETENTION_DAYS * 86400:
+                self._delete(id)
             else:
-                kept.append(Deleted(id, found.name, size(found), when))
-        return sorted(kept, key=lambda one: -one.deleted)
+                files.append(DeletedFile(id, path.name, disk_usage(path), deleted))
+        return sorted(files, key=lambda file: -file.deleted)
 
     def empty(self) -> None:
-        """Deletes all for good."""
+        """Delete all files permanently."""
         for id in self._ids():
-            self._drop(id)
+            self._delete(id)
 
     def _ids(self) -> list[str]:
         with suppress(FileNotFoundError):
             return [entry.name for entry in os.scandir(self._folder) if ID.fullmatch(entry.name)]
         return []
 
-    def _named(self, id: str) -> Path | None:
+    def _path(self, id: str) -> Path | None:
         with suppress(OSError):
             if ID.fullmatch(id):
-                return next((path for path in (self._folder / id).iterdir() if path.name != ABOUT), None)
+                return next((path for path in (self._folder / id).iterdir() if path.name != METADATA), None)
         return None
 
-    def _drop(self, id: str) -> None:
+    def _delete(self, id: str) -> None:
         shutil.rmtree(self._folder / id, ignore_errors=True)
 
 
-def size(path: Path) -> int:
-    """Bytes of a file, or of all files in a folder; what vanishes meanwhile has none."""
-    paths = path.rglob("*") if path.is_dir() else [path]
+def disk_usage(path: Path) -> int:
+    """Size in bytes of a file, or of all files in a folder. Files that disappear meanwhile count as empty."""
     total = 0
-    for one in paths:
+    for file in path.rglob("*") if path.is_dir() else [path]:
         with suppress(OSError):
-            status = one.lstat()
-            total += 0 if one.is_dir() else status.st_size
+            total += 0 if file.is_dir() else file.lstat().st_size
     return total

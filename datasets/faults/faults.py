@@ -1,6 +1,6 @@
-"""The ways in which a sensor breaks: small frozen values that print, and that turn what was read into what is reported.
+"""Sensor faults: frozen dataclasses that convert to text and JSON and transform sensor readings.
 
-Values are SI, gray levels 0 to 255 and pixels. ``datasets/faults/injection.py`` puts them on episodes.
+Units are SI, gray levels 0 to 255 and pixels. ``datasets/faults/injection.py`` applies faults to episodes.
 """
 
 from __future__ import annotations
@@ -12,37 +12,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import FloatArray
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.task import Task
 
 Readings = NDArray[Any]
-"""(T, ...): what one sensor reported at each step."""
+"""(T, ...): readings of a sensor at each step."""
 
 AXES = ("x", "y", "z")
 
-LARGEST = 1e6
-"""Of any parameter's value: beyond it float32 arithmetic of a filter has no meaning."""
+MAX_VALUE = 1e6
+"""Upper bound of every parameter: larger values exceed the useful range of float32 filters."""
 
 
 def _parameter(default: Any, kind: type, unit: str, meaning: str, **range_: Any) -> Any:
     return field(default=default, metadata={"kind": kind, "unit": unit, "meaning": meaning} | range_)
 
 
-def _number(default: float, unit: str, meaning: str, least: float = -LARGEST, most: float = LARGEST) -> Any:
-    return _parameter(default, float, unit, meaning, least=least, most=most)
+def _number(default: float, unit: str, meaning: str, minimum: float = -MAX_VALUE, maximum: float = MAX_VALUE) -> Any:
+    return _parameter(default, float, unit, meaning, minimum=minimum, maximum=maximum)
 
 
-def _whole(default: int | None, unit: str, meaning: str, least: int = 0) -> Any:
-    return _parameter(default, int, unit, meaning, least=least, most=LARGEST)
+def _integer(default: int | None, unit: str, meaning: str, minimum: int = 0) -> Any:
+    return _parameter(default, int, unit, meaning, minimum=minimum, maximum=MAX_VALUE)
 
 
-def _word(default: str, meaning: str, choices: tuple[str, ...] = ()) -> Any:
+def _name(default: str, meaning: str, choices: tuple[str, ...] = ()) -> Any:
     return _parameter(default, str, "name", meaning, choices=choices)
 
 
 @dataclass(frozen=True)
 class Span:
-    """When a fault acts: at (T,) bool. first: its first step, or the episode's last if that comes before. dt: s."""
+    """Active steps of a fault. at: (T,) bool. first: first active step, at most the last of the episode. dt: s."""
 
     at: NDArray[np.bool_]
     first: int
@@ -51,35 +51,36 @@ class Span:
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """One way in which a sensor breaks, from step ``from_`` up to, but without, step ``to``; else to the end.
+    """A sensor fault from step ``from_`` up to, but excluding, step ``to`` (default: the end).
 
-    Raises BadInput for a parameter of another type or out of its range.
+    Raises BadInput for a parameter of the wrong type or out of range.
     """
 
-    from_: int = _whole(0, "steps", "first step of the fault")
-    to: int | None = _whole(None, "steps", "first step after it; the end without it", least=1)
+    from_: int = _integer(0, "steps", "first step of the fault")
+    to: int | None = _integer(None, "steps", "first step after the fault; default: the end", minimum=1)
 
     name: ClassVar[str]
     sensor: ClassVar[str]
 
     def __post_init__(self) -> None:
-        for key, one in parameters(type(self)).items():
-            object.__setattr__(self, one.name, _checked(self.name, key, one, getattr(self, one.name)))
+        for key, parameter in parameters(type(self)).items():
+            value = _validate(self.name, key, parameter, getattr(self, parameter.name))
+            object.__setattr__(self, parameter.name, value)
         if self.to is not None and self.to <= self.from_:
             raise BadInput(f"{self.name}'s 'to' is {self.to}, not a step after 'from', which is {self.from_}")
 
     def keys(self, task: Task) -> tuple[str, ...]:
-        """The observations it breaks. Raises BadInput where the task has none such."""
+        """Observation keys that the fault changes. Raises BadInput if the task lacks the sensor."""
         if self.sensor not in task.observations:
-            raise one_of(f"sensor of task {task.name!r}", self.sensor, task.observations)
+            raise unknown_name(f"sensor of task {task.name!r}", self.sensor, task.observations)
         return (self.sensor,)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        """(T, ...): the readings as if the fault acted throughout; ``apply`` takes of them what lies in the span."""
+        """(T, ...): faulty readings for all steps; ``apply`` uses those of the active steps."""
         raise NotImplementedError
 
     def apply(self, readings: Readings, dt: float, rng: np.random.Generator) -> Readings:
-        """(T, ...): the broken readings, a new array of the same type."""
+        """(T, ...): faulty readings, a new array of the same type."""
         steps = np.arange(len(readings))
         at = (steps >= self.from_) & (steps < (len(steps) if self.to is None else self.to))
         span = Span(at, min(self.from_, len(steps) - 1), dt)
@@ -89,72 +90,73 @@ class Fault:
         return _choose(span.at, changed, readings).astype(readings.dtype)
 
     def to_json(self) -> dict[str, Any]:
-        """``{"fault": name, parameter: value, ...}``; the span only where it is not the whole episode."""
-        given = {key: getattr(self, one.name) for key, one in parameters(type(self)).items()}
-        return {"fault": self.name} | {k: v for k, v in given.items() if v is not None and (k, v) != ("from", 0)}
+        """``{"fault": name, parameter: value, ...}``; ``from`` and ``to`` only if they differ from the defaults."""
+        values = {key: getattr(self, parameter.name) for key, parameter in parameters(type(self)).items()}
+        return {"fault": self.name} | {k: v for k, v in values.items() if v is not None and (k, v) != ("from", 0)}
 
     def __str__(self) -> str:
         text, first = self.name, True
-        for key, one in parameters(type(self)).items():
-            value = getattr(self, one.name)
-            if value != one.default or isinstance(value, str):
-                text += f"={_written(value)}" if first else f":{key}={_written(value)}"
+        for key, parameter in parameters(type(self)).items():
+            value = getattr(self, parameter.name)
+            if value != parameter.default or isinstance(value, str):
+                text += f"={_format(value)}" if first else f":{key}={_format(value)}"
             first = False
         return text
 
 
 def parameters(fault: type[Fault]) -> dict[str, Field[Any]]:
-    """Parameter as written -> dataclass field; the fault's own first, then its span. ``from`` is a word of Python's."""
-    span = {one.name for one in fields(Fault)}
-    ordered = sorted(fields(fault), key=lambda one: one.name in span)
-    return {one.name.rstrip("_"): one for one in ordered}
+    """Parameter name in text -> dataclass field; the span comes last. ``from`` is a Python keyword: ``from_``."""
+    span = {parameter.name for parameter in fields(Fault)}
+    ordered = sorted(fields(fault), key=lambda parameter: parameter.name in span)
+    return {parameter.name.rstrip("_"): parameter for parameter in ordered}
 
 
-def _checked(fault: str, key: str, parameter: Field[Any], value: Any) -> Any:
-    wanted = parameter.metadata
+def _validate(fault: str, key: str, parameter: Field[Any], value: Any) -> Any:
+    meta = parameter.metadata
     if value is None and parameter.default is None:
         return None
-    if wanted["kind"] is str:
+    if meta["kind"] is str:
         if not isinstance(value, str) or not value.isprintable() or not value or set(value) & set(",:= "):
             raise BadInput(f"{fault}'s {key!r} is {value!r}, not a name")
-        if wanted["choices"] and value not in wanted["choices"]:
-            raise one_of(f"{key} of {fault}", value, wanted["choices"])
+        if meta["choices"] and value not in meta["choices"]:
+            raise unknown_name(f"{key} of {fault}", value, meta["choices"])
         return value
-    good = isinstance(value, int | float) and not isinstance(value, bool) and wanted["least"] <= value <= wanted["most"]
-    if good and wanted["kind"](value) == value:
-        return wanted["kind"](value)
-    kind = "a whole number" if wanted["kind"] is int else "a number"
-    raise BadInput(f"{fault}'s {key!r} is {value!r}, not {kind} from {wanted['least']:g} to {wanted['most']:g}")
+    low, high = meta["minimum"], meta["maximum"]
+    valid = isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+    if valid and meta["kind"](value) == value:
+        return meta["kind"](value)
+    kind = "a whole number" if meta["kind"] is int else "a number"
+    raise BadInput(f"{fault}'s {key!r} is {value!r}, not {kind} from {low:g} to {high:g}")
 
 
-def _written(value: Any) -> str:
+def _format(value: Any) -> str:
     return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
 def _choose(mask: NDArray[np.bool_], yes: Readings, no: Readings) -> Readings:
-    """(T, ...): at each step all of one or all of the other. mask: (T,)."""
+    """(T, ...): ``yes`` at steps where the mask (T,) is true, else ``no``."""
     return np.where(mask.reshape(-1, *[1] * (no.ndim - 1)), yes, no)
 
 
-def _late(readings: Readings, steps: int) -> Readings:
+def _delay(readings: Readings, steps: int) -> Readings:
     return readings[np.maximum(np.arange(len(readings)) - steps, 0)]
 
 
 def _axes(fault: Fault, readings: Readings) -> FloatArray:
-    """(d,) the fault's x, y, z for a sensor (T, d). Raises BadInput where it has a value for an axis beyond d."""
+    """(d,) x, y, z of the fault for a sensor (T, d). Raises BadInput for a nonzero value of an axis beyond d."""
     values = np.array([getattr(fault, axis) for axis in AXES], np.float32)
     d = readings.shape[1]
     if values[d:].any():
-        raise BadInput(f"{fault} is of an axis that the sensor has not. Available: {', '.join(AXES[:d])}.")
+        raise BadInput(f"{fault} uses an axis that the sensor does not have. Available: {', '.join(AXES[:d])}.")
     return values[:d]
 
 
 @dataclass(frozen=True)
 class Blackout(Fault):
-    """Pictures are black, each step on its own."""
+    """Images are blacked out, independently at each step."""
 
     name, sensor = "blackout", "image"
-    probability: float = _number(1.0, "share", "chance of a black picture at a step", 0, 1)
+    probability: float = _number(1.0, "fraction", "probability of a blackout at a step", 0, 1)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         return _choose(rng.random(len(readings)) < self.probability, np.zeros_like(readings), readings)
@@ -162,7 +164,7 @@ class Blackout(Fault):
 
 @dataclass(frozen=True)
 class ImageFrozen(Fault):
-    """The picture of the fault's first step stays."""
+    """The image of the fault's first step is repeated."""
 
     name, sensor = "image_frozen", "image"
 
@@ -171,11 +173,11 @@ class ImageFrozen(Fault):
 
 
 @dataclass(frozen=True)
-class ImageDarker(Fault):
-    """Pictures are darker, or brighter; they saturate at white."""
+class ImageUnderexposed(Fault):
+    """Images are under- or overexposed and saturate at white."""
 
-    name, sensor = "image_darker", "image"
-    factor: float = _number(0.4, "factor", "of every gray level", 0)
+    name, sensor = "image_underexposed", "image"
+    factor: float = _number(0.4, "factor", "scale of every gray level", 0)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         return readings * self.factor
@@ -183,7 +185,7 @@ class ImageDarker(Fault):
 
 @dataclass(frozen=True)
 class ImageNoise(Fault):
-    """Every pixel of every picture has noise of its own."""
+    """Independent Gaussian noise is added to every pixel."""
 
     name, sensor = "image_noise", "image"
     std: float = _number(40.0, "gray levels", "standard deviation", 0)
@@ -193,27 +195,27 @@ class ImageNoise(Fault):
 
 
 @dataclass(frozen=True)
-class ImagePatch(Fault):
-    """A square hides the same part of every picture."""
+class ImageOccluded(Fault):
+    """A square occludes the same part of every image."""
 
-    name, sensor = "image_patch", "image"
-    size: int = _whole(12, "pixels", "side of the square")
-    x: int | None = _whole(None, "pixels", "its left column; drawn for each episode without it")
-    y: int | None = _whole(None, "pixels", "its top row; drawn for each episode without it")
-    gray: float = _number(0.0, "gray levels", "of the square", 0, 255)
+    name, sensor = "image_occluded", "image"
+    size: int = _integer(12, "pixels", "side length of the square")
+    x: int | None = _integer(None, "pixels", "left column; default: random for each episode")
+    y: int | None = _integer(None, "pixels", "top row; default: random for each episode")
+    gray: float = _number(0.0, "gray levels", "gray level of the square", 0, 255)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         room = np.maximum(np.array(readings.shape[1:]) - self.size, 0)
         top, left = (int(n) for n in rng.integers(room + 1))
         top, left = top if self.y is None else self.y, left if self.x is None else self.x
-        hidden = readings.copy()
-        hidden[:, top : top + self.size, left : left + self.size] = round(self.gray)
-        return hidden
+        occluded = readings.copy()
+        occluded[:, top : top + self.size, left : left + self.size] = round(self.gray)
+        return occluded
 
 
 @dataclass(frozen=True)
 class ForceBias(Fault):
-    """The force is off by a constant."""
+    """A constant is added to the force."""
 
     name, sensor = "force_bias", "force"
     x: float = _number(0.0, "N", "offset along x")
@@ -226,7 +228,7 @@ class ForceBias(Fault):
 
 @dataclass(frozen=True)
 class ForceNoise(Fault):
-    """The force is noisy, each axis and step on its own."""
+    """Independent Gaussian noise is added to each axis of the force."""
 
     name, sensor = "force_noise", "force"
     std: float = _number(5.0, "N", "standard deviation", 0)
@@ -237,12 +239,12 @@ class ForceNoise(Fault):
 
 @dataclass(frozen=True)
 class ForceDrift(Fault):
-    """The force is off by what grows from the fault's first step on."""
+    """A bias that grows linearly from the fault's first step is added to the force."""
 
     name, sensor = "force_drift", "force"
-    x: float = _number(0.0, "N/s", "growth along x")
-    y: float = _number(0.0, "N/s", "growth along y")
-    z: float = _number(0.0, "N/s", "growth along z")
+    x: float = _number(0.0, "N/s", "drift rate along x")
+    y: float = _number(0.0, "N/s", "drift rate along y")
+    z: float = _number(0.0, "N/s", "drift rate along z")
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         return readings + _axes(self, readings) * span.dt * (np.arange(len(readings)) - span.first)[:, None]
@@ -250,7 +252,7 @@ class ForceDrift(Fault):
 
 @dataclass(frozen=True)
 class ForceSaturation(Fault):
-    """The force ends at a limit, each axis on its own."""
+    """Each axis of the force saturates at a limit."""
 
     name, sensor = "force_saturation", "force"
     limit: float = _number(5.0, "N", "largest magnitude", 0)
@@ -261,22 +263,22 @@ class ForceSaturation(Fault):
 
 @dataclass(frozen=True)
 class ForceStuck(Fault):
-    """One axis of the force stays at what it is at the fault's first step."""
+    """One axis of the force keeps its value at the fault's first step."""
 
     name, sensor = "force_stuck", "force"
-    axis: str = _word("x", "x, y or z", AXES)
+    axis: str = _name("x", "x, y or z", AXES)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         axis, stuck = AXES.index(self.axis), readings.copy()
         if axis >= readings.shape[1]:
-            raise one_of("axis of the force", self.axis, AXES[: readings.shape[1]])
+            raise unknown_name("axis of the force", self.axis, AXES[: readings.shape[1]])
         stuck[:, axis] = readings[span.first, axis]
         return stuck
 
 
 @dataclass(frozen=True)
 class EffectorOffset(Fault):
-    """The end effector is told to be elsewhere."""
+    """A constant is added to the end-effector position."""
 
     name, sensor = "effector_offset", "effector_position"
     x: float = _number(0.0, "m", "offset along x")
@@ -289,61 +291,61 @@ class EffectorOffset(Fault):
 
 @dataclass(frozen=True)
 class ContactFlipped(Fault):
-    """The contact sensor says the opposite, each step on its own."""
+    """The contact flag is inverted, independently at each step."""
 
     name, sensor = "contact_flipped", "contact"
-    probability: float = _number(1.0, "share", "chance at a step", 0, 1)
+    probability: float = _number(1.0, "fraction", "probability of an inversion at a step", 0, 1)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         return _choose(rng.random(len(readings)) < self.probability, 1 - readings, readings)
 
 
 @dataclass(frozen=True)
-class ContactLate(Fault):
-    """The contact sensor is behind."""
+class ContactDelayed(Fault):
+    """The contact flag is delayed."""
 
-    name, sensor = "contact_late", "contact"
-    steps: int = _whole(5, "steps", "how far")
+    name, sensor = "contact_delayed", "contact"
+    steps: int = _integer(5, "steps", "length of the delay")
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return _late(readings, self.steps)
+        return _delay(readings, self.steps)
 
 
 @dataclass(frozen=True)
-class OfModality(Fault):
+class ModalityFault(Fault):
     """A fault of all sensors of a modality."""
 
-    modality: str = _word("image", "a modality of the task: image, haptics")
+    modality: str = _name("image", "a modality of the task: image, haptics")
 
     def keys(self, task: Task) -> tuple[str, ...]:
         if self.modality not in task.modalities:
-            raise one_of(f"modality of task {task.name!r}", self.modality, task.modalities)
+            raise unknown_name(f"modality of task {task.name!r}", self.modality, task.modalities)
         return task.modalities[self.modality]
 
 
 @dataclass(frozen=True)
-class Delay(OfModality):
-    """A modality is behind: a step gets the readings of an earlier one, the first steps those of step 0."""
+class Delay(ModalityFault):
+    """A modality is delayed; the first steps repeat the readings of step 0."""
 
     name = "delay"
-    steps: int = _whole(5, "steps", "how far")
+    steps: int = _integer(5, "steps", "length of the delay")
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return _late(readings, self.steps)
+        return _delay(readings, self.steps)
 
 
 @dataclass(frozen=True)
-class Drop(OfModality):
-    """A modality reports nothing for a while: a picture is black, every other reading stays what it was before."""
+class Drop(ModalityFault):
+    """A modality drops out: images are black, other readings repeat their last value."""
 
     name = "drop"
-    probability: float = _number(1.0, "share", "chance at a step that a gap begins", 0, 1)
-    steps: int = _whole(1, "steps", "length of a gap", least=1)
+    probability: float = _number(1.0, "fraction", "probability that a dropout begins at a step", 0, 1)
+    steps: int = _integer(1, "steps", "length of a dropout", minimum=1)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        begun = np.concatenate([[0], np.cumsum(span.at & (rng.random(len(readings)) < self.probability))])
-        now = np.arange(1, len(begun))
-        lost = begun[now] > begun[np.maximum(now - self.steps, 0)]
+        started = np.concatenate([[0], np.cumsum(span.at & (rng.random(len(readings)) < self.probability))])
+        now = np.arange(1, len(started))
+        lost = started[now] > started[np.maximum(now - self.steps, 0)]
         if readings.dtype == np.uint8:
             return _choose(lost, np.zeros_like(readings), readings)
         return readings[np.maximum.accumulate(np.where(lost & span.at, 0, now - 1))]
@@ -354,9 +356,9 @@ FAULTS: dict[str, type[Fault]] = {
     for fault in (
         Blackout,
         ImageFrozen,
-        ImageDarker,
+        ImageUnderexposed,
         ImageNoise,
-        ImagePatch,
+        ImageOccluded,
         ForceBias,
         ForceNoise,
         ForceDrift,
@@ -364,9 +366,9 @@ FAULTS: dict[str, type[Fault]] = {
         ForceStuck,
         EffectorOffset,
         ContactFlipped,
-        ContactLate,
+        ContactDelayed,
         Delay,
         Drop,
     )
 }
-"""Every fault there is, by name. A new one is a class and a line here."""
+"""All faults by name. To add one, write a class and list it here."""

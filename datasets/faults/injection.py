@@ -1,8 +1,8 @@
-"""Fault injections: faults that act one after the other on an episode and leave a broken copy.
+"""Fault injection: apply a sequence of sensor faults to a copy of an episode.
 
-What the sensors report changes, and the controls that follow from it; the truth (states, contact, joint positions)
-never does. In text, ``blackout=0.4,force_bias:x=5:from=20`` is two faults: a value right behind a fault's name is its
-first parameter's, the others are named; commas divide faults.
+Faults change the sensor readings and the controls computed from them, never the ground truth (states, contact, joint
+positions). The text ``blackout=0.4,force_bias:x=5:from=20`` stands for two faults: the value after a fault's name sets
+its first parameter, the other parameters are named, and commas separate faults.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode, FloatArray
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.faults import FAULTS, Fault, Readings, parameters
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.simulation.simulate import hand_controls
@@ -25,36 +25,36 @@ from beliefscope.datasets.task import Task
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults in the order in which they act; ``bool`` says whether there are any, ``+`` joins, ``str`` is its text."""
+    """A sequence of faults, applied in order. False if empty; ``+`` concatenates; ``str`` returns the text."""
 
     sequence: tuple[Fault, ...] = ()
 
     @classmethod
-    def of(cls, value: Any) -> Faults:
-        """From JSON: a list of ``{"fault": name, ...}``, one such, or ``{name: first parameter's value, ...}``.
+    def from_json(cls, value: Any) -> Faults:
+        """From JSON: ``[{"fault": name, ...}, ...]``, a single such object, or ``{name: first parameter, ...}``.
 
-        Raises BadInput for anything else, and for faults, parameters and values that there are not.
+        Raises BadInput for other values, unknown faults and parameters, and values out of range.
         """
         if isinstance(value, Mapping) and "fault" not in value:
-            return cls(tuple(_fault(name, {None: first}) for name, first in value.items()))
-        listed = [value] if isinstance(value, Mapping) else value
-        if not isinstance(listed, list) or not all(isinstance(one, Mapping) and "fault" in one for one in listed):
+            return cls(tuple(_create(name, {None: first}) for name, first in value.items()))
+        items = [value] if isinstance(value, Mapping) else value
+        if not isinstance(items, list) or not all(isinstance(item, Mapping) and "fault" in item for item in items):
             raise BadInput(f'faults is {value!r}, not a list of objects such as {{"fault": "blackout"}}')
-        return cls(tuple(_fault(one["fault"], {k: v for k, v in one.items() if k != "fault"}) for one in listed))
+        return cls(tuple(_create(item["fault"], {k: v for k, v in item.items() if k != "fault"}) for item in items))
 
     @classmethod
     def parse(cls, text: str) -> Faults:
-        """From its text, ``blackout=0.4,delay=image:steps=3``, or from JSON as text. Raises BadInput as ``of`` does."""
+        """From text, ``blackout=0.4,delay=image:steps=3`` or JSON. Raises BadInput for invalid faults."""
         if text.lstrip().startswith(("{", "[")):
             try:
                 document = read_json(text)
             except ValueError as error:
                 raise BadInput(f"faults is not JSON: {error}") from None
-            return cls.of(document)
-        return cls(tuple(_read(part.strip()) for part in text.split(",")) if text.strip() else ())
+            return cls.from_json(document)
+        return cls(tuple(_parse_fault(part.strip()) for part in text.split(",")) if text.strip() else ())
 
     def to_json(self) -> list[dict[str, Any]]:
-        """``Faults.of`` makes the same of it."""
+        """The inverse of ``from_json``."""
         return [fault.to_json() for fault in self.sequence]
 
     def __str__(self) -> str:
@@ -70,55 +70,62 @@ class Faults:
         return Faults(self.sequence + other.sequence)
 
     def check(self, task: Task) -> None:
-        """Raises BadInput for a fault of a sensor that the task has not."""
+        """Raise BadInput for a fault of a sensor that the task does not have."""
         for fault in self.sequence:
             fault.keys(task)
 
     def apply(self, episode: Episode, seed: int = 0) -> Episode:
-        """A broken copy. What is drawn depends on the seed, the episode's digest and each fault's place alone.
+        """Return a faulty copy. Random numbers depend only on the seed, the episode's digest and each fault's position.
 
-        Raises BadInput for a fault of a sensor that the episode's task has not.
+        Raises BadInput for a fault of a sensor that the episode does not have.
         """
         if not self.sequence:
             return episode
         task, observations, digest = find_task(episode.task), dict(episode.observations), int(episode.digest()[:16], 16)
-        for place, fault in enumerate(self.sequence):
+        for position, fault in enumerate(self.sequence):
             for key in fault.keys(task):
                 if key not in observations:
-                    raise one_of("observation of the episode", key, observations)
-                # The same draws for all sensors of a modality: they are lost together.
-                rng = np.random.default_rng([seed, digest, place])
+                    raise unknown_name("observation of the episode", key, observations)
+                # The same random numbers for all sensors of a modality: they drop out together.
+                rng = np.random.default_rng([seed, digest, position])
                 observations[key] = fault.apply(observations[key], episode.dt, rng)
         return replace(episode, observations=observations, controls=_controls(episode, observations))
 
 
-WHOLE = Faults()
-"""No fault."""
+NO_FAULTS = Faults()
+"""The empty sequence of faults."""
 
 FAULT_PRESETS: dict[str, str] = {
-    "40 % black pictures": "blackout=0.4",
-    "80 % black pictures": "blackout=0.8",
+    "40 % image blackout": "blackout=0.4",
+    "80 % image blackout": "blackout=0.8",
     "image frozen": "image_frozen=20",
-    "image darker": "image_darker=0.4",
+    "image underexposed": "image_underexposed=0.4",
     "image noisy": "image_noise=40",
-    "image behind a patch": "image_patch=12",
-    "image 5 steps late": "delay=image:steps=5",
-    "force off by 5 N": "force_bias=5",
+    "image occluded": "image_occluded=12",
+    "image delayed 5 steps": "delay=image:steps=5",
+    "force bias 5 N": "force_bias=5",
     "force noisy": "force_noise=5",
     "force drifting": "force_drift=1",
     "force saturated at 2 N": "force_saturation=2",
     "force axis stuck": "force_stuck=x:from=20",
-    "effector off by 2 cm": "effector_offset=0.02",
+    "end-effector offset 2 cm": "effector_offset=0.02",
     "contact flipped": "contact_flipped",
-    "contact 5 steps late": "contact_late=5",
-    "haptics 5 steps late": "delay=haptics:steps=5",
+    "contact delayed 5 steps": "contact_delayed=5",
+    "haptics delayed 5 steps": "delay=haptics:steps=5",
     "haptics dropped": "drop=haptics:from=20",
 }
-"""What it is called -> faults: the ones to try first."""
+"""Label -> faults as text: suggested fault injections."""
+
+RENAMED_FAULTS = {
+    "image_darker": "image_underexposed",
+    "image_patch": "image_occluded",
+    "contact_late": "contact_delayed",
+}
+"""Fault name in files of earlier versions -> current name."""
 
 
-def ready(task: Task) -> dict[str, str]:
-    """Those of ``FAULT_PRESETS`` that the task has the sensors for."""
+def available_presets(task: Task) -> dict[str, str]:
+    """``FAULT_PRESETS`` that apply to the sensors of the task."""
 
     def fits(text: str) -> bool:
         with suppress(BadInput):
@@ -129,8 +136,8 @@ def ready(task: Task) -> dict[str, str]:
     return {name: text for name, text in FAULT_PRESETS.items() if fits(text)}
 
 
-def described() -> list[dict[str, Any]]:
-    """Every fault as JSON values: ``fault``, ``meaning`` and ``parameters``, each with default, unit and meaning."""
+def fault_catalog() -> list[dict[str, Any]]:
+    """All faults as JSON values: ``fault``, ``meaning`` and ``parameters`` (name, default, unit, meaning)."""
     return [
         {
             "fault": name,
@@ -144,51 +151,50 @@ def described() -> list[dict[str, Any]]:
     ]
 
 
-def broken_copies(faults: Faults, episodes: Iterable[Episode], seed: int) -> list[Episode]:
-    """A broken copy of each training episode."""
+def faulty_copies(faults: Faults, episodes: Iterable[Episode], seed: int) -> list[Episode]:
+    """Return a faulty copy of each training episode."""
     return [faults.apply(episode, seed) for episode in episodes if episode.split == "train"]
 
 
-def _fault(name: Any, given: Mapping[str | None, Any]) -> Fault:
-    """The fault of that name; the key None stands for its first parameter."""
+def _create(name: Any, values: Mapping[str | None, Any]) -> Fault:
+    """Create a fault. The key None stands for its first parameter."""
+    name = RENAMED_FAULTS.get(str(name), name)
     if not isinstance(name, str) or name not in FAULTS:
-        raise one_of("fault", str(name), FAULTS)
-    known = parameters(FAULTS[name])
+        raise unknown_name("fault", str(name), FAULTS)
+    available = parameters(FAULTS[name])
     arguments: dict[str, Any] = {}
-    for key, value in given.items():
-        key = next(iter(known)) if key is None else key
-        if key not in known:
-            raise one_of(f"parameter of {name}", key, known)
-        if known[key].name in arguments:
+    for key, value in values.items():
+        key = next(iter(available)) if key is None else key
+        if key not in available:
+            raise unknown_name(f"parameter of {name}", key, available)
+        if available[key].name in arguments:
             raise BadInput(f"{name}'s {key!r} is given twice")
-        arguments[known[key].name] = value
+        arguments[available[key].name] = value
     return FAULTS[name](**arguments)
 
 
-def _read(text: str) -> Fault:
-    """A fault from its text: ``name``, ``name=value`` and so on with ``:parameter=value``."""
+def _parse_fault(text: str) -> Fault:
+    """Parse ``name`` or ``name=value``, followed by any number of ``:parameter=value``."""
     head, *rest = text.split(":")
     name, _, first = head.partition("=")
-    given: dict[str | None, Any] = {None: _value(first)} if first else {}
+    values: dict[str | None, Any] = {None: _parse_value(first)} if first else {}
     for part in rest:
         key, equals, value = part.partition("=")
-        if not equals or key in given:
+        if not equals or key in values:
             raise BadInput(f"{part!r} in {text!r} is not a new parameter=value")
-        given[key] = _value(value)
-    return _fault(name, given)
+        values[key] = _parse_value(value)
+    return _create(name, values)
 
 
-def _value(text: str) -> float | int | str:
+def _parse_value(text: str) -> float | int | str:
     for kind in (int, float):
-        try:
+        with suppress(ValueError):
             return kind(text)
-        except ValueError:
-            pass
     return text
 
 
 def _controls(episode: Episode, observations: Mapping[str, Readings]) -> FloatArray:
-    """The controls that follow from what is now reported, where the episode's follow from what was."""
+    """Controls recomputed from the faulty readings, if the episode's controls derive from its readings."""
     keys = ("effector_position", "contact")
     if not all(key in episode.observations for key in keys):
         return episode.controls

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic file writes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from beliefscope.datasets.errors import BadInput
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """The old file or the new one, never half of it. Raises BadInput where it cannot be written: no folder, no room."""
+    """Replace a file atomically. Raises BadInput if it cannot be written, e.g. for a missing folder or a full disk."""
     path = Path(path)
     try:
         if not path.parent.is_dir():
@@ -29,16 +29,16 @@ def write_atomically(path: Path, data: bytes) -> None:
         finally:
             Path(temporary).unlink(missing_ok=True)
     except OSError as error:
-        raise unwritable(path, error) from None
+        raise write_error(path, error) from None
 
 
-def unwritable(path: Path, error: OSError) -> BadInput:
-    """The error for a file or folder that could not be written; of a full disk, with what is free there.
+def write_error(path: Path, error: OSError) -> BadInput:
+    """Return the error for a file or folder that could not be written. For a full disk it states the free space.
 
-    To be asked for once what was half written is gone, since that is free again.
+    Call it after removing partial files, which also occupy space.
     """
     free = ""
     if error.errno in (ENOSPC, EDQUOT):
-        with suppress(OSError):  # the folder has gone as well
+        with suppress(OSError):  # the folder no longer exists
             free = f", {shutil.disk_usage(path.parent).free / 1e6:.1f} MB are free there"
     return BadInput(f"cannot write {str(path)!r}: {error.strerror or error}{free}")

@@ -1,4 +1,4 @@
-"""JSON that comes from outside: read as it is meant, or refused."""
+"""Strict JSON reader for untrusted input."""
 
 from __future__ import annotations
 
@@ -7,29 +7,28 @@ from typing import Any, NoReturn
 
 
 def read_json(text: str | bytes) -> Any:
-    """A JSON document that can be written again. Raises ValueError, in one line, for any other text.
+    """Parse a JSON document that can be serialized again. Raises ValueError, in one line, for any other text.
 
-    Python's own reader takes NaN, numbers beyond all floats and halves of characters, which nothing after it can send
-    on, and gives up in its own way on what is nested too deeply.
+    Unlike ``json.loads``, rejects NaN, numbers beyond the range of floats, lone surrogates and excessive nesting.
     """
     try:
-        found = json.loads(text, parse_constant=_refuse, parse_int=_whole)
-        json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
+        document = json.loads(text, parse_constant=_reject, parse_int=_parse_int)
+        json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     except UnicodeEncodeError:
-        raise ValueError("it holds half a character") from None
-    return found
+        raise ValueError("it contains a lone surrogate") from None
+    return document
 
 
-def _whole(digits: str) -> int:
+def _parse_int(digits: str) -> int:
     number = int(digits)
     try:
         float(number)
-    except OverflowError:  # which pydantic would take as infinity
-        raise ValueError(f"a number of {len(digits)} digits is beyond all floats") from None
+    except OverflowError:  # pydantic would convert it to infinity
+        raise ValueError(f"a number of {len(digits)} digits is beyond the range of floats") from None
     return number
 
 
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number of JSON")
+def _reject(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not a JSON number")

@@ -1,4 +1,4 @@
-"""Python of the user's own, named as uvicorn names an app: ``path/to/file.py:NAME`` or ``package.module:NAME``."""
+"""Import of user code by name, as in uvicorn: ``path/to/file.py:NAME`` or ``package.module:NAME``."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from types import ModuleType
 from beliefscope.datasets.errors import BadInput
 
 
-def run(place: str) -> ModuleType:
-    """Runs a file, or imports a module. Raises BadInput where it does not exist or fails."""
-    return _run_file(Path(place)) if place.endswith(".py") else _run_module(place)
+def load_module(place: str) -> ModuleType:
+    """Run a file or import a module. Raises BadInput if it does not exist or fails."""
+    return _run_file(Path(place)) if place.endswith(".py") else _import(place)
 
 
 @contextmanager
 def importable(place: str) -> Iterator[None]:
-    """Meanwhile, what lies beside the file, or in the working directory, can be imported, after all else."""
+    """Append the folder of the file, or the working directory, to ``sys.path`` temporarily."""
     folder = str(Path(place).resolve().parent if place.endswith(".py") else Path.cwd())
     sys.path.append(folder)
     try:
         yield
     finally:
         sys.path.reverse()
-        sys.path.remove(folder)  # the last one, which is ours
+        sys.path.remove(folder)  # the last occurrence
         sys.path.reverse()
 
 
 def _run_file(path: Path) -> ModuleType:
     if not path.is_file():
         raise BadInput(f"{path} does not exist.")
-    spec = spec_from_file_location(f"beliefscope_own_{path.stem}", path)
+    spec = spec_from_file_location(f"beliefscope_user_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
     module = module_from_spec(spec)
-    sys.modules[module.__name__] = module  # dataclasses look their module up
+    sys.modules[module.__name__] = module  # required by dataclasses
     try:
         spec.loader.exec_module(module)
     except Exception as error:
@@ -47,7 +47,7 @@ def _run_file(path: Path) -> ModuleType:
     return module
 
 
-def _run_module(name: str) -> ModuleType:
+def _import(name: str) -> ModuleType:
     try:
         return import_module(name)
     except Exception as error:

@@ -1,10 +1,9 @@
-"""HDF5 files of others, and a full disk: what libhdf5 does not take well.
+"""Protection against libhdf5 failures on damaged files and full disks.
 
-Some damaged files lead libhdf5 round in circles (version 2.0 in a heap of strings, one of whose sizes is wrong), and
-nothing of Python's gets in between. So another process reads a file first
-(``python -m beliefscope.datasets.readers.hdf5_guard``), and this one opens only the files which that process
-survived. Where libhdf5 cannot write a file to its end, it crashes the process at exit: ``Sink`` hides the error from
-libhdf5 and reports it.
+Some damaged files make libhdf5 loop forever (version 2.0, a wrong size in a heap of strings), which Python cannot
+interrupt. A subprocess therefore probes each external file once (``python -m beliefscope.datasets.readers.hdf5_guard``)
+and only files that it survives are opened. A failed write makes libhdf5 crash the process at exit;
+``DeferredErrorFile`` hides the error from libhdf5 and reports it afterwards.
 """
 
 from __future__ import annotations
@@ -24,71 +23,69 @@ import h5py
 
 from beliefscope.datasets.errors import BadInput
 
-DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
-"""What h5py raises on meeting a damaged file. BadInput is a ValueError too."""
+HDF5_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
+"""Exceptions of h5py for a damaged file. BadInput is a ValueError too."""
 
-SHIPPED = Path(__file__).resolve().parents[1] / "samples"
-"""What lies there was looked at before it was shipped."""
+SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+"""Files distributed with the package are not probed."""
 
 SECONDS = 5.0
-SECONDS_A_MB = 1.0
-"""Of processor, that looking over one file may take. One of ours takes 0.1 s a MB, one of empty groups alone 0.25 s."""
+SECONDS_PER_MB = 1.0
+"""Limit of processor time for probing a file. Typical files take 0.1 s per MB, empty groups 0.25 s per MB."""
 
 MEMORY = 1 << 32
-"""Bytes of addresses, that looking over one file may take."""
+"""Limit of address space for probing a file, bytes."""
 
-_came_back: dict[tuple[int, int, int, int], bool] = {}
-"""Device, inode, size and time of change -> whether a process comes back from that file."""
+_readable: dict[tuple[int, int, int, int], bool] = {}
+"""Device, inode, size and modification time -> whether the probe of the file finished."""
 
 
 def open_hdf5(path: Path) -> h5py.File:
-    """For reading. Raises BadInput where it is missing, no HDF5, or damaged so that it cannot even be looked over."""
+    """Open a file for reading. Raises BadInput if it is missing, not HDF5 or damaged."""
     if not path.exists():
         raise BadInput(f"{path} does not exist.")
     if not path.is_file():
         raise BadInput(f"{path} is not a file.")
-    look_over([path])
-    if not _came_back.get(_identity(path), True):
-        most = f"{SECONDS + SECONDS_A_MB * path.stat().st_size / 1e6:.0f} s"
-        raise BadInput(f"{path} cannot be read as HDF5 within {most}: it is damaged. Collect or copy it again.")
+    probe([path])
+    if not _readable.get(_identity(path), True):
+        limit = f"{SECONDS + SECONDS_PER_MB * path.stat().st_size / 1e6:.0f} s"
+        raise BadInput(f"{path} cannot be read as HDF5 within {limit}: it is damaged. Collect or copy it again.")
     try:
         return h5py.File(path, "r")
     except PermissionError:
         raise BadInput(f"No permission to read {path}.") from None
-    except DAMAGE as error:
+    except HDF5_ERRORS as error:
         if not h5py.is_hdf5(path):
             raise BadInput(f"{path} is not an HDF5 file.") from None
-        raise damaged(path, error) from None
+        raise read_error(path, error) from None
 
 
-def look_over(paths: Iterable[Path]) -> None:
-    """Finds out which files a process comes back from: all in one, where one has to be started at all."""
-    waiting = [path for path in paths if _identity(path) not in _came_back and is_foreign(path)]
-    while waiting:
+def probe(paths: Iterable[Path]) -> None:
+    """Test in a subprocess which external files can be read. One process probes all files up to a fatal one."""
+    pending = [path for path in paths if _identity(path) not in _readable and needs_probe(path)]
+    while pending:
         process = subprocess.run(
             [sys.executable, "-P", "-m", "beliefscope.datasets.readers.hdf5_guard", str(SECONDS)],
-            input=b"\0".join(os.fsencode(path) for path in waiting),
+            input=b"\0".join(os.fsencode(path) for path in pending),
             capture_output=True,
             env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
             check=False,
         )
         assert process.returncode <= 0, process.stderr.decode(errors="replace")
-        done = len(process.stdout)
-        for path in waiting[:done]:
-            trust(path)
-        for path in waiting[done : done + 1]:
-            _came_back[_identity(path)] = False
-        waiting = waiting[done + 1 :]
+        finished = len(process.stdout)
+        for index, path in enumerate(pending[: finished + 1]):
+            _readable[_identity(path)] = index < finished
+        pending = pending[finished + 1 :]
 
 
-def trust(path: Path) -> None:
-    """Of a file that this process has written, or another came back from."""
-    _came_back[_identity(path)] = True
+def mark_readable(path: Path) -> None:
+    """Skip the probe of a file written by this process."""
+    _readable[_identity(path)] = True
 
 
-def is_foreign(path: Path) -> bool:
-    """Whether it is HDF5, and not of those that ship."""
-    return not path.resolve().is_relative_to(SHIPPED) and path.is_file() and bool(h5py.is_hdf5(path))
+def needs_probe(path: Path) -> bool:
+    """Whether the file is HDF5 and not distributed with the package."""
+    return not path.resolve().is_relative_to(SAMPLES) and path.is_file() and bool(h5py.is_hdf5(path))
 
 
 def _identity(path: Path) -> tuple[int, int, int, int]:
@@ -98,31 +95,31 @@ def _identity(path: Path) -> tuple[int, int, int, int]:
     return 0, 0, 0, 0
 
 
-def damaged(path: Path, error: Exception) -> BadInput:
-    """The error for a file that HDF5 cannot read, with its own words."""
-    return BadInput(f"{path} is damaged or cut short: {reason(error)}. Collect or copy it again.")
+def read_error(path: Path, error: Exception) -> BadInput:
+    """Return the error for a file that HDF5 cannot read, with its message."""
+    return BadInput(f"{path} is damaged or cut short: {error_message(error)}. Collect or copy it again.")
 
 
-def reason(error: Exception) -> str:
-    """HDF5's own words, in one line."""
+def error_message(error: Exception) -> str:
+    """Message of an HDF5 error in one line."""
     return " ".join((getattr(error, "strerror", None) or str(error)).split()).strip(" '\".")
 
 
-class Sink(io.FileIO):
-    """A file for libhdf5 to write to, which takes all it is given; what it could not write it says at its end.
+class DeferredErrorFile(io.FileIO):
+    """Output file for libhdf5 that reports every write as successful; ``check`` raises the first error.
 
     Attributes:
-        error: the first one, after which nothing is written any more.
+        error: the first error. Later writes are discarded.
     """
 
     error: OSError | None = None
 
     def write(self, data: Any, /) -> int:
-        left = memoryview(data)
-        size = left.nbytes
+        remaining = memoryview(data)
+        size = remaining.nbytes
         try:
-            while self.error is None and left.nbytes:
-                left = left[super().write(left) :]
+            while self.error is None and remaining.nbytes:
+                remaining = remaining[super().write(remaining) :]
         except OSError as error:
             self.error = error
         return size
@@ -135,52 +132,52 @@ class Sink(io.FileIO):
             return 0
 
     def check(self) -> None:
-        """Raises the OSError that was met."""
+        """Raise the first error, if any."""
         if self.error is not None:
             raise self.error
 
 
-def _look(path: str) -> None:
-    """Goes wherever a reader of ours may go: all names, attributes, types, shapes, and indices of chunks."""
+def _traverse(path: str) -> None:
+    """Access everything a reader may access: names, attributes, types, shapes and chunk indices."""
     with h5py.File(path, "r") as file:
-        waiting: list[Any] = [file]
-        seen = set()
-        while waiting:
-            one = waiting.pop()
-            with suppress(*DAMAGE):
-                place = h5py.h5o.get_info(one.id)
-                if (place.fileno, place.addr) in seen:  # links may lead round too
+        pending: list[Any] = [file]
+        visited = set()
+        while pending:
+            item = pending.pop()
+            with suppress(*HDF5_ERRORS):
+                info = h5py.h5o.get_info(item.id)
+                if (info.fileno, info.addr) in visited:  # links may form cycles
                     continue
-                seen.add((place.fileno, place.addr))
-            for name in _names(one.attrs):
-                with suppress(*DAMAGE):
-                    one.attrs.get(name)
-            if isinstance(one, h5py.Dataset):
-                with suppress(*DAMAGE):
-                    one.id.get_storage_size()  # walks over its chunks
-            for name in _names(one) if isinstance(one, h5py.Group) else ():
-                with suppress(*DAMAGE):
-                    if (member := one.get(name)) is not None:
-                        waiting.append(member)
+                visited.add((info.fileno, info.addr))
+            for name in _names(item.attrs):
+                with suppress(*HDF5_ERRORS):
+                    item.attrs.get(name)
+            if isinstance(item, h5py.Dataset):
+                with suppress(*HDF5_ERRORS):
+                    item.id.get_storage_size()  # reads the chunk index
+            for name in _names(item) if isinstance(item, h5py.Group) else ():
+                with suppress(*HDF5_ERRORS):
+                    if (member := item.get(name)) is not None:
+                        pending.append(member)
 
 
-def _names(of: Iterable[str]) -> list[str]:
-    with suppress(*DAMAGE):
-        return list(of)
+def _names(container: Iterable[str]) -> list[str]:
+    with suppress(*HDF5_ERRORS):
+        return list(container)
     return []
 
 
 def main() -> None:
-    """In the process: a byte on standard output for each file that it came back from. A signal ends it at another."""
+    """Entry point of the subprocess: write a byte to standard output after each file. A fatal file ends it."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY if most == resource.RLIM_INFINITY else min(MEMORY, most), most))
+    _, limit = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY if limit == resource.RLIM_INFINITY else min(MEMORY, limit), limit))
     for path in sys.stdin.buffer.read().split(b"\0"):
         try:
-            patience = float(sys.argv[1]) + SECONDS_A_MB * os.stat(path).st_size / 1e6
-            signal.setitimer(signal.ITIMER_PROF, patience)  # SIGPROF ends a process that does not care
-            _look(os.fsdecode(path))
-        except DAMAGE:
+            seconds = float(sys.argv[1]) + SECONDS_PER_MB * os.stat(path).st_size / 1e6
+            signal.setitimer(signal.ITIMER_PROF, seconds)  # SIGPROF ends the process
+            _traverse(os.fsdecode(path))
+        except HDF5_ERRORS:
             pass
         except MemoryError:
             signal.raise_signal(signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Numbers out of HDF5 files of others: a file of a few bytes can claim to hold more than any memory does."""
+"""Size limits for arrays read from HDF5: a file of a few bytes can declare an array larger than memory."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 
-LARGEST = 1 << 31
-"""Bytes of one array, at most: the pictures of two million steps."""
+MAX_BYTES = 1 << 31
+"""Limit for one array: the images of two million steps."""
 
-DENSEST = 1100
-"""Bytes of numbers for each byte in the file, at most: deflate's own bound is 1032, and other filters stay below."""
+MAX_COMPRESSION = 1100
+"""Limit for array bytes per stored byte. Deflate reaches at most 1032, other filters less."""
 
 SLACK = 1 << 16
-"""Bytes that are never too many."""
+"""Array bytes that are always allowed."""
 
 
-def check_claim(stored: h5py.Dataset, place: str) -> None:
-    """Raises BadInput, naming the place, for what are not numbers in this file, or more than it can hold."""
+def check_array(stored: h5py.Dataset, place: str) -> None:
+    """Raise BadInput if the array is not numeric, not stored in this file, or larger than the file can hold."""
     kind = stored.dtype.base if stored.dtype.subdtype else stored.dtype
     if kind.kind not in "biuf" or stored.shape is None:
         raise BadInput(f"{place} is {kind}, expected numbers.")
     if stored.is_virtual or stored.external:
-        raise BadInput(f"{place} lies in another file, expected its numbers in this one.")
-    claimed = math.prod(map(int, stored.shape)) * stored.dtype.itemsize
-    held = stored.id.get_storage_size()
-    if claimed > min(LARGEST, DENSEST * held + SLACK):
-        raise BadInput(f"{place} claims {claimed} bytes of numbers where the file holds {held}.")
+        raise BadInput(f"{place} is stored in another file, expected numbers in this one.")
+    declared = math.prod(map(int, stored.shape)) * stored.dtype.itemsize
+    size = stored.id.get_storage_size()
+    if declared > min(MAX_BYTES, MAX_COMPRESSION * size + SLACK):
+        raise BadInput(f"{place} declares {declared} bytes of numbers, but the file stores {size}.")
 
 
-def numbers(stored: h5py.Dataset, place: str) -> NDArray[Any]:
-    """All of them, after ``check_claim``."""
-    check_claim(stored, place)
+def read_array(stored: h5py.Dataset, place: str) -> NDArray[Any]:
+    """Read an array after ``check_array``."""
+    check_array(stored, place)
     return np.asarray(stored[()])

@@ -1,31 +1,29 @@
-"""The real pushes: a robot's tip pushes a steel block over plywood; estimate where the block is.
+"""MIT Push tasks: estimate the pose of a steel block that a robot's tip pushes over a table.
 
-World axes: those of the robot's base, x away from it, y to its left, z up from the table; m.
+World frame: the robot's base, x forward, y left, z up from the table; m.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beliefscope.datasets.episode import Episode, FloatArray
-from beliefscope.datasets.errors import one_of
-from beliefscope.datasets.simulation.camera import Camera, Picture, RayCaster
-from beliefscope.datasets.task import Component, Ghost, Task
+from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.simulation.camera import Camera, Image, RayCaster
+from beliefscope.datasets.task import Component, Outline, Task
 
 Array = NDArray[np.float64]
 
 RATE = 18  # Hz
-CENTRE = (0.35, -0.03)  # of the table's part that is used, m
-HEIGHT = 0.013  # of every block
-TIP_RADIUS = 0.00475
-TOUCHING = 0.002
-"""A gap that still counts as contact, m: in contact, motion capture and outline disagree by 1 to 2 mm."""
+CENTRE = (0.35, -0.03)  # centre of the workspace on the table, m
+HEIGHT = 0.013  # height of every block, m
+TIP_RADIUS = 0.00475  # m
+CONTACT_GAP = 0.002
+"""Largest gap that counts as contact, m: in contact, motion capture and outline differ by 1 to 2 mm."""
 
-VIEW = 0.2  # half the side of the table's part that a picture shows, m
+VIEW = 0.2  # half side length of the table area in an image, m
 CAMERA = Camera((*CENTRE, 0.8), (0, 0, -1), (1, 0, 0), float(2 * np.arctan(VIEW / 0.8)))
 
 
@@ -50,14 +48,14 @@ OUTLINES: dict[str, Array] = {
     "ellip3": _ellipse(0.0525, 0.0785),
     "hex": 0.0605 * np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], 1),
 }
-"""Shape -> (P, 2) corners of its convex outline in the block's own axes, counter-clockwise, m."""
+"""Shape -> (P, 2) corners of the convex outline in the block's frame, counter-clockwise, m."""
 
 
 def gap(shape: str, poses: Array, tips: Array) -> Array:
-    """(T,) m between the tip's circle and the block's outline, negative where they overlap.
+    """(T,) distance between the tip's circle and the block's outline, m; negative where they overlap.
 
     Args:
-        poses: (T, 3) the block's x, y (m) and yaw (rad). tips: (T, 2) the tip's centre, m; both world.
+        poses: (T, 3) x, y (m) and yaw (rad) of the block, world. tips: (T, 2) centre of the tip, world, m.
     """
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy = (tips - poses[:, :2]).T
@@ -71,7 +69,7 @@ def gap(shape: str, poses: Array, tips: Array) -> Array:
 
 
 def block_model(shape: str) -> mujoco.MjModel:
-    """Table, block and tip. qpos (5): the block's x, y and yaw, the tip's x and y."""
+    """Model of table, block and tip. qpos (5): x, y and yaw of the block, x and y of the tip."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     world = spec.worldbody
@@ -84,7 +82,7 @@ def block_model(shape: str) -> mujoco.MjModel:
     block.add_joint(name="block_yaw", type=hinge, axis=(0, 0, 1))
     outline = OUTLINES[shape]
     _add_prism(spec, block, "block", outline, HEIGHT / 2, (0.82, 0.84, 0.88, 1))
-    # A dark mark off the centre tells in a picture which way the block is turned.
+    # A dark mark off the centre makes the yaw visible in images.
     mark = 0.35 * outline + [0.5 * outline[:, 0].max(), 0.0]
     _add_prism(spec, block, "mark", mark, HEIGHT / 2 + 0.001, (0.12, 0.14, 0.2, 1))
     tip = world.add_body(name="tip", pos=(0, 0, 0.06))
@@ -104,41 +102,41 @@ def _add_prism(
     body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba)
 
 
-def pictures(shape: str, qpos: NDArray[np.floating]) -> Picture:
-    """(T, 32, 32) uint8: the scene at joint positions (T, 5), from above, x upwards and y to the left."""
+def render_images(shape: str, qpos: NDArray[np.floating]) -> Image:
+    """(T, 32, 32) uint8: top views at joint positions (T, 5), x upwards and y to the left."""
     model = block_model(shape)
     data, camera = mujoco.MjData(model), RayCaster(model, CAMERA)
-    taken = np.empty((len(qpos), CAMERA.size, CAMERA.size), np.uint8)
+    images = np.empty((len(qpos), CAMERA.size, CAMERA.size), np.uint8)
     for step, joints in enumerate(qpos):
         data.qpos[:] = joints
         mujoco.mj_kinematics(model, data)
-        taken[step] = camera.picture(data)
-    return taken
+        images[step] = camera.render(data)
+    return images
 
 
 def replay(episode: Episode) -> mujoco.MjModel:
-    """Block and tip of an episode. Raises BadInput where its provenance names no shape that is known."""
+    """Model of an episode's block and tip. Raises BadInput for an unknown shape in its provenance."""
     shape = episode.provenance.get("shape")
     if shape not in OUTLINES:
-        raise one_of("shape", str(shape), OUTLINES)
+        raise unknown_name("shape", str(shape), OUTLINES)
     return block_model(str(shape))
 
 
-def post_ghost(states: ArrayLike) -> Ghost:
-    """A post on the block's centre for states (..., 2) = (x, y): which way the block is turned is not in the state."""
+def post_outline(states: ArrayLike) -> Outline:
+    """Outline of a post at the block's centre for states (..., 2) = (x, y), which lack the yaw."""
     states = np.asarray(states, float)
-    return _ghost(states, np.zeros(states.shape[:-1]), (0.02, 0.02, 2 * HEIGHT))
+    return _outline(states, np.zeros(states.shape[:-1]), (0.02, 0.02, 2 * HEIGHT))
 
 
-def block_ghost(states: ArrayLike) -> Ghost:
-    """The block ``rect1`` for states (..., 3) = (x, y, yaw): see ``Ghost``."""
+def block_outline(states: ArrayLike) -> Outline:
+    """Outline of the block ``rect1`` for states (..., 3) = (x, y, yaw)."""
     states = np.asarray(states, float)
-    return _ghost(states, states[..., 2], (0.09, 0.09, HEIGHT))
+    return _outline(states, states[..., 2], (0.09, 0.09, HEIGHT))
 
 
-def _ghost(states: Array, yaw: Array, size: tuple[float, float, float]) -> Ghost:
+def _outline(states: Array, yaw: Array, size: tuple[float, float, float]) -> Outline:
     zero = np.zeros_like(yaw)
-    return Ghost(
+    return Outline(
         position=np.stack([states[..., 0], states[..., 1], np.full_like(yaw, size[2] / 2)], -1),
         wxyz=np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], -1),
         size=size,
@@ -147,7 +145,6 @@ def _ghost(states: Array, yaw: Array, size: tuple[float, float, float]) -> Ghost
 
 
 def _task(name: str, rate: int, yaw: bool) -> Task:
-    ghost: Callable[[ArrayLike], Ghost] = block_ghost if yaw else post_ghost
     return Task(
         name=name,
         components=(Component("x", "m"), Component("y", "m"), *([Component("yaw", "rad")] if yaw else [])),
@@ -159,7 +156,7 @@ def _task(name: str, rate: int, yaw: bool) -> Task:
         map_half_width=0.135,
         positions={"effector_position": (0, 1), "control": (0, 1)},
         replay=replay,
-        ghost=ghost,
+        outline=block_outline if yaw else post_outline,
         camera=CAMERA,
     )
 
@@ -171,14 +168,14 @@ PUSH_REAL_TASKS = (
     _task("push-real-50hz", 50, yaw=False),
     _task("push-real-yaw-50hz", 50, yaw=True),
 )
-"""The same pushes with the block's yaw as a third component, and at a higher rate."""
+"""Variants of ``push-real`` with the yaw as third state component and at a higher rate."""
 
 
-def observed(tips: Array, force: Array, torque: Array, touching: NDArray[np.bool_]) -> dict[str, FloatArray]:
-    """Haptic observations by key, from the tip (T, 2) m, force (T, 2) N, torque about z (T,) N m, contact (T,).
+def haptic_observations(tips: Array, force: Array, torque: Array, contact: NDArray[np.bool_]) -> dict[str, FloatArray]:
+    """Haptic observations by key, from tips (T, 2) m, force (T, 2) N, torque about z (T,) N m, contact (T,).
 
-    The sensor has three channels: the force across the table and the torque about its normal. The others are zero, so
-    that ``force`` and ``torque`` mean the same in every task. The tip's height was not recorded: half the block's.
+    The sensor has three channels: the force in the table plane and the torque about its normal. The other components
+    of ``force`` and ``torque`` are zero, so that they match the other tasks. The tip's height is half the block's.
     """
     steps = len(tips)
     position = np.column_stack([tips, np.full(steps, HEIGHT / 2)]).astype(np.float32)
@@ -186,5 +183,5 @@ def observed(tips: Array, force: Array, torque: Array, touching: NDArray[np.bool
         "effector_position": position,
         "force": np.column_stack([force, np.zeros(steps)]).astype(np.float32),
         "torque": np.column_stack([np.zeros((steps, 2)), torque]).astype(np.float32),
-        "contact": touching[:, None].astype(np.float32),
+        "contact": contact[:, None].astype(np.float32),
     }

@@ -1,4 +1,4 @@
-"""A small camera that casts rays through the scene: no graphics library, the same picture in every process."""
+"""Ray-casting camera: reproducible images without a graphics library."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-Picture = NDArray[np.uint8]
+Image = NDArray[np.uint8]
 
-_LIGHT = np.array([-0.35, 0.45, 0.82])  # towards the light, world; length one to three digits
+_LIGHT = np.array([-0.35, 0.45, 0.82])  # towards the light, world; unit length to three digits
 _AMBIENT = 0.35
 _LUMA = np.array([0.299, 0.587, 0.114])
 _BACKGROUND = 0.05
@@ -22,9 +22,9 @@ class Camera:
 
     Attributes:
         position: m, world.
-        forward: unit vector of the optical axis, world. up: unit vector towards the top of the picture.
+        forward: unit vector of the optical axis, world. up: unit vector towards the top of the image.
         field_of_view: rad, vertical.
-        size: pixels a side. oversampling: rays a side of each pixel.
+        size: pixels per side. oversampling: rays per side of each pixel.
     """
 
     position: tuple[float, float, float]
@@ -35,7 +35,7 @@ class Camera:
     oversampling: int = 2
 
     def rays(self) -> NDArray[np.float64]:
-        """(R, 3) unit directions, world, row by row from the top left; R = (size x oversampling)^2."""
+        """(R, 3) unit vectors, world, row by row from the top left; R = (size x oversampling)^2."""
         side = self.size * self.oversampling
         ticks = (np.arange(side) + 0.5) / side * 2 - 1
         forward, up = np.array(self.forward), np.array(self.up)
@@ -46,7 +46,7 @@ class Camera:
 
 
 class RayCaster:
-    """Takes pictures of one model. Shading is Lambert's: colour x (ambient + (1 - ambient) max(0, normal . light))."""
+    """Renders a model with Lambertian shading: colour x (ambient + (1 - ambient) max(0, normal . light))."""
 
     def __init__(self, model: mujoco.MjModel, camera: Camera) -> None:
         self._model, self._camera = model, camera
@@ -55,11 +55,11 @@ class RayCaster:
         self._hit = np.zeros(count, np.int32)
         self._distance = np.zeros(count)
         self._normal = np.zeros(3 * count)
-        # One brightness a geom and, at index -1, that of a ray which hits nothing.
+        # Brightness of each geom and, at index -1, of the background.
         self._brightness = np.append(model.geom_rgba[:, :3] @ _LUMA, _BACKGROUND)
 
-    def picture(self, data: mujoco.MjData) -> Picture:
-        """(size, size) uint8 of the present geometry (``mj_kinematics`` must have run)."""
+    def render(self, data: mujoco.MjData) -> Image:
+        """(size, size) uint8 image of the current geometry. Call ``mj_kinematics`` first."""
         origin = np.array(self._camera.position)
         mujoco.mj_multiRay(
             self._model,

@@ -1,4 +1,4 @@
-"""Simulate a set of episodes on all cores; pick up again after a kill."""
+"""Simulate datasets in parallel; resumes if interrupted."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ import beliefscope
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.io.atomic_write import unwritable
-from beliefscope.datasets.readers.hdf5_guard import look_over
+from beliefscope.datasets.io.atomic_write import write_error
+from beliefscope.datasets.readers.hdf5_guard import probe
 from beliefscope.datasets.store import open_dataset, write_dataset
 
 Progress = Callable[[int, int], None]
@@ -36,61 +36,57 @@ def collect(
 ) -> None:
     """Simulate ``episodes`` trajectories of ``steps`` steps into the HDF5 file ``path``.
 
-    Episode i depends on the seed and on i alone, so that the data are the same for any number of workers. Finished
-    episodes are kept in the folder ``<path>.partial`` until all are there: run again after a kill, only the missing
-    ones are simulated. The file itself appears whole, or not at all.
+    Episode i depends only on the seed and on i, so the data do not depend on the number of workers. Finished episodes
+    are stored in the folder ``<path>.partial``: an interrupted call resumes with the missing ones. The file is written
+    atomically.
 
     Args:
         task: name in ``TASKS``.
         seed: not negative.
-        workers: processes; None is one a core.
-        progress: called with (episodes done, episodes in all), at once and after each.
+        workers: number of processes; None: one per core.
+        progress: called with (finished episodes, all episodes) at the start and after each episode.
 
     Raises:
-        BadInput: for an unknown task, a count that is too small, or a place that cannot be written.
+        BadInput: for an unknown or recorded task, a count that is too small, or a path that cannot be written.
     """
-    chosen, path = load_task(task), Path(path)
-    if chosen.simulate is None:
-        raise BadInput(f"Task {task!r} cannot be simulated: its data are recorded ones.")
-    for name, value, least in (("episodes", episodes, 1), ("steps", steps, 2), ("seed", seed, 0)):
-        _require(name, value, least)
-    _require("workers", 1 if workers is None else workers, 1)
-    parts = _Parts(path, task, steps, seed)
-    missing = [i for i in range(episodes) if not parts.holds(i)]
+    path = Path(path)
+    if load_task(task).simulate is None:
+        raise BadInput(f"Task {task!r} cannot be simulated: its data are recorded.")
+    counts = {"episodes": episodes, "steps": steps, "seed": seed, "workers": 1 if workers is None else workers}
+    for (name, value), minimum in zip(counts.items(), (1, 2, 0, 1), strict=True):
+        if value < minimum:
+            raise BadInput(f"{name} is {value}, expected at least {minimum}.")
+    parts = _PartialCollection(path, task, steps, seed)
+    missing = [i for i in range(episodes) if not parts.contains(i)]
     done = episodes - len(missing)
     report = progress or (lambda done, count: None)
     report(done, episodes)
-    # Closed at once when stopped: else the workers would finish everything before the process can end.
-    with closing(_simulated(parts, missing, workers or os.cpu_count() or 1)) as simulated:
-        for _ in simulated:
+    # Close the generator if interrupted: otherwise the workers would finish all episodes first.
+    with closing(_simulate_all(parts, missing, workers or os.cpu_count() or 1)) as results:
+        for _ in results:
             done += 1
             report(done, episodes)
     parts.join(episodes)
 
 
-def _require(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise BadInput(f"{name} is {value}, expected at least {least}.")
-
-
-class _Parts:
-    """The folder of finished episodes: a file each, named after all that it depends on."""
+class _PartialCollection:
+    """Folder of finished episodes, one file each. File names contain everything the episode depends on."""
 
     def __init__(self, path: Path, task: str, steps: int, seed: int) -> None:
         self.task, self.steps, self.seed = task, steps, seed
-        self._whole, self._folder = path, path.with_name(path.name + ".partial")
+        self._path, self._folder = path, path.with_name(path.name + ".partial")
         if path.is_dir():
-            raise BadInput(f"{path} is a folder, expected the name of a file to write.")
+            raise BadInput(f"{path} is a folder, expected a file to write.")
         try:
             self._folder.mkdir(exist_ok=True)
         except FileNotFoundError:
             raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.") from None
         except OSError as error:
-            raise unwritable(path, error) from None
-        look_over(self._folder.glob("*.h5"))  # all at once
+            raise write_error(path, error) from None
+        probe(self._folder.glob("*.h5"))  # in one process
 
-    def holds(self, index: int) -> bool:
-        """Whether this episode is there and undamaged."""
+    def contains(self, index: int) -> bool:
+        """Whether the episode is finished and readable."""
         if not self._part(index).exists():
             return False
         try:
@@ -99,49 +95,49 @@ class _Parts:
             return False
         return True
 
-    def make(self, index: int) -> None:
-        """Simulate this episode."""
+    def simulate(self, index: int) -> None:
+        """Simulate an episode and store it."""
         task = load_task(self.task)
         assert task.simulate is not None
         write_dataset(self._part(index), task, [task.simulate(self.seed, index, self.steps)])
 
     def join(self, episodes: int) -> None:
-        """Make the one file of them, in the folder so that a kill leaves nothing beside it, and drop the folder."""
-        look_over(self._folder.glob("*.h5"))
+        """Write the dataset and remove the folder. Temporary files stay inside the folder if interrupted."""
+        probe(self._folder.glob("*.h5"))
         joined = self._folder / "all.h5"
         write_dataset(joined, load_task(self.task), (self._read(i) for i in range(episodes)))
-        os.replace(joined, self._whole)
+        os.replace(joined, self._path)
         shutil.rmtree(self._folder)
 
     def _part(self, index: int) -> Path:
-        made_by = f"{beliefscope.__version__}-mujoco{mujoco.__version__}"
-        return self._folder / f"{load_task(self.task).name}-seed{self.seed}-steps{self.steps}-{index}-{made_by}.h5"
+        versions = f"{beliefscope.__version__}-mujoco{mujoco.__version__}"
+        return self._folder / f"{load_task(self.task).name}-seed{self.seed}-steps{self.steps}-{index}-{versions}.h5"
 
     def _read(self, index: int) -> Episode:
         with open_dataset(self._part(index)) as part:
             return part[0]
 
 
-def _simulated(parts: _Parts, indices: list[int], workers: int) -> Generator[None, None, None]:
-    """Make the missing parts, yielding after each."""
+def _simulate_all(parts: _PartialCollection, indices: list[int], workers: int) -> Generator[None, None, None]:
+    """Simulate the missing episodes and yield after each."""
     if min(workers, len(indices)) <= 1:
         for index in indices:
-            parts.make(index)
+            parts.simulate(index)
             yield
         return
-    # Spawned, not forked: whoever calls may have threads, and locks held by them would stay locked in a fork.
+    # Spawn instead of fork: locks held by threads of the caller would stay locked in a fork.
     spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(indices)), spawn, _live_with_parent)
+    pool = ProcessPoolExecutor(min(workers, len(indices)), spawn, _exit_with_parent)
     try:
-        for future in as_completed([pool.submit(parts.make, index) for index in indices]):
+        for future in as_completed([pool.submit(parts.simulate, index) for index in indices]):
             future.result()
             yield
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _live_with_parent() -> None:
-    """In a worker: leave Ctrl-C to the parent, and end with it, be it killed, instead of waiting for work forever."""
+def _exit_with_parent() -> None:
+    """Initialize a worker: ignore Ctrl-C and exit when the parent process ends for any reason."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -1,4 +1,4 @@
-"""The hand's controller: a Cartesian impedance whose set point leads the hand, and a posture held in the null space."""
+"""Cartesian impedance controller of the hand with a limited set-point lead and null-space posture control."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Stance:
-    """How the hand is held.
+    """Reference orientation of the hand and posture of the arm.
 
     Attributes:
-        axes: (3, 3) rows of the rotation from the hand's axes to the world's, from which its rotation is measured. The
-            hand points along its own z, its fingers close along its own y.
-        posture: (7,) rad: the joints that the null space returns to.
+        axes: (3, 3) rows of the reference rotation from hand to world. The hand points along its z axis and its fingers
+            close along its y axis.
+        posture: (7,) rad: rest posture of the null-space control.
     """
 
     axes: tuple[tuple[float, float, float], ...]
     posture: tuple[float, ...]
 
 
-# Elbow to the side, hand pointing along +x at the height of a handle: its fingers close vertically.
+# Elbow to the side, hand pointing along +x at handle height, fingers closing vertically.
 FORWARD = Stance(((0, 0, 1), (-1, 0, 0), (0, -1, 0)), (-1.609, -0.615, 1.696, -1.627, 1.782, 3.228, 1.073))
-# Elbow up, hand pointing at the ground half a metre before the robot: its fingers close along y.
+# Elbow up, hand pointing at the ground half a metre in front of the robot, fingers closing along y.
 DOWN = Stance(((1, 0, 0), (0, -1, 0), (0, 0, -1)), (0.0, 0.15, 0.0, -2.35, 0.0, 2.5, 0.785))
 
 
 @dataclass(frozen=True)
 class Impedance:
-    """How the hand is held, how stiffly, and how far ahead it may be sent.
+    """Parameters of the impedance controller.
 
     Attributes:
-        stance: what it is held like.
+        stance: reference orientation and posture.
         stiffness: along world x, y, z, N/m. rotational_stiffness: about each axis, N m/rad.
-        rotational_damping: N m s/rad. posture_stiffness: of each joint, N m/rad.
-        lead: how far the set point may lead the hand, m.
+        rotational_damping: N m s/rad. posture_stiffness: N m/rad per joint.
+        lead: largest distance of the set point from the hand, m.
     """
 
     stance: Stance
@@ -55,7 +55,7 @@ class Impedance:
 def add_controller(spec: mujoco.MjSpec, impedance: Impedance) -> None:
     """Add six Cartesian actuators at the site ``grip`` and a posture servo on every arm joint.
 
-    The effective mass that a stiffness kp acts on is about 4 kg, hence the damping 1.8 sqrt(4 kp).
+    The effective mass for a stiffness kp is about 4 kg, hence the damping 1.8 sqrt(4 kp).
     """
     quaternion = np.zeros(4)
     axes = np.array(impedance.stance.axes, float)
@@ -78,7 +78,7 @@ def add_controller(spec: mujoco.MjSpec, impedance: Impedance) -> None:
 
 
 class HandController:
-    """Moves the hand of one model: ``place`` it, then ``command`` a set point every control step."""
+    """Controls the hand of a model: call ``place`` once, then ``command`` in every control step."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, impedance: Impedance) -> None:
         self._model, self._data, self._lead = model, data, impedance.lead
@@ -94,7 +94,7 @@ class HandController:
         return np.array(self._data.site_xpos[self._grip])
 
     def place(self, position: Vector, yaw: float) -> float:
-        """Put the hand at a pose by damped least squares from the rest posture; returns the error left, m + rad."""
+        """Move the hand to a pose by damped least squares from the rest posture. Returns the residual, m + rad."""
         data, n = self._data, len(ARM_JOINTS)
         data.qpos[:n] = self._rest
         error = np.inf
@@ -115,18 +115,18 @@ class HandController:
         return error
 
     def set_fingers(self, opening: float, squeeze: bool) -> None:
-        """Open each finger by ``opening`` m, then hold it there or, to ``squeeze``, close with the full force."""
+        """Open each finger by ``opening`` m, then hold the opening or ``squeeze`` with full force."""
         self._data.qpos[[self._model.joint(name).qposadr[0] for name in FINGERS]] = opening
         self._data.ctrl[self._model.actuator("gripper").id] = -GRIPPER_OPEN if squeeze else opening
 
     def command(self, target: Vector, yaw: float) -> Vector:
-        """Aim at ``target`` (3,) m, cut to the allowed lead; returns the set point in force."""
+        """Set the target (3,) m, limited to the allowed lead. Returns the active set point."""
         position = self.position
         offset = target - position
         length = float(np.linalg.norm(offset))
         set_point = position + offset * min(1.0, self._lead / max(length, 1e-9))
         self._data.ctrl[self._hand] = [*(self._axes.T @ set_point), *(yaw * self._axes[2])]
-        # Without the projection the posture would pull at the hand with about 10 N.
+        # Without the projection, posture control would pull at the hand with about 10 N.
         jacobian = self._jacobian()
         joints = np.array(self._data.qpos[: len(ARM_JOINTS)])
         null = np.eye(len(ARM_JOINTS)) - np.linalg.pinv(jacobian) @ jacobian

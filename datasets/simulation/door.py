@@ -1,71 +1,51 @@
-"""The door task: estimate where a door's hinge is, and its angle, while a robot pulls or pushes it.
+"""Door task: estimate the hinge position and the angle of a door that a robot pulls or pushes.
 
-World axes: x away from the robot's base, y to its left, z up; m. The closed door stands across x, its hinge to the
+World frame: the robot's base, x forward, y left, z up; m. The closed door is perpendicular to x, with the hinge on the
 robot's right; a positive angle opens it towards the robot.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.controller import FORWARD, Impedance, add_controller
+from beliefscope.datasets.simulation.door_physics import (
+    BAR_OFFSET,
+    HINGE_CENTRE,
+    HINGE_HALF_RANGE,
+    MAX_ANGLE,
+    DoorPhysics,
+)
+from beliefscope.datasets.simulation.door_policies import PullDoor, PushDoor
 from beliefscope.datasets.simulation.panda import ROBOT_BIT, STIFF, WORLD_BIT, add_panda, new_spec
-from beliefscope.datasets.simulation.panda_meshes import dress
+from beliefscope.datasets.simulation.panda_meshes import add_visual_meshes
 from beliefscope.datasets.simulation.sensors import add_touch
 from beliefscope.datasets.simulation.simulate import DT, POSITION_BITS, Scene, episode_rng, quantise, simulate
-from beliefscope.datasets.task import Component, Ghost, Task
+from beliefscope.datasets.task import Component, Outline, Task
 
-HINGE_CENTRE = (0.81, -0.28)
-HINGE_HALF_RANGE = 0.098  # uniform, so that the standard deviation is 5.7 cm
-PANEL_SIZE = (0.04, 0.5, 0.86)  # thickness, width, height
-PANEL_BOTTOM = 0.02
-BAR_HEIGHTS = (0.55, 0.69)
-BAR_OFFSET = 0.085  # from the panel's middle towards the robot
-BAR_RADII = (0.20, 0.46)  # from the hinge, where the bar begins and ends
-MAX_ANGLE = 1.55
+PANEL_SIZE = (0.04, 0.5, 0.86)  # thickness, width, height; m
+PANEL_BOTTOM = 0.02  # m above the floor
+BAR_HEIGHTS = (0.55, 0.69)  # range, m
+BAR_RADII = (0.20, 0.46)  # m from the hinge to both ends of the bar
 SPRING = 1.6  # N m/rad, opens a pushed door for the next push
-SPRING_REST = 2.0  # rad; friction stops the door before it
+SPRING_REST = 2.0  # rad; friction stops the door earlier
 
 CAMERA = Camera((0.50, -0.08, 2.6), (0, 0, -1), (1, 0, 0), float(np.deg2rad(31)))
 IMPEDANCE = Impedance(FORWARD, (1600, 1600, 1200), lead=0.05)
 
 
-@dataclass(frozen=True)
-class DoorPhysics:
-    """What differs between doors.
-
-    Attributes:
-        hinge: (2,) m, world. bar_height: of the handle's bar, m. spring: opens the door, N m/rad; 0 is none.
-    """
-
-    hinge: tuple[float, float]
-    bar_height: float
-    spring: float = 0.0
-
-    def bar_point(self, angle: float, radius: float) -> NDArray[np.float64]:
-        """(3,) m: the point of the bar at ``radius`` m from the hinge, for a door at ``angle`` rad.
-
-        ``hinge + R(angle) (-BAR_OFFSET, radius)``, with R the rotation about z.
-        """
-        c, s = np.cos(angle), np.sin(angle)
-        x, y = self.hinge
-        return np.array([x - BAR_OFFSET * c - radius * s, y - BAR_OFFSET * s + radius * c, self.bar_height])
-
-
-def panel_ghost(states: ArrayLike) -> Ghost:
-    """The door's panel as a box for states (..., 3) = (hinge_x, hinge_y, angle): see ``Ghost``."""
+def panel_outline(states: ArrayLike) -> Outline:
+    """Outline of the door's panel for states (..., 3) = (hinge_x, hinge_y, angle)."""
     x, y, angle = np.moveaxis(np.asarray(states, float), -1, 0)
     half = PANEL_SIZE[1] / 2
     height = np.full_like(x, PANEL_BOTTOM + PANEL_SIZE[2] / 2)
     zero = np.zeros_like(x)
-    return Ghost(
+    return Outline(
         position=np.stack([x - half * np.sin(angle), y + half * np.cos(angle), height], -1),
         wxyz=np.stack([np.cos(angle / 2), zero, zero, np.sin(angle / 2)], -1),
         size=PANEL_SIZE,
@@ -73,23 +53,24 @@ def panel_ghost(states: ArrayLike) -> Ghost:
     )
 
 
-def door_model(physics: DoorPhysics, looks: bool = False) -> mujoco.MjModel:
-    """Robot, door, frame and floor. Joint ``door`` comes last in qpos; bodies are named after what they are.
+def door_model(physics: DoorPhysics, visual: bool = False) -> mujoco.MjModel:
+    """Model of robot, door, frame and floor. Joint ``door`` is last in qpos.
 
-    Looks: with the robot's meshes, where they are installed.
+    Args:
+        visual: add the robot's meshes, if installed.
     """
     spec = new_spec()
     add_panda(spec)
     add_controller(spec, IMPEDANCE)
-    _add_surroundings(spec, physics.hinge)
+    _add_environment(spec, physics.hinge)
     _add_door(spec, physics)
     add_touch(spec, "door")
-    if looks:
-        dress(spec)
+    if visual:
+        add_visual_meshes(spec)
     return spec.compile()
 
 
-def _add_surroundings(spec: mujoco.MjSpec, hinge: tuple[float, float]) -> None:
+def _add_environment(spec: mujoco.MjSpec, hinge: tuple[float, float]) -> None:
     world = spec.worldbody
     world.add_light(pos=(0, 0, 3.5), dir=(0, 0, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     world.add_geom(
@@ -169,28 +150,25 @@ def _replay(episode: Episode) -> mujoco.MjModel:
         raise BadInput(
             "The episode's provenance does not describe its door: expected 'hinge': [x, y] and 'bar_height', in m."
         ) from None
-    return door_model(DoorPhysics((x, y), height), looks=True)
+    return door_model(DoorPhysics((x, y), height), visual=True)
 
 
-def policy_of(index: int) -> str:
-    """Alternates, and swaps every ten, so that every split holds both policies."""
+def policy_name(index: int) -> str:
+    """Policy of a trajectory: alternates with a swap every ten, so that every split contains both policies."""
     return ("pull", "push")[(index + index // 10) % 2]
 
 
 def simulate_door(seed: int, index: int, steps: int) -> Episode:
-    """Trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s, the same on every call."""
-    # Imported here because the policies need this module's door.
-    from beliefscope.datasets.simulation.policies import Pull, Push
-
+    """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
     rng = episode_rng(seed, index)
     hinge = quantise(HINGE_CENTRE + rng.uniform(-HINGE_HALF_RANGE, HINGE_HALF_RANGE, 2), POSITION_BITS)
-    name = policy_of(index)
+    name = policy_name(index)
     spring = 0.0 if name == "pull" else SPRING
     door = DoorPhysics((float(hinge[0]), float(hinge[1])), float(rng.uniform(*BAR_HEIGHTS)), spring)
     return simulate(
         "door",
         Scene(door_model(door), IMPEDANCE, CAMERA),
-        {"pull": Pull, "push": Push}[name](door, rng),
+        {"pull": PullDoor, "push": PushDoor}[name](door, rng),
         lambda qpos: np.concatenate([np.broadcast_to(hinge, (steps, 2)), qpos[:, -1:]], axis=1),
         seed,
         index,
@@ -210,7 +188,7 @@ DOOR = Task(
     map_half_width=0.135,
     positions={"effector_position": (0, 1), "control": (0, 1)},
     replay=_replay,
-    ghost=panel_ghost,
+    outline=panel_outline,
     camera=CAMERA,
     simulate=simulate_door,
 )

@@ -1,7 +1,7 @@
-"""A Franka Panda with its hand, built from Franka's published frames, limits and inertias.
+"""Model of a Franka Panda with hand, built from published frames, limits and inertias.
 
 Link frames follow Craig's modified Denavit-Hartenberg convention: frame i is reached from frame i-1 by
-``RotX(alpha) TransX(a) RotZ(q) TransZ(d)``. Shapes are primitives: they collide, and they are what the camera sees.
+``RotX(alpha) TransX(a) RotZ(q) TransZ(d)``. Shapes are primitives, used for collision and rendering.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ GRIPPER_OPEN = 0.04  # m, travel of each finger
 GRIP_FORCE = 70.0  # N on each finger
 GRIP_OFFSET = 0.1034  # m, from the hand's frame to the point between the fingertips
 
-# The fingers are light: with the usual softness a firm grip would sink centimetres into what it holds.
+# Stiff contacts: with default parameters the light fingers would sink centimetres into a grasped object.
 STIFF = {"solref": (0.008, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 
-# Bits of contype/conaffinity: the robot touches its surroundings but not itself.
+# Bits of contype/conaffinity: the robot collides with its environment but not with itself.
 ROBOT_BIT, WORLD_BIT = 1, 2
 
 # a (m), d (m), alpha (rad) of each joint frame: Franka Control Interface documentation.
@@ -44,8 +44,8 @@ _LIMITS = (
 _EFFORT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # N m
 
 # mass (kg), centre of mass (m), inertia about it (xx, yy, zz, xy, xz, yz; kg m^2), in the link's frame:
-# Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot", RA-L 2019. Link 1 turns about the vertical: how
-# high its centre lies cannot be identified, and does not matter.
+# Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot", RA-L 2019. Link 1 rotates about the vertical, so
+# the height of its centre cannot be identified and has no effect.
 _INERTIAS = (
     (4.970684, (3.875e-3, 2.081e-3, -1.75e-1), (0.70337, 0.70661, 9.117e-3, -1.39e-4, 6.772e-3, 1.9169e-2)),
     (0.646926, (-3.141e-3, -2.872e-2, 3.495e-3), (7.962e-3, 2.811e-2, 2.5995e-2, -3.925e-3, 1.0254e-2, 7.04e-4)),
@@ -68,7 +68,7 @@ _INERTIAS = (
     (0.735522, (1.0517e-2, -4.252e-3, 6.1597e-2), (1.2516e-2, 1.0027e-2, 4.815e-3, -4.28e-4, -1.196e-3, -7.41e-4)),
 )
 
-# Capsules of each link (from, to, radius), m, in the link's frame; the first is the fixed base.
+# Capsules of each link (from, to, radius), m, in the link's frame; the first entry is the fixed base.
 _CAPSULES: tuple[tuple[tuple[tuple[float, ...], tuple[float, ...], float], ...], ...] = (
     (((-0.06, 0, 0.06), (0, 0, 0.08), 0.075),),
     (((0, 0, -0.19), (0, 0, -0.05), 0.062),),
@@ -87,19 +87,19 @@ _PAD = (0.95, 0.55, 0.15, 1.0)
 
 
 def new_spec() -> mujoco.MjSpec:
-    """An empty scene with the solver settings that stiff grasps need."""
+    """Return an empty scene with solver settings for stiff grasps."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep = 0.004
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
-    spec.option.noslip_iterations = 3  # or a held bar creeps out of the fingers
+    spec.option.noslip_iterations = 3  # otherwise a grasped bar slips out of the fingers
     return spec
 
 
 def add_panda(spec: mujoco.MjSpec) -> None:
-    """Add the arm at the world's origin with hand, fingers, and wrist sensors.
+    """Add the arm with hand, fingers and wrist sensors at the world's origin.
 
     Bodies ``link0`` .. ``link7``, ``hand``, ``finger_left``, ``finger_right``; joints ``joint1`` .. ``joint7``,
     ``finger_left``, ``finger_right``; sites ``wrist`` (the force/torque sensor) and ``grip`` (between the fingertips);
@@ -179,7 +179,7 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
             friction=(1.5, 0.02, 1e-4),
             **touch,
         )
-        # A rounded tip: pushing with a box's corner makes the contact jump.
+        # Rounded tip: contact points jump when pushing with the corner of a box.
         finger.add_geom(
             type=sphere,
             pos=(0, side * 0.011, 0.05),

@@ -1,6 +1,6 @@
-"""The Panda as it looks, where the optional package with its meshes is installed: for replays, never for the camera.
+"""Visual meshes of the Panda for replays, if the optional package gymnasium-robotics is installed.
 
-The meshes are Franka's, as gymnasium-robotics carries them. Their files are read; the package is not imported.
+The camera never sees them. The mesh files are read without importing the package.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from beliefscope.datasets.errors import BadInput
 
 PACKAGE = "gymnasium_robotics"
 FOLDER = Path("envs", "assets", "kitchen_franka", "franka_assets", "meshes", "visual")
-CELL = 0.005  # m: what lies in one cell becomes one vertex; a fifth of the faces is left, and nobody sees it from afar
+CELL = 0.005  # m: vertices within a cell are merged, which keeps a fifth of the faces
 MESHES = {f"link{i}": f"link{i}" for i in range(8)} | {
     "hand": "hand",
     "finger_left": "finger",
     "finger_right": "finger",
 }
-"""Body of our Panda -> its mesh."""
+"""Body -> mesh."""
 HIDDEN_GROUP = 3
-"""Geoms of groups from 3 on are not drawn, by MuJoCo's own viewers as by the page."""
+"""Geoms of this group and above are not drawn by MuJoCo's viewers and the page."""
 
 _DARK, _WHITE = (0.25, 0.27, 0.3, 1.0), (0.92, 0.93, 0.94, 1.0)
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -33,16 +33,16 @@ _STL_HEADER = 84  # bytes, the last four the number of faces
 
 
 def mesh_folder() -> Path | None:
-    """Where the meshes are, or None where they are not installed."""
-    found = importlib.util.find_spec(PACKAGE)
-    for place in (found and found.submodule_search_locations) or ():
+    """Folder of the meshes, or None if they are not installed."""
+    package = importlib.util.find_spec(PACKAGE)
+    for place in (package and package.submodule_search_locations) or ():
         if (Path(place) / FOLDER).is_dir():
             return Path(place) / FOLDER
     return None
 
 
-def dress(spec: mujoco.MjSpec) -> None:
-    """Put the meshes over the Panda's own shapes, which stay where they are but are not drawn. Or do nothing."""
+def add_visual_meshes(spec: mujoco.MjSpec) -> None:
+    """Add the meshes, if installed, and hide the collision shapes of the Panda."""
     folder = mesh_folder()
     if folder is None:
         return
@@ -67,9 +67,9 @@ def dress(spec: mujoco.MjSpec) -> None:
 
 @cache
 def read_stl(path: Path) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices (V, 3), m, and faces (F, 3) of a binary STL file, vertices within a ``CELL`` joined to one.
+    """Vertices (V, 3), m, and faces (F, 3) of a binary STL file. Vertices within a ``CELL`` are merged.
 
-    Raises BadInput for what is not such a file.
+    Raises BadInput for other files.
     """
     data = path.read_bytes()
     count = int.from_bytes(data[_STL_HEADER - 4 : _STL_HEADER], "little")
@@ -83,5 +83,5 @@ def read_stl(path: Path) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     vertices = np.zeros((len(shared), 3))
     np.add.at(vertices, joined, corners)
     faces = joined.reshape(-1, 3)
-    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return (vertices / shared[:, None]).astype(np.float32), np.unique(faces[whole], axis=0).astype(np.int32)
+    valid = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return (vertices / shared[:, None]).astype(np.float32), np.unique(faces[valid], axis=0).astype(np.int32)

@@ -1,4 +1,4 @@
-"""Where every body of an episode's model was, from the recorded joint positions."""
+"""Body poses of an episode's model from the recorded joint positions."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Replay:
-    """One episode's model and the poses of its B bodies (body 0 is the world).
+    """Model of an episode and the poses of its B bodies (body 0 is the world).
 
     Attributes:
-        model: ``mujoco.MjModel`` of its own, which whoever draws it may change.
+        model: a ``mujoco.MjModel`` that callers may modify.
         positions: (T, B, 3) m, world. rotations: (T, B, 3, 3), body to world.
     """
 
@@ -31,31 +31,31 @@ class Replay:
 
 
 def replay(task: Task, episode: Episode) -> Replay | None:
-    """The whole replay of an episode (some 10 ms for 800 steps), or None where the task or the episode has none.
+    """Replay an episode (about 10 ms for 800 steps). None without joint positions or a model of the task.
 
-    Raises BadInput as ``model_of``.
+    Raises BadInput like ``replay_model``.
     """
-    model = model_of(task, episode)
-    return None if model is None else Replay(model, *poses(model, episode.qpos))
+    model = replay_model(task, episode)
+    return None if model is None else Replay(model, *body_poses(model, episode.qpos))
 
 
-def model_of(task: Task, episode: Episode) -> Any:
-    """The ``mujoco.MjModel`` of an episode, or None where the task or the episode has none.
+def replay_model(task: Task, episode: Episode) -> Any:
+    """The ``mujoco.MjModel`` of an episode. None without joint positions or a model of the task.
 
-    Raises BadInput where the joint positions are not those of the task's model.
+    Raises BadInput if the joint positions do not match the model.
     """
     if task.replay is None or episode.qpos.shape[1] == 0:
         return None
     model = task.replay(episode)
     if episode.qpos.shape[1] != model.nq:
         raise BadInput(
-            f"The episode's 'qpos' has {episode.qpos.shape[1]} joint positions a step; the model of task {task.name!r} "
+            f"The episode's 'qpos' has {episode.qpos.shape[1]} joint positions per step; the model of {task.name!r} "
             f"has {model.nq}."
         )
     return model
 
 
-def poses(model: Any, qpos: NDArray[np.floating]) -> tuple[Array, Array]:
+def body_poses(model: Any, qpos: NDArray[np.floating]) -> tuple[Array, Array]:
     """Positions (T, B, 3), m, and rotations (T, B, 3, 3), body to world, of all bodies at joint positions (T, nq)."""
     data = mujoco.MjData(model)
     positions = np.empty((len(qpos), model.nbody, 3))

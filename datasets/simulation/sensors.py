@@ -1,4 +1,4 @@
-"""What the robot feels: force and torque at the wrist, and touch."""
+"""Haptic sensors: force and torque at the wrist, and contact."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Vector = NDArray[np.float64]
 
 
 def add_touch(spec: mujoco.MjSpec, body: str) -> None:
-    """Add the sensor ``contact``, between the hand with its fingers and a body."""
+    """Add the sensor ``contact`` between the hand (with fingers) and a body."""
     touch = spec.add_sensor(
         name="contact",
         type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -19,8 +19,8 @@ def add_touch(spec: mujoco.MjSpec, body: str) -> None:
         reftype=mujoco.mjtObj.mjOBJ_XBODY,
         refname=body,
     )
-    found, force = int(mujoco.mjtConDataField.mjCONDATA_FOUND), int(mujoco.mjtConDataField.mjCONDATA_FORCE)
-    touch.intprm = [1 << found | 1 << force, 3, 1]  # fields; reduce to the net force; one slot
+    count, force = int(mujoco.mjtConDataField.mjCONDATA_FOUND), int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+    touch.intprm = [1 << count | 1 << force, 3, 1]  # fields; reduce to the net force; one slot
 
 
 class HandSensors:
@@ -35,10 +35,10 @@ class HandSensors:
         self._contact = starts["contact"]
 
     def wrench(self) -> Vector:
-        """(6,) N and N m, world axes, about the wrist: what the surroundings do to the hand.
+        """(6,) N and N m, world axes: wrench of the environment on the hand, about the wrist.
 
-        The raw sensor gives what link 7 does to the hand. That includes carrying the hand's weight, which it reads
-        even while the weight is compensated; the surroundings' part is the opposite of the rest.
+        The raw sensor measures the wrench of link 7 on the hand, including the hand's weight even with gravity
+        compensation. Without the weight, the wrench of the environment is its negative.
         """
         data = self._data
         axes = data.site_xmat[self._wrist].reshape(3, 3)
@@ -50,5 +50,5 @@ class HandSensors:
         return -np.concatenate([force, torque])
 
     def touching(self) -> bool:
-        """Whether the hand, its fingers included, touches the object."""
+        """Whether the hand or its fingers touch the object."""
         return bool(self._data.sensordata[self._contact] > 0)

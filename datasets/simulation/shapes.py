@@ -1,4 +1,4 @@
-"""The shapes of a MuJoCo model as points, for whoever draws it without MuJoCo: in a figure, in a recording."""
+"""Geometry of a MuJoCo model as points, for drawing it in figures and recordings."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Shape:
-    """One geom of a model.
+    """A geom of a model.
 
     Attributes:
-        body: index of the body it moves with. name: that body's.
-        points: (V, 3) m, in the body's frame. faces: (F, 3) of a mesh; None: it is the convex hull of its points.
+        body: index of its body. name: name of its body.
+        points: (V, 3) m, in the body's frame. faces: (F, 3) of a mesh; None: convex hull of the points.
         rgba: (4,) 0..1.
     """
 
@@ -39,29 +39,30 @@ class Shape:
     rgba: Array
 
 
-def shapes(model: Any, looks: bool = True) -> list[Shape]:
-    """Every shape of a model (``mujoco.MjModel``) but its planes.
+def shapes(model: Any, visual: bool = True) -> list[Shape]:
+    """All shapes of a model (``mujoco.MjModel``) except planes.
 
     Args:
-        looks: those that are seen, meshes among them; else those that collide, which are there whatever is installed.
+        visual: return visual shapes, including meshes; otherwise collision shapes, which need no optional package.
     """
-    found = []
+    result = []
     for geom in range(model.ngeom):
         kind, body = int(model.geom_type[geom]), int(model.geom_bodyid[geom])
         hidden = model.geom_group[geom] >= HIDDEN_GROUP
-        dressed = not (model.geom_contype[geom] or model.geom_conaffinity[geom]) and kind == mujoco.mjtGeom.mjGEOM_MESH
-        if kind == mujoco.mjtGeom.mjGEOM_PLANE or (hidden if looks else dressed):
+        collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
+        mesh_only = kind == mujoco.mjtGeom.mjGEOM_MESH and not collides
+        if kind == mujoco.mjtGeom.mjGEOM_PLANE or (hidden if visual else mesh_only):
             continue
-        points, faces = _of(model, geom, kind)
+        points, faces = _points(model, geom, kind)
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
         placed = points @ turn.reshape(3, 3).T + model.geom_pos[geom]
-        found.append(Shape(body, model.body(body).name, placed, faces, model.geom_rgba[geom].astype(float)))
-    return found
+        result.append(Shape(body, model.body(body).name, placed, faces, model.geom_rgba[geom].astype(float)))
+    return result
 
 
-def _of(model: Any, geom: int, kind: int) -> tuple[Array, NDArray[np.int32] | None]:
-    """Points in the geom's frame, and a mesh's faces."""
+def _points(model: Any, geom: int, kind: int) -> tuple[Array, NDArray[np.int32] | None]:
+    """Points in the geom's frame, and the faces of a mesh."""
     size, types = model.geom_size[geom].astype(float), mujoco.mjtGeom
     if kind == types.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]

@@ -1,4 +1,4 @@
-"""The loop of every simulated trajectory: the policy decides, the controller acts, sensors and camera record."""
+"""Simulation loop: policy, controller, sensors and camera."""
 
 from __future__ import annotations
 
@@ -13,50 +13,50 @@ from numpy.typing import NDArray
 
 import beliefscope
 from beliefscope.datasets.episode import Episode, FloatArray
-from beliefscope.datasets.simulation.camera import Camera, Picture, RayCaster
+from beliefscope.datasets.simulation.camera import Camera, Image, RayCaster
 from beliefscope.datasets.simulation.controller import HandController, Impedance
 from beliefscope.datasets.simulation.panda import ARM_JOINTS, FINGERS
 from beliefscope.datasets.simulation.sensors import HandSensors
 
 Vector = NDArray[np.float64]
 
-DT = 0.1  # s, of a step
-SETTLING_STEPS = 5  # before the record begins, so that a grasp has closed
-TURN = 0.05  # rad that the hand turns in a step, at most
-ROBOT_JOINTS = len(ARM_JOINTS) + len(FINGERS)  # they come first in qpos; the object's follow
+DT = 0.1  # s per step
+SETTLING_STEPS = 5  # before recording starts, to close the grasp
+MAX_TURN = 0.05  # largest rotation of the hand per step, rad
+ROBOT_JOINTS = len(ARM_JOINTS) + len(FINGERS)  # first in qpos, followed by those of the object
 
-# The sensors' resolution, in powers of two so that the values compress: 15 um, 1 mN, 61 uN m, 15 urad.
+# Sensor resolution in bits, powers of two for better compression: 15 um, 1 mN, 61 uN m, 15 urad.
 POSITION_BITS, FORCE_BITS, TORQUE_BITS, ANGLE_BITS = 16, 10, 14, 16
 
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where to send the hand (m, world), how fast the set point goes (m/s), and how many steps it waits there."""
+    """Target of the hand (m, world), speed of the set point (m/s) and steps to wait at the target."""
 
     position: Vector
     speed: float
     wait: int
 
     def steps(self, start: Vector) -> int:
-        """Steps until the next waypoint: the way at this speed, at most 4 s of it, and the wait.
+        """Number of steps until the next waypoint: at most 4 s of motion, and the wait.
 
-        Time, not arrival, ends a waypoint: against a door at its stop the hand would never arrive.
+        A waypoint ends by time, because the hand never arrives if the door is at its stop.
         """
-        way = float(np.linalg.norm(self.position - start))
-        return 1 + min(40, int(way / (DT * self.speed))) + self.wait
+        offset = float(np.linalg.norm(self.position - start))
+        return 1 + min(40, int(offset / (DT * self.speed))) + self.wait
 
     def approach(self, point: Vector, duration: float) -> Vector:
-        """(3,) m: ``point`` moved towards the waypoint for ``duration`` s."""
-        way = self.position - point
-        return point + way * min(1.0, self.speed * duration / max(float(np.linalg.norm(way)), 1e-9))
+        """(3,) m: ``point`` after moving towards the waypoint for ``duration`` s."""
+        offset = self.position - point
+        return point + offset * min(1.0, self.speed * duration / max(float(np.linalg.norm(offset)), 1e-9))
 
 
 class Policy(Protocol):
-    """Moves the hand. ``joints`` are the object's: what follows the robot's in qpos (rad, m, unit quaternions).
+    """Motion of the hand. ``joints`` are the object's part of qpos (rad, m, unit quaternions).
 
     Attributes:
-        object_start: (j,) the object's joints at the start.
-        fingers: m of opening of each finger at the start. squeeze: whether they then close with their full force.
+        object_start: (j,) initial joints of the object.
+        fingers: initial opening of each finger, m. squeeze: whether the fingers close with full force.
     """
 
     object_start: Vector
@@ -64,22 +64,21 @@ class Policy(Protocol):
     squeeze: bool
 
     def start(self) -> Vector:
-        """(3,) m, world: where the hand starts."""
+        """(3,) m, world: initial position of the hand."""
 
     def next(self, joints: Vector) -> Waypoint:
-        """The next waypoint, whenever one is over."""
+        """The next waypoint, requested when the previous one ends."""
 
     def yaw(self, joints: Vector) -> float:
-        """rad: how the hand should be turned about the vertical."""
+        """rad: desired rotation of the hand about the vertical."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What the loop is given of a task.
+    """Simulated scene of a task.
 
     Attributes:
-        model: the robot and one object.
-        impedance: of the hand, as given to ``add_controller``. camera: what takes the pictures.
+        model: robot and object. impedance: as passed to ``add_controller``. camera: camera of the images.
     """
 
     model: mujoco.MjModel
@@ -88,7 +87,7 @@ class Scene:
 
 
 def episode_rng(seed: int, index: int) -> Generator:
-    """All randomness of trajectory ``index`` of the collection with ``seed``."""
+    """Random number generator of trajectory ``index`` of the collection with ``seed``."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
 
 
@@ -102,11 +101,11 @@ def simulate(
     steps: int,
     provenance: Mapping[str, Any],
 ) -> Episode:
-    """Trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s.
+    """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s.
 
     Args:
-        states: (T, nq) recorded joint positions -> (T, n) true states.
-        provenance: what the replay needs, and what else is worth knowing, as JSON values.
+        states: (T, nq) joint positions -> (T, n) true states.
+        provenance: replay parameters and other metadata, JSON values.
     """
     log = _run(scene, policy, steps)
     effector = quantise(np.stack(log.effector), POSITION_BITS)
@@ -139,7 +138,7 @@ def simulate(
 
 
 def split_of(index: int) -> str:
-    """Of every ten trajectories, number 8 is for validation and number 9 for the test."""
+    """Of every ten trajectories, number 8 is for validation and number 9 for testing."""
     return {8: "val", 9: "test"}.get(index % 10, "train")
 
 
@@ -149,7 +148,7 @@ def quantise(values: NDArray[np.float64], bits: int) -> FloatArray:
 
 
 def hand_controls(position: FloatArray, touch: FloatArray) -> FloatArray:
-    """(T, 7): previous hand position (T, 3), its change, touch (T, 1); the position before step 0 is that of step 0."""
+    """(T, 7): previous hand position (T, 3), its change, touch (T, 1). The position before step 0 equals step 0."""
     previous = np.concatenate([position[:1], position[:-1]])
     return np.concatenate([previous, position - previous, touch], axis=1)
 
@@ -166,9 +165,9 @@ def random_wait(rng: Generator) -> int:
 
 @dataclass
 class _Log:
-    """One entry a step. ``wrench`` is the mean over the step; ``contact`` is true if there was any during it."""
+    """One entry per step. ``wrench`` is the mean over the step; ``contact`` is true for any contact during the step."""
 
-    image: list[Picture] = field(default_factory=list)
+    image: list[Image] = field(default_factory=list)
     effector: list[Vector] = field(default_factory=list)
     wrench: list[Vector] = field(default_factory=list)
     contact: list[bool] = field(default_factory=list)
@@ -184,7 +183,7 @@ def _run(scene: Scene, policy: Policy, steps: int) -> _Log:
 
     data.qpos[ROBOT_JOINTS:] = policy.object_start
     yaw = policy.yaw(policy.object_start)
-    # One push of a door in eighty would start out of reach. It then starts as near as the arm gets, and goes on.
+    # About one door push in eighty starts out of reach; the arm then starts as close as possible.
     controller.place(policy.start(), yaw)
     controller.set_fingers(policy.fingers, policy.squeeze)
     mujoco.mj_forward(model, data)
@@ -193,22 +192,22 @@ def _run(scene: Scene, policy: Policy, steps: int) -> _Log:
         controller.command(set_point, yaw)
         mujoco.mj_step(model, data, substeps)
 
-    waypoint, left = Waypoint(set_point, 0.0, 0), 0
+    waypoint, remaining = Waypoint(set_point, 0.0, 0), 0
     for _ in range(steps):
         joints = np.array(data.qpos[ROBOT_JOINTS:])
-        if left == 0:
+        if remaining == 0:
             waypoint = policy.next(joints)
-            left = waypoint.steps(set_point)
-        left -= 1
+            remaining = waypoint.steps(set_point)
+        remaining -= 1
         set_point = controller.command(waypoint.approach(set_point, DT), yaw)
-        yaw += float(np.clip(policy.yaw(joints) - yaw, -TURN, TURN))
+        yaw += float(np.clip(policy.yaw(joints) - yaw, -MAX_TURN, MAX_TURN))
         wrench, touched = np.zeros(6), False
         for _ in range(substeps):
             mujoco.mj_step(model, data)
             wrench += sensors.wrench() / substeps
             touched |= sensors.touching()
         mujoco.mj_kinematics(model, data)
-        log.image.append(camera.picture(data))
+        log.image.append(camera.render(data))
         log.effector.append(controller.position)
         log.wrench.append(wrench)
         log.contact.append(touched)

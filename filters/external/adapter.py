@@ -1,6 +1,6 @@
-"""What a filter from outside says at a step, and in which units: its adapter, and the checks of what it gives.
+"""Conventions of an external filter: its adapter, unit conversion, and validation of its output.
 
-All is in SI units and in the task's order of components, unless an ``Adapter`` says otherwise.
+Values are in SI units and in the task's order of components, unless an ``Adapter`` defines others.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.belief import Gaussian, moments
 
@@ -22,7 +22,7 @@ SHAPES = {
     "modality_mean": "Kn",
     "modality_covariance": "Knn",
     "weights": "KW",
-    "acting": "KW",
+    "effective_weights": "KW",
     "predicted_mean": "Kn",
     "predicted_covariance": "Knn",
     "observation_mean": "Kn",
@@ -33,30 +33,30 @@ SHAPES = {
     "log_likelihood": "KM",
     "ancestors": "M",
 }
-"""What a filter may say of a step, by the names of ``Trace``; its shape after N, in the letters of the conventions."""
+"""Values that a filter can return for a step, by the names of ``Trace``; their shapes after N (docs/conventions.md)."""
 
 PAIRS = (("modality_mean", "modality_covariance"), ("particles", "log_weights"))
-"""What comes together or not at all."""
+"""Values that require each other."""
 
 Values = dict[str, Tensor]
 
 
 def unchanged(observations: dict[str, Tensor], controls: Tensor) -> tuple[Any, Any]:
-    """What a module is called with, where it takes the task's own."""
+    """The default ``Adapter.inputs``: the task's observations and controls."""
     return observations, controls
 
 
 @dataclass(frozen=True)
 class Adapter:
-    """How a module is spoken to that does not speak SI units, or names things in its own way.
+    """Conventions of a module that differ from the task's: units, names and order.
 
     Attributes:
-        module: that follows the contract, in its own units.
-        components: names of its state's components in its own order; without them, the task's.
+        module: follows the contract, in its own units.
+        components: names of its state's components in its own order; by default the task's.
         mean, std: (n,) m and rad, in its order: its states are ``(state - mean) / std``.
-        inputs: observations by key and controls, SI units -> those that the module is called with.
+        inputs: observations by key and controls, SI units -> arguments of the module.
         modalities: names of its K measurement models, in order.
-        task: name of the task that it is for. Only a server needs it, which is not told otherwise.
+        task: name of its task; needed by a server if not given elsewhere.
     """
 
     module: nn.Module
@@ -69,39 +69,39 @@ class Adapter:
 
 
 class Units:
-    """From the task's SI units and order of components to a module's own, and back."""
+    """Conversion between the task's SI units and order of components and a module's own."""
 
     def __init__(self, task: Task, adapter: Adapter) -> None:
         names = [component.name for component in task.components]
         components = tuple(adapter.components) or tuple(names)
         if sorted(components) != sorted(names):
-            wrong = next((name for name in components if name not in names), None)
-            if wrong is not None:
-                raise one_of(f"component of task {task.name!r}", wrong, names)
+            unknown = next((name for name in components if name not in names), None)
+            if unknown is not None:
+                raise unknown_name(f"component of task {task.name!r}", unknown, names)
             raise BadInput(
                 f"Adapter's components are {', '.join(components)}; task {task.name!r} has {', '.join(names)}"
             )
         for name, numbers in (("mean", adapter.mean), ("std", adapter.std)):
             if len(numbers) not in (0, len(names)):
-                raise BadInput(f"Adapter's {name} has {len(numbers)} numbers, expected {len(names)}: one a component")
+                raise BadInput(f"Adapter's {name} has {len(numbers)} numbers, expected {len(names)}: one per component")
         if not all(std > 0 for std in adapter.std):
             raise BadInput(f"Adapter's std is {tuple(adapter.std)}, expected numbers above 0")
         self.order = [components.index(name) for name in names]
-        self.back = [names.index(name) for name in components]
+        self.inverse = [names.index(name) for name in components]
         self.mean = torch.tensor(adapter.mean or [0.0] * len(names), dtype=torch.float64)[self.order]
         self.std = torch.tensor(adapter.std or [1.0] * len(names), dtype=torch.float64)[self.order]
 
-    def of_start(self, belief: Gaussian, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """SI units -> the module's, mean (N, n) and covariance (N, n, n)."""
+    def from_si(self, belief: Gaussian, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Mean (N, n) and covariance (N, n, n) of a belief in SI units, in the module's units."""
         mean = (belief.mean.double() - self.mean) / self.std
         covariance = belief.covariance.double() / self.std / self.std[:, None]
-        return mean[:, self.back].to(dtype), covariance[:, self.back][:, :, self.back].contiguous().to(dtype)
+        return mean[:, self.inverse].to(dtype), covariance[:, self.inverse][:, :, self.inverse].contiguous().to(dtype)
 
     def to_si(self, values: Values) -> Values:
         """The module's units -> SI; all but indices as float32."""
-        return {name: self._one(name, value) for name, value in values.items()}
+        return {name: self._convert(name, value) for name, value in values.items()}
 
-    def _one(self, name: str, value: Tensor) -> Tensor:
+    def _convert(self, name: str, value: Tensor) -> Tensor:
         if name == "ancestors":
             return value.int()
         value = value.double()
@@ -114,54 +114,54 @@ class Units:
         return value.float()
 
 
-def named(said: Any, source: str) -> Values:
-    """What a module returned, by name."""
-    if isinstance(said, Tensor):
-        said = {"estimate_mean": said}
-    elif isinstance(said, tuple) and len(said) == 2:
-        said = dict(zip(("estimate_mean", "estimate_covariance"), said, strict=True))
-    if not isinstance(said, Mapping):
+def named_values(output: Any, source: str) -> Values:
+    """A module's return value, by name."""
+    if isinstance(output, Tensor):
+        output = {"estimate_mean": output}
+    elif isinstance(output, tuple) and len(output) == 2:
+        output = dict(zip(("estimate_mean", "estimate_covariance"), output, strict=True))
+    if not isinstance(output, Mapping):
         raise BadInput(
-            f"{source} returns a {type(said).__name__}, expected a mean, a pair of mean and covariance, or a dict"
+            f"{source} returns a {type(output).__name__}, expected a mean, a pair of mean and covariance, or a dict"
         )
-    for name, value in said.items():
+    for name, value in output.items():
         if name not in SHAPES:
-            raise one_of("value of a filter", str(name), SHAPES)
+            raise unknown_name("value of a filter", str(name), SHAPES)
         if not isinstance(value, Tensor):
             raise BadInput(f"{source} returns {name} as a {type(value).__name__}, expected a Tensor")
-    if "estimate_mean" not in said:
-        raise BadInput(f"{source} returns {', '.join(said) or 'nothing'}, but not estimate_mean")
+    if "estimate_mean" not in output:
+        raise BadInput(f"{source} returns {', '.join(output) or 'nothing'}, but not estimate_mean")
     for pair in PAIRS:
-        there = [name for name in pair if name in said]
-        if len(there) == 1:
-            raise BadInput(f"{source} returns {there[0]} alone, expected both {pair[0]} and {pair[1]}, or neither")
-    return {name: value.detach().cpu().clone() for name, value in said.items()}
+        present = [name for name in pair if name in output]
+        if len(present) == 1:
+            raise BadInput(f"{source} returns only {present[0]}, expected both {pair[0]} and {pair[1]}, or neither")
+    return {name: value.detach().cpu().clone() for name, value in output.items()}
 
 
-def checked(values: Values, leading: Sequence[int], sizes: dict[str, int], who: str) -> Values:
-    """The values, if shapes agree with each other and with those before, and no number is missing.
+def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], source: str) -> Values:
+    """Returns the values. Raises BadInput for inconsistent shapes and numbers that are not finite.
 
     Args:
-        leading: expected sizes of the axes before those in ``SHAPES``. sizes: of the letters that are known; those that
-            are new are added.
+        leading: expected sizes of the axes before those in ``SHAPES``. sizes: of the axes' letters; extended by those
+            that occur for the first time.
     """
     for name, value in values.items():
-        found, letters = tuple(value.shape), SHAPES[name]
+        shape, letters = tuple(value.shape), SHAPES[name]
         expected = (*leading, *(sizes.get(letter, letter) for letter in letters))
-        fits = len(found) == len(expected) and all(
-            isinstance(e, str) or e == f for f, e in zip(found, expected, strict=True)
+        fits = len(shape) == len(expected) and all(
+            isinstance(e, str) or e == f for f, e in zip(shape, expected, strict=True)
         )
-        if not fits or ("W" in letters and found[-1] not in (1, sizes["n"])):
-            shown = ", ".join(str(size) for size in expected)
-            raise BadInput(f"{who} gives {name} of shape {found}, expected ({shown})")
-        sizes |= dict(zip(letters, found[len(leading) :], strict=True))
+        if not fits or ("W" in letters and shape[-1] not in (1, sizes["n"])):
+            text = ", ".join(str(size) for size in expected)
+            raise BadInput(f"{source} returns {name} of shape {shape}, expected ({text})")
+        sizes |= dict(zip(letters, shape[len(leading) :], strict=True))
         if value.isnan().any() or (not name.startswith(("log_", "prior_")) and not torch.isfinite(value).all()):
-            raise BadInput(f"{who} gives {name} with a number that is not finite")
+            raise BadInput(f"{source} returns {name} with a number that is not finite")
     return values
 
 
 def derived(values: Values) -> Values:
-    """Adds what follows: moments of particles, and what each measurement model alone makes of them."""
+    """Adds derived values: moments of the particles, and each measurement model's own posterior."""
     particles = values.get("particles")
     if particles is None:
         return values
@@ -171,7 +171,7 @@ def derived(values: Values) -> Values:
     if "estimate_covariance" not in values:
         values["estimate_covariance"] = moments(particles, values["log_weights"]).covariance
     if {"log_likelihood", "prior_log_weights"} <= values.keys() and "modality_mean" not in values:
-        alone = torch.log_softmax(values["prior_log_weights"].unsqueeze(-2) + values["log_likelihood"], dim=-1)
-        each = moments(particles.unsqueeze(-3), alone)
-        values["modality_mean"], values["modality_covariance"] = each.mean, each.covariance
+        log_weights = torch.log_softmax(values["prior_log_weights"].unsqueeze(-2) + values["log_likelihood"], dim=-1)
+        posterior = moments(particles.unsqueeze(-3), log_weights)
+        values["modality_mean"], values["modality_covariance"] = posterior.mean, posterior.covariance
     return values

@@ -1,18 +1,19 @@
-"""Reads what a filter with torchfilter's interface knows while it steps, by hooks that are gone afterwards.
+"""Reads intermediate results of filters with torchfilter's interface through temporary hooks.
 
-Read are public names of torchfilter, and of the crossmodal filters that the paper's authors built upon it; what is
-called the same elsewhere is read the same:
+It uses public attributes of torchfilter, and of the paper authors' crossmodal filters built on it; other filters with
+the same attributes work as well:
 
-* particle filters: ``particle_states``, ``particle_log_weights``, ``measurement_model``; where that one fuses several,
-  its ``measurement_models``.
-* Kalman filters: ``belief_mean``, ``belief_covariance``, ``virtual_sensor_model`` or ``measurement_model``; where the
+* particle filters: ``particle_states``, ``particle_log_weights``, ``measurement_model``; if that fuses several, its
+  ``measurement_models``.
+* Kalman filters: ``belief_mean``, ``belief_covariance``, ``virtual_sensor_model`` or ``measurement_model``; if the
   virtual sensor fuses several, its own ``virtual_sensor_model``.
-* several Kalman filters that are fused: ``filter_models``; the fused covariance as ``belief_covariance`` or
+* fused Kalman filters: ``filter_models``; the fused covariance as ``belief_covariance`` or
   ``state_covariance_estimate``.
-* ``crossmodal_weight_model``, wherever it sits: gives (N, K) log-weights, or (K, N, n) weights of each component.
+* ``crossmodal_weight_model``, anywhere in the module: returns (N, K) log-weights, or (K, N, n) weights per
+  component.
 
-Such a particle filter resamples within its step, and equal weights are what is left. Its measurement model is called
-before that, with the predicted particles and while the filter still has their prior weights: hence the posterior.
+Such a particle filter resamples at the end of its step, after which all weights are equal. The posterior is derived
+from the call of its measurement model, which takes the predicted particles while the filter has the prior weights.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class Call:
-    """A call of a part of a filter. before: what the filter believed meanwhile: what it predicted."""
+    """A call of a submodule. before: the filter's belief at the time of the call, the prediction."""
 
     inputs: Mapping[str, Any]
     output: Any
@@ -36,10 +37,10 @@ class Call:
 
 
 class Capture:
-    """Listens to a filter while it is entered; ``step`` says what the last step knew.
+    """Context manager that records a filter's submodule calls; ``step`` returns the values of the last step.
 
     Attributes:
-        models: indices of the measurement models that took part in the last step; empty where none is recognised.
+        models: indices of the measurement models that took part in the last step; empty if none is recognised.
     """
 
     def __init__(self, filter_: nn.Module) -> None:
@@ -48,13 +49,13 @@ class Capture:
         self._calls: dict[nn.Module, Call] = {}
         self._hooks = ExitStack()
         named = filter_.named_modules()
-        self._weigher = next((part for name, part in named if name.endswith("crossmodal_weight_model")), None)
-        self._of_particles = hasattr(filter_, "particle_states") and hasattr(filter_, "particle_log_weights")
+        self._weight_model = next((part for name, part in named if name.endswith("crossmodal_weight_model")), None)
+        self._has_particles = hasattr(filter_, "particle_states") and hasattr(filter_, "particle_log_weights")
 
     def __enter__(self) -> Capture:
         with ExitStack() as hooks:
-            for part, believer in dict(self._parts()).items():
-                hooks.callback(part.register_forward_hook(self._keep(believer), with_kwargs=True).remove)
+            for part, belief in dict(self._parts()).items():
+                hooks.callback(part.register_forward_hook(self._recorder(belief), with_kwargs=True).remove)
             self._hooks = hooks.pop_all()
         return self
 
@@ -63,26 +64,26 @@ class Capture:
         self._calls.clear()
 
     def step(self, mean: Tensor) -> dict[str, Tensor]:
-        """What the step that estimated ``mean`` (N, n) knew, by the names of ``Trace``; forgets it.
+        """The values of the step that estimated ``mean`` (N, n), by the names of ``Trace``; clears the recorded calls.
 
-        Shapes are a trace's, with N in place of T. What could not be read is not there.
+        Shapes are those of a trace, with N in place of T. Values that could not be read are missing.
         """
-        found = self._particles() if self._of_particles else self._gaussians()
+        values = self._particles() if self._has_particles else self._gaussians()
         weights = self._weights(len(mean))
-        shares = self._shares(found, weights, mean)
-        found |= {name: value for name, value in (("weights", weights), ("acting", shares)) if value is not None}
+        effective = self._effective_weights(values, weights, mean)
+        optional = {"weights": weights, "effective_weights": effective}
         self._calls.clear()
-        return found
+        return values | {name: value for name, value in optional.items() if value is not None}
 
     def _parts(self) -> Iterator[tuple[nn.Module, Callable[[], tuple[Tensor, ...]]]]:
-        """(part to listen to, what its filter believes)."""
-        if self._weigher is not None:
-            yield self._weigher, tuple
-        if self._of_particles:
+        """(submodule to record, function that returns its filter's belief)."""
+        if self._weight_model is not None:
+            yield self._weight_model, tuple
+        if self._has_particles:
             model = getattr(self._filter, "measurement_model", None)
-            for part in (model, *_several(model, "measurement_models")):
+            for part in (model, *_modules(model, "measurement_models")):
                 if isinstance(part, nn.Module):
-                    yield part, lambda: (_copied(self._filter.particle_log_weights),)
+                    yield part, lambda: (_copy(self._filter.particle_log_weights),)
             return
         for filter_ in self._kalman():
             if filter_ is not self._filter:
@@ -90,78 +91,78 @@ class Capture:
             for sensor in _sensors(filter_):
                 yield sensor, lambda filter_=filter_: _belief(filter_)  # type: ignore[misc]
 
-    def _keep(self, believer: Callable[[], tuple[Tensor, ...]]) -> Callable[..., None]:
-        def keep(part: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: Any) -> None:
-            # The first call of a step counts: an extended Kalman filter calls its model again for the Jacobian.
+    def _recorder(self, belief: Callable[[], tuple[Tensor, ...]]) -> Callable[..., None]:
+        def record(part: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: Any) -> None:
+            # Record the first call of a step only: an extended Kalman filter calls its model again for the Jacobian.
             if part not in self._calls:
                 inputs = {"states": args[0], **kwargs} if args else kwargs
-                self._calls[part] = Call(inputs, _copied(output), believer())
+                self._calls[part] = Call(inputs, _copy(output), belief())
 
-        return keep
+        return record
 
     def _kalman(self) -> list[nn.Module]:
-        """The Kalman filters: those that are fused, or the filter itself; none where it is something else."""
-        several = _several(self._filter, "filter_models")
-        return several or ([self._filter] if hasattr(self._filter, "belief_mean") else [])
+        """The fused Kalman filters, or the filter itself if it is one."""
+        fused = _modules(self._filter, "filter_models")
+        return fused or ([self._filter] if hasattr(self._filter, "belief_mean") else [])
 
     def _particles(self) -> dict[str, Tensor]:
         model = self._filter.measurement_model
         call = self._calls.get(model)
         if call is None:
             return {}
-        states, fused, (prior,) = _copied(call.inputs.get("states")), call.output, call.before
+        states, fused, (prior,) = _copy(call.inputs.get("states")), call.output, call.before
         if not isinstance(states, Tensor) or states.ndim != 3 or not fused.shape == prior.shape == states.shape[:2]:
-            return {}  # asked piece by piece, or of something else than the particles
-        found = {
+            return {}  # called in chunks, or with other states than the particles
+        values = {
             "particles": states,
             "prior_log_weights": torch.log_softmax(prior, dim=-1),
             "log_weights": torch.log_softmax(prior + fused, dim=-1),
         }
-        models = _several(model, "measurement_models") or [model]
-        each = {k: self._calls[part].output for k, part in enumerate(models) if part in self._calls}
-        self.models = tuple(each)
-        if each and all(one.shape == fused.shape for one in each.values()):
-            found["log_likelihood"] = torch.stack(list(each.values()), dim=1)
-        after = _copied(self._filter.particle_states)
+        models = _modules(model, "measurement_models") or [model]
+        outputs = {k: self._calls[part].output for k, part in enumerate(models) if part in self._calls}
+        self.models = tuple(outputs)
+        if outputs and all(output.shape == fused.shape for output in outputs.values()):
+            values["log_likelihood"] = torch.stack(list(outputs.values()), dim=1)
+        after = _copy(self._filter.particle_states)
         if after.shape == states.shape:
             same = (after.unsqueeze(2) == states.unsqueeze(1)).all(-1)  # (N, M after, M before)
             if same.any(-1).all():
-                found["ancestors"] = same.int().argmax(-1)
-        return found
+                values["ancestors"] = same.int().argmax(-1)
+        return values
 
     def _gaussians(self) -> dict[str, Tensor]:
         filters = self._kalman()
         if not filters:
             return {}
-        found: dict[str, Tensor] = {}
-        whole = _covariance(self._filter)
-        if whole is not None:
-            found["estimate_covariance"] = whole
+        values: dict[str, Tensor] = {}
+        covariance = _covariance(self._filter)
+        if covariance is not None:
+            values["estimate_covariance"] = covariance
         if filters[0] is self._filter:
             sensors = {k: sensor for k, sensor in enumerate(_sensors(self._filter)) if sensor in self._calls}
-            believed = [_belief(self._filter)] if len(sensors) == 1 else []
+            beliefs = [_belief(self._filter)] if len(sensors) == 1 else []
         else:
-            acted = {k: filter_ for k, filter_ in enumerate(filters) if filter_ in self._calls}
-            sensors = {k: _sensors(filter_)[0] for k, filter_ in acted.items() if len(_sensors(filter_)) == 1}
-            covariances = [_covariance(filter_) for filter_ in acted.values()]
-            means = [self._calls[filter_].output for filter_ in acted.values()]
-            believed = [(m, c) for m, c in zip(means, covariances, strict=True) if c is not None]
-            if len(believed) < len(acted) or len(sensors) < len(acted):
-                return found
+            called = {k: filter_ for k, filter_ in enumerate(filters) if filter_ in self._calls}
+            sensors = {k: _sensors(filter_)[0] for k, filter_ in called.items() if len(_sensors(filter_)) == 1}
+            covariances = [_covariance(filter_) for filter_ in called.values()]
+            means = [self._calls[filter_].output for filter_ in called.values()]
+            beliefs = [(m, c) for m, c in zip(means, covariances, strict=True) if c is not None]
+            if len(beliefs) < len(called) or len(sensors) < len(called):
+                return values
         self.models = tuple(sensors)
         calls = [self._calls[sensor] for sensor in sensors.values() if sensor in self._calls]
-        _stack(found, "modality", believed)
+        _stack(values, "modality", beliefs)
         if len(calls) == len(sensors):
-            _stack(found, "predicted", [call.before for call in calls])
+            _stack(values, "predicted", [call.before for call in calls])
             if all(hasattr(filter_, "virtual_sensor_model") for filter_ in filters):
-                _stack(found, "observation", [_of_factor(call.output) for call in calls])
-        return found
+                _stack(values, "observation", [_mean_and_covariance(call.output) for call in calls])
+        return values
 
     def _weights(self, count: int) -> Tensor | None:
         """(N, K, W) of the measurement models that took part."""
-        if self._weigher is None or self._weigher not in self._calls:
+        if self._weight_model is None or self._weight_model not in self._calls:
             return None
-        output = self._calls[self._weigher].output
+        output = self._calls[self._weight_model].output
         output = output[0] if isinstance(output, tuple) else output
         if isinstance(output, Tensor) and output.ndim == 2 and len(output) == count:
             weights = output.exp().unsqueeze(-1)
@@ -171,68 +172,70 @@ class Capture:
             return None
         return weights[:, list(self.models)] if 0 < len(self.models) < weights.shape[1] else weights
 
-    def _shares(self, found: Mapping[str, Tensor], weights: Tensor | None, mean: Tensor) -> Tensor | None:
-        """(N, K, W) share of each model in what was fused, where that followed the rule that ours follow; else None."""
-        each = found.get("log_likelihood")
-        if each is not None and each.shape[1] > 1:
-            each = each if weights is None else each + weights.log()
-            if _alike(torch.logsumexp(each, dim=1), self._calls[self._filter.measurement_model].output):
-                return torch.logsumexp(found["prior_log_weights"].unsqueeze(1) + each, dim=-1, keepdim=True).softmax(1)
-        modality = found.get("modality_mean")
+    def _effective_weights(self, values: Mapping[str, Tensor], weights: Tensor | None, mean: Tensor) -> Tensor | None:
+        """(N, K, W) share of each model in the posterior if the fusion follows this package's rule; else None."""
+        scores = values.get("log_likelihood")
+        if scores is not None and scores.shape[1] > 1:
+            scores = scores if weights is None else scores + weights.log()
+            if _close(torch.logsumexp(scores, dim=1), self._calls[self._filter.measurement_model].output):
+                return torch.logsumexp(values["prior_log_weights"].unsqueeze(1) + scores, dim=-1, keepdim=True).softmax(
+                    1
+                )
+        modality = values.get("modality_mean")
         if modality is not None and weights is not None and modality.shape[1] == weights.shape[1] > 1:
             share = weights / weights.sum(1, keepdim=True)
-            if _alike((share * modality).sum(1), mean):
+            if _close((share * modality).sum(1), mean):
                 return share
         return None
 
 
-def _alike(one: Tensor, other: Tensor) -> bool:
-    """Whether a rule of fusion gives what the filter has: as near as float32 is after some hundred sums."""
-    return one.shape == other.shape and torch.allclose(one, other, rtol=1e-3, atol=1e-4)
+def _close(a: Tensor, b: Tensor) -> bool:
+    """Whether two results agree to the precision of some hundred float32 sums."""
+    return a.shape == b.shape and torch.allclose(a, b, rtol=1e-3, atol=1e-4)
 
 
-def _several(owner: Any, name: str) -> list[nn.Module]:
-    """The modules of a list of them that goes by a name; none where there is no such list."""
-    found = getattr(owner, name, None)
-    return list(found) if isinstance(found, nn.ModuleList) else []
+def _modules(owner: Any, name: str) -> list[nn.Module]:
+    """The modules of the attribute of this name if it is a ModuleList, else none."""
+    modules = getattr(owner, name, None)
+    return list(modules) if isinstance(modules, nn.ModuleList) else []
 
 
 def _sensors(filter_: Any) -> list[nn.Module]:
     """A Kalman filter's virtual sensors, or its measurement model."""
     virtual = getattr(filter_, "virtual_sensor_model", None)
     sensor = virtual if virtual is not None else getattr(filter_, "measurement_model", None)
-    return _several(virtual, "virtual_sensor_model") or ([sensor] if isinstance(sensor, nn.Module) else [])
+    return _modules(virtual, "virtual_sensor_model") or ([sensor] if isinstance(sensor, nn.Module) else [])
 
 
 def _covariance(filter_: Any) -> Tensor | None:
-    found = (getattr(filter_, name, None) for name in ("belief_covariance", "state_covariance_estimate"))
-    return next((_copied(one) for one in found if isinstance(one, Tensor)), None)
+    values = (getattr(filter_, name, None) for name in ("belief_covariance", "state_covariance_estimate"))
+    return next((_copy(value) for value in values if isinstance(value, Tensor)), None)
 
 
 def _belief(filter_: Any) -> tuple[Tensor, ...]:
-    """Mean and covariance as they are; nothing where the filter does not show both."""
+    """Mean and covariance; empty if the filter lacks one."""
     mean, covariance = getattr(filter_, "belief_mean", None), _covariance(filter_)
-    return (_copied(mean), covariance) if isinstance(mean, Tensor) and covariance is not None else ()
+    return (_copy(mean), covariance) if isinstance(mean, Tensor) and covariance is not None else ()
 
 
-def _of_factor(output: Any) -> tuple[Tensor, ...]:
-    """Mean and covariance of a virtual sensor's answer: a mean and a Cholesky factor."""
+def _mean_and_covariance(output: Any) -> tuple[Tensor, ...]:
+    """Mean and covariance of a virtual sensor's output, a mean and a Cholesky factor."""
     if not isinstance(output, tuple) or len(output) != 2:
         return ()
     mean, factor = output
     return mean, factor @ factor.transpose(-1, -2)
 
 
-def _stack(found: dict[str, Tensor], name: str, beliefs: list[tuple[Tensor, ...]]) -> None:
-    """Adds means (N, K, n) and covariances (N, K, n, n), where all K are whole."""
-    if beliefs and all(len(one) == 2 for one in beliefs):
-        found[f"{name}_mean"], found[f"{name}_covariance"] = (
-            torch.stack(one, dim=1) for one in zip(*beliefs, strict=True)
+def _stack(values: dict[str, Tensor], name: str, beliefs: list[tuple[Tensor, ...]]) -> None:
+    """Adds means (N, K, n) and covariances (N, K, n, n) if all K are complete."""
+    if beliefs and all(len(belief) == 2 for belief in beliefs):
+        values[f"{name}_mean"], values[f"{name}_covariance"] = (
+            torch.stack(parts, dim=1) for parts in zip(*beliefs, strict=True)
         )
 
 
-def _copied(value: Any) -> Any:
-    """Tensors detached and copied, since a filter may go on to write into its own; within tuples as well."""
+def _copy(value: Any) -> Any:
+    """A detached copy of a tensor or tuple of tensors, since the filter may modify its own in place."""
     if isinstance(value, tuple):
-        return tuple(_copied(one) for one in value)
+        return tuple(_copy(item) for item in value)
     return value.detach().clone() if isinstance(value, Tensor) else value

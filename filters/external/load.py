@@ -1,12 +1,12 @@
-"""Filters that are not this project's: any torch module that follows a small contract, or torchfilter's interface.
+"""External filters: torch modules that follow a small contract, or torchfilter's interface.
 
-The contract, of which ``docs/own_filter.md`` has examples:
+The contract (examples in ``docs/own_filter.md``):
 
-* ``module.initialize_beliefs(mean=, covariance=)`` starts N trajectories, (N, n) and (N, n, n). A module that has it is
-  then called step by step, ``module(observations=, controls=)``: a dictionary of (N, ...) by the task's observation
-  keys, and (N, c). A module that has it not is called once for all steps, with (T, N, ...) and (T, N, c).
-* It returns the mean (N, n), a pair of mean and covariance (N, n, n), or a dictionary by the names in
-  ``adapter.SHAPES``; with T in front where it was called once for all steps.
+* ``module.initialize_beliefs(mean=, covariance=)`` starts N trajectories, (N, n) and (N, n, n). A module with this
+  method is then called step by step, ``module(observations=, controls=)``: a dictionary of (N, ...) by the task's
+  observation keys, and (N, c). A module without it is called once for all steps, with (T, N, ...) and (T, N, c).
+* It returns the mean (N, n), a pair of mean and covariance (N, n, n), or a dictionary with the keys of
+  ``adapter.SHAPES``; with a leading axis T if called once for all steps.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from beliefscope.filters.batch import check_shapes
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.external.adapter import SHAPES, Adapter, Units, Values, checked, derived, named
+from beliefscope.filters.external.adapter import SHAPES, Adapter, Units, Values, check_values, derived, named_values
 from beliefscope.filters.external.hooks import Capture
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import START_VARIANCE
 
 
-class Foreign(Checkpoint):
-    """A filter from outside as everything downstream takes one: traced, evaluated and shown, but not stepped by hand.
+class ExternalFilter(Checkpoint):
+    """An external filter as a checkpoint: it can be traced, evaluated and displayed, but not stepped by the caller.
 
     Attributes:
-        adapter: the module, and how to speak to it. source: where it came from, as named by the user.
+        adapter: the module and its conventions. source: its origin, as given by the user.
         hash: SHA-256 of the source's name, of the files of its classes and of its state dictionary.
     """
 
     def __init__(self, adapter: Adapter, task: Task, name: str, source: str = "") -> None:
-        """Raises BadInput where the adapter does not fit the task."""
+        """Raises BadInput if the adapter does not fit the task."""
         values = {
             "name": name,
             "record": {"source": source or name},
@@ -67,57 +67,56 @@ class Foreign(Checkpoint):
 
     @property
     def filter(self) -> Filter:
-        """Raises BadInput: there is none of this project's."""
-        raise BadInput(f"{self.source} is not a filter of this project, whose steps could be taken one by one")
+        """Raises BadInput: an external filter has no ``Filter``."""
+        raise BadInput(f"{self.source} is an external filter, which does not support this operation")
 
     @property
     def task(self) -> Task:
         return self._task
 
     @property
-    def kind(self) -> Literal["foreign"]:  # type: ignore[override]
-        return "foreign"
+    def kind(self) -> Literal["external"]:  # type: ignore[override]
+        return "external"
 
     def start(self, episodes: Sequence[Episode]) -> Gaussian:
-        """The first belief, as of our filters (``rollout.start_at_truth``): (N, n), (N, n, n), SI units.
+        """The first belief, as in ``rollout.start_at_truth``: (N, n), (N, n, n), SI units.
 
-        The covariance is 0.1 I in the adapter's standardised units, or in those of the filters that ship for the task.
-        It is NaN where there are neither.
+        The covariance is 0.1 I in the adapter's standardised units, or in those of the task's pretrained filters. It is
+        NaN if there are neither.
         """
         mean = torch.from_numpy(np.stack([episode.states[0] for episode in episodes])).float()
-        std = self._units.std if self.adapter.std else _spread(self._task)
+        std = self._units.std if self.adapter.std else _state_std(self._task)
         return Gaussian(mean, torch.diag(START_VARIANCE * std.float() ** 2).expand(len(mean), -1, -1))
 
     def run(
         self, episodes: Sequence[Episode], seed: int = 0, progress: Callable[[float], None] | None = None
     ) -> tuple[Values, tuple[str, ...]]:
-        """Filters N episodes of equal length at once, from the true state. Leaves no hook on the module.
+        """Filters N episodes of equal length at once, from the true state. Removes all hooks from the module.
 
         Args:
-            seed: of torch's own generator, which is put back afterwards.
-            progress: called with the share done, 0..1.
+            seed: of torch's global generator, whose state is restored.
+            progress: called with the completed fraction, 0..1.
 
         Returns:
-            What is known of each step, (T, N, ...) by the names of ``Trace``, SI units, float32; and the K names of
-            the measurement models.
+            The values of each step, (T, N, ...) by the names of ``Trace``, SI units, float32; and the K names of the
+            measurement models.
 
         Raises:
-            BadInput: an episode does not fit the task, the module fails, or gives what is not as it should be; says
-                at which step.
+            BadInput: an episode does not fit the task, the module fails, or it returns invalid values; the message
+                names the step.
         """
         observations, controls = _inputs(self._task, episodes, _dtype(self.adapter.module))
         models: tuple[int, ...] = ()
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            if self._steps_alone:
+            if self._stepwise:
                 steps: list[Values] = []
-                for step, took_part in self._steps(observations, controls, self.start(episodes)):
-                    steps.append(step)
-                    models = took_part
+                for values, models in self._steps(observations, controls, self.start(episodes)):  # noqa: B007
+                    steps.append(values)
                     if progress is not None:
                         progress(len(steps) / len(controls))
-                always = [name for name in steps[0] if all(name in step for step in steps)]
-                values = {name: torch.stack([step[name] for step in steps]) for name in always}
+                common = [name for name in steps[0] if all(name in step for step in steps)]
+                values = {name: torch.stack([step[name] for step in steps]) for name in common}
             else:
                 values = self._at_once(observations, controls)
                 if progress is not None:
@@ -125,12 +124,14 @@ class Foreign(Checkpoint):
         return derived(self._units.to_si(values)), self._names(values, models)
 
     def live(self, episode: Episode, seed: int = 0) -> Iterator[tuple[Values, tuple[str, ...]]]:
-        """``run`` of one episode, a step at a time as it is asked for: (N, ...) with N = 1, and the models' names.
+        """Like ``run`` for one episode, as an iterator over steps: (N, ...) with N = 1, and the models' names.
 
-        Raises BadInput as ``run``, and for a model of sequences, which takes no steps.
+        Raises BadInput as ``run``, and for a module that processes whole sequences.
         """
-        if not self._steps_alone:
-            raise BadInput(f"{self.source} has no initialize_beliefs: it takes all steps at once, and cannot run live")
+        if not self._stepwise:
+            raise BadInput(
+                f"{self.source} has no initialize_beliefs: it processes all steps at once, and cannot run live"
+            )
         observations, controls = _inputs(self._task, [episode], _dtype(self.adapter.module))
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -138,120 +139,119 @@ class Foreign(Checkpoint):
                 yield self._units.to_si(step), self._names({n: v[None] for n, v in step.items()}, models)
 
     @property
-    def _steps_alone(self) -> bool:
+    def _stepwise(self) -> bool:
         return hasattr(self.adapter.module, "initialize_beliefs")
 
     def _steps(
         self, observations: Mapping[str, Tensor], controls: Tensor, start: Gaussian
     ) -> Iterator[tuple[Values, tuple[int, ...]]]:
-        """What each step says and shows, in the module's units, and which of its measurement models took part."""
+        """The values of each step, in the module's units, and the indices of the measurement models that took part."""
         if start.covariance.isnan().any():
             raise BadInput(
-                f"{self.source} starts from a covariance, and no filter ships for task {self._task.name!r} to say how "
-                "large: give Adapter(module, mean=..., std=...)"
+                f"{self.source} needs an initial covariance, and task {self._task.name!r} has no pretrained filter to "
+                "take it from: give Adapter(module, mean=..., std=...)"
             )
         module, (n, count) = self.adapter.module, (len(self._task.components), len(start.mean))
-        mean, covariance = self._units.of_start(start, _dtype(module))
-        with self._blamed("initialize_beliefs"):
-            getattr(module, "initialize_beliefs")(mean=mean, covariance=covariance)  # noqa: B009 - mypy takes it for a Tensor
+        mean, covariance = self._units.from_si(start, _dtype(module))
+        with self._errors_at("initialize_beliefs"):
+            getattr(module, "initialize_beliefs")(mean=mean, covariance=covariance)  # noqa: B009 - mypy infers a Tensor
         sizes: dict[str, int] = {"n": n}
         with Capture(module) as capture:
             for t in range(len(controls)):
                 where = f"step {t}"
-                with self._blamed(where):
-                    seen = self.adapter.inputs({key: value[t] for key, value in observations.items()}, controls[t])
-                    said = named(module(observations=seen[0], controls=seen[1]), self.source)
-                    values = capture.step(said["estimate_mean"]) | said
-                yield checked(values, (count,), sizes, f"{self.source} at {where}"), capture.models
+                with self._errors_at(where):
+                    inputs = self.adapter.inputs({key: value[t] for key, value in observations.items()}, controls[t])
+                    output = named_values(module(observations=inputs[0], controls=inputs[1]), self.source)
+                    values = capture.step(output["estimate_mean"]) | output
+                yield check_values(values, (count,), sizes, f"{self.source} at {where}"), capture.models
 
     def _at_once(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
-        with self._blamed("all steps"):
-            seen = self.adapter.inputs(dict(observations), controls)
-            said = named(self.adapter.module(observations=seen[0], controls=seen[1]), self.source)
-        return checked(said, controls.shape[:2], {"n": len(self._task.components)}, f"{self.source} over all steps")
+        with self._errors_at("all steps"):
+            inputs = self.adapter.inputs(dict(observations), controls)
+            output = named_values(self.adapter.module(observations=inputs[0], controls=inputs[1]), self.source)
+        return check_values(
+            output, controls.shape[:2], {"n": len(self._task.components)}, f"{self.source} over all steps"
+        )
 
     @contextmanager
-    def _blamed(self, where: str) -> Iterator[None]:
-        """What goes wrong in a stranger's code is told with the place."""
+    def _errors_at(self, where: str) -> Iterator[None]:
+        """Turns exceptions of the module into BadInput with the location."""
         try:
             yield
         except BadInput:
             raise
         except Exception as error:
-            what = (str(error).strip().splitlines() or ["no message"])[0]
-            raise BadInput(f"{self.source} fails at {where}: {type(error).__name__}: {what}") from error
+            message = (str(error).strip().splitlines() or ["no message"])[0]
+            raise BadInput(f"{self.source} fails at {where}: {type(error).__name__}: {message}") from error
 
     def _names(self, values: Values, models: tuple[int, ...]) -> tuple[str, ...]:
         return model_names(values, 2, self.adapter.modalities, self._task, models, self.source)
 
 
 def model_names(
-    values: Values, axis: int, given: Sequence[str], task: Task, models: Sequence[int] = (), who: str = "the filter"
+    values: Values, axis: int, names: Sequence[str], task: Task, models: Sequence[int] = (), source: str = "the filter"
 ) -> tuple[str, ...]:
-    """Of the measurement models: as given, after the task's modalities where there are as many, or numbered.
+    """Names of the measurement models: as given, or the task's modalities if there are as many, or numbered.
 
     Args:
-        axis: of the values along which they lie. models: which of all took part, where not all did.
+        axis: of the values that indexes the models. models: indices of those that took part, if not all did.
 
-    Raises BadInput where there are others than the given.
+    Raises BadInput if the number of given names does not match.
     """
     counts = [values[name].shape[axis] for name, shape in SHAPES.items() if shape[0] == "K" and name in values]
-    count, given, known = max(counts, default=0), tuple(given), tuple(task.modalities)
-    for names in (given, known):
-        if count and len(names) > count == len(models):
-            return tuple(names[k] for k in models)
-        if count and len(names) == count:
-            return names
-    if given and count:
-        raise BadInput(f"{who} names {len(given)} modalities, {', '.join(given)}, but has {count}")
-    return ("+".join(known),) if count == 1 else tuple(f"model-{k + 1}" for k in range(count))
+    count, modalities = max(counts, default=0), tuple(task.modalities)
+    for candidates in (tuple(names), modalities):
+        if count and len(candidates) > count == len(models):
+            return tuple(candidates[k] for k in models)
+        if count and len(candidates) == count:
+            return candidates
+    if names and count:
+        raise BadInput(f"{source} names {len(names)} modalities, {', '.join(names)}, but has {count}")
+    return ("+".join(modalities),) if count == 1 else tuple(f"model-{k + 1}" for k in range(count))
 
 
-def load_foreign(source: str, task: str = "", unsaid: str = "") -> Foreign:
-    """The filter that ``path/to/file.py:NAME`` or ``package.module:NAME`` makes when it is called without arguments.
+def load_external(source: str, task: str = "", default_task: str = "") -> ExternalFilter:
+    """The filter that ``path/to/file.py:NAME`` or ``package.module:NAME`` returns when called without arguments.
 
     Args:
-        task: name of the task; without it, what the filter says, by ``Adapter.task`` or an attribute ``task``.
-        unsaid: name of the task where neither says it.
+        task: name of the task; by default that of the filter, ``Adapter.task`` or an attribute ``task``.
+        default_task: name of the task if neither is given.
 
     Raises:
-        BadInput: nothing is there by that name, it fails, gives no torch module, or one for another task.
+        BadInput: the name does not exist, the call fails or does not return a torch module, or the task differs.
     """
     place, _, attribute = source.rpartition(":")
     with user_code.importable(place):
-        module = user_code.run(place)
+        module = user_code.load_module(place)
         build = getattr(module, attribute, None)
         if not callable(build):
-            here = [
+            functions = [
                 n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == module.__name__
             ]
-            what = f"holds no {attribute!r}" if build is None else f"holds {attribute!r}, which cannot be called"
-            raise BadInput(f"{place} {what}. To be called in it: {', '.join(here) or 'nothing'}.")
+            problem = f"has no {attribute!r}" if build is None else f"has {attribute!r}, which is not callable"
+            raise BadInput(f"{place} {problem}. Available: {', '.join(functions) or 'none'}.")
         try:
-            built = build()
+            result = build()
         except Exception as error:
-            raise BadInput(f"{source} fails when it is called: {type(error).__name__}: {error}") from error
-    adapter = Adapter(built) if isinstance(built, nn.Module) else built
+            raise BadInput(f"{source} fails when called: {type(error).__name__}: {error}") from error
+    adapter = Adapter(result) if isinstance(result, nn.Module) else result
     if not isinstance(adapter, Adapter) or not isinstance(adapter.module, nn.Module):
-        found = adapter.module if isinstance(adapter, Adapter) else adapter
-        raise BadInput(f"{source} gives a {type(found).__name__}, expected a torch.nn.Module, or an Adapter of one")
-    meant = adapter.task or getattr(adapter.module, "task", "")
-    meant = meant if isinstance(meant, str) else ""
-    task = task or meant or unsaid
+        value = adapter.module if isinstance(adapter, Adapter) else adapter
+        raise BadInput(f"{source} returns a {type(value).__name__}, expected a torch.nn.Module, or an Adapter of one")
+    own_task = adapter.task or getattr(adapter.module, "task", "")
+    own_task = own_task if isinstance(own_task, str) else ""
+    task = task or own_task or default_task
     if not task:
-        raise BadInput(
-            f"{source} does not say which task it is for: give it an attribute task, or name one with --task"
-        )
-    known = load_task(task)
-    if meant and meant != known.name:
-        raise BadInput(f"filter {source!r} is for task {meant!r}, not for {known.name!r}")
-    return Foreign(
-        adapter, known, f"{Path(place).stem}-{attribute}" if place.endswith(".py") else source.replace(":", "-"), source
-    )
+        raise BadInput(f"{source} does not name its task: give it an attribute task, or use --task")
+    loaded = load_task(task)
+    if own_task and own_task != loaded.name:
+        raise BadInput(f"filter {source!r} is for task {own_task!r}, not for {loaded.name!r}")
+    name = f"{Path(place).stem}-{attribute}" if place.endswith(".py") else source.replace(":", "-")
+    return ExternalFilter(adapter, loaded, name, source)
 
 
 def _inputs(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tuple[dict[str, Tensor], Tensor]:
-    """Observations (T, N, ...) by key, pictures as uint8; controls (T, N, c)."""
+    """Observations (T, N, ...) by key, images as uint8; controls (T, N, c)."""
     for number, episode in enumerate(episodes):
         check_shapes(task, episode, f"episode {number}")
     observations = {
@@ -262,22 +262,22 @@ def _inputs(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tupl
     return {k: v if v.dtype == torch.uint8 else v.to(dtype) for k, v in observations.items()}, controls
 
 
-def _spread(task: Task) -> Tensor:
-    """(n,) m and rad: standard deviations of the states that the filters that ship were trained on; else NaN."""
+def _state_std(task: Task) -> Tensor:
+    """(n,) m and rad: standard deviations of the pretrained filters' training states; NaN if there are none."""
     for name in filters_of(task):
-        with suppress(BadInput):  # not every filter ships
+        with suppress(BadInput):  # not every filter is pretrained
             return load_checkpoint(shipped(task.name, name)).filter.statistics.mean_std("state")[1]
     return torch.full((len(task.components),), torch.nan)
 
 
 def _dtype(module: nn.Module) -> torch.dtype:
-    """That of the module's numbers."""
-    numbers = (tensor.dtype for tensor in (*module.parameters(), *module.buffers()) if tensor.is_floating_point())
-    return next(numbers, torch.float32)
+    """The floating-point type of the module's parameters and buffers."""
+    types = (tensor.dtype for tensor in (*module.parameters(), *module.buffers()) if tensor.is_floating_point())
+    return next(types, torch.float32)
 
 
 def _hash(adapter: Adapter, source: str) -> str:
-    """SHA-256 of everything that a run of the module depends on, as far as it can be seen."""
+    """SHA-256 of the adapter's settings, the module's source files and its state dictionary."""
     digest = hashlib.sha256(repr((source, [*adapter.components], [*adapter.mean], [*adapter.std])).encode())
     digest.update(repr([*adapter.modalities]).encode())
     names = {type(part).__module__ for part in adapter.module.modules()} | {adapter.inputs.__module__}

@@ -1,4 +1,4 @@
-"""The loop of a fine-tuning: its steps, its looks at episodes it does not learn from, and where it stands."""
+"""The optimisation loop of a fine-tuning: its steps, its validations, and its state for resuming."""
 
 from __future__ import annotations
 
@@ -6,37 +6,38 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from beliefscope.filters.evaluate import LEFT_OUT, metrics
+from beliefscope.filters.evaluate import WARMUP, metrics
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.finetuning.batch_mix import Mix, spread
+from beliefscope.filters.finetuning.batch_mix import Mix, evenly_spaced
 from beliefscope.filters.finetuning.module_selection import matching
+from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.models.networks import ImageEncoder
 from beliefscope.filters.rollout import rollout, start_at_truth
 from beliefscope.filters.training import losses
 
-if TYPE_CHECKING:
-    from beliefscope.filters.finetuning.finetune import FineTune
+MAX_LENGTH, MAX_WINDOWS, PARTICLES = 100, 32, 100
+"""Of a validation: steps in a window, windows of each slice, and particles."""
 
-LONGEST, WINDOWS, PARTICLES = 100, 32, 100
-"""Of a look: steps of a window and windows of each slice, at most; particles."""
+NOISE_RATE, ENCODER_RATE = 10.0, 1 / 3
+"""Relative learning rates, as in training: of the logarithmic process noise, which scales all else, and of encoders."""
 
-NOISE, PICTURES = 10.0, 1 / 3
-"""Times the rate, as in training: process noise, which is logarithmic and scales all else, and picture encoders."""
+PROGRESS = ("done", "best_step", "failures", "loss", "gradients")
+"""Attributes of the loop that its saved state contains."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """How the filter does on episodes that it does not learn from.
+class Validation:
+    """Metrics on episodes that are not trained on.
 
     Attributes:
-        step: steps done. loss: mean of the training loss since the look before; NaN in the first.
-        slices: slice -> ``Metrics.to_dict`` over the steps that count, and ``error``: root mean square of the error in
-            standardised units, all components together. score: of all slices (``score``).
+        step: steps done. loss: mean training loss since the previous validation; None for the first.
+        slices: slice -> ``Metrics.to_dict`` over the slice's steps, and ``error``: root mean square error in
+            standardised units over all components. score: over all slices (``score``).
     """
 
     step: int
@@ -46,61 +47,62 @@ class Look:
 
 
 @torch.no_grad()
-def look(filter_: Filter, mix: Mix, step: int, loss: float | None, settings: FineTune) -> Look:
-    """Over windows spread evenly over each slice's episodes, the first 30 steps (a third of short ones) left out."""
-    length = min(LONGEST, int(mix.steps.length.min()))
-    unheeded = min(LEFT_OUT, length // 3)
-    windows = mix.windows(spread(mix.starts(length, unheeded), WINDOWS), length, unheeded)
+def validate(filter_: Filter, mix: Mix, step: int, loss: float | None, settings: FineTune) -> Validation:
+    """Metrics over windows spaced evenly over each slice's episodes, without the first 30 steps (a third if short)."""
+    length = min(MAX_LENGTH, int(mix.steps.length.min()))
+    warmup = min(WARMUP, length // 3)
+    windows = mix.windows(evenly_spaced(mix.starts(length, warmup), MAX_WINDOWS), length, warmup)
     batch = windows.batch
     generator = torch.Generator(batch.states.device).manual_seed(settings.seed)
-    evidence = windows.heard(filter_.encode(batch))
+    evidence = windows.select_evidence(filter_.encode(batch))
     estimate = rollout(filter_, evidence, start_at_truth(filter_, batch), generator, PARTICLES).estimate
     error = filter_.statistics.state_to_si(estimate.mean) - batch.states
     covariance = filter_.statistics.covariance_to_si(estimate.covariance)
-    standardised = (estimate.mean - losses.state(filter_, batch)).square().sum(-1)
+    standardised = (estimate.mean - losses.true_states(filter_, batch)).square().sum(-1)
     slices = {}
     for name, columns in windows.parts.items():
-        counts = windows.weight[:, columns] > 0
-        found = metrics(filter_.task, error[:, columns][counts].cpu(), covariance[:, columns][counts].cpu())
-        slices[name] = found.to_dict() | {"error": float(standardised[:, columns][counts].mean().sqrt())}
-    return Look(step, loss, slices)
+        mask = windows.weight[:, columns] > 0
+        values = metrics(filter_.task, error[:, columns][mask].cpu(), covariance[:, columns][mask].cpu())
+        slices[name] = values.to_dict() | {"error": float(standardised[:, columns][mask].mean().sqrt())}
+    return Validation(step, loss, slices)
 
 
-def score(found: Look, parent: Look, shares: Mapping[str, float], likelihood_weight: float) -> float:
-    """What is to fall: each slice's error as a multiple of the parent's, plus how much its likelihood has got worse.
+def score(current: Validation, base: Validation, shares: Mapping[str, float], likelihood_weight: float) -> float:
+    """The criterion of the best weights: each slice's error relative to the base, plus its increase in NLL.
 
-    ``sum_s share_s (error_s / error_s' + likelihood_weight (nll_s - nll_s'))``, where ' is the parent's.
+    ``sum_s share_s (error_s / error_s' + likelihood_weight (nll_s - nll_s'))``, where ' is the base checkpoint's.
     """
     total = 0.0
     for name, share in shares.items():
-        now, before = found.slices[name], parent.slices[name]
-        total += share * now["error"] / max(before["error"], 1e-9)
-        if now["nll"] is not None and before["nll"] is not None:
-            total += share * likelihood_weight * (now["nll"] - before["nll"])
+        after, before = current.slices[name], base.slices[name]
+        total += share * after["error"] / max(before["error"], 1e-9)
+        if after["nll"] is not None and before["nll"] is not None:
+            total += share * likelihood_weight * (after["nll"] - before["nll"])
     return total
 
 
-class Tuning:
-    """A filter, some of whose parameters learn from a mix of slices.
+class FineTuneLoop:
+    """Trains some of a filter's parameters on a mix of slices.
 
-    Every step draws from generators seeded with its number, so that a run does the same wherever it was cut.
+    Every step draws from generators seeded with its number, so that an interrupted run resumes with identical results.
 
     Attributes:
-        done: steps. looks: so far, the parent's first. best_step: after which the weights did best.
+        done: number of steps. validations: so far, the base checkpoint's first. best_step: step of the best weights.
+        failures: validations since the best one.
     """
 
     def __init__(
         self, filter_: Filter, trained: Mapping[str, nn.Parameter], settings: FineTune, train: Mix, val: Mix
     ) -> None:
-        """Raises BadInput where a slice has no window of this length in the training episodes."""
+        """Raises BadInput if a slice has no window of this length in the training episodes."""
         self.filter, self.trained, self.settings = filter_, dict(trained), settings
         self.train, self.val = train, val
         self.starts = train.starts(settings.length)
-        self.parent = {name: p.detach().clone() for name, p in trained.items()}
-        self.best = dict(self.parent)
+        self.base = {name: p.detach().clone() for name, p in trained.items()}
+        self.best = dict(self.base)
         self.gradients = dict.fromkeys(trained, 0.0)
-        self.looks: list[Look] = []
-        self.done = self.best_step = self.since = 0
+        self.validations: list[Validation] = []
+        self.done = self.best_step = self.failures = 0
         self.loss = 0.0
         self.rates = self._rates()
         groups = [
@@ -111,65 +113,60 @@ class Tuning:
 
     def _rates(self) -> dict[str, float]:
         rate = self.settings.rate
-        seeing = {id(p) for m in self.filter.modules() if isinstance(m, ImageEncoder) for p in m.parameters()}
-        rates = {name: rate * PICTURES if id(p) in seeing else rate for name, p in self.trained.items()}
+        encoders = {id(p) for m in self.filter.modules() if isinstance(m, ImageEncoder) for p in m.parameters()}
+        rates = {name: rate * ENCODER_RATE if id(p) in encoders else rate for name, p in self.trained.items()}
         if "dynamics.log_noise" in rates:
-            rates["dynamics.log_noise"] = rate * NOISE
+            rates["dynamics.log_noise"] = rate * NOISE_RATE
         for pattern, other in self.settings.rates:
             rates |= dict.fromkeys(matching(rates, pattern), other)
         return rates
 
     @property
     def finished(self) -> bool:
-        return self.done >= self.settings.steps or self.since >= self.settings.patience
+        return self.done >= self.settings.steps or self.failures >= self.settings.patience
 
     @property
-    def due(self) -> bool:
-        """Whether the step just done is followed by a look."""
+    def validation_due(self) -> bool:
+        """Whether a validation follows the last step."""
         return self.done % self.settings.check == 0 or self.done == self.settings.steps
 
-    def begin(self) -> Look:
-        """The look before the first step."""
-        self.looks = [look(self.filter, self.val, 0, None, self.settings)]
-        return self.looks[0]
-
     def step(self) -> float:
-        """One step of Adam, and then one back towards the parent; returns the loss.
+        """One step of Adam followed by one of L2-SP, towards the base checkpoint's weights; returns the loss.
 
-        The way back is the proximal step of ``pull / 2 |p - p'|^2`` ("L2-SP", Li et al., "Explicit Inductive Bias for
-        Transfer Learning", 2018): ``p' + (p - p') / (1 + rate pull)``.
+        The latter is the proximal step of ``l2_sp / 2 |p - p'|^2`` (Li et al., "Explicit Inductive Bias for Transfer
+        Learning with Convolutional Networks", 2018): ``p' + (p - p') / (1 + rate l2_sp)``.
         """
-        settings, faded = self.settings, 1.0 - 0.95 * self.done / self.settings.steps
-        loss = self.loss_of(self.done)
+        settings, decay = self.settings, 1.0 - 0.95 * self.done / self.settings.steps
+        loss = self.step_loss(self.done)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         sizes = {n: float(p.grad.square().sum()) for n, p in self.trained.items() if p.grad is not None}
         norm = nn.utils.clip_grad_norm_(self.trained.values(), 5.0)
-        # One step whose gradient overflowed must not spoil the weights.
-        if torch.isfinite(norm):
+        if torch.isfinite(norm):  # else a gradient overflowed: skip the step
             for group in self.optimiser.param_groups:
-                group["lr"] = group["rate"] * faded
+                group["lr"] = group["rate"] * decay
             for name, size in sizes.items():
                 self.gradients[name] += size
             self.optimiser.step()
             with torch.no_grad():
                 for name, parameter in self.trained.items():
-                    back = 1.0 / (1.0 + self.rates[name] * faded * settings.pull)
-                    parameter.lerp_(self.parent[name], 1.0 - back)
+                    shrinkage = 1.0 / (1.0 + self.rates[name] * decay * settings.l2_sp)
+                    parameter.lerp_(self.base[name], 1.0 - shrinkage)
         self.done += 1
         value = float(loss.detach())
         self.loss += value
         return value
 
-    def loss_of(self, step: int) -> Tensor:
-        """The loss of the windows that this step draws."""
+    def step_loss(self, step: int) -> Tensor:
+        """The loss of the windows drawn for this step."""
         settings, device = self.settings, self.train.steps.states.device
         seed = int.from_bytes(hashlib.sha256(f"{settings.seed} {step}".encode()).digest()[:7], "big")
         generator = torch.Generator().manual_seed(seed)
         noise = torch.Generator(device).manual_seed(seed)
-        starts = self.train.drawn(self.starts, settings.windows, generator)
-        windows = self.train.windows(starts, settings.length)
-        evidence = windows.heard(self.filter.encode(windows.batch))
+        windows = self.train.windows(
+            self.train.sample_starts(self.starts, settings.windows, generator), settings.length
+        )
+        evidence = windows.select_evidence(self.filter.encode(windows.batch))
         return losses.through_filter(
             self.filter,
             evidence,
@@ -180,50 +177,54 @@ class Tuning:
             windows.weight,
         )
 
-    def look(self) -> Look:
-        """After a step that is ``due``: looks, and keeps the weights where they do better than all before."""
-        settings, last = self.settings, self.looks[-1].step
-        found = look(self.filter, self.val, self.done, self.loss / (self.done - last), settings)
-        shares = {one.name: share for one, share in settings.shares().items()}
-        found = replace(found, score=score(found, self.looks[0], shares, settings.likelihood_weight))
-        self.loss, self.since = 0.0, self.since + 1
-        if found.score < min(one.score for one in self.looks):
-            self.best = {name: p.detach().clone() for name, p in self.trained.items()}
-            self.best_step, self.since = self.done, 0
-        self.looks.append(found)
-        return found
+    def validate(self) -> Validation:
+        """Validates the current weights, and stores them if they are the best so far."""
+        settings = self.settings
+        if not self.validations:
+            validation = validate(self.filter, self.val, 0, None, settings)
+        else:
+            loss = self.loss / (self.done - self.validations[-1].step)
+            validation = validate(self.filter, self.val, self.done, loss, settings)
+            shares = {slice_.name: share for slice_, share in settings.shares().items()}
+            total = score(validation, self.validations[0], shares, settings.likelihood_weight)
+            validation = replace(validation, score=total)
+            self.loss, self.failures = 0.0, self.failures + 1
+            if validation.score < min(earlier.score for earlier in self.validations):
+                self.best = {name: p.detach().clone() for name, p in self.trained.items()}
+                self.best_step, self.failures = self.done, 0
+        self.validations.append(validation)
+        return validation
 
     @torch.no_grad()
-    def take_best(self) -> None:
+    def restore_best(self) -> None:
         for name, parameter in self.trained.items():
             parameter.copy_(self.best[name])
 
-    def parts(self) -> dict[str, list[float]]:
-        """Parameter -> root mean square of its gradient's norm over the steps, norm of its change, of the parent's."""
+    def parameter_changes(self) -> dict[str, list[float]]:
+        """Parameter -> root mean square gradient norm over the steps, norm of its change, norm of the base weights."""
         return {
             name: [
                 math.sqrt(self.gradients[name] / max(self.done, 1)),
-                float((parameter - self.parent[name]).norm()),
-                float(self.parent[name].norm()),
+                float((parameter - self.base[name]).norm()),
+                float(self.base[name].norm()),
             ]
             for name, parameter in self.trained.items()
         }
 
     def state(self, seconds: float) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """All that ``restore`` needs to go on as if nothing had been, as tensors and as JSON."""
+        """The state that ``restore`` needs to resume with identical results, as tensors and as JSON."""
         tensors: dict[str, Tensor] = {f"now.{name}": p for name, p in self.trained.items()}
         tensors |= {f"best.{name}": p for name, p in self.best.items()}
         for name, parameter in self.trained.items():
             tensors |= {f"{key}.{name}": value for key, value in self.optimiser.state[parameter].items()}
-        names = ("done", "best_step", "since", "loss", "gradients")
-        progress = {name: getattr(self, name) for name in names}
-        return tensors, progress | {"looks": [asdict(one) for one in self.looks], "seconds": seconds}
+        progress = {name: getattr(self, name) for name in PROGRESS}
+        return tensors, progress | {"validations": [asdict(v) for v in self.validations], "seconds": seconds}
 
     def restore(self, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> float:
-        """Where ``state`` left off; returns the seconds spent until then."""
-        for name in ("done", "best_step", "since", "loss", "gradients"):
+        """Restores a ``state``; returns the seconds spent until then."""
+        for name in PROGRESS:
             setattr(self, name, progress[name])
-        self.looks = [Look(**one) for one in progress["looks"]]
+        self.validations = [Validation(**values) for values in progress["validations"]]
         with torch.no_grad():
             for name, parameter in self.trained.items():
                 parameter.copy_(tensors[f"now.{name}"])

@@ -1,7 +1,7 @@
-"""Slices: parts of what a filter meets, to be measured and trained apart. ``blackout in contact`` is one.
+"""Data slices: subsets of steps, sensor faults and modalities that are evaluated and trained on separately.
 
-In text, ``NAME:faults=FAULTS:contact=yes:only=MODALITY+MODALITY``, of which all but the name may be left out. What
-stands behind ``faults=`` up to ``contact=`` or ``only=`` is the faults's own text, colons included.
+As text, ``NAME:faults=FAULTS:contact=yes:only=MODALITY+MODALITY``; everything but the name is optional. The text after
+``faults=``, up to ``contact=`` or ``only=``, is that of the faults, colons included.
 """
 
 from __future__ import annotations
@@ -15,86 +15,93 @@ import torch
 from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, one_of
-from beliefscope.datasets.faults.injection import WHOLE, Faults
+from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import Task
+from beliefscope.filters import legacy_names
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence
 
 CONTACT = {"yes": True, "no": False}
+KEYS = ("name", "faults", "contact", "only")
 
 
 @dataclass(frozen=True)
 class Slice:
-    """What is broken, which steps count, and who may speak.
+    """Sensor faults, a condition on the steps, and the modalities to use.
 
     Attributes:
-        name: as shown; without ``:`` and ``=``. faults: how the sensors are broken.
-        contact: only steps that truly are in contact (True) or out of it (False); None: all steps.
-        only: the measurement models whose evidence is used; empty: all of them.
+        name: displayed; without ``:`` and ``=``. faults: injected into the sensors.
+        contact: restricts to steps in true contact (True) or in free motion (False); None: all steps.
+        only: the measurement models whose evidence is used; empty: all.
     """
 
     name: str
-    faults: Faults = WHOLE
+    faults: Faults = NO_FAULTS
     contact: bool | None = None
     only: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raises BadInput for a name that could not be read back."""
+        """Raises BadInput for a name that ``parse`` could not read."""
         if not self.name.strip() or self.name != self.name.strip() or set(self.name) & set(":=\n"):
-            raise BadInput(f"a slice's name is {self.name!r}; give it some text without : and =")
+            raise BadInput(f"a slice's name is {self.name!r}; it must not be empty or contain : or =")
 
     @classmethod
     def parse(cls, text: str, standard: Iterable[Slice] = ()) -> Slice:
-        """From its text, or from the bare name of one of the ``standard`` slices.
+        """Reads a slice's text, or the name of one of the ``standard`` slices.
 
-        Raises BadInput for a name that is not among them, a key that there is not, or a value that does not fit.
+        Raises BadInput for an unknown name or key, and for an invalid value.
         """
         name, *parts = text.split(":")
-        known = {one.name: one for one in standard}
         if not parts:
-            if name.strip() not in known:
-                raise BadInput(f"{one_of('slice', name, known)} A new one is written {name}:faults=...:contact=yes")
-            return known[name.strip()]
+            by_name = {slice_.name: slice_ for slice_ in standard}
+            name = legacy_names.slice_name(name.strip())
+            if name not in by_name:
+                error = unknown_name("slice", name, by_name)
+                raise BadInput(f"{error} To define a new one, write {name}:faults=...:contact=yes")
+            return by_name[name]
         values: dict[str, str] = {}
         for part in parts:
             key, equals, value = part.partition("=")
-            if key.strip() in ("faults", "contact", "only") and equals and key.strip() not in values:
+            if key.strip() in KEYS[1:] and equals and key.strip() not in values:
                 values[key.strip()] = value
             elif values and next(reversed(values)) == "faults":
                 values["faults"] += f":{part}"
             else:
-                raise BadInput(f"{part!r} in slice {text!r} is not a new one of faults=..., contact=yes|no, only=...")
+                raise BadInput(
+                    f"{part!r} in slice {text!r} is not one of faults=..., contact=yes|no, only=..., each once"
+                )
         contact = values.get("contact")
         if contact is not None and contact not in CONTACT:
-            raise BadInput(f"contact is {contact!r} in slice {text!r}; it is yes or no")
+            raise BadInput(f"contact is {contact!r} in slice {text!r}, expected yes or no")
         only = values.get("only")
         return cls(
             name=name.strip(),
             faults=Faults.parse(values.get("faults", "")),
             contact=None if contact is None else CONTACT[contact],
-            only=() if only is None else tuple(one.strip() for one in only.split("+")),
+            only=() if only is None else tuple(modality.strip() for modality in only.split("+")),
         )
 
     @classmethod
-    def of(cls, value: Any) -> Slice:
-        """From its text or from ``to_json``'s values, all but the name may be left out. Raises BadInput for others."""
+    def from_json(cls, value: Any) -> Slice:
+        """Reads a slice's text or the values of ``to_json``; only the name is required. Raises BadInput for others."""
         if isinstance(value, str):
             return cls.parse(value)
         if not isinstance(value, Mapping) or not isinstance(value.get("name"), str):
             raise BadInput(f'slice is {value!r}, not an object such as {{"name": "contact", "contact": true}}')
+        value = legacy_names.slice_json(value)
         for key in value:
-            if key not in ("name", "faults", "recipe", "contact", "only"):  # recipe: files of earlier versions
-                raise one_of("key of a slice", str(key), ("name", "faults", "contact", "only"))
+            if key not in KEYS:
+                raise unknown_name("key of a slice", str(key), KEYS)
         contact, only = value.get("contact"), value.get("only", [])
         if contact not in (None, True, False) or isinstance(contact, int) != isinstance(contact, bool):
-            raise BadInput(f"slice's contact is {contact!r}; it is true, false or null")
-        if not isinstance(only, list) or not all(isinstance(one, str) for one in only):
-            raise BadInput(f"slice's only is {only!r}, not a list of modalities")
-        return cls(value["name"], Faults.of(value.get("faults", value.get("recipe", []))), contact, tuple(only))
+            raise BadInput(f"contact of a slice is {contact!r}, expected true, false or null")
+        if not isinstance(only, list) or not all(isinstance(modality, str) for modality in only):
+            raise BadInput(f"only of a slice is {only!r}, not a list of modalities")
+        return cls(value["name"], Faults.from_json(value.get("faults", [])), contact, tuple(only))
 
     def to_json(self) -> dict[str, Any]:
-        """``Slice.of`` makes the same of it."""
+        """The inverse of ``from_json``."""
         return {
             "name": self.name,
             "faults": self.faults.to_json(),
@@ -103,54 +110,54 @@ class Slice:
         }
 
     def __str__(self) -> str:
-        """``Slice.parse`` makes the same of it."""
+        """The inverse of ``parse``."""
         parts = [f"faults={self.faults}"] if self.faults else []
         parts += [] if self.contact is None else [f"contact={'yes' if self.contact else 'no'}"]
         parts += [f"only={'+'.join(self.only)}"] if self.only else []
         return ":".join([self.name, *(parts or ["faults="])])
 
     def check(self, task: Task, models: Sequence[str]) -> None:
-        """Raises BadInput where the task lacks a sensor, or the filter one of ``models`` that the slice names."""
+        """Raises BadInput if the task lacks a sensor, or the filter's ``models`` lack one of the slice's modalities."""
         self.faults.check(task)
         for name in self.only:
             if name not in models:
-                raise one_of(f"modality of slice {self.name!r}", name, models)
+                raise unknown_name(f"modality of slice {self.name!r}", name, models)
 
-    def broken(self, episodes: Iterable[Episode], seed: int) -> list[Episode]:
+    def apply_faults(self, episodes: Iterable[Episode], seed: int) -> list[Episode]:
         """Copies of episodes with the slice's faults."""
         return [self.faults.apply(episode, seed) for episode in episodes]
 
     def mask(self, batch: Batch) -> Tensor:
-        """(T, N) bool: the steps that count."""
+        """(T, N) bool: the steps of the slice."""
         return torch.ones_like(batch.contact) if self.contact is None else batch.contact == self.contact
 
-    def heard(self, evidence: Evidence, models: Sequence[str]) -> Evidence:
-        """The evidence of those who may speak: as if the rest of ``models`` were not there."""
+    def select_evidence(self, evidence: Evidence, models: Sequence[str]) -> Evidence:
+        """The evidence of the slice's modalities, as if the other ``models`` were absent."""
         if not self.only:
             return evidence
         present = torch.tensor([name in self.only for name in models], device=evidence.control.device)
-        return evidence.of(present.expand(*evidence.control.shape[:2], -1))
+        return evidence.select_models(present.expand(*evidence.control.shape[:2], -1))
 
 
-NOMINAL = Slice("nominal")
-"""Everything as it is."""
+CLEAN = Slice("clean")
+"""All steps, all modalities, no faults."""
 
 
-def slices_of(task: Task) -> tuple[Slice, ...]:
-    """What is always looked at: nominal, contact and not, 80 % black pictures, each modality alone."""
-    found = [
-        NOMINAL,
+def standard_slices(task: Task) -> tuple[Slice, ...]:
+    """The slices evaluated by default: clean, contact, free motion, 80 % image blackout, each single modality."""
+    slices = [
+        CLEAN,
         Slice("contact", contact=True),
-        Slice("no contact", contact=False),
+        Slice("free motion", contact=False),
         Slice("blackout 0.8", Faults.parse("blackout=0.8")),
     ]
     if len(task.modalities) > 1:
-        found += [Slice(f"{modality} alone", only=(modality,)) for modality in task.modalities]
-    return tuple(one for one in found if _fits(one, task))
+        slices += [Slice(f"{modality} only", only=(modality,)) for modality in task.modalities]
+    return tuple(slice_ for slice_ in slices if _fits(slice_, task))
 
 
-def _fits(one: Slice, task: Task) -> bool:
+def _fits(slice_: Slice, task: Task) -> bool:
     with suppress(BadInput):
-        one.check(task, tuple(task.modalities))
+        slice_.check(task, tuple(task.modalities))
         return True
     return False

@@ -1,4 +1,4 @@
-"""The dynamics model that every filter shares."""
+"""The dynamics model, common to all filters with a prediction step."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from beliefscope.filters.models.networks import Residual, Stack, dual_linear, ve
 class Dynamics(nn.Module):
     """``x_t = x_{t-1} + f1(x_{t-1}, u_t) * sigmoid(f2(x_{t-1}, u_t))`` plus process noise (Lee et al., sec. V).
 
-    f1 is a vector, f2 a scalar gate, so that direction and size of the change are learned apart. State and control go
-    through three layers each; the seven that follow are shared. The first of these is kept as two summands, so that the
-    controls' part is computed once for all steps.
+    f1 is a vector, f2 a scalar gate, so that direction and size of the change are learned separately. State and control
+    pass through three layers each, followed by seven shared layers. The first shared layer is split into two summands,
+    so that the controls' part is computed once for all steps.
     """
 
     def __init__(self, n: int, control_size: int, units: int) -> None:
@@ -29,7 +29,7 @@ class Dynamics(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Fresh weights: the state hardly changes, with little noise."""
+        """Initial weights: small changes of the state, and little noise."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 module.reset_parameters()
@@ -54,7 +54,7 @@ class Dynamics(nn.Module):
         return states + change * torch.sigmoid(gate)
 
     def with_jacobian(self, states: Tensor, control_part: Tensor) -> tuple[Tensor, Tensor]:
-        """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass of dual numbers."""
+        """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass with dual numbers."""
         identity = torch.eye(self.n, dtype=states.dtype, device=states.device)
         tangents = identity.expand(*states.shape[:-1], self.n, self.n)
         x = torch.cat([states.unsqueeze(-2), tangents], dim=-2)

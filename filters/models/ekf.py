@@ -29,14 +29,14 @@ def predict(belief: Gaussian, mean: Tensor, jacobian: Tensor, noise: Tensor) -> 
 def update(belief: Gaussian, observation: Tensor, noise: Tensor) -> Gaussian:
     """Update with an observation of the whole state, H = I: ``K = S (S + R)^-1`` (Lee et al., eq. 7-9).
 
-    The covariance ``(I - K) S`` is computed as the equal ``(I - K) S (I - K)^T + K R K^T``, which rounding leaves
-    positive.
+    The covariance ``(I - K) S`` is computed in Joseph form, ``(I - K) S (I - K)^T + K R K^T``, which stays positive
+    definite despite rounding.
 
     Args:
         observation: (..., n) z. noise: (..., n) square root of R's diagonal.
     """
     r = torch.diag_embed(noise**2)
-    # K^T = (S + R)^-1 S, as S and R are symmetric.
+    # K^T = (S + R)^-1 S, since S and R are symmetric.
     gain = torch.linalg.solve(belief.covariance + r, belief.covariance).transpose(-1, -2)
     mean = belief.mean + (gain @ (observation - belief.mean).unsqueeze(-1)).squeeze(-1)
     keep = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain
@@ -64,8 +64,8 @@ class VirtualSensor(nn.Module):
 class ExtendedKalmanFilter(Filter):
     """A bank of K unimodal EKFs that share the dynamics model, fused after every step.
 
-    The belief passed between steps is the bank, Gaussian (N, K, n): the unimodal filters run on alone, as in the
-    paper's text, unless ``architecture.feedback`` hands each the fused belief.
+    The belief passed between steps is the bank, Gaussian (N, K, n): the unimodal filters stay independent, as in
+    the paper's text, unless ``architecture.feedback`` replaces each belief by the fused one.
     """
 
     def __init__(self, architecture: Architecture) -> None:
@@ -82,7 +82,7 @@ class ExtendedKalmanFilter(Filter):
             control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
             observation=torch.stack(z, dim=2),
             noise=torch.stack(noise, dim=2),
-            log_weights=self.weights_part(batch),
+            log_weights=self.log_weights(batch),
         )
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Gaussian:
@@ -96,9 +96,9 @@ class ExtendedKalmanFilter(Filter):
         predicted = self.predict(belief, evidence.control.unsqueeze(1))
         bank = update(predicted, evidence.observation, evidence.noise)
         if evidence.present is not None:
-            seen = evidence.present.unsqueeze(-1)
-            mean = torch.where(seen, bank.mean, predicted.mean)
-            bank = Gaussian(mean, torch.where(seen.unsqueeze(-1), bank.covariance, predicted.covariance))
+            present = evidence.present.unsqueeze(-1)
+            mean = torch.where(present, bank.mean, predicted.mean)
+            bank = Gaussian(mean, torch.where(present.unsqueeze(-1), bank.covariance, predicted.covariance))
         fused = self.fuse(bank, evidence.log_weights, evidence.present)
         trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)
         if self.architecture.feedback:
@@ -109,7 +109,7 @@ class ExtendedKalmanFilter(Filter):
         return bank, trace
 
     def predict(self, belief: Gaussian, control_part: Tensor) -> Gaussian:
-        """The bank (N, K, n) after the dynamics; ``control_part`` (N, 1, u)."""
+        """The predicted bank (N, K, n); ``control_part`` (N, 1, u)."""
         mean, jacobian = self.dynamics.with_jacobian(belief.mean, control_part)
         return predict(belief, mean, jacobian, self.dynamics.noise)
 

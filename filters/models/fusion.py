@@ -1,4 +1,4 @@
-"""Ways to fuse K unimodal beliefs or likelihoods. Pure functions; the modality axis is said in each."""
+"""Rules to fuse K unimodal beliefs or likelihoods, as pure functions."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ CovarianceRule = Literal["paper", "moments"]
 def product_of_experts(bank: Gaussian, present: Tensor | None = None) -> Gaussian:
     """Product of K Gaussians (N, K, n): ``S = (sum S_k^-1)^-1``, ``m = S sum S_k^-1 m_k`` (Lee et al., eq. 10, 11).
 
-    present: (N, K) bool, which of them there are. Where none is left, the K predictions, each to the power 1 / K, so
-    that they do not count as K pieces of evidence.
+    present: (N, K) bool, which to include. If none is, the K predictions, each to the power 1 / K, so that they do not
+    count as K independent pieces of evidence.
     """
     precision = torch.linalg.inv(bank.covariance)
     if present is not None:
@@ -30,11 +30,11 @@ def product_of_experts(bank: Gaussian, present: Tensor | None = None) -> Gaussia
 def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule = "paper") -> Gaussian:
     """Crossmodal weights per component: ``m = sum b_k * m_k / sum b_k`` (Lee et al., eq. 12, 13).
 
-    ``paper``: ``S = sum B_k * S_k / sum B_k``, all elementwise, ``B_k = n b_k b_k^T``. Taken literally the result
-    need not be
-    positive definite, since each entry is averaged with weights of its own; where it is not, its correlations are
-    limited to what always is. It also ignores that the modalities disagree.
-    ``moments``: the covariance of the mixture that has these weights: adds the spread of the means; always definite.
+    ``paper``: ``S = sum B_k * S_k / sum B_k``, all elementwise, ``B_k = n b_k b_k^T``. It may be indefinite,
+    since each entry is averaged with its own weights; its correlations are then clipped (``positive_definite``).
+    The rule also ignores the disagreement of the modalities.
+    ``moments``: the covariance of the mixture with these weights, which adds the spread of the means; always positive
+    definite.
 
     Args:
         bank: mean (N, K, n), covariance (N, K, n, n). log_weights: (N, K, n), log beta.
@@ -46,7 +46,7 @@ def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule =
         spread = bank.mean - mean.unsqueeze(-2)
         inner = bank.covariance + spread.unsqueeze(-1) * spread.unsqueeze(-2)
         return Gaussian(mean, symmetric((root.unsqueeze(-1) * root.unsqueeze(-2) * inner).sum(-3)))
-    # Logs keep the ratio finite where two one-hot weights differ between components (0 / 0 otherwise).
+    # In log space, the ratio stays finite for one-hot weights that differ between components (else 0 / 0).
     log_beta = torch.log_softmax(log_weights, dim=-2).clamp_min(-40.0)
     share = torch.softmax(log_beta.unsqueeze(-1) + log_beta.unsqueeze(-2), dim=-3)
     return Gaussian(mean, positive_definite(symmetric((share * bank.covariance).sum(-3))))
@@ -60,10 +60,10 @@ def mixture(log_likelihood: Tensor, log_weights: Tensor | None) -> Tensor:
 
 
 def only_present(log_likelihood: Tensor, present: Tensor) -> Tensor:
-    """Log-likelihoods (N, K, M) without those of models that are not ``present`` (N, K); where none is, flat ones."""
+    """Log-likelihoods (N, K, M), -inf for models that are not ``present`` (N, K); uniform if none is."""
     none = ~present.any(-1, keepdim=True)
-    kept = log_likelihood.masked_fill(~present.unsqueeze(-1), -torch.inf)
-    return kept.masked_fill(none.unsqueeze(-1), 0.0)
+    masked = log_likelihood.masked_fill(~present.unsqueeze(-1), -torch.inf)
+    return masked.masked_fill(none.unsqueeze(-1), 0.0)
 
 
 def symmetric(matrix: Tensor) -> Tensor:
@@ -72,19 +72,20 @@ def symmetric(matrix: Tensor) -> Tensor:
 
 
 def positive_definite(covariance: Tensor) -> Tensor:
-    """Matrices (..., n, n) that are positive definite stay; in others correlations are clipped to 0.95 / (n - 1).
+    """Clips the correlations of matrices (..., n, n) that are not positive definite to 0.95 / (n - 1).
 
-    A matrix with unit diagonal and off-diagonal entries below 1 / (n - 1) is diagonally dominant, hence definite.
+    A matrix with unit diagonal and off-diagonal entries below 1 / (n - 1) is diagonally dominant and hence positive
+    definite.
     """
     n = covariance.shape[-1]
     if n == 1:
         return covariance
-    bad = torch.linalg.cholesky_ex(covariance.detach()).info > 0
-    if not bool(bad.any()):
+    indefinite = torch.linalg.cholesky_ex(covariance.detach()).info > 0
+    if not bool(indefinite.any()):
         return covariance
     scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).sqrt()
     outer = scale.unsqueeze(-1) * scale.unsqueeze(-2)
     limit = 0.95 / (n - 1)
     diagonal = torch.eye(n, dtype=torch.bool, device=covariance.device)
     clipped = torch.where(diagonal, covariance, (covariance / outer).clamp(-limit, limit) * outer)
-    return torch.where(bad[..., None, None], clipped, covariance)
+    return torch.where(indefinite[..., None, None], clipped, covariance)

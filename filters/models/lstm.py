@@ -19,7 +19,7 @@ LAYERS = 2
 class Cell(nn.Module):
     """One LSTM layer: ``c' = s(f) c + s(i) tanh(g)``, ``h' = s(o) tanh(c')``, ``(i, f, g, o) = x Wx + h Wh + b``.
 
-    The weights lie with the inputs along the rows, unlike PyTorch's own: for one trajectory that is a quarter faster.
+    Weight matrices have inputs along the rows, unlike PyTorch's, which is a quarter faster for one trajectory.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -40,10 +40,10 @@ class Cell(nn.Module):
 
 
 class Lstm(Filter):
-    """Encoders of all modalities and of the controls, shared layers, two LSTM layers of 512, a readout of the state.
+    """Encoders of all modalities and of the controls, shared layers, two LSTM layers of 512 units, a state readout.
 
-    It predicts nothing and knows no covariance. Its first hidden state is a learned function of the first belief's
-    mean, so that it starts where the other filters start.
+    It has no prediction step and no covariance. Its first hidden state is a learned function of the first belief's
+    mean, so that it starts from the same belief as the other filters.
     """
 
     has_covariance = False
@@ -75,7 +75,7 @@ class Lstm(Filter):
         return self.read(belief, hidden)
 
     def steps(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> Iterator[StepTrace]:
-        """All steps, one layer after the other: the same numbers, while one layer's weights stay in the cache."""
+        """All steps, layer by layer: identical results, but each layer's weights stay in the CPU cache."""
         assert isinstance(belief, Recurrent)
         inputs, hidden = evidence.observation.squeeze(2).unbind(0), []
         for layer, state in zip(self.layers, belief.hidden.unbind(1), strict=True):

@@ -1,4 +1,4 @@
-"""Building blocks of all networks: residual layers, encoders, and forward-mode derivatives through them."""
+"""Building blocks of the networks: residual layers, encoders, and forward-mode derivatives."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from torch.nn import functional
 
 Pooling = Literal["flatten", "spatial-softmax", "mean"]
 
-PICTURES_AT_ONCE = 128
-"""Pictures encoded in one go: enough to keep the cores busy, few enough to stay in the caches."""
+IMAGE_CHUNK = 128
+"""Images encoded at once: enough to use all cores, few enough to stay in the CPU caches."""
+
+ROW_CHUNK = 1024
+"""Particles or map cells evaluated at once, so that their activations stay in the CPU caches."""
 
 
-ROWS_AT_ONCE = 1024
-"""Particles or map cells that go through full layers in one go: their activations stay in the caches."""
-
-
-def in_groups(function: Callable[[Tensor], Tensor], states: Tensor) -> Tensor:
-    """``function`` of states (N, M, n), so many particles at a time; results (N, M, ...) are joined again."""
-    groups = states.split(max(1, ROWS_AT_ONCE // len(states)), dim=1)
-    return function(states) if len(groups) == 1 else torch.cat([function(group) for group in groups], dim=1)
+def in_chunks(function: Callable[[Tensor], Tensor], states: Tensor) -> Tensor:
+    """``function`` of states (N, M, n), evaluated for a limited number of particles at once; result (N, M, ...)."""
+    chunks = states.split(max(1, ROW_CHUNK // len(states)), dim=1)
+    return function(states) if len(chunks) == 1 else torch.cat([function(chunk) for chunk in chunks], dim=1)
 
 
 class Residual(nn.Module):
@@ -57,7 +56,7 @@ def dual_relu(x: Tensor) -> Tensor:
 
 
 class Stack(nn.Sequential):
-    """Linear, ReLU and Residual layers in a row, on values or on dual numbers."""
+    """A sequence of Linear, ReLU and Residual layers, for values or dual numbers."""
 
     def dual(self, x: Tensor) -> Tensor:
         """Values and derivatives (..., 1 + n, d) through the stack."""
@@ -91,7 +90,7 @@ class ResidualConvolution(nn.Module):
 
 
 class SpatialSoftmax(nn.Module):
-    """Channels (B, C, H, W) to where each is active: the mean x and y (B, 2 C) of its softmax, from -1 to 1.
+    """Channels (B, C, H, W) to the mean x and y (B, 2 C) of each channel's softmax, from -1 to 1.
 
     Levine et al., "End-to-End Training of Deep Visuomotor Policies", 2016.
     """
@@ -105,21 +104,20 @@ class SpatialSoftmax(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Pictures (B, H, W), standardised, to features (B, units).
+    """Images (B, H, W), standardised, to features (B, units).
 
-    Pooling leads from the convolutions' 8 channels to the first full layer: ``flatten`` hands on every cell,
-    ``spatial-softmax`` where each channel is active, ``mean`` how much. A first layer of stride 2 takes a fifth of the
-    time of full resolution at like accuracy (see docs/filters.md).
+    Pooling reduces the convolutions' 8 channels: ``flatten`` keeps every cell, ``spatial-softmax`` the position of each
+    channel's activation, ``mean`` its average. A first layer of stride 2 takes a fifth of the time of full resolution
+    at similar accuracy (see docs/filters.md).
 
     Attributes:
-        table: (pictures + 1, units) what it says to each training picture and, last, to a black one; only while a
-            trainer leaves it as it is.
-        pictures: numbers of pictures (...) to pictures (..., H, W), standardised; only while a trainer numbers them and
-            yet trains it.
+        table: (images + 1, units) cached features of each training image and, last, of a black one; only while the
+            encoder is frozen during training.
+        images: image indices (...) to images (..., H, W), standardised; only while the encoder is trained on indices.
     """
 
     table: Tensor | None = None
-    pictures: Callable[[Tensor], Tensor] | None = None
+    images: Callable[[Tensor], Tensor] | None = None
 
     def __init__(self, shape: tuple[int, int], units: int, stride: int = 2, pooling: Pooling = "flatten") -> None:
         super().__init__()
@@ -132,7 +130,7 @@ class ImageEncoder(nn.Module):
             nn.Conv2d(16, 8, 3, padding=1),
             nn.ReLU(inplace=True),
         )
-        # With the channels innermost, convolutions on a CPU take two thirds of the time.
+        # With channels last, convolutions on a CPU take two thirds of the time.
         self.convolutions.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         cells = -(-shape[0] // stride) * -(-shape[1] // stride)
         size, self.pooling = {
@@ -142,13 +140,13 @@ class ImageEncoder(nn.Module):
         }[pooling]
         self.output = Stack(nn.Linear(size, units), nn.ReLU(inplace=True), Residual(units))
 
-    def forward(self, pictures: Tensor) -> Tensor:
-        features: Tensor = self.output(self.pooling(self.convolutions(pictures.unsqueeze(1))))
+    def forward(self, images: Tensor) -> Tensor:
+        features: Tensor = self.output(self.pooling(self.convolutions(images.unsqueeze(1))))
         return features
 
 
 class Encoders(nn.Module):
-    """One encoder a modality; their features joined: observations (T, N, ...) to (T, N, units x modalities)."""
+    """One encoder per modality, with joined features: observations (T, N, ...) to (T, N, units x modalities)."""
 
     def __init__(
         self, shapes: Mapping[str, tuple[int, ...]], units: int, image_stride: int, pooling: Pooling = "flatten"
@@ -166,24 +164,24 @@ class Encoders(nn.Module):
         features = []
         for modality, encoder in self.by_modality.items():
             observed = observations[modality]
-            if isinstance(encoder, ImageEncoder) and encoder.pictures is not None:
-                observed = encoder.pictures(observed)
+            if isinstance(encoder, ImageEncoder) and encoder.images is not None:
+                observed = encoder.images(observed)
             if isinstance(encoder, ImageEncoder) and observed.dtype == torch.int64:
                 assert encoder.table is not None
                 features.append(encoder.table[observed])
             elif isinstance(encoder, ImageEncoder):
-                parts = [encoder(part) for part in observed.flatten(0, 1).split(PICTURES_AT_ONCE)]
+                parts = [encoder(part) for part in observed.flatten(0, 1).split(IMAGE_CHUNK)]
                 features.append(torch.cat(parts).unflatten(0, observed.shape[:2]))
             else:
                 features.append(encoder(observed))
         return torch.cat(features, dim=-1)
 
 
-def fresh(module: nn.Module) -> None:
-    """New weights for a module, drawn from torch's global generator."""
+def reset_weights(module: nn.Module) -> None:
+    """Initialises a module's weights from torch's global generator."""
     reset = getattr(module, "reset_parameters", None)
     if callable(reset):
         reset()
     else:
         for child in module.children():
-            fresh(child)
+            reset_weights(child)

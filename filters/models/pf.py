@@ -16,15 +16,15 @@ from beliefscope.filters.filter import Architecture, Filter, WeightModel, encode
 from beliefscope.filters.models import common_random_numbers
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import mixture, only_present
-from beliefscope.filters.models.networks import Residual, Stack, in_groups, vector_stack
+from beliefscope.filters.models.networks import Residual, Stack, in_chunks, vector_stack
 from beliefscope.filters.models.resampling import resample
 
 
 class MeasurementModel(nn.Module):
     """log p(observation | state) up to a constant, from observations and the state of each particle.
 
-    The first layer that sees both is kept as two summands: ``observation_part`` is computed once a step, ``state_part``
-    once a particle, and ``log_likelihood`` needs only their sum.
+    The first joint layer is split into two summands: ``observation_part`` is computed once per step, ``state_part``
+    once per particle, and ``log_likelihood`` takes their sum.
     """
 
     def __init__(self, task: Task, model: str, architecture: Architecture) -> None:
@@ -47,15 +47,15 @@ class MeasurementModel(nn.Module):
         return part
 
     def log_likelihood(self, observation_part: Tensor, state_part: Tensor) -> Tensor:
-        """Two parts that broadcast against each other, (..., units), to (...)."""
+        """Two broadcastable parts (..., units) to (...)."""
         value: Tensor = self.head(observation_part + state_part)
         return value.squeeze(-1)
 
 
 class ParticleFilter(Filter):
-    """Sampling importance resampling with ``w_i = sum_k beta_k p_k(z | x_i) / s_k``.
+    """Sampling importance resampling with ``w_i = sum_k beta_k p_k(z | x_i) / s_k``, resampled at every step.
 
-    The scale s_k is each model's evidence, or 1 (``architecture.likelihoods``). Resampling at every step.
+    The scale s_k is each model's evidence, or 1 (``architecture.likelihoods``).
     """
 
     def __init__(self, architecture: Architecture) -> None:
@@ -66,7 +66,7 @@ class ParticleFilter(Filter):
             self.weight_model = WeightModel(self.task, architecture, 1)
 
     def measurement_model(self, name: str) -> MeasurementModel:
-        """The model of one modality, typed."""
+        """The model of one modality."""
         model = self.measurement_models[name]
         assert isinstance(model, MeasurementModel)
         return model
@@ -78,20 +78,20 @@ class ParticleFilter(Filter):
             control=self.dynamics.control_part(self.statistics.standardise("control", batch.controls)),
             observation=torch.stack(parts, dim=2),
             noise=None,
-            log_weights=self.weights_part(batch),
+            log_weights=self.log_weights(batch),
         )
 
     def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
-        """Of each modality, for particles (N, M, n) at one step: (N, K, M), not normalised."""
+        """Of each modality, for particles (N, M, n) at one step: (N, K, M), unnormalised."""
 
-        def of(k: int, states: Tensor) -> Tensor:
+        def model_likelihood(k: int, states: Tensor) -> Tensor:
             model = self.measurement_model(self.names[k])
             return model.log_likelihood(evidence.observation[:, k, None], model.state_part(states))
 
-        return torch.stack([in_groups(partial(of, k), states) for k in range(len(self.names))], dim=1)
+        return torch.stack([in_chunks(partial(model_likelihood, k), states) for k in range(len(self.names))], dim=1)
 
     def scale(self, log_weights: Tensor, log_likelihood: Tensor) -> Tensor:
-        """(N, K, 1) what is taken off each model's log-likelihoods (N, K, M) before they are fused.
+        """(N, K, 1) log scale subtracted from each model's log-likelihoods (N, K, M) before the fusion.
 
         Normalised: the evidence ``log sum_i w_i p_k(z | x_i)`` with the particles' prior log-weights (N, M). Raw: zero.
         """
@@ -109,14 +109,14 @@ class ParticleFilter(Filter):
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Particles, StepTrace]:
         assert isinstance(belief, Particles)
         control = evidence.control.unsqueeze(1)
-        moved = in_groups(lambda states: self.dynamics(states, control), belief.states)
+        moved = in_chunks(lambda states: self.dynamics(states, control), belief.states)
         unit = common_random_numbers.normal(moved.shape, generator)
         predicted = Particles(moved + unit * self.dynamics.noise, belief.log_weights)
         log_likelihood = self.log_likelihood(evidence, predicted.states)
-        weighed = log_likelihood - self.scale(predicted.log_weights, log_likelihood)
+        scaled = log_likelihood - self.scale(predicted.log_weights, log_likelihood)
         if evidence.present is not None:
-            weighed = only_present(weighed, evidence.present)
-        log_weights = predicted.log_weights + mixture(weighed, evidence.log_weights)
+            scaled = only_present(scaled, evidence.present)
+        log_weights = predicted.log_weights + mixture(scaled, evidence.log_weights)
         posterior = Particles(predicted.states, torch.log_softmax(log_weights, dim=-1))
         rule, share = self.architecture.resampling, self.architecture.soft_share
         ancestors, log_weights = resample(posterior.log_weights, rule, share, generator)

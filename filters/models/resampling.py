@@ -1,4 +1,4 @@
-"""Resampling of particles: which ones go on, and what they weigh then."""
+"""Resampling of particles: ancestors and the weights after resampling."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Resampling = Literal["systematic", "hard", "soft"]
 def resample(
     log_weights: Tensor, rule: Resampling, soft_share: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Ancestors (N, M) int64 and the log-weights (N, M) of what they become, normalised: logsumexp over M is 0.
+    """Ancestors (N, M) int64 and the log-weights (N, M) after resampling, normalised: logsumexp over M is 0.
 
-    ``systematic`` and ``hard`` (multinomial) draw from the weights w and leave all weights equal; no gradient passes.
-    ``soft`` draws from ``q = a w + (1 - a) / M`` and corrects by the importance weights w / q, which carry gradients
+    ``systematic`` and ``hard`` (multinomial) sample from the weights w and make all weights equal; no gradient passes.
+    ``soft`` samples from ``q = a w + (1 - a) / M`` and corrects by the importance weights w / q, which carry gradients
     (Karkus et al., "Particle Filter Networks", 2018).
 
     Args:
-        log_weights: (N, M), normalised. soft_share: a. generator: of the same device.
+        log_weights: (N, M), normalised. soft_share: a. generator: on the same device.
     """
     if rule == "systematic":
         return systematic(log_weights.detach(), generator), uniform(log_weights)
@@ -34,28 +34,28 @@ def resample(
 
 
 def systematic(log_weights: Tensor, generator: torch.Generator) -> Tensor:
-    """Ancestors (N, M) int64 by systematic resampling: one uniform number a set, M evenly spaced pointers.
+    """Ancestors (N, M) int64 by systematic resampling: one uniform number per set, M evenly spaced pointers.
 
-    Particle i is drawn floor(M w_i) or ceil(M w_i) times, M w_i in expectation.
+    Particle i is sampled floor(M w_i) or ceil(M w_i) times, M w_i in expectation.
 
     Args:
-        log_weights: (N, M), normalised. generator: of the same device.
+        log_weights: (N, M), normalised. generator: on the same device.
     """
     count = log_weights.shape[-1]
     offset = common_random_numbers.uniform((len(log_weights), 1), generator)
     pointers = (torch.arange(count, device=log_weights.device) + offset) / count
-    return pointed_at(log_weights, pointers)
+    return select_by_weight(log_weights, pointers)
 
 
 def multinomial(log_weights: Tensor, generator: torch.Generator) -> Tensor:
-    """Ancestors (N, M) int64, each drawn on its own: particle i with the chance w_i. Arguments as ``systematic``."""
-    return pointed_at(log_weights, common_random_numbers.uniform(log_weights.shape, generator))
+    """Ancestors (N, M) int64, independent: particle i with probability w_i. Arguments as in ``systematic``."""
+    return select_by_weight(log_weights, common_random_numbers.uniform(log_weights.shape, generator))
 
 
 def soft(log_weights: Tensor, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Soft resampling: ancestors (N, M) and ``log(w / (q M))`` of each, whose exponentials sum to 1 in expectation.
 
-    The weighted sum of any function over the resampled particles has the expectation it had before.
+    The weighted sum of any function over the particles has the same expectation as before.
     """
     count = log_weights.shape[-1]
     uniform_part = torch.full_like(log_weights, math.log1p(-share) - math.log(count) if share < 1.0 else -math.inf)
@@ -64,10 +64,10 @@ def soft(log_weights: Tensor, share: float, generator: torch.Generator) -> tuple
     return ancestors, (log_weights - log_proposal).gather(-1, ancestors) - math.log(count)
 
 
-def pointed_at(log_weights: Tensor, pointers: Tensor) -> Tensor:
-    """The particle in whose share of [0, 1) each pointer (N, M) lies."""
+def select_by_weight(log_weights: Tensor, pointers: Tensor) -> Tensor:
+    """Index of the particle whose interval of the cumulative weights contains each pointer (N, M) in [0, 1)."""
     cumulative = log_weights.exp().cumsum(-1)
-    # Rounding may leave the last sum a little off 1; dividing keeps every pointer inside.
+    # Rounding may leave the last sum slightly below 1; normalise so that every pointer falls inside.
     cumulative = cumulative / cumulative[:, -1:]
     return torch.searchsorted(cumulative, pointers, right=True).clamp_max(log_weights.shape[-1] - 1)
 

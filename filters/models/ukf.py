@@ -1,4 +1,4 @@
-"""Unscented Kalman filters: the extended ones with another prediction (beyond the paper)."""
+"""Unscented Kalman filters: extended Kalman filters with an unscented prediction (not in the paper)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.fusion import symmetric
 
 ALPHA, BETA, KAPPA = 1.0, 2.0, 0.0
-"""Of the scaled transform. With these no weight is negative, so that every covariance is positive definite; 2 is the
-beta for Gaussians."""
+"""Parameters of the scaled transform: no weight is negative, so that covariances are positive definite; beta is 2 for
+Gaussians."""
 
 
 def sigma_points(belief: Gaussian) -> Tensor:
-    """The mean and, on both sides of it, n points at ``sqrt(n + lambda)`` standard deviations: (..., 2 n + 1, n)."""
+    """The mean and n points on either side of it at ``sqrt(n + lambda)`` standard deviations: (..., 2 n + 1, n)."""
     n = belief.mean.shape[-1]
     # Row i is column i of the Cholesky factor, scaled: n + lambda = alpha^2 (n + kappa).
     offsets = ALPHA * (n + KAPPA) ** 0.5 * torch.linalg.cholesky(belief.covariance).transpose(-1, -2)
@@ -24,7 +24,7 @@ def sigma_points(belief: Gaussian) -> Tensor:
 
 
 def unscented(points: Tensor) -> Gaussian:
-    """Mean and covariance of what a function made of the sigma points (..., 2 n + 1, n).
+    """Mean and covariance of transformed sigma points (..., 2 n + 1, n).
 
     Weights of the scaled unscented transform (Wan and van der Merwe, "The Unscented Kalman Filter for Nonlinear
     Estimation", 2000): ``lambda / (n + lambda)`` for the centre, with ``1 - alpha^2 + beta`` added in the covariance,
@@ -32,21 +32,21 @@ def unscented(points: Tensor) -> Gaussian:
     """
     n = points.shape[-1]
     spread = ALPHA**2 * (n + KAPPA)
-    of_mean = points.new_full((2 * n + 1,), 0.5 / spread)
-    of_mean[0] = 1.0 - n / spread
-    of_covariance = of_mean.clone()
-    of_covariance[0] += 1.0 - ALPHA**2 + BETA
-    mean = of_mean @ points
+    mean_weights = points.new_full((2 * n + 1,), 0.5 / spread)
+    mean_weights[0] = 1.0 - n / spread
+    covariance_weights = mean_weights.clone()
+    covariance_weights[0] += 1.0 - ALPHA**2 + BETA
+    mean = mean_weights @ points
     deviation = points - mean.unsqueeze(-2)
-    return Gaussian(mean, (deviation * of_covariance.unsqueeze(-1)).transpose(-1, -2) @ deviation)
+    return Gaussian(mean, (deviation * covariance_weights.unsqueeze(-1)).transpose(-1, -2) @ deviation)
 
 
 class UnscentedKalmanFilter(ExtendedKalmanFilter):
-    """A bank of unscented Kalman filters with the extended ones' virtual sensors, updates and fusion.
+    """A bank of unscented Kalman filters with the virtual sensors, updates and fusion of the EKF.
 
-    An update needs no sigma points: the virtual sensors observe the state itself, H = I.
+    The update needs no sigma points, since virtual sensors observe the state itself: H = I.
     """
 
     def predict(self, belief: Gaussian, control_part: Tensor) -> Gaussian:
-        moved = unscented(self.dynamics(sigma_points(belief), control_part.unsqueeze(-2)))
-        return Gaussian(moved.mean, symmetric(moved.covariance) + torch.diag_embed(self.dynamics.noise**2))
+        predicted = unscented(self.dynamics(sigma_points(belief), control_part.unsqueeze(-2)))
+        return Gaussian(predicted.mean, symmetric(predicted.covariance) + torch.diag_embed(self.dynamics.noise**2))

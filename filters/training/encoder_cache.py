@@ -1,6 +1,6 @@
-"""Frozen encoders asked once: every different picture gets a number, and what they say to it is looked up.
+"""Cached outputs of frozen image encoders: each distinct image is encoded once and then looked up by its index.
 
-Pictures cost nearly all of a training step's time, and what a frozen encoder says to one never changes.
+Encoding images takes nearly all of a training step's time, and the output of a frozen encoder never changes.
 """
 
 from __future__ import annotations
@@ -15,64 +15,67 @@ from torch import Tensor
 
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.models.networks import PICTURES_AT_ONCE, ImageEncoder
+from beliefscope.filters.models.networks import IMAGE_CHUNK, ImageEncoder
 
-Pictures = Mapping[str, Tensor]
-"""Modality -> (P, H, W) uint8, no two alike."""
+Images = Mapping[str, Tensor]
+"""Modality -> (P, H, W) uint8, all different."""
 
 
-def numbered(sets: Sequence[Steps]) -> tuple[list[Steps], Pictures]:
-    """The sets of steps with a number in place of each picture, and the pictures. All black ones are the same."""
+def index_images(sets: Sequence[Steps]) -> tuple[list[Steps], Images]:
+    """The sets of steps with an index in place of each image, and the distinct images."""
     observations = [dict(steps.observations) for steps in sets]
-    pictures: dict[str, Tensor] = {}
+    images: dict[str, Tensor] = {}
     for modality, values in sets[0].observations.items():
         if values.dtype != torch.uint8:
             continue
         joined = torch.cat([steps.observations[modality] for steps in sets])
         rows = np.ascontiguousarray(joined.cpu().numpy().reshape(len(joined), -1))
-        whole = rows.view(np.dtype((np.void, rows.shape[1]))).ravel()
-        _, first, number = np.unique(whole, return_index=True, return_inverse=True)
-        pictures[modality] = joined[torch.from_numpy(first).to(values.device)]
-        numbers = torch.from_numpy(number.astype(np.int64)).to(values.device)
-        for found, part in zip(observations, numbers.split([len(steps.states) for steps in sets]), strict=True):
-            found[modality] = part
-    return [replace(steps, observations=found) for steps, found in zip(sets, observations, strict=True)], pictures
+        rows = rows.view(np.dtype((np.void, rows.shape[1]))).ravel()
+        _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
+        images[modality] = joined[torch.from_numpy(first).to(values.device)]
+        indices = torch.from_numpy(inverse.astype(np.int64)).to(values.device)
+        for indexed, part in zip(observations, indices.split([len(steps.states) for steps in sets]), strict=True):
+            indexed[modality] = part
+    return [replace(steps, observations=indexed) for steps, indexed in zip(sets, observations, strict=True)], images
 
 
 @contextmanager
-def recalling(
-    filter_: Filter, pictures: Pictures, progress: Callable[[float], None] = lambda share: None
+def cached_encoders(
+    filter_: Filter, images: Images, progress: Callable[[float], None] = lambda share: None
 ) -> Iterator[None]:
-    """Within, the filter takes numbers for pictures: frozen encoders look up, others encode what the number stands for.
+    """Within this context the filter takes image indices: frozen encoders look up features, others encode the image.
 
-    Encoders are frozen where no parameter requires a gradient on entry. Results differ from those on pictures only as
-    sums in another order do.
+    An encoder counts as frozen if none of its parameters requires a gradient on entry. Results differ from those on
+    images only by rounding, since sums are taken in another order.
     """
-    work = [
+    encoders = [
         (name.rpartition(".by_modality.")[2], module)
         for name, module in filter_.named_modules()
         if isinstance(module, ImageEncoder)
     ]
     tables: dict[tuple[str, bytes], Tensor] = {}
     try:
-        for done, (modality, encoder) in enumerate(work):
+        for count, (modality, encoder) in enumerate(encoders, 1):
             if any(parameter.requires_grad for parameter in encoder.parameters()):
-                encoder.pictures = lambda n, m=modality: filter_.statistics.standardise(m, pictures[m][n])
+                encoder.images = lambda n, m=modality: filter_.statistics.standardise(m, images[m][n])
                 continue
-            # Encoders that are the same share a table.
-            key = modality, torch.cat([p.detach().flatten() for p in encoder.parameters()]).cpu().numpy().tobytes()
+            key = modality, weights_key(encoder)
             if key not in tables:
-                tables[key] = _table(filter_, modality, encoder, pictures[modality])
+                tables[key] = encode_images(filter_, modality, encoder, images[modality])
             encoder.table = tables[key]
-            progress((done + 1) / len(work))
+            progress(count / len(encoders))
         yield
     finally:
-        for _, encoder in work:
-            encoder.table = encoder.pictures = None
+        for _, encoder in encoders:
+            encoder.table = encoder.images = None
+
+
+def weights_key(encoder: ImageEncoder) -> bytes:
+    """The encoder's parameters as bytes: encoders with equal weights share one table."""
+    return torch.cat([p.detach().flatten() for p in encoder.parameters()]).cpu().numpy().tobytes()
 
 
 @torch.no_grad()
-def _table(filter_: Filter, modality: str, encoder: ImageEncoder, pictures: Tensor) -> Tensor:
-    """(P, units) what the encoder says to each picture."""
-    parts = pictures.split(PICTURES_AT_ONCE)
-    return torch.cat([encoder(filter_.statistics.standardise(modality, part)) for part in parts])
+def encode_images(filter_: Filter, modality: str, encoder: ImageEncoder, images: Tensor) -> Tensor:
+    """(P, units) features of images (P, H, W), uint8."""
+    return torch.cat([encoder(filter_.statistics.standardise(modality, part)) for part in images.split(IMAGE_CHUNK)])

@@ -1,4 +1,4 @@
-"""What each stage of training minimises. Functions of a filter and a batch of training windows; standardised units."""
+"""Loss functions of the training stages, of a filter and a batch of training windows, in standardised units."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from beliefscope.filters.models.pf import MeasurementModel
 from beliefscope.filters.rollout import START_VARIANCE, rollout, start_at_truth
 
 
-def state(filter_: Filter, batch: Batch) -> Tensor:
-    """(T, N, n) the truth."""
+def true_states(filter_: Filter, batch: Batch) -> Tensor:
+    """(T, N, n), standardised."""
     return filter_.statistics.standardise("state", batch.states)
 
 
 def prediction(filter_: Filter, batch: Batch) -> Tensor:
-    """Mean squared error of the dynamics alone, T steps ahead from the truth."""
+    """Mean squared error of the dynamics model, T steps ahead from the true state."""
     control = filter_.dynamics.control_part(filter_.statistics.standardise("control", batch.controls))
-    target, total = state(filter_, batch), torch.zeros((), device=batch.states.device)
+    target, total = true_states(filter_, batch), torch.zeros((), device=batch.states.device)
     x = filter_.statistics.standardise("state", batch.previous)
     for t in range(len(batch)):
         x = filter_.dynamics(x, control[t])
@@ -33,35 +33,35 @@ def prediction(filter_: Filter, batch: Batch) -> Tensor:
 
 
 def likelihood(filter_: Filter, model: MeasurementModel, batch: Batch, noise: torch.Generator) -> Tensor:
-    """Of a measurement model: the log density where there is a picture, contrast where there is none or it is black."""
+    """Loss of a measurement model: ``log_density`` for steps with a visible image, ``contrast`` for all others."""
     part = model.observation_part(filter_.observations(batch)).flatten(0, 1)
-    truth = state(filter_, batch).flatten(0, 1)
-    lit = shown(batch, model.encoders.by_modality).flatten()
+    truth = true_states(filter_, batch).flatten(0, 1)
+    visible = image_visible(batch, model.encoders.by_modality).flatten()
     total = torch.zeros((), device=truth.device)
-    if bool(lit.any()):
-        total = total + lit.float().mean() * log_density(model, part[lit], truth[lit], noise)
-    if not bool(lit.all()):
-        total = total + (~lit).float().mean() * contrast(model, part[~lit], truth[~lit])
+    if bool(visible.any()):
+        total = total + visible.float().mean() * log_density(model, part[visible], truth[visible], noise)
+    if not bool(visible.all()):
+        total = total + (~visible).float().mean() * contrast(model, part[~visible], truth[~visible])
     return total
 
 
-def shown(batch: Batch, modalities: Iterable[str]) -> Tensor:
-    """(T, N) whether one of these modalities is a picture that is not black."""
-    lit = torch.zeros(batch.states.shape[:2], dtype=torch.bool, device=batch.states.device)
+def image_visible(batch: Batch, modalities: Iterable[str]) -> Tensor:
+    """(T, N) bool: whether one of these modalities is an image that is not blacked out."""
+    visible = torch.zeros(batch.states.shape[:2], dtype=torch.bool, device=batch.states.device)
     for modality in modalities:
         values = batch.observations[modality]
         if values.dtype == torch.int64:
-            lit = lit | (values >= 0)
+            visible = visible | (values >= 0)
         elif values.dtype == torch.uint8:
-            lit = lit | (values.amax((-2, -1)) > 0)
-    return lit
+            visible = visible | (values.amax((-2, -1)) > 0)
+    return visible
 
 
 def log_density(model: MeasurementModel, part: Tensor, truth: Tensor, noise: torch.Generator) -> Tensor:
-    """Regression of the Gaussian log density around the truth (B, n), covariance 0.1 I, as in the paper's training.
+    """Regression of the Gaussian log density around the true state (B, n), covariance 0.1 I, as in the paper.
 
-    Half of the 20 states a step come from that Gaussian; half from a unit one, so that the likelihood is also right far
-    from the truth, where maps show it. The constant is left out; values end at -10.
+    Half of the 20 states per step are drawn from that Gaussian, half from a unit Gaussian, so that the likelihood is
+    also accurate far from the true state, where maps show it. The constant is omitted; targets are clamped at -10.
     """
     scale = torch.ones(20, 1, device=truth.device)
     scale[:10] = START_VARIANCE**0.5
@@ -72,10 +72,10 @@ def log_density(model: MeasurementModel, part: Tensor, truth: Tensor, noise: tor
 
 
 def contrast(model: MeasurementModel, part: Tensor, states: Tensor) -> Tensor:
-    """Which of the states (B, n) belongs to an observation (B, units)? The best answer is log p(z | x) / p(z) + c(z).
+    """Contrastive loss: which of the states (B, n) belongs to an observation? Optimum: log p(z | x) / p(z) + c(z).
 
-    A regression of the expected log density is no likelihood where an observation says little: it bulges where the
-    training states end. This is flat there. The second term pins c(z) at 0.
+    Regression of the expected log density does not yield a likelihood where an observation carries little information:
+    it has a bump where the training states end. This loss is flat there. The second term fixes c(z) at 0.
     """
     value = model.log_likelihood(part.unsqueeze(1), model.state_part(states))
     evidence = torch.logsumexp(value, dim=1) - math.log(len(value))
@@ -91,15 +91,15 @@ def through_filter(
     likelihood_weight: float,
     weight: Tensor | None = None,
 ) -> Tensor:
-    """Of the filter's estimates over T steps: squared error and, where it has a covariance, negative log-likelihood.
+    """End-to-end loss over T steps: squared error and, if there is a covariance, negative log-likelihood.
 
     Args:
-        noise: of the first belief and of the filter's own draws.
-        weight: (T, N) of each step of each trajectory, sum 1; without it all count alike.
+        noise: generator of the first belief and of the filter's own samples.
+        weight: (T, N) of each step of each trajectory, sum 1; uniform if None.
     """
     start = perturbed(start_at_truth(filter_, batch), noise)
     estimate = rollout(filter_, evidence, start, noise, particles).estimate
-    error = estimate.mean - state(filter_, batch)
+    error = estimate.mean - true_states(filter_, batch)
     total = averaged(error.square().sum(-1), weight)
     if not filter_.has_covariance:
         return total
@@ -107,12 +107,12 @@ def through_filter(
 
 
 def averaged(values: Tensor, weight: Tensor | None) -> Tensor:
-    """The mean of (T, N), or their sum with these weights."""
+    """The mean of (T, N), or the weighted sum."""
     return values.mean() if weight is None else (weight * values).sum()
 
 
 def perturbed(start: Gaussian, noise: torch.Generator) -> Gaussian:
-    """A first belief whose mean is off by as much as its covariance says: the filter must learn to come back."""
+    """The first belief with its mean drawn from its own distribution, so that the filter learns to recover."""
     unit = torch.randn(start.mean.shape, generator=noise, device=start.mean.device)
     return replace(start, mean=start.mean + START_VARIANCE**0.5 * unit)
 
@@ -120,7 +120,7 @@ def perturbed(start: Gaussian, noise: torch.Generator) -> Gaussian:
 def negative_log_likelihood(error: Tensor, covariance: Tensor) -> Tensor:
     """``0.5 (e^T S^-1 e + log det S)``, without the constant: (..., n), (..., n, n) to (...).
 
-    A floor of 1e-4 on the diagonal keeps a collapsed particle set from a gradient without bound.
+    A floor of 1e-4 on the diagonal bounds the gradient of a collapsed particle set.
     """
     covariance = covariance + 1e-4 * torch.eye(error.shape[-1], device=error.device)
     factor = torch.linalg.cholesky(covariance)

@@ -1,4 +1,4 @@
-"""What a change of a filter mended and what it broke: two checkpoints over the same held-out episodes, by slice."""
+"""Comparison of two checkpoints over the same held-out episodes: improvements and regressions by slice."""
 
 from __future__ import annotations
 
@@ -12,29 +12,32 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.load import Foreign
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.finetuning.slices import Slice, slices_of
-from beliefscope.inspect.compare.effects import LEVEL, Difference, Worsening, differences, worsenings
+from beliefscope.filters.finetuning.slices import Slice, standard_slices
+from beliefscope.inspect.compare.effects import LEVEL, Difference, Regression, differences, find_regressions
+from beliefscope.inspect.compare.lineage import base_of
 from beliefscope.inspect.compare.modules import ModuleChange, module_changes
-from beliefscope.inspect.diagnostics.base import Array, Diagnostic, Line, Plot, Table, Value
-from beliefscope.inspect.statistics.bootstrap import FEWEST
+from beliefscope.inspect.diagnostics.base import Diagnostic
+from beliefscope.inspect.diagnostics.views import Line, Plot, Table, Value
+from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES
 from beliefscope.inspect.statistics.calibration import LEVELS
-from beliefscope.inspect.statistics.episode_sums import curve, measures_of, spread, tally
+from beliefscope.inspect.statistics.episode_sums import calibration, measures_of, sample_steps, sum_episodes
+from beliefscope.inspect.statistics.measures import Array
 
-SHOWN = 20
-"""Rows of what was mended and what damaged."""
+MAX_ROWS = 20
+"""Maximum number of rows in the tables of improvements and regressions."""
 
-PROBED = 128
-"""Steps at which the modules' outputs are compared."""
+OUTPUT_STEPS = 128
+"""Number of steps for comparing module outputs."""
 
 DEPTH = 3
-"""Names of so many parts are in the table of modules, of frozen ones only the outermost; all are in the result."""
+"""Maximum depth of modules in the table of modules; of frozen modules only the outermost are listed."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """A slice, and how much of the data it has: episodes with a step in it that counts, and such steps."""
+class SliceSize:
+    """A slice, and the number of episodes and counted steps that it contains."""
 
     slice: Slice
     episodes: int
@@ -42,84 +45,87 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Change(Diagnostic):
-    """Result of ``change_of``; pairs are before and after.
+class CheckpointComparison(Diagnostic):
+    """Result of ``compare_checkpoints``; pairs are (before, after).
 
     Attributes:
-        task: its name. filters, hashes: names and hashes of the checkpoints. child: whether the second says that it was
-            made from the first.
-        episodes: indices in the data set that both ran over. seed, particles: of both.
-        parts: the slices. left_out: those that the filters do not fit, and why.
-        differences: every measure in every slice, in their order.
-        calibration: (S, 2, P) share of steps whose truth lies in the region of each of ``levels`` (P,).
-        moments: those that got worse, the greatest rise first.
-        modules: what became of each that both have.
+        task: task name.
+        filters, hashes: names and hashes of the checkpoints.
+        finetuned: whether the second checkpoint was fine-tuned from the first.
+        episodes: indices in the data set.
+        seed, particles: settings of both runs.
+        slices: evaluated slices.
+        left_out: slices that do not fit the filters, with the reason.
+        differences: all measures in all slices.
+        calibration: (S, 2, P) share of steps with the true state in the region of each of ``levels`` (P,).
+        events: regressed steps, largest increase first.
+        modules: changes of the modules that both filters have.
     """
 
     task: str
     filters: tuple[str, str]
     hashes: tuple[str, str]
-    child: bool
+    finetuned: bool
     episodes: tuple[int, ...]
     seed: int
     particles: int | None
-    parts: tuple[Part, ...]
+    slices: tuple[SliceSize, ...]
     left_out: tuple[str, ...]
     differences: tuple[Difference, ...]
     levels: Array
     calibration: Array
-    moments: tuple[Worsening, ...]
+    events: tuple[Regression, ...]
     modules: tuple[ModuleChange, ...]
 
-    def mended(self) -> list[Difference]:
-        """The most first: errors, then beliefs."""
-        return sorted((d for d in self.differences if d.mended), key=lambda d: (not d.is_error, d.effect))
+    def improvements(self) -> list[Difference]:
+        """Improved measures, largest effect first: errors, then belief measures."""
+        return sorted((d for d in self.differences if d.improved), key=lambda d: (not d.is_error, d.effect))
 
-    def damaged(self) -> list[Difference]:
-        """The worst first: errors, then beliefs."""
-        return sorted((d for d in self.differences if d.damaged), key=lambda d: (not d.is_error, -d.effect))
+    def regressions(self) -> list[Difference]:
+        """Regressed measures, largest effect first: errors, then belief measures."""
+        return sorted((d for d in self.differences if d.regressed), key=lambda d: (not d.is_error, -d.effect))
 
     @property
     def frozen(self) -> tuple[str, ...]:
-        """The outermost modules whose parameters and buffers have the hashes that they had."""
-        same = [m.name for m in self.modules if m.same]
-        return tuple(n for n in same if not any(n.startswith(f"{other}.") for other in same))
+        """Outermost modules whose parameters and buffers have unchanged hashes."""
+        names = [m.name for m in self.modules if m.unchanged]
+        return tuple(n for n in names if not any(n.startswith(f"{other}.") for other in names))
 
     @property
     def verdict(self) -> str:
         if self.hashes[0] == self.hashes[1] or not any(d.effect for d in self.differences):
-            return f"{self.filters[1]} does exactly what {self.filters[0]} does: nothing is mended and nothing damaged."
-        if len(self.episodes) < FEWEST:
-            return f"{len(self.episodes)} episodes are too few to tell what changed: intervals need {FEWEST}."
+            return f"{self.filters[1]} is identical to {self.filters[0]} in all measures."
+        if len(self.episodes) < MIN_TRAJECTORIES:
+            return f"No verdict from {len(self.episodes)} episodes: intervals need at least {MIN_TRAJECTORIES}."
         errors = [d for d in self.differences if d.is_error]
-        mended, damaged = self.mended(), self.damaged()
-        return f"{_sentence('Mends', mended, errors, -1.0)}; {_sentence('damages', damaged, errors, 1.0)}."
+        improved = _summary("Improved", self.improvements(), errors, -1.0)
+        return f"{improved}; {_summary('regressed', self.regressions(), errors, 1.0)}."
 
     def tables(self) -> list[Table]:
         errors, beliefs = ([d for d in self.differences if d.is_error is kind] for kind in (True, False))
         by_slice = ("slice", "measure", "unit", "before", "after")
-        parts = Table(
+        slices = Table(
             "Slices",
-            ("slice", "sensors", "steps in", "only", "episodes", "steps"),
-            tuple(map(_part_row, self.parts)),
+            ("slice", "faults", "phase", "only", "episodes", "steps"),
+            tuple(map(_slice_row, self.slices)),
         )
         return [
             *(
-                Table(title, ("slice", "measure", "before -> after", "change", "95 % interval"), tuple(rows[:SHOWN]))
-                for title, found in (("Mended", self.mended()), ("Damaged, the worst first", self.damaged()))
-                if (rows := [(d.slice, _title(d), *_told(d)) for d in found])
+                Table(title, ("slice", "measure", "before -> after", "change", "95 % interval"), tuple(rows[:MAX_ROWS]))
+                for title, changes in (("Improvements", self.improvements()), ("Regressions", self.regressions()))
+                if (rows := [(d.slice, _title(d), *_change_texts(d)) for d in changes])
             ),
             Table(
                 "Errors by slice (RMSE)",
-                (*by_slice, "change %", "low %", "high %", "judgement"),
-                tuple((*_numbers(d), *(_percent(x) for x in (d.effect, d.low, d.high)), _judged(d)) for d in errors),
+                (*by_slice, "change %", "low %", "high %", "result"),
+                tuple((*_numbers(d), *(_percent(x) for x in (d.effect, d.low, d.high)), _outcome(d)) for d in errors),
             ),
             Table(
                 "Beliefs by slice",
-                (*by_slice, "effect", "low", "high", "judgement"),
-                tuple((*_numbers(d), *(_known(x) for x in (d.effect, d.low, d.high)), _judged(d)) for d in beliefs),
+                (*by_slice, "effect", "low", "high", "result"),
+                tuple((*_numbers(d), *(_rounded(x) for x in (d.effect, d.low, d.high)), _outcome(d)) for d in beliefs),
             ),
-            self.table_of(self.moments),
+            self.event_table(),
             Table(
                 "Modules",
                 (
@@ -135,15 +141,15 @@ class Change(Diagnostic):
                 tuple(
                     _module_row(m)
                     for m in self.modules
-                    if m.name in self.frozen or (not m.same and m.name.count(".") < DEPTH)
+                    if m.name in self.frozen or (not m.unchanged and m.name.count(".") < DEPTH)
                 ),
             ),
-            parts,
+            slices,
         ]
 
-    def table_of(self, moments: Sequence[Worsening]) -> Table:
-        """A line a moment."""
-        columns = ("slice", "episode", "step", "from", "to", "contact", "before cm", "after cm", "rise cm")
+    def event_table(self) -> Table:
+        """One row per regressed event."""
+        columns = ("slice", "episode", "step", "from", "to", "contact", "before cm", "after cm", "increase cm")
         rows = tuple(
             (
                 m.slice,
@@ -156,32 +162,32 @@ class Change(Diagnostic):
                 100 * m.after,
                 100 * (m.after - m.before),
             )
-            for m in moments
+            for m in self.events
         )
-        return Table("Moments that got worse", columns, rows)
+        return Table("Regressed events", columns, rows)
 
     def plots(self) -> list[Plot]:
-        """Position error by slice with its change; calibration of the first slice and of the one that changed most."""
+        """Position error by slice; calibration of the first slice and of the slice that changed most."""
         position = [d for d in self.differences if d.measure == "position"]
         names = tuple(d.slice for d in position)
         x = np.arange(len(position), dtype=np.float64)
-        before, after = (np.array(values) for values in zip(*(d.shown[:2] for d in position), strict=True))
+        before, after = (np.array(values) for values in zip(*(d.display[:2] for d in position), strict=True))
         bars = (Line("before", x, before), Line("after", x, after, "fused"))
         plots = [Plot("Position by slice", "", "RMSE (cm)", bars, "bars", names=names)]
         if np.isnan(self.calibration).all():
             return plots
-        far = np.nan_to_num(np.abs(self.calibration[:, 1] - self.calibration[:, 0]).mean(-1))
-        for s in dict.fromkeys((0, int(far.argmax()))):
+        changes = np.nan_to_num(np.abs(self.calibration[:, 1] - self.calibration[:, 0]).mean(-1))
+        for s in dict.fromkeys((0, int(changes.argmax()))):
             lines = tuple(
                 Line(name, self.levels, self.calibration[s, i], layer)
                 for i, (name, layer) in enumerate((("before", ""), ("after", "fused")))
             )
-            title = f"Calibration: {self.parts[s].slice.name}"
-            plots.append(Plot(title, "level of the region", "share of truths in it", lines, diagonal=True))
+            title = f"Calibration: {self.slices[s].slice.name}"
+            plots.append(Plot(title, "level of the region", "share of true states inside", lines, diagonal=True))
         return plots
 
 
-def change_of(
+def compare_checkpoints(
     before: Checkpoint,
     after: Checkpoint,
     data: Dataset | Mapping[int, Episode] | Sequence[Episode],
@@ -191,104 +197,110 @@ def change_of(
     particles: int = 300,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
-) -> Change:
-    """Holds two checkpoints of one task and modalities against each other.
+) -> CheckpointComparison:
+    """Compare two checkpoints of one task with equal modalities.
 
-    Both run with the same broken sensors and the same random numbers; intervals draw whole episodes, the same for both.
+    Both run with the same sensor faults and random numbers. Intervals resample episodes, paired between checkpoints.
 
     Args:
-        episodes: indices in ``data``; without them those that a ``Dataset`` holds out, or all.
-        slices: looked at beside the standard ones (``slices_of``). progress: called with the share done, 0..1.
+        episodes: indices in ``data``; by default the held-out episodes of a ``Dataset``, otherwise all.
+        slices: slices to evaluate in addition to the standard ones.
+        progress: called with the completed fraction, 0..1.
 
-    Raises BadInput for checkpoints that cannot be compared, slices that do not fit them, and as ``evaluate`` does.
+    Raises BadInput for checkpoints that cannot be compared, slices that do not fit, and as ``evaluate`` does.
     """
     filters = _comparable(before, after)
     task = before.task
-    for one in slices:
+    for slice_ in slices:
         for filter_ in filters:
-            one.check(task, filter_.names)
-    chosen, left_out = _standard(filters, {one.name for one in slices})
-    chosen += slices
+            slice_.check(task, filter_.names)
+    selected, left_out = _standard(filters, {slice_.name for slice_ in slices})
+    selected += slices
     if episodes is None and isinstance(data, Dataset):
         episodes = data.held_out()
     elif episodes is None:
         episodes = data if isinstance(data, Mapping) else range(len(data))
     indices = tuple(episodes)
     members = [data[index] for index in indices]
-    found = tally(filters, chosen, members, particles=particles, seed=seed, progress=progress)
-    counts = found.sums[:, 0, :, 0]
-    child = (after.record.get("parent") or {}).get("hash") == before.hash
-    return Change(
+    sums = sum_episodes(filters, selected, members, particles=particles, seed=seed, progress=progress)
+    counts = sums.sums[:, 0, :, 0]
+    finetuned = base_of(after.record).get("hash") == before.hash
+    return CheckpointComparison(
         task=task.name,
         filters=(before.name, after.name),
         hashes=(before.hash, after.hash),
-        child=child,
+        finetuned=finetuned,
         episodes=indices,
         seed=seed,
         particles=particles if "pf" in (before.kind, after.kind) else None,
-        parts=tuple(Part(one, int((counts[:, s] > 0).sum()), int(counts[:, s].sum())) for s, one in enumerate(chosen)),
+        slices=tuple(
+            SliceSize(slice_, int((counts[:, s] > 0).sum()), int(counts[:, s].sum()))
+            for s, slice_ in enumerate(selected)
+        ),
         left_out=left_out,
-        differences=differences(found.sums, [one.name for one in chosen], measures_of(task)),
+        differences=differences(sums.sums, [slice_.name for slice_ in selected], measures_of(task)),
         levels=LEVELS,
-        calibration=curve(found.sums.sum(0)).swapaxes(0, 1),
-        moments=worsenings(found, chosen, indices, members, task.dt),
-        modules=module_changes(*filters, spread(members, task, PROBED), after.record.get("parts") if child else None),
+        calibration=calibration(sums.sums.sum(0)).swapaxes(0, 1),
+        events=find_regressions(sums, selected, indices, members, task.dt),
+        modules=module_changes(
+            *filters, sample_steps(members, task, OUTPUT_STEPS), after.record.get("parts") if finetuned else None
+        ),
     )
 
 
 def _comparable(before: Checkpoint, after: Checkpoint) -> tuple[Filter, Filter]:
-    for one in (before, after):
-        if isinstance(one, Foreign):
-            raise BadInput(
-                f"{one.source} is from outside: what a change did is told of two checkpoints of this project"
-            )
+    for checkpoint in (before, after):
+        if isinstance(checkpoint, ExternalFilter):
+            raise BadInput(f"{checkpoint.source} is an external filter; only checkpoints can be compared")
     if before.task.name != after.task.name:
         raise BadInput(f"checkpoints are of tasks {before.task.name!r} and {after.task.name!r}; give two of one task")
     if set(before.filter.names) != set(after.filter.names):
-        a, b = (", ".join(one.filter.names) for one in (before, after))
+        a, b = (", ".join(checkpoint.filter.names) for checkpoint in (before, after))
         raise BadInput(f"checkpoints have modalities {a} and {b}; give two of the same modalities")
     return before.filter, after.filter
 
 
 def _standard(filters: Sequence[Filter], without: set[str]) -> tuple[list[Slice], tuple[str, ...]]:
-    """The standard slices that the filters fit, but for some names; and of the others why they do not."""
-    chosen, left_out = list[Slice](), list[str]()
-    for one in slices_of(filters[0].task):
+    """Standard slices that fit the filters except those named, and the reasons why others do not fit."""
+    selected, left_out = list[Slice](), list[str]()
+    for slice_ in standard_slices(filters[0].task):
         try:
             for filter_ in filters:
-                one.check(filter_.task, filter_.names)
+                slice_.check(filter_.task, filter_.names)
         except BadInput as error:
-            left_out.append(f"{one.name}: {error}")
+            left_out.append(f"{slice_.name}: {error}")
             continue
-        # One modality alone is all that there is, where there is only one.
-        if one.name not in without and not (one.only and len(filters[0].names) == 1):
-            chosen.append(one)
-    return chosen, tuple(left_out)
+        # For a filter of one modality, using only that modality changes nothing.
+        if slice_.name not in without and not (slice_.only and len(filters[0].names) == 1):
+            selected.append(slice_)
+    return selected, tuple(left_out)
 
 
-MEASURES = {"nll": "NLL", "nees": "NEES", "coverage95": "coverage of 95 %"}
-"""Measures whose names are not words."""
+MEASURES = {"nll": "NLL", "nees": "NEES", "coverage95": "95 % coverage"}
+"""Display names of measures."""
 
 
-def _sentence(verb: str, found: Sequence[Difference], errors: Sequence[Difference], sign: float) -> str:
-    """What the first of them is, with its numbers, and how many more there are.
-
-    Where there is none: whether the intervals exclude any, or else the error that changed most in this direction.
+def _summary(verb: str, changes: Sequence[Difference], errors: Sequence[Difference], sign: float) -> str:
+    """The largest significant change and the number of others, or the most likely one if none is significant.
 
     Args:
-        errors: all of them. sign: of the effect, 1 where worse.
+        changes: significant changes.
+        errors: all differences of errors.
+        sign: sign of the effect, 1 for regressions.
     """
-    if found:
-        return f"{verb} {_numbered(found[0])}{f' and {len(found) - 1} more' if len(found) > 1 else ''}"
+    if changes:
+        return f"{verb}: {_description(changes[0])}{f' and {len(changes) - 1} more' if len(changes) > 1 else ''}"
     possible = [d for d in errors if max(sign * d.low, sign * d.high) >= math.log1p(LEVEL)]
     if not possible:
-        return f"{verb} nothing beyond {100 * LEVEL:.0f} %"
-    most = max(possible, key=lambda d: sign * d.effect)
-    return f"{verb} nothing for certain" + (f", most likely {_numbered(most)}" if sign * most.effect > 0.0 else "")
+        return f"{verb}: nothing by more than {100 * LEVEL:.0f} %"
+    largest = max(possible, key=lambda d: sign * d.effect)
+    return f"{verb}: nothing significant" + (
+        f"; largest change {_description(largest)}" if sign * largest.effect > 0.0 else ""
+    )
 
 
-def _numbered(d: Difference) -> str:
-    values, change, interval = _told(d)
+def _description(d: Difference) -> str:
+    values, change, interval = _change_texts(d)
     return f"{d.slice}: {_title(d)} {values} ({change}, 95 % interval {interval})"
 
 
@@ -296,22 +308,22 @@ def _title(d: Difference) -> str:
     return MEASURES.get(d.measure, d.measure.replace("_", " "))
 
 
-def _told(d: Difference) -> tuple[str, str, str]:
-    """Before and after, the change, and its interval, as text."""
-    before, after, unit = d.shown
-    shares = d.measure not in ("coverage95", "miscalibration")
-    one, low, high = (_factor(x) if shares else f"{100 * x:+.1f}" for x in (d.effect, d.low, d.high))
-    unit_of_change = " %" if shares else " points off"
-    return f"{before:.3g} -> {after:.3g} {unit}".rstrip(), f"{one}{unit_of_change}", f"{low} to {high}"
+def _change_texts(d: Difference) -> tuple[str, str, str]:
+    """Values, change and interval as text."""
+    before, after, unit = d.display
+    relative = d.measure not in ("coverage95", "miscalibration")
+    change, low, high = (_factor(x) if relative else f"{100 * x:+.1f}" for x in (d.effect, d.low, d.high))
+    change_unit = " %" if relative else " points"
+    return f"{before:.3g} -> {after:.3g} {unit}".rstrip(), f"{change}{change_unit}", f"{low} to {high}"
 
 
 def _factor(effect: float) -> str:
-    """A factor's logarithm as per cent more or less."""
+    """Logarithm of a factor as change in percent."""
     return f"{100 * math.expm1(min(effect, 30.0)):+.3g}"
 
 
 def _numbers(d: Difference) -> tuple[Value, ...]:
-    before, after, unit = d.shown
+    before, after, unit = d.display
     return d.slice, _title(d), unit, before, after
 
 
@@ -319,22 +331,22 @@ def _percent(effect: float) -> float | None:
     return round(100.0 * math.expm1(min(effect, 30.0)), 2) if math.isfinite(effect) else None
 
 
-def _known(effect: float) -> float | None:
+def _rounded(effect: float) -> float | None:
     return round(effect, 4) if math.isfinite(effect) else None
 
 
-def _judged(d: Difference) -> str:
-    return "mended" if d.mended else "damaged" if d.damaged else ""
+def _outcome(d: Difference) -> str:
+    return "improved" if d.improved else "regressed" if d.regressed else ""
 
 
-def _part_row(part: Part) -> tuple[Value, ...]:
-    one = part.slice
-    contact = "all" if one.contact is None else "contact" if one.contact else "no contact"
-    return one.name, str(one.faults), contact, " + ".join(one.only), part.episodes, part.steps
+def _slice_row(size: SliceSize) -> tuple[Value, ...]:
+    slice_ = size.slice
+    phase = "all" if slice_.contact is None else "contact" if slice_.contact else "free motion"
+    return slice_.name, str(slice_.faults), phase, " + ".join(slice_.only), size.episodes, size.steps
 
 
 def _module_row(m: ModuleChange) -> tuple[Value, ...]:
     changed, drift = (None if math.isnan(x) else 100.0 * x for x in (m.weights, m.drift))
     gradient = None if math.isnan(m.gradient) else m.gradient
-    hashes = m.hashes[0][:12] if m.same else " -> ".join(digest[:12] for digest in m.hashes)
-    return m.name, m.kind, m.parameters, gradient, changed, drift, "same" if m.same else "", hashes
+    hashes = m.hashes[0][:12] if m.unchanged else " -> ".join(digest[:12] for digest in m.hashes)
+    return m.name, m.kind, m.parameters, gradient, changed, drift, "yes" if m.unchanged else "", hashes

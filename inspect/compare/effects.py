@@ -1,4 +1,4 @@
-"""Two filters over the same episodes, measure by measure and moment by moment: how much worse, and how surely."""
+"""Effect sizes of the difference between two filters, with confidence intervals, and steps with larger errors."""
 
 from __future__ import annotations
 
@@ -9,37 +9,39 @@ from dataclasses import dataclass
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.filters.evaluate import LEFT_OUT, UNITS
+from beliefscope.filters.evaluate import UNITS, WARMUP
 from beliefscope.filters.finetuning.slices import Slice
-from beliefscope.inspect.diagnostics.base import Array
-from beliefscope.inspect.failures.moments import stretches
+from beliefscope.inspect.failures.events import event_spans
 from beliefscope.inspect.failures.step_scores import RECENT
-from beliefscope.inspect.statistics.bootstrap import FEWEST, resampled
-from beliefscope.inspect.statistics.episode_sums import Measure, Tally, condition
+from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES, resample_sums
+from beliefscope.inspect.statistics.episode_sums import EpisodeSums, Measure, condition
+from beliefscope.inspect.statistics.measures import Array
 
 HIGH = 0.95
-"""A moment got worse where the error's rise is above this quantile of all steps' rises."""
+"""Quantile of the error increase over all steps above which a step is part of a regression event."""
 
-KEPT = 20
-"""Moments that got worse most."""
+MAX_EVENTS = 20
+"""Maximum number of regression events."""
 
-RISE = 1e-3
-"""m: less is no moment."""
+MIN_INCREASE = 1e-3
+"""m, minimum error increase of a regression event."""
 
 LEVEL = 0.02
-"""A smaller change of an error, as a share of it, is neither mending nor damage."""
+"""Minimum relative change that counts as improved or regressed."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One measure in one slice, before and after.
+    """A measure of one slice, before and after.
 
     Attributes:
-        slice, measure: their names. unit: of before and after: m, rad, nats or none.
-        effect: natural logarithm of the factor by which it is worse; below zero it is better. Of an error: ln of the
-            ratio. Of the NLL: its rise over n, as if all errors and deviations had grown by that factor. Of the NEES:
-            of the factor that deviations are wrong by. Of coverage and calibration: how much farther off, as a share.
-        low, high: 95 % bootstrap interval of the effect over episodes; NaN of fewer than ``FEWEST``.
+        slice, measure: names.
+        unit: unit of before and after: m, rad, nats or none.
+        before, after: values.
+        effect: natural logarithm of the factor of deterioration; negative is better. Errors: log ratio. NLL: increase
+            over n, equivalent to scaling all errors and standard deviations. NEES: factor by which standard deviations
+            are wrong. Coverage and calibration: increase of the deviation from the ideal, a share.
+        low, high: 95 % bootstrap interval of the effect over episodes; NaN below ``MIN_TRAJECTORIES`` episodes.
     """
 
     slice: str
@@ -52,13 +54,13 @@ class Difference:
     high: float
 
     @property
-    def mended(self) -> bool:
-        """Better by ``LEVEL`` or more, and the interval excludes no change."""
+    def improved(self) -> bool:
+        """Whether it is better by at least ``LEVEL`` and the interval excludes zero."""
         return self.high < 0.0 and self.effect <= -math.log1p(LEVEL)
 
     @property
-    def damaged(self) -> bool:
-        """Worse by ``LEVEL`` or more, and the interval excludes no change."""
+    def regressed(self) -> bool:
+        """Whether it is worse by at least ``LEVEL`` and the interval excludes zero."""
         return self.low > 0.0 and self.effect >= math.log1p(LEVEL)
 
     @property
@@ -66,20 +68,23 @@ class Difference:
         return self.unit in UNITS
 
     @property
-    def shown(self) -> tuple[float, float, str]:
-        """Before and after as people read them, and their unit."""
+    def display(self) -> tuple[float, float, str]:
+        """Before and after in display units, and the unit."""
         unit, factor = UNITS.get(self.unit, (self.unit, 1.0))
         return factor * self.before, factor * self.after, unit
 
 
 @dataclass(frozen=True)
-class Worsening:
-    """A stretch of steps at which the error rose, and its peak.
+class Regression:
+    """Consecutive steps with a larger error than before.
 
     Attributes:
-        slice: the first one in whose run it is. faults: how the sensors were broken. only: who spoke.
-        episode: index in the data set. first, last, step: its steps, and the peak among them. contact: at the peak.
-        before, after: m, distance of the estimate from the truth on the map, at the peak.
+        slice: first slice with this condition.
+        faults, only: condition of the slice: sensor faults, and modalities that are used.
+        episode: index in the data set.
+        first, last, step: first and last step, and the step of the largest increase (peak).
+        contact: whether there is contact at the peak.
+        before, after: m, position error at the peak.
     """
 
     slice: str
@@ -95,48 +100,51 @@ class Worsening:
 
 
 def differences(sums: Array, slices: Sequence[str], measures: Sequence[Measure]) -> tuple[Difference, ...]:
-    """Every measure in every slice with its interval. sums: (E, 2, S, Q), as in ``Tally``.
+    """Compute the difference of every measure in every slice.
 
-    Slices without a step, and measures that one of the filters does not have, are left out.
+    Slices without steps and measures that a filter does not have are omitted.
+
+    Args:
+        sums: (E, 2, S, Q), see ``EpisodeSums``.
     """
-    whole = sums.sum(0)
-    drawn = resampled(sums) if len(sums) >= FEWEST else None
+    total = sums.sum(0)
+    resamples = resample_sums(sums) if len(sums) >= MIN_TRAJECTORIES else None
     rows = []
     for s, name in enumerate(slices):
         for measure in measures:
-            before, after = (float(value) for value in measure.of(whole[:, s]))
+            before, after = (float(value) for value in measure.value(total[:, s]))
             if not (math.isfinite(before) and math.isfinite(after)):
                 continue
-            effect = float(np.subtract(*measure.off(np.array([after, before]))))
+            effect = float(np.subtract(*measure.loss(np.array([after, before]))))
             low = high = math.nan
-            if drawn is not None:
-                off = measure.off(measure.of(drawn[:, :, s]))
-                # A resample without a step of the slice says nothing.
-                low, high = (float(x) for x in np.nanpercentile(off[:, 1] - off[:, 0], [2.5, 97.5]))
+            if resamples is not None:
+                loss = measure.loss(measure.value(resamples[:, :, s]))
+                # NaN: resample without a step of the slice.
+                low, high = (float(x) for x in np.nanpercentile(loss[:, 1] - loss[:, 0], [2.5, 97.5]))
             rows.append(Difference(name, measure.name, measure.unit, before, after, effect, low, high))
     return tuple(rows)
 
 
-def worsenings(
-    found: Tally, slices: Sequence[Slice], indices: Sequence[int], episodes: Sequence[Episode], dt: float
-) -> tuple[Worsening, ...]:
-    """Stretches of steps at which the error on the map rose, one moment each, the greatest rise first."""
+def find_regressions(
+    sums: EpisodeSums, slices: Sequence[Slice], indices: Sequence[int], episodes: Sequence[Episode], dt: float
+) -> tuple[Regression, ...]:
+    """Find intervals of steps with a larger position error, largest increase first."""
     episode = np.concatenate([np.full(len(e), i) for i, e in enumerate(episodes)])
     step = np.concatenate([np.arange(len(e)) for e in episodes])
     last = np.concatenate([np.full(len(e), len(e) - 1) for e in episodes])
     contact = np.concatenate([e.contact.astype(bool) for e in episodes])
-    counted = step >= np.minimum(LEFT_OUT, last)
-    bridge = max(1, round(RECENT / dt))
-    moments: list[Worsening] = []
-    for (faults, only), distance in found.distance.items():
+    counted = step >= np.minimum(WARMUP, last)
+    gap = max(1, round(RECENT / dt))
+    events: list[Regression] = []
+    for (faults, only), distance in sums.distance.items():
         before, after = np.concatenate(distance, axis=1)
-        rise = np.where(counted, after - before, -np.inf)
-        high = rise > max(RISE, float(np.quantile(rise[counted], HIGH)))
-        name = next(one.name for one in slices if condition(one) == (faults, only))
-        for a, b in stretches(high, episode, bridge):
-            at = a + int(np.argmax(rise[a : b + 1]))
-            moments.append(
-                Worsening(
+        increase = np.where(counted, after - before, -np.inf)
+        high = increase > max(MIN_INCREASE, float(np.quantile(increase[counted], HIGH)))
+        name = next(slice_.name for slice_ in slices if condition(slice_) == (faults, only))
+        for a, b in event_spans(high, episode, gap):
+            at = a + int(np.argmax(increase[a : b + 1]))
+            events.append(
+                Regression(
                     slice=name,
                     faults=faults,
                     only=only,
@@ -149,4 +157,4 @@ def worsenings(
                     after=float(after[at]),
                 )
             )
-    return tuple(sorted(moments, key=lambda m: m.before - m.after)[:KEPT])
+    return tuple(sorted(events, key=lambda event: event.before - event.after)[:MAX_EVENTS])

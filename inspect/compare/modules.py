@@ -1,4 +1,4 @@
-"""What two versions of a filter have in common and what not, module by module: weights, and what comes out."""
+"""Differences between two versions of a filter by module: weights and outputs."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ from torch import Tensor, nn
 
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.finetuning.module_selection import digest, moved, within
+from beliefscope.filters.finetuning.module_selection import digest, module_change, within
 from beliefscope.filters.rollout import start_at_truth
 
 PARTICLES = 30
-"""Of a particle filter that is listened to."""
+"""Number of particles when recording module outputs."""
 
 
 @dataclass(frozen=True)
 class ModuleChange:
-    """One module before and after; both filters have it, with tensors of the same shapes.
+    """A module before and after; it exists in both filters with tensors of equal shapes.
 
     Attributes:
-        name: dotted. kind: its class. parameters: how many numbers it learns.
-        weights: norm of the parameters' change over their norm before; NaN where that is zero.
-        drift: root mean square of its output's change over that of its output before, where both filters look at the
-            same observations and begin a step at the same, true state; NaN for a module that is not called as a whole.
-        gradient: norm of the loss's gradient by its parameters, root mean square over the steps of the fine-tuning that
-            made the one after of the one before; NaN where nothing of it was trained, or not so.
+        name: dotted name.
+        kind: class name.
+        parameters: number of trainable parameters.
+        weights: norm of the parameter change relative to the norm before; NaN if that is zero.
+        drift: root mean square change of the output relative to the output before, for equal observations and equal
+            true states; NaN for a module that is not called as a whole.
+        gradient: norm of the loss gradient, root mean square over the fine-tuning steps between the versions; NaN if
+            the module was not trained.
         hashes: SHA-256 of its parameters and buffers, before and after.
     """
 
@@ -43,23 +45,23 @@ class ModuleChange:
     hashes: tuple[str, str]
 
     @property
-    def same(self) -> bool:
-        """Whether every bit of its parameters and buffers is as it was."""
+    def unchanged(self) -> bool:
+        """Whether parameters and buffers are bit-identical."""
         return self.hashes[0] == self.hashes[1]
 
 
 @torch.no_grad()
 def module_changes(
-    before: Filter, after: Filter, batch: Batch, ran: Mapping[str, Sequence[float]] | None = None
+    before: Filter, after: Filter, batch: Batch, parameter_changes: Mapping[str, Sequence[float]] | None = None
 ) -> tuple[ModuleChange, ...]:
-    """Of every module with tensors that both have, in the filter's order; the filter itself is not among them.
+    """Compare all modules with tensors that both filters have, in the filter's order, without the filter itself.
 
     Args:
-        batch: T = 1: the steps that outputs are compared at.
-        ran: of the fine-tuning between them, as ``moved`` takes it.
+        batch: steps for comparing outputs, T = 1.
+        parameter_changes: of the fine-tuning between the versions, see ``module_change``.
     """
     others = dict(after.named_modules())
-    outputs = [heard(filter_, batch) for filter_ in (before, after)]
+    outputs = [module_outputs(filter_, batch) for filter_ in (before, after)]
     changes = []
     for name, module in before.named_modules():
         states = [module.state_dict(), others[name].state_dict() if name in others else {}]
@@ -73,34 +75,36 @@ def module_changes(
                 parameters=sum(p.numel() for p in parameters[0]),
                 weights=_relative(*parameters),
                 drift=_relative(*(outputs[i].get(name, []) for i in (0, 1))),
-                gradient=moved(name, ran)["gradient"] if ran and any(within(key, name) for key in ran) else math.nan,
+                gradient=module_change(name, parameter_changes)["gradient"]
+                if parameter_changes and any(within(key, name) for key in parameter_changes)
+                else math.nan,
                 hashes=(digest(module, states[0]), digest(others[name], states[1])),
             )
         )
     return tuple(changes)
 
 
-def heard(filter_: Filter, batch: Batch) -> dict[str, list[Tensor]]:
-    """Module -> what came out of it, flat, call by call, in one step from the truth at each of N places; T is 1."""
+def module_outputs(filter_: Filter, batch: Batch) -> dict[str, list[Tensor]]:
+    """Module -> flattened outputs by call, over one step (T = 1) from the true state of N trajectories."""
     generator = torch.Generator().manual_seed(0)
-    with _listening(filter_) as found:
+    with _output_hooks(filter_) as outputs:
         evidence, start = filter_.encode(batch), start_at_truth(filter_, batch)
         filter_.step(filter_.start(start, PARTICLES, generator), evidence[0], generator)
-        if hasattr(filter_, "dynamics"):  # Kalman filters ask it for Jacobians, not as a module
+        if hasattr(filter_, "dynamics"):  # Kalman filters call its Jacobian, not the module
             filter_.dynamics(start.mean, evidence.control[0])
-    return found
+    return outputs
 
 
 @contextmanager
-def _listening(filter_: nn.Module) -> Iterator[dict[str, list[Tensor]]]:
-    """Hooks on every module with parameters, which are gone afterwards."""
-    found: dict[str, list[Tensor]] = {}
+def _output_hooks(filter_: nn.Module) -> Iterator[dict[str, list[Tensor]]]:
+    """Record the outputs of all modules with parameters; removes the hooks on exit."""
+    outputs: dict[str, list[Tensor]] = {}
 
     def keep(name: str, output: Any) -> None:
-        for one in output if isinstance(output, tuple) else (output,):
-            if isinstance(one, Tensor):
-                # A copy: the layer behind may work in place.
-                found.setdefault(name, []).append(one.detach().flatten().clone())
+        for value in output if isinstance(output, tuple) else (output,):
+            if isinstance(value, Tensor):
+                # Copy: later layers may work in place.
+                outputs.setdefault(name, []).append(value.detach().flatten().clone())
 
     hooks = [
         module.register_forward_hook(lambda _, __, output, name=name: keep(name, output))
@@ -108,7 +112,7 @@ def _listening(filter_: nn.Module) -> Iterator[dict[str, list[Tensor]]]:
         if name and next(module.parameters(), None) is not None
     ]
     try:
-        yield found
+        yield outputs
     finally:
         for hook in hooks:
             hook.remove()
@@ -119,7 +123,7 @@ def _shapes(state: dict[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 
 def _relative(before: list[Tensor], after: list[Tensor]) -> float:
-    """Norm of the difference over that of ``before``; NaN where there is nothing, or nothing alike."""
+    """Norm of the difference relative to ``before``; NaN if there are no tensors or their shapes differ."""
     if not before or [t.shape for t in before] != [t.shape for t in after]:
         return float("nan")
     a, b = torch.cat(before).double(), torch.cat(after).double()

@@ -1,7 +1,7 @@
-"""Consistency: whether a filter errs by as much as it says, by layer and by kind of step.
+"""Consistency: whether errors match the predicted covariance, by layer and phase.
 
-A covariance S is true when ``e^T S^-1 e`` averages to n. Where it is more, the filter is over-confident, by the root
-of the ratio: so much too small is the standard deviation that it states.
+The covariance S is consistent if ``e^T S^-1 e`` averages to n. If the average is larger, the filter is overconfident:
+its standard deviations are too small by the root of the ratio.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from scipy.special import chdtrc
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.training.study import nees_bounds
-from beliefscope.inspect.diagnostics.base import Curve, Diagnostic, Entry, Line, Plot, Table, Value
+from beliefscope.filters.evaluate import nees_bounds
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.views import Curve, Line, Plot, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import (
     LAGS,
@@ -34,31 +35,35 @@ from beliefscope.inspect.trace import Trace
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-ALL, FUSED = "all", "fused"
+ALL, FUSED, CONSISTENT = "all", "fused", "consistent"
 
-FEWEST = 5
-"""Trajectories without which being inside the bounds says little."""
+MIN_TRAJECTORIES = 5
+"""Minimum number of trajectories for an unqualified verdict of consistency."""
 
-FEWEST_STEPS = 10
-"""Of a kind before the verdict speaks of it."""
+MIN_STEPS = 10
+"""Minimum number of steps of a phase in the verdict."""
 
 
 @dataclass(frozen=True)
 class LayerConsistency:
-    """One layer on one kind of step.
+    """Consistency of one layer in one phase.
 
     Attributes:
-        layer: modality or ``fused``. split: kind of step. trajectories, steps: that have it.
-        nees: mean of ``e^T S^-1 e / n``. bounds: where 95 % of consistent filters lie, with one independent error a
-            trajectory. nis: the same of the innovations over ``P + R``; NaN where there are none.
-        coverage95: share of steps whose truth lies in the 95 % region.
-        calibration: (P,) the share at each of ``LEVELS``. miscalibration: its mean distance from them.
-        nll: mean negative log-density of the truth under the Gaussian, nats in m and rad.
-        rmse, sharpness, crps: (n,) m, rad: root mean square error, root mean stated variance, mean CRPS.
+        layer: modality or ``fused``.
+        phase: phase name.
+        trajectories, steps: number of trajectories and steps in the phase.
+        nees: mean of ``e^T S^-1 e / n``.
+        bounds: 95 % bounds of ``nees`` for a consistent filter, assuming one independent error per trajectory.
+        nis: mean of the normalised innovation squared over n; NaN without innovations.
+        coverage95: share of steps with the true state in the 95 % region.
+        calibration: (P,) share of steps with the true state in the region of each of ``LEVELS``.
+        miscalibration: mean absolute difference between ``calibration`` and ``LEVELS``.
+        nll: mean negative log density of the true state, nats in m and rad.
+        rmse, sharpness, crps: (n,) m, rad: root mean square error, root mean predicted variance, mean CRPS.
     """
 
     layer: str
-    split: str
+    phase: str
     trajectories: int
     steps: int
     nees: float
@@ -74,39 +79,41 @@ class LayerConsistency:
 
     @property
     def factor(self) -> float:
-        """How much too small the stated standard deviation is; below 1 where it is too large."""
+        """Factor by which predicted standard deviations are too small; below 1 if too large."""
         return math.sqrt(self.nees)
 
     @property
-    def judgement(self) -> str:
-        """``consistent`` inside the bounds; else by how much it is over- or under-confident."""
+    def assessment(self) -> str:
+        """``consistent`` within the bounds, otherwise over- or underconfident with the factor."""
         low, high = self.bounds
         if self.nees > high:
-            return f"over-confident by {_times(self.factor)}"
-        return f"under-confident by {_times(1.0 / self.factor)}" if self.nees < low else "consistent"
+            return f"overconfident by a factor of {_number(self.factor)}"
+        return f"underconfident by a factor of {_number(1.0 / self.factor)}" if self.nees < low else CONSISTENT
 
     @property
     def evidence(self) -> str:
-        """The numbers behind it."""
+        """NEES / n and its bounds."""
         low, high = self.bounds
         return f"NEES/n {_number(self.nees)}, 95 % bounds {low:.2f} to {high:.2f}"
 
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Whether the innovations of one modality in one component carry no news of the next, as those of a right model do.
+    """Whiteness test of the innovations of one modality in one component.
 
     Attributes:
-        autocorrelation: at lag 1, mean over trajectories. statistic: Ljung and Box's, summed over them.
-        freedom: its degrees of freedom where white. p: chance of so large a one.
+        autocorrelation: at lag 1, mean over trajectories.
+        statistic: Ljung-Box statistic, summed over trajectories.
+        degrees: its degrees of freedom.
+        p_value: probability of a larger statistic for white innovations.
     """
 
     modality: str
     component: str
     autocorrelation: float
     statistic: float
-    freedom: int
-    p: float
+    degrees: int
+    p_value: float
 
 
 @dataclass(frozen=True)
@@ -114,11 +121,13 @@ class Consistency(Diagnostic):
     """Result of ``consistency``.
 
     Attributes:
-        task: its name. filter: its name. trajectories: how many traces.
-        by_layer: every layer on every kind of step that there is. whiteness: by modality and component; Kalman filters.
-        levels: (P,) of the calibration curves.
-        nees, nis: (T, L), (T, K) over n, at the steps of a lone trace; (0, L) of several.
-        contact, blackout: (T,) its steps.
+        task, filter: names.
+        trajectories: number of traces.
+        by_layer: all layers in all phases with steps.
+        whiteness: by modality and component; Kalman filters only.
+        levels: (P,) levels of the calibration curves.
+        nees, nis: (T, L), (T, K) NEES / n and NIS / n by step of a single trace; (0, L), (0, K) for several.
+        contact, blackout: (T,) masks of a single trace.
     """
 
     task: str
@@ -132,99 +141,112 @@ class Consistency(Diagnostic):
     contact: Mask
     blackout: Mask
 
-    def of(self, layer: str, split: str = ALL) -> LayerConsistency:
-        """The numbers of a layer on a kind of step. Raises KeyError where there is no such step."""
-        return {(one.layer, one.split): one for one in self.by_layer}[layer, split]
+    def entry(self, layer: str, phase: str = ALL) -> LayerConsistency:
+        """Consistency of a layer in a phase. Raises KeyError if the phase has no steps."""
+        return {(entry.layer, entry.phase): entry for entry in self.by_layer}[layer, phase]
 
     @property
     def layers(self) -> tuple[str, ...]:
         """The modalities, then ``fused``."""
-        return tuple(dict.fromkeys(one.layer for one in self.by_layer))
+        return tuple(dict.fromkeys(entry.layer for entry in self.by_layer))
 
     @property
-    def splits(self) -> tuple[str, ...]:
-        """Kinds of steps that there are."""
-        return tuple(dict.fromkeys(one.split for one in self.by_layer))
+    def phases(self) -> tuple[str, ...]:
+        """Phases with steps."""
+        return tuple(dict.fromkeys(entry.phase for entry in self.by_layer))
 
     @property
     def verdict(self) -> str:
-        whole = self.of(FUSED)
-        judgement = whole.judgement
-        if judgement == "consistent" and self.trajectories < FEWEST:
-            judgement += (
-                f" as far as {self.trajectories} trajector{'y tells' if self.trajectories == 1 else 'ies tell'}"
-            )
-        parts = [_sentence(f"{judgement} ({whole.evidence})")]
-        enough = [one for one in self.by_layer if one.steps >= FEWEST_STEPS]
-        kinds = [one for one in enough if one.layer == FUSED and one.split != ALL]
-        worst = max(kinds, key=_strangeness, default=whole)
-        if worst.judgement != "consistent" and _strangeness(worst) > _strangeness(whole) + 2.0 * math.log(1.1):
-            parts.append(f"Worst in {worst.split}: {worst.judgement} ({worst.evidence}).")
-        elif kinds and all(one.judgement == "consistent" for one in (whole, *kinds)):
-            parts.append(f"So it is in each kind of step: {', '.join(one.split for one in kinds)}.")
-        alone = [one for one in enough if one.layer != FUSED]
-        if len(self.layers) > 2 and alone:
-            worst = max(alone, key=_strangeness)
-            of = "each modality alone is consistent"
-            if worst.judgement != "consistent":
-                of = (
-                    f"worst alone is {worst.layer} in {_steps(worst)}, {worst.judgement} (NEES/n {_number(worst.nees)})"
-                )
-            parts.append(_sentence(of))
+        fused = self.entry(FUSED)
+        assessment = fused.assessment
+        if assessment == CONSISTENT and self.trajectories < MIN_TRAJECTORIES:
+            assessment += f", based on {self.trajectories} trajector{'y' if self.trajectories == 1 else 'ies'} only"
+        parts = [_sentence(f"{assessment} ({fused.evidence})")]
+        candidates = [entry for entry in self.by_layer if entry.steps >= MIN_STEPS]
+        phases = [entry for entry in candidates if entry.layer == FUSED and entry.phase != ALL]
+        worst = max(phases, key=_inconsistency, default=fused)
+        if worst.assessment != CONSISTENT and _inconsistency(worst) > _inconsistency(fused) + 2.0 * math.log(1.1):
+            parts.append(f"Least consistent phase: {worst.phase}, {worst.assessment} ({worst.evidence}).")
+        elif phases and all(entry.assessment == CONSISTENT for entry in (fused, *phases)):
+            parts.append(f"Also consistent in each phase: {', '.join(entry.phase for entry in phases)}.")
+        unimodal = [entry for entry in candidates if entry.layer != FUSED]
+        if len(self.layers) > 2 and unimodal:
+            parts.append(self._unimodal_sentence(max(unimodal, key=_inconsistency)))
         if self.whiteness:
-            parts.append(self._of_innovations())
+            parts.append(self._innovation_sentence())
         return " ".join(parts)
 
-    def _of_innovations(self) -> str:
-        one = max(self.whiteness, key=lambda one: abs(one.autocorrelation))
-        if min(other.p for other in self.whiteness) > 0.05 / len(self.whiteness):
+    def _unimodal_sentence(self, worst: LayerConsistency) -> str:
+        if worst.assessment == CONSISTENT:
+            return "All unimodal posteriors are consistent."
+        where = "all steps" if worst.phase == ALL else worst.phase
+        return (
+            f"Least consistent unimodal posterior: {worst.layer} in {where}, {worst.assessment} "
+            f"(NEES/n {_number(worst.nees)})."
+        )
+
+    def _innovation_sentence(self) -> str:
+        strongest = max(self.whiteness, key=lambda test: abs(test.autocorrelation))
+        if min(test.p_value for test in self.whiteness) > 0.05 / len(self.whiteness):
             return "Innovations are white."
-        size = _number(math.sqrt(self.of(one.modality).nis))
-        where = f"{one.modality}, {one.component}: autocorrelation {one.autocorrelation:.2f} at lag 1"
-        text = f"innovations are not white ({where}) and {size} x as large as stated"
-        if one.autocorrelation > 0.2:
-            text += ": one error returns at every step, and the filter counts it as new evidence each time"
-        return _sentence(text)
+        size = _number(math.sqrt(self.entry(strongest.modality).nis))
+        where = f"{strongest.modality}, {strongest.component}: autocorrelation {strongest.autocorrelation:.2f} at lag 1"
+        text = f"Innovations are not white ({where}) and {size} times as large as predicted"
+        if strongest.autocorrelation > 0.2:
+            text += ": errors persist over steps, but the filter treats them as independent"
+        return f"{text}."
 
     def tables(self) -> list[Table]:
         task = find_task(self.task)
-        units, scale = measures.shown_units(task)
+        units, scale = measures.display_units(task)
         rows: list[tuple[Value, ...]] = []
-        wide: list[tuple[Value, ...]] = []
-        for one in self.by_layer:
-            low, high = one.bounds
-            nis = None if math.isnan(one.nis) else one.nis
-            head = (one.layer, one.split)
-            found = (one.trajectories, one.steps, one.nees, f"{low:.2f} to {high:.2f}", nis, one.coverage95)
-            rows.append((*head, *found, one.miscalibration, one.nll, one.judgement))
-            each = zip(one.rmse * scale, one.sharpness * scale, one.crps * scale, strict=True)
-            wide.append((*head, *(float(value) for three in each for value in three)))
-        columns = ("layer", "steps", "trajectories", "count", "NEES/n", "95 % bounds", "NIS/n", "coverage of 95 %")
-        tables = [Table("Consistency", (*columns, "miscalibration", "NLL (nats)", "judgement"), tuple(rows))]
-        names = [f"{c.name} ({unit}): {what}" for c, unit in zip(task.components, units, strict=True) for what in WIDE]
-        tables.append(Table("Errors beside what is stated", ("layer", "steps", *names), tuple(wide)))
+        error_rows: list[tuple[Value, ...]] = []
+        for entry in self.by_layer:
+            low, high = entry.bounds
+            nis = None if math.isnan(entry.nis) else entry.nis
+            head = (entry.layer, entry.phase)
+            values = (entry.trajectories, entry.steps, entry.nees, f"{low:.2f} to {high:.2f}", nis, entry.coverage95)
+            rows.append((*head, *values, entry.miscalibration, entry.nll, entry.assessment))
+            components = zip(entry.rmse * scale, entry.sharpness * scale, entry.crps * scale, strict=True)
+            error_rows.append((*head, *(float(value) for component in components for value in component)))
+        columns = ("layer", "phase", "trajectories", "steps", "NEES/n", "95 % bounds", "NIS/n", "95 % coverage")
+        tables = [Table("Consistency", (*columns, "miscalibration", "NLL (nats)", "result"), tuple(rows))]
+        names = [
+            f"{c.name} ({unit}): {quantity}"
+            for c, unit in zip(task.components, units, strict=True)
+            for quantity in ERROR_QUANTITIES
+        ]
+        title = "Errors and predicted standard deviations"
+        tables.append(Table(title, ("layer", "phase", *names), tuple(error_rows)))
         if self.whiteness:
-            white = tuple(
-                (one.modality, one.component, one.autocorrelation, one.statistic, one.freedom, one.p)
-                for one in self.whiteness
+            tests = tuple(
+                (test.modality, test.component, test.autocorrelation, test.statistic, test.degrees, test.p_value)
+                for test in self.whiteness
             )
-            heads = ("modality", "component", "autocorrelation at lag 1", "Ljung-Box Q", "degrees of freedom", "p")
-            tables.append(Table("Whiteness of the innovations", heads, white))
+            heads = (
+                "modality",
+                "component",
+                "autocorrelation at lag 1",
+                "Ljung-Box Q",
+                "degrees of freedom",
+                "p-value",
+            )
+            tables.append(Table("Whiteness of the innovations", heads, tests))
         return tables
 
     def curves(self) -> list[Curve]:
-        """Roots of NEES / n and NIS / n: errors in stated standard deviations, within bounds 95 % of the time."""
+        """Roots of NEES / n and NIS / n: errors in predicted standard deviations, with 95 % bounds."""
         if not len(self.nees):
             return []
         low, high = nees_bounds(len(find_task(self.task).components), 1)
         bounds = (math.sqrt(low), math.sqrt(high))
-        charts = [("Error in stated standard deviations (root of NEES/n)", "error", self.nees, self.layers)]
+        charts = [("Error in predicted standard deviations (root of NEES/n)", "error", self.nees, self.layers)]
         if self.nis.size:
-            title = "Innovation in stated standard deviations (root of NIS/n)"
+            title = "Innovation in predicted standard deviations (root of NIS/n)"
             charts.append((title, "innovation", self.nis, self.layers[:-1]))
         return [
-            Curve(f"{layer} {what}", np.sqrt(values[:, k]), chart, "standard deviations", layer, bounds)
-            for chart, what, values, names in charts
+            Curve(f"{layer} {quantity}", np.sqrt(values[:, k]), chart, "standard deviations", layer, bounds)
+            for chart, quantity, values, names in charts
             for k, layer in enumerate(names)
         ]
 
@@ -233,41 +255,41 @@ class Consistency(Diagnostic):
 
     def plots(self) -> list[Plot]:
         plots = []
-        for split in self.splits:
+        for phase in self.phases:
             lines = [
-                Line(one.layer, self.levels, one.calibration, one.layer) for one in self.by_layer if one.split == split
+                Line(entry.layer, self.levels, entry.calibration, entry.layer)
+                for entry in self.by_layer
+                if entry.phase == phase
             ]
-            title = f"Calibration, {'all steps' if split == ALL else split}"
-            plots.append(Plot(title, "level of the region", "share of truths in it", tuple(lines), diagonal=True))
+            title = f"Calibration, {'all steps' if phase == ALL else phase}"
+            plots.append(Plot(title, "level of the region", "share of true states inside", tuple(lines), diagonal=True))
         return plots
 
 
-WIDE = ("RMSE", "stated", "CRPS")
+ERROR_QUANTITIES = ("RMSE", "predicted", "CRPS")
 
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
-    """In one line; None where it can be made."""
+    """One-line reason why the diagnostic does not apply, or None."""
     if not trace.has_covariance or not np.isfinite(trace.estimate_covariance).any():
-        return f"{trace.filter} states no covariance, so there is nothing that its errors could be held against"
+        return f"{trace.filter} has no covariance to compare its errors with"
     return None
 
 
 def consistency(traces: Sequence[Trace]) -> Consistency:
-    """Consistency of one filter, over one or several trajectories."""
+    """Evaluate the consistency of one filter over one or more trajectories."""
     first = traces[0]
-    made = [_measured(trace) for trace in traces]
-    pooled = {name: np.concatenate([one[name] for one in made]) for name in made[0]}
-    owner, splits = measures.owners(traces), measures.pooled_splits(traces)
+    steps_of = [_step_measures(trace) for trace in traces]
+    pooled = {name: np.concatenate([steps[name] for steps in steps_of]) for name in steps_of[0]}
+    owner, phases = measures.trace_indices(traces), measures.pooled_phases(traces)
     by_layer = []
     for k, layer in enumerate(measures.layers(first)):
-        for split, where in splits.items():
+        for phase, where in phases.items():
             steps = {name: values[where, k] for name, values in pooled.items()}
-            # Of a filter that is not ours, what a modality alone believes may not be known.
+            # An external filter may not report unimodal posteriors.
             if np.isfinite(steps["nees"]).any():
-                by_layer.append(_of_steps(layer, split, len(np.unique(owner[where])), steps))
-    lone = len(traces) == 1
-    keep = len(first) if lone else 0
-    contact, black = first.episode.contact.astype(bool), measures.blackout(first)
+                by_layer.append(_summarise(layer, phase, len(np.unique(owner[where])), steps))
+    keep = len(first) if len(traces) == 1 else 0
     has_nis = first.observation_mean is not None
     return Consistency(
         task=first.episode.task,
@@ -278,13 +300,13 @@ def consistency(traces: Sequence[Trace]) -> Consistency:
         levels=LEVELS,
         nees=pooled["nees"][:keep],
         nis=pooled["nis"][:keep, : len(first.modalities) if has_nis else 0],
-        contact=contact[:keep],
-        blackout=black[:keep],
+        contact=first.episode.contact.astype(bool)[:keep],
+        blackout=measures.blackout(first)[:keep],
     )
 
 
 def innovations(trace: Trace) -> tuple[Array, Array] | None:
-    """``z - H x`` (T, K, n), angles wrapped, and ``P + R`` (T, K, n, n), H = I; None but for Kalman filters."""
+    """``z - H x`` (T, K, n), angles wrapped, and ``P + R`` (T, K, n, n), H = I; None unless a Kalman filter."""
     parts = (
         trace.observation_mean,
         trace.predicted_mean,
@@ -297,16 +319,16 @@ def innovations(trace: Trace) -> tuple[Array, Array] | None:
     return measures.wrapped(measures.task_of(trace), z - predicted), p + r
 
 
-def _measured(trace: Trace) -> dict[str, Array]:
-    """By step and layer, (T, L, ...): what the numbers are means of."""
+def _step_measures(trace: Trace) -> dict[str, Array]:
+    """Measures by step and layer, (T, L, ...)."""
     task = measures.task_of(trace)
     error, covariance = measures.errors(trace), measures.covariances(trace)
     n = error.shape[-1]
     nees = measures.nees(trace)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     nis = np.full(nees.shape, np.nan)
-    if (found := innovations(trace)) is not None:
-        nu, s = found
+    if (pair := innovations(trace)) is not None:
+        nu, s = pair
         nis[:, :-1] = np.einsum("tkn,tkn->tk", nu, np.linalg.solve(s, nu[..., None])[..., 0]) / n
     if trace.log_likelihood is None or trace.prior_log_weights is None:
         level = gaussian_level(n * nees, n)
@@ -314,22 +336,22 @@ def _measured(trace: Trace) -> dict[str, Array]:
     else:
         assert trace.particles is not None
         level, crps = np.empty(nees.shape), np.empty(error.shape)
-        away = measures.wrapped(task, trace.particles - trace.episode.states[:, None])
+        deviation = measures.wrapped(task, trace.particles - trace.episode.states[:, None])
         weights = np.exp(measures.particle_log_weights(trace))
-        for k in range(error.shape[1]):  # layer by layer: (T, M, n) is large enough
-            from_mean = measures.wrapped(task, away - error[:, k, None])
+        for k in range(error.shape[1]):  # one layer at a time limits memory to (T, M, n)
+            from_mean = measures.wrapped(task, deviation - error[:, k, None])
             level[:, k] = particle_level(from_mean, weights[:, k], error[:, k], covariance[:, k])
-            crps[:, k] = particle_crps(np.swapaxes(away, 1, 2), weights[:, k, None])
+            crps[:, k] = particle_crps(np.swapaxes(deviation, 1, 2), weights[:, k, None])
     nll = 0.5 * (n * nees + np.linalg.slogdet(covariance)[1] + n * math.log(2.0 * math.pi))
     return {"error": error, "variance": variance, "nees": nees, "nis": nis, "level": level, "nll": nll, "crps": crps}
 
 
-def _of_steps(layer: str, split: str, trajectories: int, steps: dict[str, Array]) -> LayerConsistency:
+def _summarise(layer: str, phase: str, trajectories: int, steps: dict[str, Array]) -> LayerConsistency:
     error, level = steps["error"], steps["level"]
     curve = calibration_curve(level)
     return LayerConsistency(
         layer=layer,
-        split=split,
+        phase=phase,
         trajectories=trajectories,
         steps=len(error),
         nees=float(steps["nees"].mean()),
@@ -346,38 +368,30 @@ def _of_steps(layer: str, split: str, trajectories: int, steps: dict[str, Array]
 
 
 def _whiteness(traces: Sequence[Trace]) -> list[Whiteness]:
-    """Of innovations over their stated standard deviations; trajectories are independent, so their statistics add."""
-    found: list[tuple[Array, Array]] = []
+    """Test innovations in predicted standard deviations; statistics of independent trajectories add up."""
+    results: list[tuple[Array, Array]] = []
     for trace in traces:
-        both = innovations(trace)
+        pair = innovations(trace)
         keep = measures.counted(trace)
-        if both is None or keep.sum() <= 2 * LAGS:
+        if pair is None or keep.sum() <= 2 * LAGS:
             continue
-        nu, s = both
+        nu, s = pair
         normalised = nu / np.sqrt(np.diagonal(s, axis1=-2, axis2=-1))
-        found.append(ljung_box(normalised[keep].reshape(keep.sum(), -1)))
-    if not found:
+        results.append(ljung_box(normalised[keep].reshape(keep.sum(), -1)))
+    if not results:
         return []
-    statistic, correlation = np.sum([q for q, _ in found], axis=0), np.mean([r for _, r in found], axis=0)
-    freedom = LAGS * len(found)
+    statistic, correlation = np.sum([q for q, _ in results], axis=0), np.mean([r for _, r in results], axis=0)
+    degrees = LAGS * len(results)
     pairs = [(m, c.name) for m in traces[0].modalities for c in measures.task_of(traces[0]).components]
     return [
-        Whiteness(modality, component, float(r), float(q), freedom, float(chdtrc(freedom, q)))
+        Whiteness(modality, component, float(r), float(q), degrees, float(chdtrc(degrees, q)))
         for (modality, component), q, r in zip(pairs, statistic, correlation, strict=True)
     ]
 
 
-def _strangeness(one: LayerConsistency) -> float:
-    """How far NEES / n is from 1, over and under alike."""
-    return abs(math.log(one.nees)) if one.nees > 0 else math.inf
-
-
-def _steps(one: LayerConsistency) -> str:
-    return "all steps" if one.split == ALL else one.split
-
-
-def _times(value: float) -> str:
-    return f"{_number(value)} x"
+def _inconsistency(entry: LayerConsistency) -> float:
+    """Absolute logarithm of NEES / n."""
+    return abs(math.log(entry.nees)) if entry.nees > 0 else math.inf
 
 
 def _number(value: float) -> str:
@@ -391,7 +405,7 @@ def _sentence(text: str) -> str:
 ENTRY = Entry(
     name="consistency",
     title="Consistency",
-    question="Does the filter err by as much as it says, and where not?",
+    question="Do the errors match the predicted covariance, and in which phases do they not?",
     run=consistency,
     why_not=why_not,
 )

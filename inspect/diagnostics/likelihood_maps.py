@@ -1,4 +1,4 @@
-"""Likelihood maps of every step as a diagnostic: how wide they are, how they differ, and where their ridges point."""
+"""Statistics of the likelihood maps of all steps: area, divergence and ridge orientation."""
 
 from __future__ import annotations
 
@@ -9,33 +9,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.diagnostics.base import Curve, Diagnostic, Entry, Table, Value
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.likelihood import COARSE, MapEngine, no_maps
-from beliefscope.inspect.maps.statistics import MapNumbers, measure_maps
-from beliefscope.inspect.statistics.measures import blackout, splits
+from beliefscope.inspect.maps.statistics import MapStatistics, measure_maps
+from beliefscope.inspect.statistics.measures import blackout, phases
 from beliefscope.inspect.trace import Trace
 
 Mask = NDArray[np.bool_]
 ROUND = 1.3
-"""Times as long as wide below which a map's long axis says little."""
+"""Elongation below which the principal axis of a map is not meaningful."""
 
 STEPS_AT_ONCE = 64
-"""Maps measured together: their sorted cells stay in a few MB."""
+"""Number of maps processed together; limits memory to a few MB."""
 
 
 @dataclass(frozen=True)
-class Maps(Diagnostic):
-    """Numbers of the maps of all steps of one or more traces, end to end.
+class MapSurvey(Diagnostic):
+    """Statistics of the maps of all steps of one or more concatenated traces.
 
     Attributes:
-        numbers: of B steps. felt: the layers whose ridge is spoken of: modalities that know where the hand is.
-        kinds: kind of step -> mask (B,), first steps of each trace left out. trajectories: traces. size: cells a side.
-        contact, blackout: (B,), first steps as well.
+        numbers: statistics of B steps.
+        ridge_layers: modalities that observe the end effector, whose ridge orientation is evaluated.
+        phases: phase -> mask (B,) without warm-up steps.
+        trajectories: number of traces.
+        size: cells per side.
+        contact, blackout: (B,) masks including warm-up steps.
     """
 
-    numbers: MapNumbers
-    felt: tuple[str, ...]
-    kinds: dict[str, Mask]
+    numbers: MapStatistics
+    ridge_layers: tuple[str, ...]
+    phases: dict[str, Mask]
     trajectories: int
     size: int
     contact: Mask
@@ -43,32 +47,35 @@ class Maps(Diagnostic):
 
     @property
     def verdict(self) -> str:
-        lines = [self._ridge(layer) for layer in self.felt]
-        return (
-            " ".join([*lines, "45° is chance."]) if lines else "No modality knows where the hand is: no ridge to judge."
-        )
+        if not self.ridge_layers:
+            return "No modality observes the end effector, so there is no ridge orientation to evaluate."
+        sentences = [self._ridge(layer) for layer in self.ridge_layers]
+        return " ".join([*sentences, "A random orientation has a median of 45°."])
 
     def _ridge(self, layer: str) -> str:
-        index, said = self.numbers.layers.index(layer), []
-        for kind in ("contact", "no contact"):
-            mask = self.kinds[kind]
+        index, parts = self.numbers.layers.index(layer), []
+        for phase in ("contact", "free motion"):
+            mask = self.phases[phase]
             if not mask.any():
                 continue
             low, median, high = np.percentile(np.degrees(self.numbers.off_line[mask, index]), (25, 50, 75))
-            long = float(np.median(self.numbers.elongation[mask, index]))
-            flat = ", hardly a ridge" if long < ROUND else ""
-            said.append(
-                f"{kind} {median:.0f}° (median; quartiles {low:.0f}° to {high:.0f}°) over {mask.sum()} steps, "
-                f"{long:.1f} times as long as wide{flat}"
+            elongation = float(np.median(self.numbers.elongation[mask, index]))
+            note = ", no distinct ridge" if elongation < ROUND else ""
+            parts.append(
+                f"{phase} {median:.0f}° (quartiles {low:.0f}° to {high:.0f}°) over {mask.sum()} steps, "
+                f"elongation {elongation:.1f}{note}"
             )
-        return f"Long axis of the {layer} map off the line from the truth to the hand: {'; '.join(said)}."
+        return (
+            f"Median angle between the principal axis of the {layer} map and the line from the true position to the "
+            f"end effector: {'; '.join(parts)}."
+        )
 
     def tables(self) -> list[Table]:
         n = self.numbers
         rows: list[tuple[Value, ...]] = []
         fused = len(n.layers) - 1
         for i, layer in enumerate(n.layers):
-            for kind, mask in self.kinds.items():
+            for phase, mask in self.phases.items():
                 if not mask.any():
                     continue
                 values = (
@@ -82,23 +89,27 @@ class Maps(Diagnostic):
                     n.overlap[:, i, fused],
                 )
                 medians = [round(float(np.median(value[mask])), 3) for value in values]
-                rows.append((layer, kind, int(mask.sum()), *(v if np.isfinite(v) else None for v in medians)))
-        columns = ("map", "steps", "number", "axis off line (deg)", "elongation", "50 % area (cm²)", "95 % area (cm²)")
-        more = ("entropy (nats, per cm²)", "ln truth / max", "KL to fused (nats)", "overlap with fused")
+                rows.append((layer, phase, int(mask.sum()), *(v if np.isfinite(v) else None for v in medians)))
+        columns = ("map", "phase", "steps", "angle to line (deg)", "elongation", "50 % area (cm²)", "95 % area (cm²)")
+        more = ("entropy (nats, per cm²)", "ln p(true position) / max", "KL to fused (nats)", "overlap with fused")
         return [Table("Medians over steps", (*columns, *more), tuple(rows))]
 
     def curves(self) -> list[Curve]:
         if self.trajectories > 1:
             return []
-        n, shown = self.numbers, []
-        for layer in self.felt:
-            off = np.degrees(n.off_line[:, n.layers.index(layer)])
-            shown.append(Curve(layer, off, "Long axis against the line truth - hand", "°", layer, (0.0, 45.0)))
+        n, curves = self.numbers, []
+        for layer in self.ridge_layers:
+            angle = np.degrees(n.off_line[:, n.layers.index(layer)])
+            curves.append(
+                Curve(
+                    layer, angle, "Angle between principal axis and line to the end effector", "°", layer, (0.0, 45.0)
+                )
+            )
         for i, layer in enumerate(n.layers):
-            shown.append(Curve(layer, 1e4 * n.area95[:, i], "Area that holds 95 %", "cm²", layer))
+            curves.append(Curve(layer, 1e4 * n.area95[:, i], "95 % area", "cm²", layer))
         for i, layer in enumerate(n.layers[:-1]):
-            shown.append(Curve(layer, n.divergence[:, i, -1], "Divergence to the fused map", "nats", layer))
-        return shown
+            curves.append(Curve(layer, n.divergence[:, i, -1], "KL divergence to the fused map", "nats", layer))
+        return curves
 
     def bands(self) -> dict[str, Mask]:
         return {} if self.trajectories > 1 else {"contact": self.contact, "blackout": self.blackout}
@@ -109,9 +120,9 @@ def maps(
     checkpoint: Checkpoint,
     size: int = COARSE,
     progress: Callable[[float], None] | None = None,
-) -> Maps:
-    """Maps of every step at the true angle, ``size`` cells a side. Raises BadInput for a filter without maps."""
-    parts, kinds = [], []
+) -> MapSurvey:
+    """Evaluate the maps of all steps at the true angle. Raises BadInput for a filter without maps."""
+    parts, masks = [], []
     for i, trace in enumerate(traces):
         engine = MapEngine(checkpoint, trace)
         for first in range(0, len(trace), STEPS_AT_ONCE):
@@ -119,29 +130,32 @@ def maps(
             parts.append(measure_maps(list(engine.maps(steps, size)), trace))
             if progress is not None:
                 progress((i + steps.stop / len(trace)) / len(traces))
-        kinds.append(splits(trace))
+        masks.append(phases(trace))
     joined = {
         f.name: np.concatenate([getattr(part, f.name) for part in parts])
-        for f in fields(MapNumbers)
+        for f in fields(MapStatistics)
         if f.name != "layers"
     }
     keys = checkpoint.task.modalities
-    felt = tuple(
+    ridge_layers = tuple(
         name for name in parts[0].layers[:-1] if any("effector_position" in keys.get(m, ()) for m in name.split("+"))
     )
-    together = {kind: np.concatenate([each[kind] for each in kinds]) for kind in kinds[0]}
+    pooled = {phase: np.concatenate([mask[phase] for mask in masks]) for phase in masks[0]}
     contact = np.concatenate([trace.episode.contact.astype(bool) for trace in traces])
-    black = np.concatenate([blackout(trace) for trace in traces])
-    return Maps(MapNumbers(layers=parts[0].layers, **joined), felt, together, len(traces), size, contact, black)
+    blackouts = np.concatenate([blackout(trace) for trace in traces])
+    return MapSurvey(
+        MapStatistics(layers=parts[0].layers, **joined), ridge_layers, pooled, len(traces), size, contact, blackouts
+    )
 
 
 ENTRY = Entry(
     name="maps",
     title="Likelihood maps",
-    question="What does each modality find likely, how sharply, and does touch see a ridge along the line to the hand?",
+    question="Which positions does each modality consider likely, and does the haptics map have a ridge along the line to "
+    "the end effector?",
     run=maps,
     why_not=lambda trace, checkpoint: None if checkpoint is None else no_maps(checkpoint, trace),
     needs="checkpoint",
     slow=True,
-    options={"size": "cells along a side, 41 by default"},
+    options={"size": "cells per side, 41 by default"},
 )

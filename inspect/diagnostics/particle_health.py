@@ -1,4 +1,4 @@
-"""Particle health: how many particles carry the belief, where they come from, and whether the truth is among them."""
+"""Particle health: effective sample size, ancestry, modes, and whether the particles cover the true state."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.diagnostics.base import Curve, Diagnostic, Entry, Table, Value
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import particle_level
 from beliefscope.inspect.trace import Trace
@@ -18,30 +19,32 @@ from beliefscope.inspect.trace import Trace
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FEW = 0.1
-"""Effective share of the particles below which a set counts as degenerate."""
+DEGENERATE = 0.1
+"""Ratio of effective sample size to particles below which a particle set is degenerate."""
 
 CELLS, EDGE = 64, 4.0
-"""Of the density's grid: cells a side, and where it ends, in standard deviations from the mean."""
+"""Density grid: cells per side, and extent in standard deviations from the mean."""
 HEIGHTS = (0.1, 0.25, 0.5)
-"""Shares of the highest density at which modes may part."""
-LEAST = 0.1
-"""Share of all weight that a region must hold to be a mode."""
+"""Fractions of the maximum density at which modes are separated."""
+MIN_WEIGHT = 0.1
+"""Minimum share of the total weight in a mode."""
 
 
 @dataclass(frozen=True)
 class ParticleSteps:
-    """By step of one trace.
+    """Particle measures by step of one trace.
 
     Attributes:
-        effective: (T,) effective sample size ``1 / sum w^2`` of the posterior weights. largest: (T,) largest of them.
-        ancestors: (T,) how many particles have offspring. resampled: (T,) whether any was replaced.
-        evidence: (T, K) ``log sum_i w_i p_k(z | x_i)`` under the prior weights, as the model gives p_k: nats, up to a
-            constant of each model. NaN where likelihoods are not known.
-        modes: (T,) of the posterior on the map's plane (``modes``).
-        farther: (T,) share of the predicted weight that is farther from its mean than the truth (Mahalanobis): 0 where
-            the truth is outside of all particles.
-        contact, blackout: (T,) its steps.
+        effective: (T,) effective sample size ``1 / sum w^2`` of the posterior weights.
+        largest: (T,) largest posterior weight.
+        ancestors: (T,) number of particles with offspring.
+        resampled: (T,) whether any particle was replaced.
+        evidence: (T, K) ``log sum_i w_i p_k(z | x_i)`` under the prior weights in nats, up to a constant per model; NaN
+            if likelihoods are not available.
+        modes: (T,) number of modes of the posterior over the map components.
+        farther: (T,) share of predicted weight that is farther from the mean than the true state (Mahalanobis); 0 if
+            the true state is outside of all particles.
+        contact, blackout: (T,) phases.
     """
 
     effective: Array
@@ -56,12 +59,19 @@ class ParticleSteps:
 
 
 @dataclass(frozen=True)
-class SplitParticles:
-    """Over one kind of step: medians of effective sample size, ancestors and largest weight, the smallest effective
-    sample size; the shares of steps that are degenerate (below ``FEW``), resampled, of several modes, and with the
-    truth outside of all particles; mean evidence (K,)."""
+class PhaseParticles:
+    """Particle measures of one phase.
 
-    split: str
+    Attributes:
+        phase, steps: phase name and number of steps.
+        effective, ancestors, largest: medians.
+        smallest: smallest effective sample size.
+        degenerate, resampled, several_modes, outside: share of steps with a degenerate set, with resampling, with
+            several modes, and with the true state outside of all particles.
+        evidence: (K,) mean.
+    """
+
+    phase: str
     steps: int
     effective: float
     smallest: float
@@ -76,92 +86,96 @@ class SplitParticles:
 
 @dataclass(frozen=True)
 class ParticleHealth(Diagnostic):
-    """Result of ``particles``.
+    """Result of ``particle_health``.
 
     Attributes:
-        filter, modalities, particles: its name, K names, M. trajectories: how many traces.
-        splits: by kind of step. lone: the steps of a lone trace; None of several.
-        worst_episode, worst_step: where the effective sample size is smallest. worst: of that one step.
+        filter, modalities, particles: filter name, K modality names, M.
+        trajectories: number of traces.
+        phases: measures by phase.
+        steps: measures by step of a single trace; None for several.
+        worst_episode, worst_step: episode and step with the smallest effective sample size.
+        worst: measures of that step.
     """
 
     filter: str
     modalities: tuple[str, ...]
     particles: int
     trajectories: int
-    splits: tuple[SplitParticles, ...]
-    lone: ParticleSteps | None
+    phases: tuple[PhaseParticles, ...]
+    steps: ParticleSteps | None
     worst_episode: int
     worst_step: int
     worst: ParticleSteps
 
     @property
     def verdict(self) -> str:
-        whole, worst, count = self.splits[0], self.worst, self.particles
-        often = f"below {FEW:.0%} of {count} particles in {whole.degenerate:.1%} of steps"
-        if not whole.degenerate:
-            often = f"never below {FEW:.0%} of {count} particles"
-        when = [kind for kind in ("contact", "blackout") if getattr(worst, kind)[0]]
+        total, worst, count = self.phases[0], self.worst, self.particles
+        frequency = f"below {DEGENERATE:.0%} of {count} particles in {total.degenerate:.1%} of steps"
+        if not total.degenerate:
+            frequency = f"never below {DEGENERATE:.0%} of {count} particles"
+        conditions = [phase for phase in ("contact", "blackout") if getattr(worst, phase)[0]]
         where = f"step {self.worst_step} of episode {self.worst_episode}" + (
-            f", in {' and '.join(when)}" if when else ""
+            f", in {' and '.join(conditions)}" if conditions else ""
         )
         parts = [
-            f"The effective sample size is {often}, {whole.effective:.0f} in the median.",
-            f"Worst at {where}: {worst.effective[0]:.1f} effective, the largest weight {worst.largest[0]:.2f}, "
-            f"{worst.ancestors[0]} with offspring.",
+            f"The effective sample size is {frequency}, with a median of {total.effective:.0f}.",
+            f"Minimum at {where}: effective sample size {worst.effective[0]:.1f}, largest weight "
+            f"{worst.largest[0]:.2f}, {worst.ancestors[0]} particles with offspring.",
         ]
-        kinds = [one for one in self.splits[1:] if one.degenerate > 1.5 * whole.degenerate > 0.0]
-        if kinds:
-            most = max(kinds, key=lambda one: one.degenerate)
-            parts.append(f"It happens most in {most.split}: {most.degenerate:.1%} of steps.")
-        outside = (
-            f"lies outside all predicted particles in {whole.outside:.1%} of steps, where no weights could find it"
+        phases = [entry for entry in self.phases[1:] if entry.degenerate > 1.5 * total.degenerate > 0.0]
+        if phases:
+            most = max(phases, key=lambda entry: entry.degenerate)
+            parts.append(f"Degeneracy is most frequent in {most.phase}: {most.degenerate:.1%} of steps.")
+        parts.append(
+            f"The true state is outside of all predicted particles in {total.outside:.1%} of steps."
+            if total.outside
+            else "The true state is always covered by the predicted particles."
         )
-        parts.append(f"The truth {outside if whole.outside else 'is always among the predicted particles'}.")
-        if whole.several_modes:
-            parts.append(f"The posterior has several modes in {whole.several_modes:.1%} of steps.")
+        if total.several_modes:
+            parts.append(f"The posterior is multimodal in {total.several_modes:.1%} of steps.")
         return " ".join(parts)
 
     def tables(self) -> list[Table]:
         rows: list[tuple[Value, ...]] = [
             (
-                one.split,
-                one.steps,
-                one.effective,
-                one.smallest,
-                100.0 * one.degenerate,
-                one.largest,
-                one.ancestors,
-                100.0 * one.resampled,
-                100.0 * one.several_modes,
-                100.0 * one.outside,
-                *map(float, one.evidence),
+                entry.phase,
+                entry.steps,
+                entry.effective,
+                entry.smallest,
+                100.0 * entry.degenerate,
+                entry.largest,
+                entry.ancestors,
+                100.0 * entry.resampled,
+                100.0 * entry.several_modes,
+                100.0 * entry.outside,
+                *map(float, entry.evidence),
             )
-            for one in self.splits
+            for entry in self.phases
         ]
         columns = (
+            "phase",
             "steps",
-            "count",
             "ESS (median)",
-            "ESS (least)",
-            f"ESS below {FEW:.0%} (% of steps)",
+            "ESS (minimum)",
+            f"ESS below {DEGENERATE:.0%} (% of steps)",
             "largest weight (median)",
             "with offspring (median)",
             "resampled (% of steps)",
-            "several modes (% of steps)",
-            "truth outside (% of steps)",
+            "multimodal (% of steps)",
+            "true state outside (% of steps)",
             *(f"evidence of {modality} (nats)" for modality in self.modalities),
         )
         return [Table(f"Particle health, {self.particles} particles", columns, tuple(rows))]
 
     def curves(self) -> list[Curve]:
-        if self.lone is None:
+        if self.steps is None:
             return []
-        steps, bounds = self.lone, (FEW * self.particles, float(self.particles))
+        steps, bounds = self.steps, (DEGENERATE * self.particles, float(self.particles))
         curves = [
             Curve("effective sample size", steps.effective, "Particles", "particles", "fused", bounds),
             Curve("with offspring", steps.ancestors.astype(float), "Particles", "particles"),
-            Curve("largest weight", steps.largest, "Shares", "", "fused"),
-            Curve("predicted weight farther than the truth", steps.farther, "Shares", "", "truth"),
+            Curve("largest weight", steps.largest, "Weights", "", "fused"),
+            Curve("predicted weight farther than the true state", steps.farther, "Weights", "", "truth"),
             Curve("modes", steps.modes.astype(float), "Modes of the posterior", "", "fused"),
         ]
         return curves + [
@@ -170,45 +184,45 @@ class ParticleHealth(Diagnostic):
         ]
 
     def bands(self) -> dict[str, Mask]:
-        return {} if self.lone is None else {"contact": self.lone.contact, "blackout": self.lone.blackout}
+        return {} if self.steps is None else {"contact": self.steps.contact, "blackout": self.steps.blackout}
 
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
-    """In one line; None where it can be made."""
+    """One-line reason why the diagnostic does not apply, or None."""
     if trace.particles is None or trace.log_weights is None:
         return f"{trace.filter} has no particles"
     return None
 
 
 def particle_health(traces: Sequence[Trace]) -> ParticleHealth:
-    """Particle health of one filter, over one or several trajectories."""
+    """Evaluate the particle health of one filter over one or more trajectories."""
     first = traces[0]
     assert first.particles is not None
-    made = [of_trace(trace) for trace in traces]
-    pooled = {f.name: np.concatenate([getattr(one, f.name) for one in made]) for f in fields(ParticleSteps)}
-    masks = measures.pooled_splits(traces)
+    measured = [measure_steps(trace) for trace in traces]
+    pooled = {f.name: np.concatenate([getattr(steps, f.name) for steps in measured]) for f in fields(ParticleSteps)}
+    masks = measures.pooled_phases(traces)
     count = first.particles.shape[1]
-    splits = []
-    for split, where in masks.items():
+    phases = []
+    for phase, where in masks.items():
         if where.any():
-            splits.append(_of_steps(split, count, {name: values[where] for name, values in pooled.items()}))
+            phases.append(_summarise(phase, count, {name: values[where] for name, values in pooled.items()}))
     at = int(np.where(masks["all"], pooled["effective"], np.inf).argmin())
-    owner = measures.owners(traces)[at]
+    index = measures.trace_indices(traces)[at]
     return ParticleHealth(
         filter=first.filter,
         modalities=first.modalities,
         particles=count,
         trajectories=len(traces),
-        splits=tuple(splits),
-        lone=made[0] if len(traces) == 1 else None,
-        worst_episode=traces[owner].episode_index,
-        worst_step=at - sum(len(trace) for trace in traces[:owner]),
+        phases=tuple(phases),
+        steps=measured[0] if len(traces) == 1 else None,
+        worst_episode=traces[index].episode_index,
+        worst_step=at - sum(len(trace) for trace in traces[:index]),
         worst=ParticleSteps(**{name: values[at : at + 1] for name, values in pooled.items()}),
     )
 
 
-def of_trace(trace: Trace) -> ParticleSteps:
-    """Its steps."""
+def measure_steps(trace: Trace) -> ParticleSteps:
+    """Compute the measures of all steps of a trace."""
     assert trace.particles is not None
     assert trace.log_weights is not None
     task = measures.task_of(trace)
@@ -219,14 +233,14 @@ def of_trace(trace: Trace) -> ParticleSteps:
     evidence = np.full((steps, len(trace.modalities)), np.nan)
     if trace.log_likelihood is not None:
         evidence = np.logaddexp.reduce(prior[:, None] + trace.log_likelihood, axis=-1)
-    own = np.arange(count)
-    ancestors = np.broadcast_to(own, (steps, count)) if trace.ancestors is None else trace.ancestors
+    indices = np.arange(count)
+    ancestors = np.broadcast_to(indices, (steps, count)) if trace.ancestors is None else trace.ancestors
     where = list(task.map_indices)
     return ParticleSteps(
         effective=1.0 / np.square(weights).sum(1),
         largest=weights.max(1),
         ancestors=1 + (np.diff(np.sort(ancestors, axis=1), axis=1) != 0).sum(1),
-        resampled=(ancestors != own).any(1),
+        resampled=(ancestors != indices).any(1),
         evidence=evidence,
         modes=modes(trace.particles[..., where].astype(np.float64), weights),
         farther=_farther(trace, np.exp(prior)),
@@ -236,64 +250,64 @@ def of_trace(trace: Trace) -> ParticleSteps:
 
 
 def modes(points: Array, weights: Array) -> NDArray[np.int64]:
-    """(T,) how many modes weighted particles (T, M, 2) with weights (T, M) have, from one on.
+    """(T,) number of modes of weighted particles (T, M, 2) with weights (T, M), at least one.
 
-    The density is smoothed over the cloud, whitened by its own covariance, with a Gaussian kernel of Silverman's width
-    ``ESS^(-1/6)`` standard deviations. Modes are the connected regions above a share of its peak that hold at least
-    ``LEAST`` of its weight; the height at which most of them part counts (``HEIGHTS``). Of 300
-    particles in two equal clouds half of the sets part at 4.5 of their own standard deviations, nine of ten at 5.
+    The density is whitened by the covariance of the particles and smoothed by a Gaussian kernel of Silverman's width
+    ``ESS^(-1/6)`` standard deviations. Modes are connected regions above a fraction of the maximum with at least
+    ``MIN_WEIGHT`` of the weight; the largest number over ``HEIGHTS`` counts. For 300 particles in two equal
+    clusters, half of the sets are separated at a distance of 4.5 cluster standard deviations, 90 % at 5.
     """
     steps = len(weights)
-    away = points - (weights[..., None] * points).sum(1, keepdims=True)
-    covariance = np.einsum("tm,tmi,tmj->tij", weights, away, away) + measures.FLOOR * np.eye(2)
-    white = np.swapaxes(np.linalg.solve(np.linalg.cholesky(covariance), np.swapaxes(away, 1, 2)), 1, 2)
+    deviation = points - (weights[..., None] * points).sum(1, keepdims=True)
+    covariance = np.einsum("tm,tmi,tmj->tij", weights, deviation, deviation) + measures.FLOOR * np.eye(2)
+    white = np.swapaxes(np.linalg.solve(np.linalg.cholesky(covariance), np.swapaxes(deviation, 1, 2)), 1, 2)
     cells = np.floor((white + EDGE) * (CELLS / (2.0 * EDGE))).astype(np.int64)
     inside = ((cells >= 0) & (cells < CELLS)).all(-1)
     at = np.arange(steps)[:, None] * CELLS**2 + cells[..., 0] * CELLS + cells[..., 1]
-    drawn = np.bincount(at[inside], weights[inside], steps * CELLS**2).reshape(steps, CELLS, CELLS)
+    histogram = np.bincount(at[inside], weights[inside], steps * CELLS**2).reshape(steps, CELLS, CELLS)
     centres = (np.arange(CELLS) + 0.5) * (2.0 * EDGE / CELLS)
     width = np.square(weights).sum(1)[:, None, None] ** (1.0 / 6.0)
     kernel = np.exp(-0.5 * np.square((centres[:, None] - centres) / width))
-    density = kernel @ drawn @ kernel
+    density = kernel @ histogram @ kernel
     density /= density.sum((1, 2), keepdims=True)
     return np.max([_regions(density, height) for height in HEIGHTS], axis=0).clip(1)
 
 
 def _regions(density: Array, height: float) -> NDArray[np.int64]:
-    """(T,) connected regions of each step's density (T, S, S) above a share of its peak, with enough weight."""
+    """(T,) number of connected regions of a density (T, S, S) above a fraction of its maximum, with enough weight."""
     neighbours = np.zeros((3, 3, 3), dtype=bool)
-    neighbours[1] = True  # steps do not touch one another
-    labels, found = label(density >= height * density.max((1, 2), keepdims=True), neighbours)
-    step = np.zeros(found + 1, dtype=np.int64)
+    neighbours[1] = True  # regions do not extend across steps
+    labels, count = label(density >= height * density.max((1, 2), keepdims=True), neighbours)
+    step = np.zeros(count + 1, dtype=np.int64)
     step[labels.ravel()] = np.repeat(np.arange(len(density)), density[0].size)
-    weight = np.bincount(labels.ravel(), density.ravel(), found + 1)
-    return np.bincount(step[1:][weight[1:] >= LEAST], minlength=len(density))
+    weight = np.bincount(labels.ravel(), density.ravel(), count + 1)
+    return np.bincount(step[1:][weight[1:] >= MIN_WEIGHT], minlength=len(density))
 
 
 def _farther(trace: Trace, weights: Array) -> Array:
-    """(T,) share of the predicted particles' weight (T, M) that is farther from their mean than the truth is."""
+    """(T,) share of the predicted weight (T, M) that is farther from the mean than the true state."""
     assert trace.particles is not None
     task = measures.task_of(trace)
-    away = measures.wrapped(task, trace.particles - trace.episode.states[:, None])
-    error = (weights[..., None] * away).sum(1)
-    from_mean = measures.wrapped(task, away - error[:, None])
+    deviation = measures.wrapped(task, trace.particles - trace.episode.states[:, None])
+    error = (weights[..., None] * deviation).sum(1)
+    from_mean = measures.wrapped(task, deviation - error[:, None])
     covariance = np.einsum("tm,tmi,tmj->tij", weights, from_mean, from_mean)
     return 1.0 - particle_level(from_mean, weights, error, covariance + measures.FLOOR * np.eye(error.shape[-1]))
 
 
-def _of_steps(split: str, count: int, steps: dict[str, Array]) -> SplitParticles:
+def _summarise(phase: str, count: int, steps: dict[str, Array]) -> PhaseParticles:
     effective = steps["effective"]
-    return SplitParticles(
-        split=split,
+    return PhaseParticles(
+        phase=phase,
         steps=len(effective),
         effective=float(np.median(effective)),
         smallest=float(effective.min()),
         ancestors=float(np.median(steps["ancestors"])),
         largest=float(np.median(steps["largest"])),
-        degenerate=float((effective < FEW * count).mean()),
+        degenerate=float((effective < DEGENERATE * count).mean()),
         resampled=float(steps["resampled"].mean()),
         several_modes=float((steps["modes"] > 1).mean()),
-        # Weights sum to one but for rounding.
+        # Tolerance for rounding in the sum of weights.
         outside=float((steps["farther"] < 1e-6).mean()),
         evidence=steps["evidence"].mean(0),
     )
@@ -302,7 +316,7 @@ def _of_steps(split: str, count: int, steps: dict[str, Array]) -> SplitParticles
 ENTRY = Entry(
     name="particles",
     title="Particle health",
-    question="Do enough particles carry the belief, and is the truth among them?",
+    question="Do enough particles carry the belief, and do they cover the true state?",
     run=particle_health,
     why_not=why_not,
 )

@@ -1,4 +1,4 @@
-"""Figures in a paper's size: their style, and the figure of any diagnostic."""
+"""Matplotlib figures of diagnostics in a paper's width."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from beliefscope.datasets.errors import one_of
+from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
-from beliefscope.inspect.diagnostics.base import Curve, Diagnostic, Picture, Plot
+from beliefscope.inspect.diagnostics.views import Curve, ImagePanel, Plot, Views
 from beliefscope.inspect.palette import COLOURS, colour
-from beliefscope.inspect.statistics.measures import stretches
+from beliefscope.inspect.statistics.measures import intervals
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -31,13 +31,13 @@ STYLE: dict[Any, Any] = {
     "axes.linewidth": 0.6,
     "hatch.linewidth": 0.4,
     "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "beliefscope",  # the same results give the same file
+    "svg.hashsalt": "beliefscope",  # reproducible files
 }
 
 WIDTH = 7.16
 """Inches: two columns of a paper."""
-MANY = 5000
-"""Points of a plot among which looking for the best place of its legend takes seconds."""
+MAX_LEGEND_POINTS = 5000
+"""Number of points above which matplotlib takes seconds to find the best legend position."""
 
 
 FORMATS: dict[str, dict[str, Any]] = {
@@ -45,7 +45,7 @@ FORMATS: dict[str, dict[str, Any]] = {
     "pdf": {"metadata": {"CreationDate": None}},
     "png": {"dpi": 300},
 }
-"""Formats of figures, and what makes the same numbers give the same file."""
+"""Figure formats with options for reproducible files."""
 
 BANDS = {
     "contact": {"facecolor": COLOURS["contact"], "alpha": 0.2},
@@ -54,11 +54,11 @@ BANDS = {
 }
 
 PANEL_HEIGHT = 1.5
-"""Inches of a chart over time, which is as wide as the figure; plots and pictures: half as wide, 1.6 x as high."""
+"""Inches, height of a full-width chart over time; plots and image panels are half as wide and 1.6 x as high."""
 
 
 def write_figure(figure: Figure, path: Path) -> None:
-    """Writes a figure as SVG, PDF or PNG (300 dpi), by the path's ending. Raises BadInput for another ending."""
+    """Write a figure as SVG, PDF or PNG (300 dpi) depending on the suffix. Raises BadInput for other suffixes."""
     suffix = figure_format(path)
     data = io.BytesIO()
     with rc_context(STYLE):
@@ -67,17 +67,17 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 
 def figure_format(path: Path) -> str:
-    """``svg``, ``pdf`` or ``png``, by the path's ending. Raises BadInput for another ending."""
+    """``svg``, ``pdf`` or ``png`` depending on the suffix. Raises BadInput for other suffixes."""
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in FORMATS:
-        raise one_of("format of a figure", suffix, FORMATS)
+        raise unknown_name("format of a figure", suffix, FORMATS)
     return suffix
 
 
-def figure_of(diagnostic: Diagnostic) -> Figure:
-    """Curves by chart, one below the other; then plots and pictures, two a row; the verdict on top."""
+def draw_figure(diagnostic: Views) -> Figure:
+    """Draw the verdict, charts below one another, then plots and image panels, two per row."""
     charts = charts_of(diagnostic)
-    panels: list[Plot | Picture] = [*diagnostic.plots(), *diagnostic.pictures()]
+    panels: list[Plot | ImagePanel] = [*diagnostic.plots(), *diagnostic.images()]
     rows = len(charts) + -(-len(panels) // 2)
     with rc_context(STYLE):
         height = PANEL_HEIGHT * (len(charts) + 1.6 * -(-len(panels) // 2)) + 0.5
@@ -98,8 +98,8 @@ def figure_of(diagnostic: Diagnostic) -> Figure:
     return figure
 
 
-def png_of(panel: Plot | Picture) -> bytes:
-    """One plot or picture by itself as PNG, half as wide as a figure."""
+def panel_png(panel: Plot | ImagePanel) -> bytes:
+    """Draw one plot or image panel as PNG, half as wide as a figure."""
     data = io.BytesIO()
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH / 2, 1.6 * PANEL_HEIGHT), layout="constrained")
@@ -109,13 +109,13 @@ def png_of(panel: Plot | Picture) -> bytes:
     return data.getvalue()
 
 
-def charts_of(diagnostic: Diagnostic) -> list[tuple[str, list[Curve]]]:
-    """The curves of each chart, under its name. Those of one chart are neighbours."""
+def charts_of(diagnostic: Views) -> list[tuple[str, list[Curve]]]:
+    """Charts by title with their curves; curves of one chart are consecutive."""
     return [(name, list(curves)) for name, curves in groupby(diagnostic.curves(), key=lambda curve: curve.chart)]
 
 
-def draw_chart(axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Diagnostic) -> None:
-    """Curves over steps, with the bands behind them and their bounds dashed."""
+def draw_chart(axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Views) -> None:
+    """Draw curves over steps with shaded bands and dashed bounds."""
     steps = np.arange(len(curves[0].values))
     draw_bands(axes, diagnostic.bands())
     layers = [curve.layer for curve in curves]
@@ -128,36 +128,36 @@ def draw_chart(axes: Axes, name: str, curves: Sequence[Curve], diagnostic: Diagn
     axes.set_ylabel(curves[0].unit)
     axes.set_xlabel("step")
     axes.set_xlim(-0.5, len(steps) - 0.5)
-    # Beside the title, where no curve is.
+    # Next to the title, clear of the curves.
     axes.legend(frameon=False, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
 
 
-def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], named: bool = False) -> None:
-    """Shades the steps of each kind, half a step to both sides, behind all else. ``named``: for the legend."""
-    for kind, mask in bands.items():
+def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], labelled: bool = False) -> None:
+    """Shade the steps of each phase, extended by half a step on both sides. ``labelled``: add legend entries."""
+    for phase, mask in bands.items():
         if mask.any():
-            spans = [(first - 0.5, end - first) for first, end in stretches(mask)]
-            shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, "zorder": 0, **BANDS[kind]}
-            axes.broken_barh(spans, (0, 1), label=kind if named else None, **shade)
+            spans = [(first - 0.5, end - first) for first, end in intervals(mask)]
+            shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, "zorder": 0, **BANDS[phase]}
+            axes.broken_barh(spans, (0, 1), label=phase if labelled else None, **shade)
 
 
-def draw_panel(axes: Axes, panel: Plot | Picture) -> None:
-    """What is not over time."""
-    draw_plot(axes, panel) if isinstance(panel, Plot) else draw_picture(axes, panel)
+def draw_panel(axes: Axes, panel: Plot | ImagePanel) -> None:
+    """Draw a plot or an image panel."""
+    draw_plot(axes, panel) if isinstance(panel, Plot) else draw_image(axes, panel)
 
 
 def draw_plot(axes: Axes, plot: Plot) -> None:
-    """Lines, points or bars."""
+    """Draw lines, points or bars."""
     layers = [line.layer for line in plot.lines]
     width = 0.8 / max(1, len(plot.lines))
     for i, line in enumerate(plot.lines):
-        look: dict[str, Any] = {"label": line.name, "color": colour_of(line.layer, layers)}
+        style: dict[str, Any] = {"label": line.name, "color": colour_of(line.layer, layers)}
         if plot.kind == "bars":
-            axes.bar(np.asarray(line.x) + (i - (len(plot.lines) - 1) / 2) * width, line.y, 0.9 * width, **look)
+            axes.bar(np.asarray(line.x) + (i - (len(plot.lines) - 1) / 2) * width, line.y, 0.9 * width, **style)
         elif plot.kind == "points":
-            axes.plot(line.x, line.y, ls="", marker="o", ms=2, **look)
+            axes.plot(line.x, line.y, ls="", marker="o", ms=2, **style)
         else:
-            axes.plot(line.x, line.y, lw=1.0, **look)
+            axes.plot(line.x, line.y, lw=1.0, **style)
     if plot.diagonal:
         axes.plot([0, 1], [0, 1], color="black", lw=0.6, ls="--")
     if plot.names:
@@ -166,28 +166,28 @@ def draw_plot(axes: Axes, plot: Plot) -> None:
     axes.set_xlabel(plot.x_label)
     axes.set_ylabel(plot.y_label)
     if any(line.name for line in plot.lines):
-        many = sum(len(line.x) for line in plot.lines) > MANY
-        axes.legend(frameon=False, loc="upper right" if many else "best")
+        points = sum(len(line.x) for line in plot.lines)
+        axes.legend(frameon=False, loc="upper right" if points > MAX_LEGEND_POINTS else "best")
 
 
-def draw_picture(axes: Axes, picture: Picture) -> None:
-    """Values per pixel; signed ones from blue through white to red."""
-    limit = float(np.nanmax(np.abs(picture.values))) or 1.0
-    low, shades = (-limit, "RdBu_r") if picture.signed else (float(np.nanmin(picture.values)), "viridis")
-    drawn = axes.imshow(picture.values, cmap=shades, vmin=low, vmax=limit)
-    axes.figure.colorbar(drawn, ax=axes, label=picture.unit)
-    axes.set_title(picture.title, loc="left")
+def draw_image(axes: Axes, image: ImagePanel) -> None:
+    """Draw values per pixel; signed values from blue through white to red."""
+    limit = float(np.nanmax(np.abs(image.values))) or 1.0
+    low, colours = (-limit, "RdBu_r") if image.signed else (float(np.nanmin(image.values)), "viridis")
+    mappable = axes.imshow(image.values, cmap=colours, vmin=low, vmax=limit)
+    axes.figure.colorbar(mappable, ax=axes, label=image.unit)
+    axes.set_title(image.title, loc="left")
     axes.set_axis_off()
 
 
 def colour_of(layer: str, layers: Sequence[str]) -> str:
-    """The layer's colour; black for a curve that belongs to none."""
-    named = list(dict.fromkeys(one for one in layers if one))
-    return colour(layer, named) if layer else "#333333"
+    """Colour of a layer; dark gray without a layer."""
+    names = list(dict.fromkeys(name for name in layers if name))
+    return colour(layer, names) if layer else "#333333"
 
 
 @cache
 def colour_table(name: str) -> NDArray[np.uint8]:
-    """(256, 3) RGB of a colour map of matplotlib's, from its low end to its high one."""
-    shades = np.asarray(colormaps[name](np.linspace(0.0, 1.0, 256)))
-    return np.rint(255.0 * shades[:, :3]).astype(np.uint8)
+    """(256, 3) RGB values of a matplotlib colour map."""
+    colours = np.asarray(colormaps[name](np.linspace(0.0, 1.0, 256)))
+    return np.rint(255.0 * colours[:, :3]).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Shapley values of the modalities: how much of the error, and of the estimate, each one accounts for. Exact."""
+"""Exact Shapley values of the modalities: their contributions to the error and to the estimate."""
 
 from __future__ import annotations
 
@@ -19,35 +19,37 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import rollout
-from beliefscope.inspect.diagnostics.base import Array, Curve, Diagnostic, Entry, Table, Value
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.bootstrap import FEWEST, resampled
+from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES, resample_sums
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.replay import Replay
 
 Mask = NDArray[np.bool_]
 
-MOST = 6
-"""Modalities: of K there are 2^K subsets, each a run of its own."""
+MAX_MODALITIES = 6
+"""K modalities have 2^K subsets, each of which is a run."""
 
-REPLAYED = 0.3
-"""Share of the time, roughly, that the run as it was takes before those of the subsets."""
+REPLAY_TIME = 0.3
+"""Approximate share of the computing time for the replay of the original run."""
 
-WHEN = {"contact": "In contact", "no contact": "Without contact", "blackout": "Under black pictures"}
+PHASE_NAMES = {"contact": "In contact", "free motion": "In free motion", "blackout": "During image blackout"}
 
 
 @dataclass(frozen=True)
-class SplitValues:
-    """Over one kind of step.
+class PhaseValues:
+    """Shapley values in one phase.
 
     Attributes:
-        split: kind of step. trajectories, steps: that have it.
-        rmse: (2^K, 1 + n) m, rad: of the position on the map and of each component, by subset.
-        shapley: (K, 1 + n) m, rad: each modality's value of that RMSE; below zero where it lowers it.
-        low, high: its 95 % bootstrap interval over trajectories, NaN where there are fewer than ``FEWEST``.
+        phase: phase name.
+        trajectories, steps: number of trajectories and steps in the phase.
+        rmse: (2^K, 1 + n) m, rad: RMSE of the position and of each component, by subset.
+        shapley: (K, 1 + n) m, rad: Shapley values of the RMSE; negative if a modality lowers it.
+        low, high: 95 % bootstrap intervals over trajectories; NaN below ``MIN_TRAJECTORIES`` trajectories.
     """
 
-    split: str
+    phase: str
     trajectories: int
     steps: int
     rmse: Array
@@ -58,16 +60,19 @@ class SplitValues:
 
 @dataclass(frozen=True)
 class Shapley(Diagnostic):
-    """Result of ``shapley``. K modalities, n components, T steps of a lone trace (0 of several); m and rad.
+    """Result of ``shapley``; K modalities, n components, T steps of a single trace (0 for several); m and rad.
 
     Attributes:
-        task, filter, kind: of the traces. modalities: K names. trajectories: how many traces.
-        off: how far off the truth the runs started, in standard deviations of the first belief.
-        subsets: 2^K of them, the empty one first and all of them last.
-        splits: by kind of step.
-        position_error: (T, 2^K) distance of each subset's estimate from the truth on the map.
-        of_position: (T, K) Shapley values of that error. of_estimate: (T, K, n) of the estimate itself.
-        contact, blackout: (T,).
+        task, filter, kind: of the traces.
+        modalities: K names.
+        trajectories: number of traces.
+        offset: initial error of the runs in standard deviations of the initial belief.
+        subsets: 2^K subsets of modalities, the empty one first and the complete one last.
+        phases: values by phase.
+        position_error: (T, 2^K) position error of each subset.
+        position_values: (T, K) Shapley values of the position error.
+        estimate_values: (T, K, n) Shapley values of the estimate.
+        contact, blackout: (T,) masks.
     """
 
     task: str
@@ -75,147 +80,152 @@ class Shapley(Diagnostic):
     kind: str
     modalities: tuple[str, ...]
     trajectories: int
-    off: float
+    offset: float
     subsets: tuple[tuple[str, ...], ...]
-    splits: tuple[SplitValues, ...]
+    phases: tuple[PhaseValues, ...]
     position_error: Array
-    of_position: Array
-    of_estimate: Array
+    position_values: Array
+    estimate_values: Array
     contact: Mask
     blackout: Mask
 
     @property
     def verdict(self) -> str:
-        by_name = {one.split: one for one in self.splits}
-        kinds = [by_name[split] for split in WHEN if split in by_name] or [self.splits[0]]
+        by_name = {values.phase: values for values in self.phases}
+        phases = [by_name[phase] for phase in PHASE_NAMES if phase in by_name] or [self.phases[0]]
         sentences = []
-        for one in kinds:
+        for values in phases:
             changes = [
                 f"{name} {'lowers' if value < 0 else 'raises'} {{}} by {abs(value):.2f} cm"
-                for name, value in zip(self.modalities, 100.0 * one.shapley[:, 0], strict=True)
+                for name, value in zip(self.modalities, 100.0 * values.shapley[:, 0], strict=True)
             ]
-            said = changes[0].format("the position RMSE"), *(change.format("it") for change in changes[1:])
-            none, every = 100.0 * one.rmse[0, 0], 100.0 * one.rmse[-1, 0]
+            parts = changes[0].format("the position RMSE"), *(change.format("it") for change in changes[1:])
+            empty, complete = 100.0 * values.rmse[0, 0], 100.0 * values.rmse[-1, 0]
             sentences.append(
-                f"{WHEN.get(one.split, 'Over all steps')} {', '.join(said)} ({none:.2f} cm by {self.nothing}, "
-                f"{every:.2f} cm with {'all' if len(self.modalities) > 1 else 'it'})."
+                f"{PHASE_NAMES.get(values.phase, 'Over all steps')} {', '.join(parts)} "
+                f"({empty:.2f} cm with {self.baseline}, {complete:.2f} cm with "
+                f"{'all modalities' if len(self.modalities) > 1 else self.modalities[0]})."
             )
         if len(self.modalities) > 1:
-            whole = 100.0 * self.splits[0].rmse[:, 0]
-            missed = [f"{whole[-1 - 2**k]:.2f} cm without {name}" for k, name in enumerate(self.modalities)]
-            sentences.append(f"All steps: {whole[-1]:.2f} cm, {', '.join(missed)}.")
-        if not self.off:
-            sentences.append(f"Runs start at the truth, which favours {self.nothing}.")
-        if self.trajectories < FEWEST:
-            sentences.append(f"Intervals need {FEWEST} trajectories.")
+            total = 100.0 * self.phases[0].rmse[:, 0]
+            without = [f"{total[-1 - 2**k]:.2f} cm without {name}" for k, name in enumerate(self.modalities)]
+            sentences.append(f"All steps: {total[-1]:.2f} cm, {', '.join(without)}.")
+        if not self.offset:
+            sentences.append(f"Runs start at the true state, which favours {self.baseline}.")
+        if self.trajectories < MIN_TRAJECTORIES:
+            sentences.append(f"Intervals need {MIN_TRAJECTORIES} trajectories.")
         return " ".join(sentences)
 
     @property
-    def nothing(self) -> str:
-        """What is left where no modality is seen."""
-        return "controls alone" if self.kind == "lstm" else "dynamics alone"
+    def baseline(self) -> str:
+        """Name of the empty subset."""
+        return "controls only" if self.kind == "lstm" else "dynamics only"
 
     def _title(self, subset: tuple[str, ...]) -> str:
-        return " + ".join(subset) or self.nothing
+        return " + ".join(subset) or self.baseline
 
     def tables(self) -> list[Table]:
         task = find_task(self.task)
-        units, scale = measures.shown_units(task)
+        units, scale = measures.display_units(task)
         names = ["position", *(component.name for component in task.components)]
         titles = [f"{name} ({unit})" for name, unit in zip(names, ("cm", *units), strict=True)]
         factors = np.array([100.0, *scale])
-        # Of many modalities only the subsets that say what one does alone, and what is missed without it.
-        few = [
+        # With many modalities, list single modalities and leave-one-out subsets only.
+        listed = [
             i
-            for i, one in enumerate(self.subsets)
-            if len(one) in (0, 1, len(self.modalities) - 1, len(self.subsets[-1]))
+            for i, subset in enumerate(self.subsets)
+            if len(subset) in (0, 1, len(self.modalities) - 1, len(self.subsets[-1]))
         ]
-        values: list[tuple[Value, ...]] = []
-        runs: list[tuple[Value, ...]] = []
-        for split in self.splits:
+        value_rows: list[tuple[Value, ...]] = []
+        subset_rows: list[tuple[Value, ...]] = []
+        for phase in self.phases:
             for q, title in enumerate(titles):
                 rmse, phi, low, high = (
-                    factors[q] * getattr(split, name)[:, q] for name in ("rmse", "shapley", "low", "high")
+                    factors[q] * getattr(phase, name)[:, q] for name in ("rmse", "shapley", "low", "high")
                 )
-                ends = [number for pair in zip(low, high, strict=True) for number in pair if self._bounded]
-                each = [None if math.isnan(v) else float(v) for v in (rmse[0], *phi, rmse[-1], *ends)]
-                values.append((split.split, split.steps, title, *each))
-                runs.append((split.split, split.steps, title, *map(float, rmse[few])))
-        ends_of = [f"{m}: 95 % {end}" for m in self.modalities for end in ("from", "to") if self._bounded]
-        head = ("steps", "count", "RMSE of")
+                ends = [number for pair in zip(low, high, strict=True) for number in pair if self._has_intervals]
+                numbers = [None if math.isnan(v) else float(v) for v in (rmse[0], *phi, rmse[-1], *ends)]
+                value_rows.append((phase.phase, phase.steps, title, *numbers))
+                subset_rows.append((phase.phase, phase.steps, title, *map(float, rmse[listed])))
+        interval_names = [f"{m}: 95 % {end}" for m in self.modalities for end in ("from", "to") if self._has_intervals]
+        head = ("phase", "steps", "RMSE of")
         return [
             Table(
                 "Shapley values of the RMSE",
-                (*head, self.nothing, *self.modalities, "with all", *ends_of),
-                tuple(values),
+                (*head, self.baseline, *self.modalities, "all modalities", *interval_names),
+                tuple(value_rows),
             ),
-            Table("RMSE with each subset", (*head, *(self._title(self.subsets[i]) for i in few)), tuple(runs)),
+            Table(
+                "RMSE by subset of modalities",
+                (*head, *(self._title(self.subsets[i]) for i in listed)),
+                tuple(subset_rows),
+            ),
         ]
 
     @property
-    def _bounded(self) -> bool:
-        return self.trajectories >= FEWEST
+    def _has_intervals(self) -> bool:
+        return self.trajectories >= MIN_TRAJECTORIES
 
     def curves(self) -> list[Curve]:
-        if not len(self.of_position):
+        if not len(self.position_values):
             return []
         task = find_task(self.task)
-        shown = [
-            Curve(name, 100.0 * self.of_position[:, k], "Shapley values of the position error", "cm", name)
+        curves = [
+            Curve(name, 100.0 * self.position_values[:, k], "Shapley values of the position error", "cm", name)
             for k, name in enumerate(self.modalities)
         ]
         for i, subset in enumerate(self.subsets):
             if len(subset) <= 1 or i == len(self.subsets) - 1:
                 layer = subset[0] if len(subset) == 1 else "fused" if subset else ""
-                chart = "Position error with each alone, and with all"
-                shown.append(Curve(self._title(subset), 100.0 * self.position_error[:, i], chart, "cm", layer))
-        for c, (component, unit, factor) in enumerate(zip(task.components, *measures.shown_units(task), strict=True)):
+                chart = "Position error by subset"
+                curves.append(Curve(self._title(subset), 100.0 * self.position_error[:, i], chart, "cm", layer))
+        for c, (component, unit, factor) in enumerate(zip(task.components, *measures.display_units(task), strict=True)):
             chart = f"Shapley values of the estimate: {component.name}"
-            shown += [
-                Curve(name, factor * self.of_estimate[:, k, c], chart, unit, name)
+            curves += [
+                Curve(name, factor * self.estimate_values[:, k, c], chart, unit, name)
                 for k, name in enumerate(self.modalities)
             ]
-        return shown
+        return curves
 
     def bands(self) -> dict[str, Mask]:
-        return {"contact": self.contact, "blackout": self.blackout} if len(self.of_position) else {}
+        return {"contact": self.contact, "blackout": self.blackout} if len(self.position_values) else {}
 
 
-def seen(filter_: Filter) -> tuple[str, ...]:
-    """The modalities that a filter sees, also those that several share a model."""
+def input_modalities(filter_: Filter) -> tuple[str, ...]:
+    """Input modalities of a filter, including those that share a model."""
     return tuple(dict.fromkeys(modality for model in filter_.names for modality in model.split("+")))
 
 
 def members(count: int) -> Mask:
-    """(2^K, K): which of K modalities each subset has; row 0 is the empty one, the last has all."""
+    """(2^K, K) membership of K modalities in each subset; the first row is empty, the last complete."""
     return (np.arange(2**count)[:, None] >> np.arange(count) & 1).astype(bool)
 
 
 def shapley_weights(count: int) -> Array:
-    """(K, 2^K): Shapley values are these times a function of the subsets, in the order of ``members``.
+    """(K, 2^K) matrix that maps values of the subsets, in the order of ``members``, to Shapley values.
 
     ``phi_k = sum over S without k of |S|! (K - |S| - 1)! / K! (v(S + k) - v(S))`` (Shapley, 1953).
     """
     member = members(count)
     size = member.sum(-1)
     factorial = np.array([math.factorial(i) for i in range(count + 1)], dtype=np.float64)
-    joined = factorial[np.maximum(size - 1, 0)] * factorial[count - size]
-    before = factorial[np.minimum(size, count - 1)] * factorial[np.maximum(count - size - 1, 0)]
-    return np.where(member.T, joined, -before) / factorial[count]
+    with_member = factorial[np.maximum(size - 1, 0)] * factorial[count - size]
+    without_member = factorial[np.minimum(size, count - 1)] * factorial[np.maximum(count - size - 1, 0)]
+    return np.where(member.T, with_member, -without_member) / factorial[count]
 
 
 def subset_evidence(replay: Replay, member: Mask) -> Evidence:
-    """Evidence of all subsets of ``seen(filter)``, (T, 2^K, ...), as the replayed run had it.
+    """Evidence (T, 2^K, ...) of all subsets of ``input_modalities(filter)`` in a replayed run.
 
-    A model whose modalities are all missing is not there (``Evidence.of``). To one that sees several and lacks some,
-    and to an LSTM, what is missing is a black picture or the training mean. Beta is what the network gave in the run
-    as it was, what is left of it in the same proportions.
+    Models without any of their modalities are deselected (``Evidence.select_models``). For a shared model that lacks
+    some modalities, and for an LSTM, missing images are black and missing vectors are at the training mean. Beta keeps
+    the proportions of the original run.
     """
     filter_ = replay.checkpoint.filter
     models = [model.split("+") for model in filter_.names]
-    sees = torch.tensor([[modality in model for modality in seen(filter_)] for model in models])
+    uses = torch.tensor([[modality in model for modality in input_modalities(filter_)] for model in models])
     has = torch.from_numpy(member)
-    present = (has[:, None] & sees).any(-1)
+    present = (has[:, None] & uses).any(-1)
     evidence = replay.evidence
     if any(len(model) > 1 for model in models):
         weights = evidence.log_weights
@@ -223,57 +233,57 @@ def subset_evidence(replay: Replay, member: Mask) -> Evidence:
             filter_.encode(_without(replay.batch, filter_, has)),
             log_weights=None if weights is None else weights.expand(-1, len(member), -1, -1),
         )
-    return evidence.of(present.expand(len(evidence), -1, -1))
+    return evidence.select_models(present.expand(len(evidence), -1, -1))
 
 
 def _without(batch: Batch, filter_: Filter, has: Tensor) -> Batch:
-    """A batch of one trajectory once a subset; modalities that ``has`` (S, K) lacks black, or at the training mean."""
+    """Repeat a batch of one trajectory for S subsets; modalities missing in ``has`` (S, K) are neutralised."""
 
-    def wide(values: Tensor) -> Tensor:
+    def expand(values: Tensor) -> Tensor:
         return values.expand(-1, len(has), *values.shape[2:])
 
-    observations = {modality: wide(values) for modality, values in batch.observations.items()}
-    for k, modality in enumerate(seen(filter_)):
+    observations = {modality: expand(values) for modality, values in batch.observations.items()}
+    for k, modality in enumerate(input_modalities(filter_)):
         values = observations[modality]
-        there = has[:, k].reshape(-1, *(1,) * (values.ndim - 2))
-        nothing = values.new_zeros(()) if values.ndim == 4 else filter_.statistics.mean_std(modality)[0]
-        observations[modality] = torch.where(there, values, nothing)
+        available = has[:, k].reshape(-1, *(1,) * (values.ndim - 2))
+        neutral = values.new_zeros(()) if values.ndim == 4 else filter_.statistics.mean_std(modality)[0]
+        observations[modality] = torch.where(available, values, neutral)
     return Batch(
         observations=observations,
-        controls=wide(batch.controls),
-        states=wide(batch.states),
-        contact=wide(batch.contact),
+        controls=expand(batch.controls),
+        states=expand(batch.states),
+        contact=expand(batch.contact),
         previous=batch.previous.expand(len(has), -1),
     )
 
 
 @torch.no_grad()
 def run_subsets(
-    checkpoint: Checkpoint, trace: Trace, off: float = 0.0, progress: Callable[[float], None] | None = None
+    checkpoint: Checkpoint, trace: Trace, offset: float = 0.0, progress: Callable[[float], None] | None = None
 ) -> Array:
-    """(T, 2^K, n) m, rad: what the filter of a trace would have estimated with every subset of its modalities.
+    """(T, 2^K, n) m, rad: estimates of the trace's filter with every subset of its modalities.
 
-    One rollout, subsets side by side, each with the trace's own random numbers.
+    All subsets run side by side in one rollout, with the random numbers of the trace.
 
     Args:
-        off: the first belief's mean is off the truth by so many of its standard deviations times a normal draw that
-            depends on the trace's seed and episode.
+        offset: initial error in standard deviations of the initial belief, times a normal random vector determined by
+            the trace's seed and episode.
     """
-    say = progress or (lambda share: None)
-    replay = Replay(checkpoint, trace, lambda share: say(REPLAYED * share))
-    filter_, member = checkpoint.filter, members(len(seen(checkpoint.filter)))
+    report = progress or (lambda share: None)
+    replay = Replay(checkpoint, trace, lambda share: report(REPLAY_TIME * share))
+    filter_, member = checkpoint.filter, members(len(input_modalities(checkpoint.filter)))
     start = replay.start
-    draw = np.random.default_rng([trace.seed, trace.episode_index]).standard_normal(start.mean.shape)
-    shift = torch.linalg.cholesky(start.covariance) @ torch.from_numpy(draw).to(start.mean)[..., None]
+    noise = np.random.default_rng([trace.seed, trace.episode_index]).standard_normal(start.mean.shape)
+    shift = torch.linalg.cholesky(start.covariance) @ torch.from_numpy(noise).to(start.mean)[..., None]
     count = len(member)
-    start = Gaussian((start.mean + off * shift[..., 0]).expand(count, -1), start.covariance.expand(count, -1, -1))
+    start = Gaussian((start.mean + offset * shift[..., 0]).expand(count, -1), start.covariance.expand(count, -1, -1))
     result = rollout(
         filter_,
         subset_evidence(replay, member),
         start,
         Common().manual_seed(trace.seed),
         int(trace.settings["particles"]),
-        progress=lambda share: say(REPLAYED + (1.0 - REPLAYED) * share),
+        progress=lambda share: report(REPLAY_TIME + (1.0 - REPLAY_TIME) * share),
     )
     return filter_.statistics.state_to_si(result.estimate.mean).double().numpy()
 
@@ -281,17 +291,17 @@ def run_subsets(
 def shapley(
     traces: Sequence[Trace],
     checkpoint: Checkpoint,
-    off: float = 0.0,
+    offset: float = 0.0,
     progress: Callable[[float], None] | None = None,
 ) -> Shapley:
-    """Shapley values of the modalities of one filter, over one or several trajectories.
+    """Compute the Shapley values of the modalities of one filter over one or more trajectories.
 
-    ``off`` as in ``run_subsets``; raises BadInput where it is below 0 or not finite.
+    For ``offset`` see ``run_subsets``. Raises BadInput if it is negative or not finite.
     """
-    if not 0.0 <= off < math.inf:
-        raise BadInput(f"off is {off:g} standard deviations: it must be 0 or more, and finite")
+    if not 0.0 <= offset < math.inf:
+        raise BadInput(f"offset must be a finite number of standard deviations, at least 0, not {offset:g}")
     first, task = traces[0], measures.task_of(traces[0])
-    modalities = seen(checkpoint.filter)
+    modalities = input_modalities(checkpoint.filter)
     weights = shapley_weights(len(modalities))
     errors = []
     for i, trace in enumerate(traces):
@@ -300,61 +310,61 @@ def shapley(
             if progress is not None:
                 progress((i + done) / len(traces))
 
-        estimates = run_subsets(checkpoint, trace, off, share)
+        estimates = run_subsets(checkpoint, trace, offset, share)
         errors.append(measures.wrapped(task, estimates - trace.episode.states[:, None]))
     position = [np.linalg.norm(error[..., list(task.map_indices)], axis=-1) for error in errors]
-    lone = len(first) if len(traces) == 1 else 0
+    keep = len(first) if len(traces) == 1 else 0
     return Shapley(
         task=task.name,
         filter=first.filter,
         kind=first.kind,
         modalities=modalities,
         trajectories=len(traces),
-        off=off,
+        offset=offset,
         subsets=tuple(tuple(np.array(modalities)[has].tolist()) for has in members(len(modalities))),
-        splits=_splits(traces, errors, position, weights),
-        position_error=position[0][:lone],
-        of_position=position[0][:lone] @ weights.T,
-        # The truth is the same in all subsets, so that the error's values are the estimate's.
-        of_estimate=np.einsum("ks,tsn->tkn", weights, errors[0][:lone]),
-        contact=first.episode.contact.astype(bool)[:lone],
-        blackout=measures.blackout(first)[:lone],
+        phases=_phases(traces, errors, position, weights),
+        position_error=position[0][:keep],
+        position_values=position[0][:keep] @ weights.T,
+        # The true state cancels between subsets, so values of the error equal those of the estimate.
+        estimate_values=np.einsum("ks,tsn->tkn", weights, errors[0][:keep]),
+        contact=first.episode.contact.astype(bool)[:keep],
+        blackout=measures.blackout(first)[:keep],
     )
 
 
-def _splits(
+def _phases(
     traces: Sequence[Trace], errors: Sequence[Array], position: Sequence[Array], weights: Array
-) -> tuple[SplitValues, ...]:
-    """RMSE pooled over the steps of all traces, and its Shapley values."""
+) -> tuple[PhaseValues, ...]:
+    """RMSE pooled over the steps of all traces, and its Shapley values, by phase."""
     squares = [
-        np.square(np.concatenate([away[..., None], error], axis=-1))
-        for away, error in zip(position, errors, strict=True)
+        np.square(np.concatenate([distance[..., None], error], axis=-1))
+        for distance, error in zip(position, errors, strict=True)
     ]
-    masks = [measures.splits(trace) for trace in traces]
-    found = []
-    for split in masks[0]:
-        counts = np.array([mask[split].sum() for mask in masks], dtype=np.float64)
-        have = counts > 0
-        if not have.any():
+    masks = [measures.phases(trace) for trace in traces]
+    values = []
+    for phase in masks[0]:
+        counts = np.array([mask[phase].sum() for mask in masks], dtype=np.float64)
+        nonempty = counts > 0
+        if not nonempty.any():
             continue
-        sums = np.stack([square[mask[split]].sum(0) for square, mask in zip(squares, masks, strict=True)])[have]
+        sums = np.stack([square[mask[phase]].sum(0) for square, mask in zip(squares, masks, strict=True)])[nonempty]
         rmse = np.sqrt(sums.sum(0) / counts.sum())
         low = high = np.full((len(weights), rmse.shape[-1]), np.nan)
-        if have.sum() >= FEWEST:
-            of_steps = resampled(counts[have])[:, None, None]
-            low, high = np.percentile(weights @ np.sqrt(resampled(sums) / of_steps), [2.5, 97.5], axis=0)
-        found.append(SplitValues(split, int(have.sum()), int(counts.sum()), rmse, weights @ rmse, low, high))
-    return tuple(found)
+        if nonempty.sum() >= MIN_TRAJECTORIES:
+            steps = resample_sums(counts[nonempty])[:, None, None]
+            low, high = np.percentile(weights @ np.sqrt(resample_sums(sums) / steps), [2.5, 97.5], axis=0)
+        values.append(PhaseValues(phase, int(nonempty.sum()), int(counts.sum()), rmse, weights @ rmse, low, high))
+    return tuple(values)
 
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
-    """In one line; None where it can be made."""
+    """One-line reason why the diagnostic does not apply, or None."""
     if checkpoint is None:
         return None
-    count = len(seen(checkpoint.filter))
+    count = len(input_modalities(checkpoint.filter))
     return (
-        f"{trace.filter} has {count} modalities: {2**count} subsets are more runs than {2**MOST}"
-        if count > MOST
+        f"{trace.filter} has {count} modalities; at most {MAX_MODALITIES} are supported"
+        if count > MAX_MODALITIES
         else None
     )
 
@@ -362,13 +372,13 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
 ENTRY = Entry(
     name="shapley",
     title="Shapley values",
-    question="Which modality lowers the error, or raises it, and by how much, in contact and without?",
+    question="How much does each modality lower or raise the error, in contact and in free motion?",
     run=shapley,
     why_not=why_not,
     needs="checkpoint",
     slow=True,
     options={
-        "off": "by how many standard deviations of the first belief the runs start off the truth, drawn by seed and "
-        "episode; 0, the default: at the truth, as the trace did"
+        "offset": "initial error in standard deviations of the initial belief, 0 by default; direction by seed and "
+        "episode"
     },
 )

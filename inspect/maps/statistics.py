@@ -1,4 +1,4 @@
-"""What likelihood maps amount to in numbers: where they peak, how wide and how long they are, how they differ."""
+"""Statistics of likelihood maps: peak, entropy, area, orientation and divergence."""
 
 from __future__ import annotations
 
@@ -8,29 +8,31 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
+from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class MapNumbers:
-    """Of the maps of B steps, L layers each. p is a map's likelihood normalised to a density over its square.
+class MapStatistics:
+    """Statistics of the maps of B steps with L layers. p is the likelihood normalised to a density over the map square.
 
     Attributes:
-        steps: (B,) of the trace. layers: names, L of them.
-        peak: (B, L, 2) m, offset of the maximum from the truth. log_peak: (B, L) its log-likelihood.
-        truth: (B, L) log-likelihood at the truth minus that of the maximum; 0 where the truth is the maximum.
-        entropy: (B, L) nats, ``-int p ln p``, p per m^2: does not depend on the number of cells. A flat map has the log
-            of its square's area, the largest there is.
-        area50, area95: (B, L) m^2 of the smallest region that holds so much of p.
-        axis: (B, L) rad in -pi/2..pi/2 from the x axis: direction of p's largest spread.
-        elongation: (B, L) largest over smallest standard deviation of p; 1 for a round or flat map, whose axis means
-            nothing.
-        line: (B,) rad, direction from the truth to the end effector; NaN where there is none.
-        off_line: (B, L) rad in 0..pi/2, angle between axis and line; 45 deg on average by chance.
-        divergence: (B, L, L) nats, ``KL(p_i || p_j)``. overlap: (B, L, L) ``int min(p_i, p_j)``, 0 to 1.
+        steps: (B,) steps of the trace.
+        layers: L names.
+        peak: (B, L, 2) m, offset of the maximum from the true position.
+        log_peak: (B, L) log-likelihood of the maximum.
+        truth: (B, L) log-likelihood at the true position relative to the maximum.
+        entropy: (B, L) nats, ``-int p ln p``, p per m^2; independent of the number of cells. The maximum is the log of
+            the square's area, of a uniform map.
+        area50, area95: (B, L) m^2, area of the smallest region with that share of p.
+        axis: (B, L) rad in -pi/2..pi/2 from the x axis: principal axis of p.
+        elongation: (B, L) ratio of largest to smallest standard deviation of p; at 1 the axis is undefined.
+        line: (B,) rad, direction from the true position to the end effector; NaN without an end effector.
+        off_line: (B, L) rad in 0..pi/2, angle between axis and line; 45 deg on average for random axes.
+        divergence: (B, L, L) nats, ``KL(p_i || p_j)``.
+        overlap: (B, L, L) ``int min(p_i, p_j)``, 0 to 1.
     """
 
     steps: NDArray[np.int64]
@@ -49,8 +51,8 @@ class MapNumbers:
     overlap: Array
 
 
-def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapNumbers:
-    """The numbers of maps of one size, all steps and layers at once."""
+def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
+    """Compute the statistics of maps of equal size."""
     log = np.stack([m.log_likelihood for m in maps]).astype(np.float64)
     x, y = (offsets.astype(np.float64) for offsets in (maps[0].offsets_x, maps[0].offsets_y))
     size, cell = len(x), float(x[-1] - x[0]) * float(y[-1] - y[0]) / (len(x) - 1) ** 2
@@ -60,15 +62,15 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapNumbers:
     share /= total
     log_share = log - log_peak[..., None, None] - np.log(total)
     flat, flat_log = share.reshape(*share.shape[:2], -1), log_share.reshape(*share.shape[:2], -1)
-    middle = [(size - 1) // 2, size // 2]  # one cell, or the four about the truth where the size is even
+    middle = [(size - 1) // 2, size // 2]  # one cell, or the four around the true position for an even size
     at_truth = log[:, :, middle][..., middle].mean(axis=(2, 3))
     best = flat.argmax(axis=-1)
     axis, elongation = _principal(share, x, y)
     line = _line(maps, trace)
-    apart = np.abs((axis - line[:, None] + np.pi / 2.0) % np.pi - np.pi / 2.0)
+    deviation = np.abs((axis - line[:, None] + np.pi / 2.0) % np.pi - np.pi / 2.0)
     plogp = np.einsum("blc,blc->bl", flat, flat_log)
     ordered = -np.sort(-flat, axis=-1)
-    return MapNumbers(
+    return MapStatistics(
         steps=np.array([m.step for m in maps]),
         layers=maps[0].layers,
         peak=np.stack([x[best % size], y[best // size]], axis=-1),
@@ -80,29 +82,29 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapNumbers:
         axis=axis,
         elongation=elongation,
         line=line,
-        off_line=apart,
+        off_line=deviation,
         divergence=np.maximum(plogp[:, :, None] - np.einsum("blc,bmc->blm", flat, flat_log), 0.0),
         overlap=np.minimum(flat[:, :, None], flat[:, None]).sum(axis=-1),
     )
 
 
 def _area(ordered: Array, mass: float) -> Array:
-    """(B, L) cells, the largest first, that hold so much; the last one in part."""
-    held = ordered.cumsum(axis=-1)
-    whole = (held < mass).sum(axis=-1, keepdims=True)
+    """(B, L) number of cells, largest first, with that share of the total; the last cell counts in part."""
+    cumulative = ordered.cumsum(axis=-1)
+    whole = (cumulative < mass).sum(axis=-1, keepdims=True)
     last = np.take_along_axis(ordered, whole, axis=-1)
-    before = np.take_along_axis(held, whole, axis=-1) - last
+    before = np.take_along_axis(cumulative, whole, axis=-1) - last
     return np.asarray((whole + (mass - before) / last)[..., 0], dtype=np.float64)
 
 
 def _principal(share: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    """(B, L) direction and elongation of the covariance of maps that sum to one."""
+    """(B, L) principal axis and elongation of the covariance of normalised maps."""
     along_x, along_y = share.sum(axis=2), share.sum(axis=3)
     mean_x, mean_y = along_x @ x, along_y @ y
     xx, yy = along_x @ x**2 - mean_x**2, along_y @ y**2 - mean_y**2
     xy = (share @ x) @ y - mean_x * mean_y
     spread = np.hypot(0.5 * (xx - yy), xy)
-    tiny = (x[1] - x[0]) ** 2 / 12.0  # the spread inside of a cell: a map of one cell is round
+    tiny = (x[1] - x[0]) ** 2 / 12.0  # variance within a cell; a map of one cell is round
     ratio = (0.5 * (xx + yy) + spread + tiny) / np.maximum(0.5 * (xx + yy) - spread + tiny, 1e-12)
     return 0.5 * np.arctan2(2.0 * xy, xx - yy), np.sqrt(ratio)
 

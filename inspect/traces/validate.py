@@ -1,10 +1,10 @@
-"""Whether a trace out of a file holds together: its arrays' shapes and types, and what is said of them."""
+"""Validation of loaded traces: array shapes and types, and metadata."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -12,17 +12,15 @@ from beliefscope.datasets.dataset import SPLITS
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.external.adapter import SHAPES
 from beliefscope.filters.filter import Kind
+from beliefscope.inspect.traces.data import Trace
 
-if TYPE_CHECKING:
-    from beliefscope.inspect.trace import Trace
-
-KINDS = (*get_args(Kind), "foreign")
+KINDS = (*get_args(Kind), "external")
 STATIC = {"start_mean": "n", "start_covariance": "nn"}
 LARGEST_SEED = 2**63 - 1
 
 
-def check_intact(trace: Trace) -> None:
-    """Raises BadInput, naming what is wrong, for what no run of a filter can have left."""
+def validate_trace(trace: Trace) -> None:
+    """Raise BadInput naming the first field with an impossible value."""
     episode = trace.episode
     _check(trace.kind in KINDS, "kind", trace.kind)
     for name in ("filter", "checkpoint_hash", "data_hash"):
@@ -50,18 +48,18 @@ def check_intact(trace: Trace) -> None:
         raise BadInput(f"ancestors are {ancestors.min()} to {ancestors.max()}, the trace has {particles} particles")
 
 
-def _check(good: bool, name: str, value: Any) -> None:
-    if not good:
+def _check(valid: bool, name: str, value: Any) -> None:
+    if not valid:
         raise BadInput(f"{name} is {value!r:.200}")
 
 
 def _check_array(name: str, array: Any, letters: str, sizes: dict[str, int], kinds: str) -> None:
-    """Letters stand for sizes, those of the conventions; what a letter is at first, it is in all arrays."""
+    """Check dtype and shape. Letters stand for sizes as in the conventions; each must be equal in all arrays."""
     if array is None:
         return
     if array.dtype.kind not in kinds:
         raise BadInput(f"{name} is {array.dtype}")
-    wanted = [sizes.get(letter, "any") for letter in letters]
-    if array.ndim != len(letters) or any(n not in ("any", m) for n, m in zip(wanted, array.shape, strict=True)):
-        raise BadInput(f"{name} has shape {array.shape}, expected ({', '.join(map(str, wanted))})")
+    expected = [sizes.get(letter, "any") for letter in letters]
+    if array.ndim != len(letters) or any(n not in ("any", m) for n, m in zip(expected, array.shape, strict=True)):
+        raise BadInput(f"{name} has shape {array.shape}, expected ({', '.join(map(str, expected))})")
     sizes |= {letter: size for letter, size in zip(letters, array.shape, strict=True) if letter != "_"}

@@ -1,10 +1,9 @@
-"""A report: what traces of one filter tell, as a folder of figures, tables and data, and a page that stands alone.
+"""Writes a report of traces of one filter: a folder with a self-contained page, figures, tables and data.
 
     FOLDER/report.html       self-contained      FOLDER/figures/*.svg, *.pdf     FOLDER/tables/*.csv
-    FOLDER/manifest.json     hashes of the rest  FOLDER/data/*.json, *.npz
+    FOLDER/manifest.json     hashes              FOLDER/data/*.json, *.npz
 
-The folder is made under another name and renamed when it is whole. The same traces give the same bytes, the manifest's
-date aside.
+The same traces give the same bytes, except for the date in the manifest.
 """
 
 from __future__ import annotations
@@ -29,34 +28,38 @@ from beliefscope import __version__
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics import weight_audit
-from beliefscope.inspect.diagnostics.base import Table, as_json
 from beliefscope.inspect.diagnostics.plotting import charts_of, write_figure
+from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
-from beliefscope.inspect.figures.top_view import snapshot
+from beliefscope.inspect.figures.top_view import draw_step
 from beliefscope.inspect.likelihood import FINE, MapEngine, no_maps
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
-from beliefscope.recordings.report.figures import error_figure, moment_figure, zoom_of
+from beliefscope.recordings.report.figures import error_figure, event_figure, zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
 from beliefscope.recordings.report.page import page
 from beliefscope.recordings.report.sections import (
-    Moment,
+    Event,
+    Item,
     Report,
     Section,
-    Shown,
     accuracy,
-    happening,
-    moment_table,
-    worst_moments,
+    event_summary,
+    event_table,
+    worst_events,
 )
 
-SCENE = (
-    "The scene from above, its object as it was (line) and as the filter takes it to be (dashed). Arrow: the force on "
-    "the hand, 4 cm for 10 N. Beside it the belief, its likelihood beneath: 2 sigma contours, and particles, redder "
-    "the more they weigh."
+SCENE_CAPTION = (
+    "The scene from above with the object at its true state (solid) and at its estimated state (dashed). Arrow: force "
+    "on the end effector, 4 cm per 10 N. Right: the belief over the likelihood; 2 sigma contours, and particles "
+    "coloured by weight"
 )
-CHARTS = 8
-"""Traces whose errors are drawn, those of the largest RMSE."""
+MAP_CAPTION = (
+    "Inputs of the filter, and likelihood maps over offsets from the true position, each relative to its maximum. "
+    "Cross hairs: true position. Rings: estimate of each layer, which also depends on the prediction."
+)
+MAX_CHARTS = 8
+"""Maximum number of error charts; shows the traces with the largest RMSE."""
 
 
 def compose(
@@ -65,158 +68,162 @@ def compose(
     *,
     files: Sequence[Path] = (),
     title: str = "",
-    chosen: Sequence[tuple[int, int]] = (),
-    every: bool = False,
+    steps: Sequence[tuple[int, int]] = (),
+    slow: bool = False,
     link: Callable[[int, int], str] = lambda trace, step: "",
-    opened: str = "",
+    links_note: str = "",
     commands: tuple[str, ...] = (),
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> Report:
-    """The report of traces of one filter, every diagnostic that applies made.
+    """Compute the contents of a report, including every applicable diagnostic.
 
     Args:
-        checkpoint: of the filter, where it is there: without it there are no maps. files: of the traces.
-        chosen: (index in ``traces``, step) of the moments; without any, the worst. every: slow diagnostics too.
-        link: of such a moment. opened: how links are opened, or why there are none. commands: that make it again.
+        checkpoint: of the filter; without it there are no maps.
+        files: of the traces.
+        steps: (index in ``traces``, step) of the events. Default: the steps with the largest error.
+        slow: whether to run slow diagnostics.
+        link: permalink of an event.
+        links_note: how to open permalinks, or why there are none.
+        commands: command lines that reproduce the report.
     """
     first = traces[0]
-    found, refused = {}, {}
-    for done, (name, entry) in enumerate(DIAGNOSTICS.items(), start=1):
-        why = next(filter(None, (entry.refusal(trace, checkpoint) for trace in traces)), None)
-        if why is None and entry.slow and not every:
-            why = "takes a while: ask for it with --all"
-        if why is None:
-            found[name] = entry(traces, checkpoint)
+    results, reasons = {}, {}
+    for index, (name, entry) in enumerate(DIAGNOSTICS.items(), start=1):
+        reason = next(filter(None, (entry.refusal(trace, checkpoint) for trace in traces)), None)
+        if reason is None and entry.slow and not slow:
+            reason = "slow diagnostic; include it with --all"
+        if reason is None:
+            results[name] = entry(traces, checkpoint)
         else:
-            refused[entry.title] = why
-        progress(done / len(DIAGNOSTICS))
-    moments = [Moment(index, step) for index, step in chosen] or worst_moments(traces)
-    how = "Those that were asked for." if chosen else "The steps with the largest position error, the worst first."
+            reasons[entry.title] = reason
+        progress(index / len(DIAGNOSTICS))
+    events = [Event(index, step) for index, step in steps] or worst_events(traces)
     return Report(
         title=title or f"{first.filter} on {first.episode.task}",
         traces=tuple(traces),
         checkpoint=checkpoint,
-        found=found,
-        asked={name: (DIAGNOSTICS[name].title, DIAGNOSTICS[name].question) for name in found},
-        refused=refused,
-        moments=tuple(replace(one, link=link(one.trace, one.step)) for one in moments),
-        chosen=how,
-        links=opened,
+        results=results,
+        titles={name: (DIAGNOSTICS[name].title, DIAGNOSTICS[name].question) for name in results},
+        reasons=reasons,
+        events=tuple(replace(event, link=link(event.trace, event.step)) for event in events),
+        events_note="Requested steps." if steps else "Steps with the largest position error, in descending order.",
+        links_note=links_note,
         commands=commands,
         sources=tuple({"file": f.name, "sha256": hashlib.sha256(f.read_bytes()).hexdigest()} for f in files),
-        versions=versions(),
+        versions={
+            "beliefscope": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "matplotlib": matplotlib.__version__,
+        },
     )
 
 
 class Writer:
-    """Puts a report's parts into a folder, and keeps what the page shows of them."""
+    """Writes figures, tables and data of a report to a folder, and returns them as sections of the page."""
 
     def __init__(self, report: Report, folder: Path) -> None:
         self.report, self.folder = report, folder
         for name in ("figures", "tables", "data"):
             (folder / name).mkdir()
-        if report.checkpoint is None:
-            self.no_maps: str | None = "the filter's checkpoint is not at hand"
-        else:
+        self.no_maps: str | None = "the filter's checkpoint is not available"
+        if report.checkpoint is not None:
             self.no_maps = no_maps(report.checkpoint, report.traces[0])
         self._engines: dict[int, MapEngine] = {}
 
-    def figure(self, name: str, caption: str, figure: Figure, *data: str) -> Shown:
-        """As SVG and PDF; the page has the SVG."""
-        files = tuple(f"figures/{name}.{ending}" for ending in ("svg", "pdf"))
+    def figure(self, name: str, caption: str, figure: Figure, *data: str) -> Item:
+        """Write a figure as SVG and PDF."""
+        files = tuple(f"figures/{name}.{suffix}" for suffix in ("svg", "pdf"))
         for file in files:
             write_figure(figure, self.folder / file)
-        return Shown(caption, (*files, *data), svg=(self.folder / files[0]).read_text(encoding="utf-8"))
+        return Item(caption, (*files, *data), svg=(self.folder / files[0]).read_text(encoding="utf-8"))
 
-    def table(self, name: str, table: Table) -> Shown:
-        """As CSV with all digits, unknown values empty."""
+    def table(self, name: str, table: Table) -> Item:
+        """Write a table as CSV with all digits; missing values are empty."""
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([table.columns, *table.rows])
-        return Shown(table.title, (self.write(f"tables/{name}.csv", text.getvalue().encode()),), table)
+        return Item(table.title, (self.write(f"tables/{name}.csv", text.getvalue().encode()),), table)
 
     def write(self, file: str, data: bytes) -> str:
+        """Write a file; returns its path in the folder."""
         (self.folder / file).write_bytes(data)
         return file
 
     def summary(self) -> Section:
-        """Accuracy of all traces, and the runs with their moments."""
+        """Accuracy over all traces, and the error over time with marked events."""
         traces = self.report.traces
         rmse = [float(np.sqrt(np.mean(measures.position_error(t)[measures.counted(t), -1] ** 2))) for t in traces]
-        drawn = sorted(sorted(range(len(traces)), key=lambda i: -rmse[i])[:CHARTS])
+        charts = sorted(sorted(range(len(traces)), key=lambda i: -rmse[i])[:MAX_CHARTS])
         marks: dict[int, list[tuple[int, str]]] = {}
-        for number, moment in enumerate(self.report.moments, start=1):
-            if moment.trace in drawn:
-                marks.setdefault(drawn.index(moment.trace), []).append((moment.step, str(number)))
-        left_out = f" The {CHARTS} of {len(traces)} traces with the largest errors." if len(drawn) < len(traces) else ""
-        caption = (
-            "Position error of each modality alone and fused over the steps. Shaded: contact; gray: black pictures. "
-            f"Dotted: the moments that are shown below.{left_out}"
+        for number, event in enumerate(self.report.events, start=1):
+            if event.trace in charts:
+                marks.setdefault(charts.index(event.trace), []).append((event.step, str(number)))
+        omitted = (
+            f" The {MAX_CHARTS} of {len(traces)} traces with the largest errors." if len(charts) < len(traces) else ""
         )
-        shown = [
+        caption = (
+            "Position error of each modality's update and of the fused estimate. Shaded: contact; gray: image "
+            f"blackout. Dotted: the events below.{omitted}"
+        )
+        items = [
             self.table("accuracy", accuracy(traces)),
-            self.figure("error", caption, error_figure([traces[i] for i in drawn], marks)),
+            self.figure("error", caption, error_figure([traces[i] for i in charts], marks)),
         ]
         worst = traces[int(np.argmax(rmse))]
         if weight_audit.why_not(worst) is None:
-            caption = f"Estimates of the map's components, and fusion weight_audit. Episode {worst.episode_index}."
-            shown.append(self.figure("estimates", caption, paper.weights_figure(worst)))
-        if self.no_maps is None and worst.alone and worst.episode.contact.any():
+            caption = f"Estimates of the map components, and fusion weights. Episode {worst.episode_index}."
+            items.append(self.figure("estimates", caption, paper.weights_figure(worst)))
+        if self.no_maps is None and worst.modalities_with_posterior and worst.episode.contact.any():
             assert self.report.checkpoint is not None
             figure = paper.maps_figure(self.report.checkpoint, worst, paper.steps_by_contact(worst))
             caption = (
-                f"Likelihood of each modality over the square about the truth, episode {worst.episode_index}: in the "
-                "middle of the longest stretch in contact, and of the longest without."
+                f"Likelihood of each modality around the true position, episode {worst.episode_index}, in the middle "
+                "of the longest stretch of contact and of free motion."
             )
-            shown.append(self.figure("maps-by-contact", caption, figure))
-        return Section("summary", "Accuracy", "", "", tuple(shown))
+            items.append(self.figure("maps-by-contact", caption, figure))
+        return Section("summary", "Accuracy", "", "", tuple(items))
 
     def diagnostic(self, name: str) -> Section:
-        """One diagnostic's figure, tables and data."""
-        result, (title, question) = self.report.found[name], self.report.asked[name]
+        """Figure, tables and data of a diagnostic."""
+        result, (title, question) = self.report.results[name], self.report.titles[name]
         data = self.write(f"data/{name}.json", _json(result.to_dict()))
-        shown = []
-        if result.curves() or result.plots() or result.pictures():
+        items = []
+        if result.curves() or result.plots() or result.images():
             figure = result.plot()
-            figure.suptitle("")  # the page has the verdict as text, and a paper has captions
-            names = [*(chart for chart, _ in charts_of(result)), *(p.title for p in result.plots())]
-            names += [picture.title for picture in result.pictures()]
-            shown.append(self.figure(name, f"{title}: {'; '.join(names)}", figure, data))
-        for i, table in enumerate(result.tables(), start=1):
-            shown.append(self.table(f"{name}-{i}", table))
-        return Section(name, title, question, result.verdict, tuple(shown))
+            figure.suptitle("")  # the verdict is on the page as text
+            names = [*(chart for chart, _ in charts_of(result)), *(plot.title for plot in result.plots())]
+            names += [image.title for image in result.images()]
+            items.append(self.figure(name, f"{title}: {'; '.join(names)}", figure, data))
+        items += [self.table(f"{name}-{i}", table) for i, table in enumerate(result.tables(), start=1)]
+        return Section(name, title, question, result.verdict, tuple(items))
 
-    def moment(self, number: int) -> Section:
-        """One moment: the scene, pictures, maps, numbers."""
-        moment = self.report.moments[number]
-        trace, step = self.report.traces[moment.trace], moment.step
-        name = f"moment-{number + 1}"
-        map_ = drawn = None
+    def event(self, index: int) -> Section:
+        """Scene, images, maps and values of an event."""
+        event = self.report.events[index]
+        trace, step = self.report.traces[event.trace], event.step
+        name = f"event-{index + 1}"
+        map_ = zoomed = None
         zoom, data = 1, []
         if self.no_maps is None:
-            map_ = drawn = self._engine(moment.trace).map(step, size=FINE)
+            map_ = zoomed = self._engine(event.trace).map(step, size=FINE)
             buffer = io.BytesIO()
             arrays: dict[str, Any] = {f.name: np.asarray(getattr(map_, f.name)) for f in fields(map_)}
             np.savez_compressed(buffer, **arrays)
             data.append(self.write(f"data/{name}-maps.npz", buffer.getvalue()))
-            caption = (
-                "What the filter was given, and likelihood maps over offsets from the truth, each over its maximum. "
-                "Cross hairs: the truth. Rings: each layer's own estimate, which rests on its prediction as well."
-            )
-            zoom = zoom_of(map_)
+            caption, zoom = MAP_CAPTION, zoom_of(map_)
             if zoom > 1:
-                caption += f" The middle of the map, {zoom} times narrower than its square."
-                drawn = self._engine(moment.trace).map(step, size=FINE * zoom)
+                caption += f" Centre of the map, magnified {zoom} times."
+                zoomed = self._engine(event.trace).map(step, size=FINE * zoom)
         else:
-            caption = (
-                f"What the filter was given, and its estimates as offsets from the truth. No maps: {self.no_maps}."
-            )
-        shown = (
-            self.figure(f"{name}-scene", SCENE, snapshot(trace, step, drawn)),
-            self.figure(name, caption, moment_figure(trace, step, drawn, zoom), *data),
-            self.table(name, moment_table(trace, step, map_)),
+            caption = f"Inputs of the filter, and estimates as offsets from the true position. No maps: {self.no_maps}."
+        items = (
+            self.figure(f"{name}-scene", SCENE_CAPTION, draw_step(trace, step, zoomed)),
+            self.figure(name, caption, event_figure(trace, step, zoomed, zoom), *data),
+            self.table(name, event_table(trace, step, map_)),
         )
-        title = f"{number + 1}. Episode {trace.episode_index}, step {step}"
-        return Section(name, title, "", happening(trace, step), shown, moment.link)
+        title = f"{index + 1}. Episode {trace.episode_index}, step {step}"
+        return Section(name, title, "", event_summary(trace, step), items, event.link)
 
     def _engine(self, trace: int) -> MapEngine:
         assert self.report.checkpoint is not None
@@ -229,39 +236,39 @@ def write_report(
     report: Report,
     folder: Path,
     pdf: Callable[[Path, Path], None] | None = None,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> dict[str, Any]:
-    """Writes the report's folder, whole or not at all, and returns its manifest.
+    """Write the folder of a report atomically; returns its manifest.
 
     Args:
-        pdf: prints (page, PDF), for a ``report.pdf``. progress: called with the share done, 0..1.
+        pdf: prints (page, PDF) to write ``report.pdf``.
+        progress: called with the completed fraction, 0..1.
 
     Raises:
-        BadInput: the folder holds something else than a report.
+        BadInput: the folder contains something other than a report.
     """
-    parts = 1 + len(report.found) + len(report.moments)
-    with new_folder(folder) as made:
-        writer = Writer(report, made)
-        summary = writer.summary()
-        progress(1 / (parts + 1))
-        sections: list[Section] = []
-        for done, name in enumerate(report.found, start=2):
+    total = 2 + len(report.results) + len(report.events)
+    with new_folder(folder) as target:
+        writer = Writer(report, target)
+        sections: list[Section] = [writer.summary()]
+        progress(1 / total)
+        for name in report.results:
             sections.append(writer.diagnostic(name))
-            progress(done / (parts + 1))
-        moments: list[Section] = []
-        for number in range(len(report.moments)):
-            moments.append(writer.moment(number))
-            progress((2 + len(sections) + number) / (parts + 1))
-        writer.write("report.html", page(report, summary, sections, moments, writer.no_maps).encode())
+            progress(len(sections) / total)
+        for index in range(len(report.events)):
+            sections.append(writer.event(index))
+            progress(len(sections) / total)
+        diagnostics, events = sections[1 : 1 + len(report.results)], sections[1 + len(report.results) :]
+        writer.write("report.html", page(report, sections[0], diagnostics, events).encode())
         if pdf is not None:
-            pdf(made / "report.html", made / "report.pdf")
-        document = manifest(report, made)
+            pdf(target / "report.html", target / "report.pdf")
+        document = manifest(report, target)
         writer.write("manifest.json", _json(document))
     return document
 
 
 def manifest(report: Report, folder: Path) -> dict[str, Any]:
-    """What the report was made of and by, and the SHA-256 of each of its files."""
+    """Sources and versions of a report, and the SHA-256 of each of its files."""
     first, checkpoint = report.traces[0], report.checkpoint
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {
@@ -284,23 +291,12 @@ def manifest(report: Report, folder: Path) -> dict[str, Any]:
             }
             for source, trace in zip(report.sources or ({},) * len(report.traces), report.traces, strict=True)
         ],
-        "moments": [{"episode": report.traces[m.trace].episode_index, **asdict(m)} for m in report.moments],
-        "diagnostics": {name: result.verdict for name, result in report.found.items()},
-        "not_made": dict(report.refused),
+        "events": [{"episode": report.traces[e.trace].episode_index, **asdict(e)} for e in report.events],
+        "diagnostics": {name: result.verdict for name, result in report.results.items()},
+        "not_made": dict(report.reasons),
         "versions": dict(report.versions),
         "commands": list(report.commands),
         "files": {str(p.relative_to(folder).as_posix()): hashlib.sha256(p.read_bytes()).hexdigest() for p in files},
-    }
-
-
-def versions() -> dict[str, str]:
-    """Of what the numbers and figures come from."""
-    return {
-        "beliefscope": __version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "matplotlib": matplotlib.__version__,
     }
 
 

@@ -1,8 +1,9 @@
-"""Figures that only a report has: the error of each run with the chosen moments, and one moment at a glance."""
+"""Figures of a report: the error of each run with marked events, and the details of one event."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import patheffects, rc_context
@@ -16,32 +17,32 @@ from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 
-A_ROW = 4
-"""Panels of a moment side by side."""
+COLUMNS = 4
+"""Maximum number of panels per row."""
 
 ZOOMS = (6, 4, 2)
-HELD = 0.98
-"""Share of each layer's likelihood that the middle of a map holds, for the rest to be left out."""
+MIN_SHARE = 0.98
+"""Minimum fraction of each layer's likelihood inside a zoomed map."""
 
 EDGE = [patheffects.withStroke(linewidth=2.6, foreground="white")]
 
 
 def zoom_of(map_: LikelihoodMap) -> int:
-    """How many times narrower than the map the middle is that holds nearly all that every layer finds likely."""
+    """Largest zoom of a map that still contains ``MIN_SHARE`` of the likelihood of every layer."""
     share = np.exp(map_.log_likelihood - map_.log_likelihood.max(axis=(1, 2), keepdims=True)).astype(np.float64)
     share /= share.sum(axis=(1, 2), keepdims=True)
     for zoom in ZOOMS:
         x, y = (np.abs(offsets) <= np.abs(map_.offsets_x).max() / zoom for offsets in (map_.offsets_x, map_.offsets_y))
-        if (share[:, y][:, :, x].sum(axis=(1, 2)) >= HELD).all():
+        if (share[:, y][:, :, x].sum(axis=(1, 2)) >= MIN_SHARE).all():
             return zoom
     return 1
 
 
 def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int, str]]]) -> Figure:
-    """Position error of each layer over the steps, one chart a trace.
+    """Position error of each layer over time, one chart per trace.
 
     Args:
-        marks: index in ``traces`` -> (step, name) of the moments that are marked in it.
+        marks: index in ``traces`` -> (step, name) of marked events.
     """
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 1.55 * len(traces) + 0.3), layout="constrained")
@@ -50,11 +51,11 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
         for index, (axes, trace) in enumerate(zip(charts, traces, strict=True)):
             error = 100.0 * measures.position_error(trace)
             for layer, values in zip(measures.layers(trace), error.T, strict=True):
-                if layer == "fused" or layer in trace.alone:
-                    look = {"lw": 1.5, "zorder": 2.5} if layer == "fused" else {"lw": 0.9}
-                    axes.plot(values, label=layer, color=colour(layer, trace.modalities), **look)
+                if layer == "fused" or layer in trace.modalities_with_posterior:
+                    style = {"lw": 1.5, "zorder": 2.5} if layer == "fused" else {"lw": 0.9}
+                    axes.plot(values, label=layer, color=colour(layer, trace.modalities), **style)
             bands = {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}
-            draw_bands(axes, bands, named=True)
+            draw_bands(axes, bands, labelled=True)
             for step, name in marks.get(index, ()):
                 axes.axvline(step, color="black", lw=0.6, ls=":")
                 place = {"xytext": (2, -1), "textcoords": "offset points", "va": "top", "fontsize": 7}
@@ -68,60 +69,71 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
     return figure
 
 
-def moment_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int = 1) -> Figure:
-    """The pictures that the filter was given and each layer's map, its own estimate upon it; all offsets are from the
-    truth. Without maps: where the estimates are.
+def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int = 1) -> Figure:
+    """Input images and likelihood maps at a step, with estimates, as offsets from the true position.
 
     Args:
-        zoom: how many times narrower than the map the square is that is drawn.
+        map_: None to show the estimates only.
+        zoom: magnification of the map.
     """
-    task = measures.task_of(trace)
-    pictures = {key: one[step] for key, one in trace.episode.observations.items() if one.ndim == 3}
+    images = {key: array[step] for key, array in trace.episode.observations.items() if array.ndim == 3}
     layers = map_.layers if map_ is not None else ("estimates",)
-    count = len(pictures) + len(layers)
-    columns = min(A_ROW, count)
+    count = len(images) + len(layers)
+    columns = min(COLUMNS, count)
     rows = -(-count // columns)
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH * columns / A_ROW, 2.05 * rows), layout="constrained")
+        figure = Figure(figsize=(WIDTH * columns / COLUMNS, 2.05 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         grid = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axes, (key, picture) in zip(grid, pictures.items(), strict=False):
-            axes.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+        for axes, (key, image) in zip(grid, images.items(), strict=False):
+            axes.imshow(image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
             axes.set(xticks=[], yticks=[])
-            axes.set_title(key + (", black" if not picture.any() else ""), loc="left", fontsize=7.5)
-        half = 100.0 * task.map_half_width
-        centre = trace.episode.states[step][list(task.map_indices)]
-        offsets = 100.0 * (measures.means(trace)[step][:, list(task.map_indices)] - centre)
-        where = dict(zip(measures.layers(trace), offsets, strict=True))
-        first = len(pictures)
+            axes.set_title(key + (", blackout" if not image.any() else ""), loc="left", fontsize=7.5)
         for i, layer in enumerate(layers):
-            axes = grid[first + i]
-            if map_ is None:
-                axes.axhline(0.0, color=COLOURS["truth"], lw=0.6)
-                axes.axvline(0.0, color=COLOURS["truth"], lw=0.6)
-                for name in (*trace.alone, "fused"):
-                    _estimate(axes, where[name], colour(name, trace.modalities), name)
-                axes.legend(frameon=False, fontsize=6)
-            else:
-                log = map_.log_likelihood[i]
-                extent = (-half, half, -half, half)
-                look = {"cmap": "viridis", "vmin": 0.0, "vmax": 1.0, "origin": "lower", "extent": extent}
-                axes.imshow(np.exp(log - log.max()), interpolation="nearest", **look)
-                hair = [-half, -0.15 * half / zoom, np.nan, 0.15 * half / zoom, half]
-                for x, y in ((hair, [0.0] * 5), ([0.0] * 5, hair)):
-                    axes.plot(x, y, color="white", lw=0.5, alpha=0.7)
-                if layer == "fused" or layer in trace.alone:
-                    _estimate(axes, where[layer], colour(layer, trace.modalities), layer)
-            axes.set(xlim=(-half / zoom, half / zoom), ylim=(-half / zoom, half / zoom), aspect="equal")
-            axes.set_title(layer, loc="left", fontsize=7.5)
-            axes.set_xlabel(f"{task.map_components[0].replace('_', ' ')} offset (cm)")
-            if i == 0 or (first + i) % columns == 0:
-                axes.set_ylabel(f"{task.map_components[1].replace('_', ' ')} offset (cm)")
+            index = len(images) + i
+            _draw_layer(grid[index], trace, step, map_, layer, zoom)
+            if i > 0 and index % columns > 0:
+                grid[index].set_ylabel("")
         for axes in grid[count:]:
             axes.set_visible(False)
     return figure
 
 
-def _estimate(axes: Axes, place: np.ndarray, shade: str, name: str) -> None:
-    """A ring, so that what lies beneath is seen."""
-    axes.plot(*place, marker="o", ms=7, mfc="none", mec=shade, mew=1.3, ls="", label=name, path_effects=EDGE, zorder=4)
+def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None, layer: str, zoom: int) -> None:
+    """Draw a layer's map with its estimate, or without a map the estimates of all layers."""
+    task = measures.task_of(trace)
+    half = 100.0 * task.map_half_width
+    centre = trace.episode.states[step][list(task.map_indices)]
+    offsets = 100.0 * (measures.means(trace)[step][:, list(task.map_indices)] - centre)
+    positions = dict(zip(measures.layers(trace), offsets, strict=True))
+    if map_ is None:
+        axes.axhline(0.0, color=COLOURS["truth"], lw=0.6)
+        axes.axvline(0.0, color=COLOURS["truth"], lw=0.6)
+        for name in (*trace.modalities_with_posterior, "fused"):
+            _draw_estimate(axes, positions[name], colour(name, trace.modalities), name)
+        axes.legend(frameon=False, fontsize=6)
+    else:
+        log = map_.log_likelihood[map_.layers.index(layer)]
+        style: dict[str, Any] = {
+            "cmap": "viridis",
+            "vmin": 0.0,
+            "vmax": 1.0,
+            "origin": "lower",
+            "extent": (-half, half, -half, half),
+        }
+        axes.imshow(np.exp(log - log.max()), interpolation="nearest", **style)
+        cross = [-half, -0.15 * half / zoom, np.nan, 0.15 * half / zoom, half]
+        for x, y in ((cross, [0.0] * 5), ([0.0] * 5, cross)):
+            axes.plot(x, y, color="white", lw=0.5, alpha=0.7)
+        if layer == "fused" or layer in trace.modalities_with_posterior:
+            _draw_estimate(axes, positions[layer], colour(layer, trace.modalities), layer)
+    axes.set(xlim=(-half / zoom, half / zoom), ylim=(-half / zoom, half / zoom), aspect="equal")
+    axes.set_title(layer, loc="left", fontsize=7.5)
+    axes.set_xlabel(f"{task.map_components[0].replace('_', ' ')} offset (cm)")
+    axes.set_ylabel(f"{task.map_components[1].replace('_', ' ')} offset (cm)")
+
+
+def _draw_estimate(axes: Axes, position: np.ndarray, hue: str, name: str) -> None:
+    """Draw a ring, which leaves the map below visible."""
+    style: dict[str, Any] = {"marker": "o", "ms": 7, "mfc": "none", "mec": hue, "mew": 1.3, "ls": ""}
+    axes.plot(*position, label=name, path_effects=EDGE, zorder=4, **style)

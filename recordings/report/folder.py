@@ -1,4 +1,4 @@
-"""A report's folder: there as a whole or not at all, and nothing but an older report is ever replaced by it."""
+"""The folder of a report: written completely or not at all; replaces nothing but an existing report."""
 
 from __future__ import annotations
 
@@ -16,61 +16,61 @@ from beliefscope.datasets.errors import BadInput
 
 FAMILY = "beliefscope-report "
 FORMAT = f"{FAMILY}1"
-"""What a report's manifest says that it is."""
+"""Format in the manifest of a report."""
 
 
 def check_folder(folder: Path) -> None:
-    """Raises BadInput where a report must not be written: only an older report may be replaced."""
+    """Raise BadInput if a report cannot be written to the folder: it must be new, empty, or contain a report."""
     if folder.is_file():
         raise BadInput(f"{str(folder)!r} is a file; give the name of a folder")
     if not folder.absolute().parent.is_dir():
-        raise BadInput(f"folder {str(folder.parent)!r} does not exist, so {folder.name!r} cannot be made in it")
+        raise BadInput(f"folder {str(folder.parent)!r} does not exist, so {folder.name!r} cannot be created")
     if folder.is_dir() and any(folder.iterdir()) and not _is_report(folder):
-        raise BadInput(f"folder {str(folder)!r} holds something else than a report; give another name")
+        raise BadInput(f"folder {str(folder)!r} contains something other than a report; give another name")
 
 
 def _is_report(folder: Path) -> bool:
     try:
-        found = json.loads((folder / "manifest.json").read_bytes())
+        manifest = json.loads((folder / "manifest.json").read_bytes())
     except (OSError, ValueError):
         return False
-    return isinstance(found, dict) and str(found.get("format", "")).startswith(FAMILY)
+    return isinstance(manifest, dict) and str(manifest.get("format", "")).startswith(FAMILY)
 
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """A hidden folder beside it, which takes its name when all went well, and is gone when not."""
+    """Yields a hidden folder next to it, renamed at the end or removed on errors."""
     folder = Path(folder).absolute()
     check_folder(folder)
-    with _held(folder.parent):  # so that nobody clears away what is not held yet
-        _clear(folder)
-        made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        holding = ExitStack()
-        holding.enter_context(_held(made))
-    old = made.with_name(f"{made.name}.old")
+    with _locked(folder.parent):  # no cleanup between creating and locking the folder
+        _clean_up(folder)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        lock = ExitStack()
+        lock.enter_context(_locked(temporary))
+    old = temporary.with_name(f"{temporary.name}.old")
     try:
-        yield made
-        os.chmod(made, 0o755)
-        check_folder(folder)  # it may have become something else meanwhile
+        yield temporary
+        os.chmod(temporary, 0o755)
+        check_folder(folder)  # it may have changed in the meantime
         if folder.exists():
             folder.rename(old)
         try:
-            made.rename(folder)
+            temporary.rename(folder)
         except OSError:
             if old.exists():
                 old.rename(folder)
             raise
     finally:
-        holding.close()
-        shutil.rmtree(made, ignore_errors=True)
+        lock.close()
+        shutil.rmtree(temporary, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _clear(folder: Path) -> None:
-    """Removes what reports left there that were killed; one killed between its two renames leaves the older report."""
-    for left in folder.parent.glob(f".{glob.escape(folder.name)}.????????"):
-        with suppress(OSError), _held(left, wait=False):  # one that is being written is held
-            shutil.rmtree(left)
+def _clean_up(folder: Path) -> None:
+    """Remove folders of killed processes. Restore the old report if one was killed between its two renames."""
+    for temporary in folder.parent.glob(f".{glob.escape(folder.name)}.????????"):
+        with suppress(OSError), _locked(temporary, wait=False):  # folders in use are locked
+            shutil.rmtree(temporary)
     for old in folder.parent.glob(f".{glob.escape(folder.name)}.????????.old"):
         with suppress(OSError):
             if folder.exists():
@@ -80,8 +80,8 @@ def _clear(folder: Path) -> None:
 
 
 @contextmanager
-def _held(folder: Path, wait: bool = True) -> Iterator[None]:
-    """Holds a folder among all who ask so; a process that ends lets go. Raises OSError for one that is held."""
+def _locked(folder: Path, wait: bool = True) -> Iterator[None]:
+    """Lock a folder; released when the process ends. Raises OSError if it is locked and ``wait`` is false."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Prints a page as PDF with a Chromium that is installed."""
+"""Prints a page as PDF with an installed Chromium."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from pathlib import Path
 from beliefscope.datasets.errors import BadInput
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-PATIENCE = 180  # s
+TIMEOUT = 180  # s
 FLAGS = ("--headless", "--disable-gpu", "--no-first-run", "--disable-extensions", "--no-pdf-header-footer")
 
 
 def browser() -> str:
-    """Path of a Chromium: ``BELIEFSCOPE_CHROMIUM``, or one on the path. Raises BadInput where there is none."""
-    found = os.environ.get("BELIEFSCOPE_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        raise BadInput("no Chromium to print with: install it, or give its path in BELIEFSCOPE_CHROMIUM")
-    return found
+    """Path of a Chromium: ``BELIEFSCOPE_CHROMIUM``, or one in PATH. Raises BadInput if there is none."""
+    path = os.environ.get("BELIEFSCOPE_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        raise BadInput("PDF output requires Chromium: install it, or set BELIEFSCOPE_CHROMIUM to its path")
+    return path
 
 
 def print_page(chromium: str, page: Path, pdf: Path) -> None:
-    """Raises BadInput where the browser does not print it. The dates that it writes into the file are taken out."""
+    """Print the page, with dates in the PDF set to zero. Raises BadInput if the browser fails."""
     # Chromium's own sandbox does not start as root.
     root = ["--no-sandbox"] if os.geteuid() == 0 else []
     with tempfile.TemporaryDirectory() as profile:
         command = [chromium, *FLAGS, *root, f"--user-data-dir={profile}", f"--print-to-pdf={pdf}", page.as_uri()]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+            done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise BadInput(f"{chromium} did not print the report: {error}") from None
     if done.returncode or not pdf.is_file():
-        said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise BadInput(f"{chromium} did not print the report: {said}")
-    # Of the same length, so that the offsets in the file stay true.
+        reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise BadInput(f"{chromium} did not print the report: {reason}")
+    # Same length, so that the offsets in the file remain valid.
     pdf.write_bytes(
         re.sub(rb"\(D:[^)]{4,}\)", lambda date: b"(D:" + date[0][3:-1].translate(ZEROS) + b")", pdf.read_bytes())
     )

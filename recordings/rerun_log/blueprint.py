@@ -1,4 +1,4 @@
-"""The layout that every recording carries: the scene and what the robot senses left, the story over time right."""
+"""Layout of a recording: scene and observations on the left, time series on the right."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from beliefscope.recordings.schema import STEP
 
 TRAIL_STEPS = 100
 VIEWING_DISTANCE = 1.2
-"""m from the scene's middle: an arm's reach is in view."""
-# Dark whatever the viewer's theme, so that a map's empty cells look empty.
+"""m from the centre of the scene, so that the reach of the arm is in view."""
+# Dark in every theme of the viewer, so that empty cells of a map look empty.
 BACKGROUND = rrb.Background(kind="SolidColor", color=[16, 17, 24])
 LINKED = rrb.TimeAxis(link="LinkToGlobal")
 
@@ -33,25 +33,27 @@ def blueprint(
     diagnostics: Mapping[str, Diagnostic] = MappingProxyType({}),
     growing: bool = False,
 ) -> rrb.Blueprint:
-    """The layout for a trace.
+    """Layout of the recording of a trace.
 
     Args:
-        first: of its maps; where there is none, they have no views. diagnostics: by name, a tab each beside the story.
-        growing: whether this is the beginning of a run that goes on: the cursor follows it, and so do the axes.
+        first: first likelihood map; None for no maps.
+        diagnostics: by name; each has a tab next to the time series.
+        growing: whether the run is in progress: the cursor and axes follow its end.
     """
-    sensed = [_picture(key) for key, shape in task.observations.items() if len(shape) == 2]
+    observed = [_camera(key) for key, shape in task.observations.items() if len(shape) == 2]
     if first is not None:
-        sensed += [_map(layer, len(first.offsets_x)) for layer in first.layers]
+        observed += [_map(layer, len(first.offsets_x)) for layer in first.layers]
     scene = rrb.Vertical(
         _scene(trace, task),
-        rrb.Horizontal(*sensed) if sensed else rrb.TextDocumentView(origin="about"),
-        row_shares=[3, 2] if len(sensed) < 4 else [5, 2],
+        rrb.Horizontal(*observed) if observed else rrb.TextDocumentView(origin="about"),
+        row_shares=[3, 2] if len(observed) < 4 else [5, 2],
     )
-    story = _story(trace, task, growing)
+    series = _time_series(trace, task, growing)
     if diagnostics:
-        story = rrb.Tabs(story, *(diagnostic_tab(one, name) for name, one in diagnostics.items()), active_tab=0)
+        tabs = (diagnostic_tab(diagnostic, name) for name, diagnostic in diagnostics.items())
+        series = rrb.Tabs(series, *tabs, active_tab=0)
     return rrb.Blueprint(
-        rrb.Horizontal(scene, story, column_shares=[1, 1]),
+        rrb.Horizontal(scene, series, column_shares=[1, 1]),
         rrb.TimePanel(state="collapsed", timeline=STEP, play_state="following" if growing else "paused"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -61,7 +63,7 @@ def blueprint(
 
 
 def _scene(trace: Trace, task: Task) -> rrb.Container:
-    """The whole scene from behind the robot, and the belief from straight above, as the maps show it."""
+    """The scene from behind the robot, and the belief from above, as on the maps."""
     x, y = task.map_indices
     anchor = np.array([*positions(trace)[:, [x, y]].mean(axis=0), plane_height(trace, task)])
     effector = trace.episode.observations.get("effector_position")
@@ -95,22 +97,22 @@ def _eye(target: NDArray[np.float64], position: NDArray[np.float64], up: tuple[i
     return rrb.EyeControls3D(position=position, look_target=target, eye_up=up, kind="Orbital")
 
 
-def _picture(key: str) -> rrb.Spatial2DView:
+def _camera(key: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=f"observations/{key}", name="Camera")
 
 
 def _map(layer: str, side: int) -> rrb.Spatial2DView:
-    # Without bounds the view would shrink the map to make room for an estimate that lies outside it.
+    # Without bounds, the view would zoom out to include estimates outside the map.
     bounds = rrb.VisualBounds2D(x_range=[0, side], y_range=[0, side])
     return rrb.Spatial2DView(origin=f"maps/{layer}", name=layer, visual_bounds=bounds)
 
 
-def _story(trace: Trace, task: Task, growing: bool) -> rrb.Container:
+def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     rows: list[rrb.View | rrb.Container] = []
     rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=LINKED))
     shares = [1.6]
-    shown = {"weights": "Fusion weights beta", "acting": "Share as it acted"}
-    fusion = [_plot(name, title, (-0.05, 1.05)) for name, title in shown.items() if getattr(trace, name) is not None]
+    titles = {"weights": "Fusion weights beta", "effective_weights": "Effective weights"}
+    fusion = [_plot(name, title, (-0.05, 1.05)) for name, title in titles.items() if getattr(trace, name) is not None]
     if fusion:
         rows.append(rrb.Tabs(*fusion, active_tab=0))
         shares.append(2.5)
@@ -131,7 +133,7 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
     i, scale = task.index(component.name), SHOWN_SCALE[component.unit]
     limits = None
     if not growing:
-        # The axis fits the truth and the fused band; a modality that runs away may leave it.
+        # Limits fit the true state and the fused 2 sigma band; diverging modalities may exceed them.
         sigma = np.nan_to_num(SIGMAS * np.sqrt(trace.estimate_covariance[:, i, i]))
         mean = trace.estimate_mean[:, i]
         values = np.concatenate([trace.episode.states[:, i], mean - sigma, mean + sigma])

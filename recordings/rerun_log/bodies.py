@@ -1,4 +1,4 @@
-"""Robot and object in a recording: their shapes once, and where each body was at every step."""
+"""Robot and object in a recording: shapes (static), and the pose of each body at every step."""
 
 from __future__ import annotations
 
@@ -10,50 +10,52 @@ import numpy as np
 import rerun as rr
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.simulation.replay import model_of, poses
+from beliefscope.datasets.simulation.replay import body_poses, replay_model
 from beliefscope.datasets.simulation.shapes import shapes
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.figures.meshes import Solid, solid
+from beliefscope.inspect.figures.meshes import Mesh, mesh_of
 from beliefscope.inspect.trace import Trace
 
 
 class Bodies:
-    """The bodies of a trace's replay that have a shape; none where it cannot be replayed."""
+    """Bodies with a shape in the replay of a trace; none if it cannot be replayed."""
 
     def __init__(self, trace: Trace, task: Task) -> None:
-        self._solids: dict[tuple[int, str], list[Solid]] = {}
+        self._solids: dict[tuple[int, str], list[Mesh]] = {}
         try:
-            self._model = model_of(task, trace.episode)
-        except BadInput:  # a recording of others may not say what its world was like
+            self._model = replay_model(task, trace.episode)
+        except BadInput:  # external data may lack the parameters of the simulation
             self._model = None
         if self._model is not None:
-            found = sorted(shapes(self._model), key=lambda one: one.body)
-            for body, group in groupby(found, key=lambda one: (one.body, one.name)):
-                self._solids[body] = [solid(shape) for shape in group]
+            by_body = sorted(shapes(self._model), key=lambda shape: shape.body)
+            for body, group in groupby(by_body, key=lambda shape: (shape.body, shape.name)):
+                self._solids[body] = [mesh_of(shape) for shape in group]
 
-    def looks(self) -> Iterator[tuple[str, rr.Mesh3D]]:
-        """The shape of each, which does not change."""
+    def meshes(self) -> Iterator[tuple[str, rr.Mesh3D]]:
+        """Path and mesh of each body."""
         for (_, name), parts in self._solids.items():
-            first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+            offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
             yield (
                 f"world/bodies/{name}",
                 rr.Mesh3D(
                     vertex_positions=np.concatenate([part.vertices for part in parts]),
                     vertex_normals=np.concatenate([part.normals for part in parts]),
                     vertex_colors=np.concatenate([np.tile(_rgba(part), (len(part.vertices), 1)) for part in parts]),
-                    triangle_indices=np.concatenate([part.faces + at for part, at in zip(parts, first, strict=False)]),
+                    triangle_indices=np.concatenate(
+                        [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
+                    ),
                 ),
             )
 
     def columns(self, qpos: np.ndarray) -> Iterator[tuple[str, Any]]:
-        """Where each was at some steps, by their joint positions (T, nq)."""
+        """Poses of the bodies at joint positions (T, nq)."""
         if self._model is None:
             return
-        positions, rotations = poses(self._model, qpos)
+        positions, rotations = body_poses(self._model, qpos)
         for body, name in self._solids:
-            at, turned = positions[:, body], rotations[:, body]
-            yield f"world/bodies/{name}", rr.Transform3D.columns(translation=at, mat3x3=turned)
+            transforms = rr.Transform3D.columns(translation=positions[:, body], mat3x3=rotations[:, body])
+            yield f"world/bodies/{name}", transforms
 
 
-def _rgba(part: Solid) -> np.ndarray:
+def _rgba(part: Mesh) -> np.ndarray:
     return np.rint(255.0 * part.rgba).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A diagnostic as Rerun paths, and their layout: what the page and a figure show of it, in a recording."""
+"""Diagnostics in a recording: Rerun entities and their layout."""
 
 from __future__ import annotations
 
@@ -12,36 +12,37 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnostics.base import Curve, Diagnostic, Picture, Plot, Table, Value
-from beliefscope.inspect.diagnostics.plotting import charts_of, png_of
+from beliefscope.inspect.diagnostics.base import Diagnostic
+from beliefscope.inspect.diagnostics.plotting import charts_of, panel_png
+from beliefscope.inspect.diagnostics.views import Curve, ImagePanel, Plot, Table, Value
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.rerun_log.entities import line, rgba, series, time_columns
 
-COLOUR_OF_NOTHING = "#9A9A9A"
-"""Of curves that belong to no layer, and of bounds."""
+NEUTRAL_COLOUR = "#9A9A9A"
+"""Of bounds and of curves without a layer."""
 
-HEIGHT, WORDS, AXIS, LANE, LEAST = 800.0, 230.0, 56.0, 41.0, 110.0
-"""Points: of a tab in a window of common size, of its words, of the kinds of steps' axis and of each, of a chart."""
+TAB_HEIGHT, TEXT_HEIGHT, AXIS_HEIGHT, LANE_HEIGHT, CHART_HEIGHT = 800.0, 230.0, 56.0, 41.0, 110.0
+"""Points: of a tab in a typical window, its text, the axis and each lane of the bands, and a chart at least."""
 
-COLOURS_OF_BANDS = {"contact": "#CC79A7", "blackout": "#808080", "edit": "#0072B2"}
+BAND_COLOURS = {"contact": "#CC79A7", "blackout": "#808080", "edit": "#0072B2"}
 
 
 def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, name: str, trace: Trace) -> None:
-    """Logs what is shown of a diagnostic under ``diagnostics/{name}``; docs/recordings.md has the paths.
+    """Log a diagnostic under ``diagnostics/{name}`` (paths: docs/recordings.md).
 
     Args:
-        stream: where to; None for Rerun's current one, as ``rr.log`` does.
-        name: as in ``DIAGNOSTICS``, whose title and question are then told, or any other.
-        trace: of whose steps the curves are. A diagnostic of several traces has none.
+        stream: None for Rerun's current recording stream.
+        name: of an entry of ``DIAGNOSTICS``, which provides title and question, or another name.
+        trace: with the steps of the curves. Diagnostics of several traces have no curves.
 
     Raises:
-        BadInput: the curves have another number of steps than the trace.
+        BadInput: the numbers of steps of the curves and of the trace differ.
     """
     root = f"diagnostics/{slug(name)}"
     rr.log(
         f"{root}/about",
-        rr.TextDocument(told(diagnostic, name), media_type="text/markdown"),
+        rr.TextDocument(markdown(diagnostic, name), media_type="text/markdown"),
         static=True,
         recording=stream,
     )
@@ -51,19 +52,19 @@ def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, na
         for i, curve in enumerate(curves):
             if len(curve.values) != len(trace):
                 raise BadInput(
-                    f"{name} has curves of {len(curve.values)} steps and the trace has {len(trace)}: "
-                    "log it with the trace that it is of"
+                    f"{name} has curves of {len(curve.values)} steps, but the trace has {len(trace)} steps: "
+                    "log it with its own trace"
                 )
             path = f"{root}/curves/{slug(chart)}/{slug(curve.name)}"
             rr.log(path, _line(curve, layers, layers[:i].count(curve.layer)), static=True, recording=stream)
             rr.send_columns(path, times, series(curve.values), recording=stream)
-        bounds = sorted({one for curve in curves if curve.bounds for one in curve.bounds if np.isfinite(one)})
+        bounds = sorted({b for curve in curves if curve.bounds for b in curve.bounds if np.isfinite(b)})
         if bounds:
             path = f"{root}/bounds/{slug(chart)}"
             ends = np.unique([0, len(trace) - 1])
             rr.log(
                 path,
-                line(COLOUR_OF_NOTHING, 0.8, *["bounds"] * len(bounds)),
+                line(NEUTRAL_COLOUR, 0.8, *["bounds"] * len(bounds)),
                 static=True,
                 recording=stream,
             )
@@ -75,30 +76,30 @@ def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, na
             )
     for kind, mask in _bands(diagnostic).items():
         _log_band(stream, f"{root}/bands/{slug(kind)}", kind, mask, trace)
-    for where, panels in (("plots", diagnostic.plots()), ("pictures", diagnostic.pictures())):
+    for where, panels in (("plots", diagnostic.plots()), ("images", diagnostic.images())):
         for panel in panels:
-            image = rr.EncodedImage(contents=png_of(panel), media_type="image/png")
+            image = rr.EncodedImage(contents=panel_png(panel), media_type="image/png")
             rr.log(f"{root}/{where}/{slug(panel.title)}", image, static=True, recording=stream)
 
 
 def diagnostic_tab(diagnostic: Diagnostic, name: str) -> rrb.Container:
-    """The layout of what ``log_diagnostic`` logs: words, plots and pictures above, the curves below."""
+    """Layout of a diagnostic logged by ``log_diagnostic``: text, plots and images above, curves below."""
     root = f"diagnostics/{slug(name)}"
-    panels: list[tuple[str, Plot | Picture]] = [
+    panels: list[tuple[str, Plot | ImagePanel]] = [
         *(("plots", plot) for plot in diagnostic.plots()),
-        *(("pictures", picture) for picture in diagnostic.pictures()),
+        *(("images", picture) for picture in diagnostic.images()),
     ]
-    said = [
-        rrb.TextDocumentView(origin=f"{root}/about", name="What it says"),
+    views = [
+        rrb.TextDocumentView(origin=f"{root}/about", name="Verdict"),
         *(rrb.Spatial2DView(origin=f"{root}/{where}/{slug(p.title)}", name=p.title) for where, p in panels),
     ]
-    rows: list[rrb.View | rrb.Container] = [rrb.Tabs(*said, active_tab=0)]
-    heights = [WORDS]
+    rows: list[rrb.View | rrb.Container] = [rrb.Tabs(*views, active_tab=0)]
+    heights = [TEXT_HEIGHT]
     linked = rrb.TimeAxis(link="LinkToGlobal")
     charts, bands = charts_of(diagnostic), _bands(diagnostic)
     if charts and bands:
-        rows.append(rrb.StateTimelineView(origin=f"{root}/bands", name="Steps", time_view=linked))
-        heights.append(AXIS + LANE * len(bands))
+        rows.append(rrb.StateTimelineView(origin=f"{root}/bands", name="Phases", time_view=linked))
+        heights.append(AXIS_HEIGHT + LANE_HEIGHT * len(bands))
     for chart, curves in charts:
         unit = curves[0].unit
         rows.append(
@@ -110,27 +111,27 @@ def diagnostic_tab(diagnostic: Diagnostic, name: str) -> rrb.Container:
                 plot_legend=rrb.PlotLegend(corner="LeftTop"),
             )
         )
-    heights += [max(LEAST, (HEIGHT - sum(heights)) / len(charts))] * len(charts) if charts else []
+    heights += [max(CHART_HEIGHT, (TAB_HEIGHT - sum(heights)) / len(charts))] * len(charts) if charts else []
     return rrb.Vertical(*rows, row_shares=heights, name=title_of(name))
 
 
 def title_of(name: str) -> str:
-    """The title of a diagnostic of the catalog; any other's is its name."""
+    """Title of a diagnostic in the catalog; the name of any other."""
     return DIAGNOSTICS[name].title if name in DIAGNOSTICS else name
 
 
 def slug(name: str) -> str:
-    """A name as one part of a path: letters and digits in lower case, with ``_`` for what lies between them."""
+    """A name as one part of a path: lower-case letters and digits, joined by ``_``."""
     return re.sub(r"\W+", "_", name.lower()).strip("_") or "_"
 
 
-def told(diagnostic: Diagnostic, name: str) -> str:
-    """Title, question, verdict and tables as Markdown, with a last one of what its curves are."""
+def markdown(diagnostic: Diagnostic, name: str) -> str:
+    """Title, question, verdict and tables as Markdown, including a table of the curves."""
     question = [f"*{DIAGNOSTICS[name].question}*"] if name in DIAGNOSTICS else []
     tables = diagnostic.tables()
     if curves := diagnostic.curves():
-        rows = [(one.chart, one.name, one.unit, *(one.bounds or (None, None))) for one in curves]
-        tables = [*tables, Table("Curves", ("chart", "curve", "unit", "should be from", "to"), tuple(rows))]
+        rows = [(curve.chart, curve.name, curve.unit, *(curve.bounds or (None, None))) for curve in curves]
+        tables = [*tables, Table("Curves", ("chart", "curve", "unit", "lower bound", "upper bound"), tuple(rows))]
     return "\n\n".join([f"# {title_of(name)}", *question, diagnostic.verdict, *map(_table, tables)]) + "\n"
 
 
@@ -145,23 +146,23 @@ def _cell(value: Value) -> str:
 
 
 def _line(curve: Curve, layers: Sequence[str], before: int) -> rr.SeriesLines:
-    """Curves of one layer share its colour and tell apart by their strength; ``before``: how many came before."""
+    """Curves of a layer share its colour and differ in opacity. before: number of earlier curves of the layer."""
     count = layers.count(curve.layer)
-    named = list(dict.fromkeys(one for one in layers if one))
-    hue = colour(curve.layer, named) if curve.layer else COLOUR_OF_NOTHING
+    names = list(dict.fromkeys(layer for layer in layers if layer))
+    hue = colour(curve.layer, names) if curve.layer else NEUTRAL_COLOUR
     return line(hue, 1.5, curve.name, opacity=np.linspace(1.0, 0.4, count)[before : before + 1])
 
 
 def _bands(diagnostic: Diagnostic) -> dict[str, NDArray[np.bool_]]:
-    """Those that some step is of."""
+    """Bands with at least one step."""
     return {kind: mask for kind, mask in diagnostic.bands().items() if mask.any()}
 
 
 def _log_band(stream: rr.RecordingStream | None, path: str, kind: str, mask: NDArray[np.bool_], trace: Trace) -> None:
-    """Where it begins and ends, step 0 first."""
+    """Log the steps at which a band begins and ends; step 0 first."""
     steps = np.flatnonzero(np.concatenate([[True], mask[1:] != mask[:-1]]))
-    hue = rgba(COLOURS_OF_BANDS.get(kind, COLOUR_OF_NOTHING))
-    looks = rr.StateConfiguration(values=["no", kind], colors=np.full(2, hue, np.uint32), visible=[False, True])
-    rr.log(path, looks, static=True, recording=stream)
+    hue = rgba(BAND_COLOURS.get(kind, NEUTRAL_COLOUR))
+    style = rr.StateConfiguration(values=["no", kind], colors=np.full(2, hue, np.uint32), visible=[False, True])
+    rr.log(path, style, static=True, recording=stream)
     changes = rr.StateChange.columns(state=[kind if mask[step] else "no" for step in steps])
     rr.send_columns(path, time_columns(steps, trace.episode.dt), changes, recording=stream)

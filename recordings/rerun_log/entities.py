@@ -1,4 +1,4 @@
-"""A stretch of a trace as Rerun columns: what the eye is shown, drawn from the trace's numbers (``schema.SCHEMA``)."""
+"""Steps of a trace as Rerun columns for display, derived from its arrays (``schema.SCHEMA``)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Component, Ghost, Task
+from beliefscope.datasets.task import Component, Outline, Task
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours
 from beliefscope.inspect.trace import Trace
@@ -17,35 +17,35 @@ from beliefscope.recordings.schema import STEP, TIME
 
 Array = NDArray[Any]
 Columns = Iterable[tuple[str, Any]]
-"""Pairs of an entity path and its columns, one row a step."""
+"""Pairs of an entity path and its columns with one row per step."""
 
 SHOWN_UNIT = {"m": "cm", "rad": "deg"}
 SHOWN_SCALE = {"m": 100.0, "rad": 180.0 / np.pi}
-CONTACT_NAMES = ("free", "contact")
+CONTACT_NAMES = ("free motion", "contact")
 SIGMAS = 2.0
-DRAWN, SHADES = 2.0**-13, 32
-"""Of drawn particles: an eighth of a mm, to which places are rounded, and steps of the weight's colour. Nobody sees
-either, and both pack into half the room. The particles' own numbers are under ``trace/``, exact."""
+PARTICLE_GRID, SHADES = 2.0**-13, 32
+"""m and number of colours to which displayed particles are rounded: invisible, and halves the file size. The exact
+particles are under ``trace/``."""
 
-COLOUR_OF_ROBOT = "#B0B0B0"
-MODALITY = "this modality alone, its weight"
+ROBOT_COLOUR = "#B0B0B0"
+MODALITY = "single-modality update, fusion weight"
 KINDS = {
     "ekf": "An extended Kalman filter for each measurement model",
     "ukf": "An unscented Kalman filter for each measurement model",
     "pf": "A particle filter",
-    "lstm": "An LSTM, which knows no covariance and no likelihood,",
-    "foreign": "A filter from outside, of which is shown what it says,",
+    "lstm": "An LSTM without covariance and likelihood",
+    "external": "An external filter",
 }
 MEANINGS = {
-    "truth": "what the filter should find",
-    "fused": "the filter's estimate from all modalities",
+    "truth": "true state",
+    "fused": "estimate from all modalities",
     "contact": "the robot touches the object",
 }
 
 
 def sources(trace: Trace) -> tuple[str, ...]:
-    """Whose estimates there are: ``fused``, then each modality's where it is known."""
-    return ("fused", *trace.alone)
+    """Sources of estimates: ``fused``, then the modalities with estimates of their own."""
+    return ("fused", *trace.modalities_with_posterior)
 
 
 def angles(task: Task) -> tuple[Component, ...]:
@@ -54,29 +54,29 @@ def angles(task: Task) -> tuple[Component, ...]:
 
 
 def positions(trace: Trace) -> Array:
-    """(T, n) true states, or where they are not known the estimated ones: where things are, for a layout."""
-    return trace.episode.states if knows_truth(trace) else trace.estimate_mean
+    """(T, n) true states, or estimated states if unknown."""
+    return trace.episode.states if has_truth(trace) else trace.estimate_mean
 
 
-def knows_truth(trace: Trace, steps: slice = slice(None)) -> bool:
-    """Whether the true state is known at each of the steps: on a robot it may not be."""
+def has_truth(trace: Trace, steps: slice = slice(None)) -> bool:
+    """Whether the true state is known at all of the steps; on a robot it may be unknown."""
     return not np.isnan(trace.episode.states[steps]).any()
 
 
 def plane_height(trace: Trace, task: Task) -> float:
-    """World height (m) of the plane on which the belief is drawn: of the object's anchor, else of the end effector."""
-    if task.ghost is not None:
-        return float(task.ghost(positions(trace)[0]).anchor[2])
+    """World height (m) of the plane of the displayed belief: of the object's anchor, else of the end effector."""
+    if task.outline is not None:
+        return float(task.outline(positions(trace)[0]).anchor[2])
     effector = trace.episode.observations.get("effector_position")
     return 0.0 if effector is None else float(effector[0, 2])
 
 
 def columns(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
-    """Every drawn path of a stretch of steps, except the maps' and the contact's changes."""
+    """Every displayed path over some steps, except maps and contact changes."""
     yield from _world(trace, task, steps)
     yield from _states(trace, task, steps)
     yield from _errors(trace, task, steps)
-    for name in ("weights", "acting"):
+    for name in ("weights", "effective_weights"):
         values = getattr(trace, name)
         if values is not None:
             for k, modality in enumerate(trace.modalities):
@@ -86,27 +86,27 @@ def columns(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
 
 
 def series(values: Array) -> Any:
-    """Columns of (T,) or (T, S) numbers, S series in one entity. float32 survives as float64, so nothing is lost."""
+    """Columns of (T,) or (T, S) numbers, S series in one entity, as float64."""
     rows = values.reshape(len(values), -1).astype(np.float64)
     return rr.Scalars.columns(scalars=rows.ravel()).partition([rows.shape[1]] * len(rows))
 
 
 def time_columns(steps: NDArray[np.int64], dt: float) -> list[rr.TimeColumn]:
-    """Both timelines at some steps of ``dt`` s."""
+    """Both timelines at some steps; dt in s."""
     nanoseconds = np.rint(steps * (dt * 1e9)).astype("timedelta64[ns]")
     return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
 
 
 def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
-    """What does not change: names, colours and widths of every series and marker."""
+    """Static properties: names, colours and widths of every series and marker."""
     yield "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
     yield "world/plane", rr.Transform3D(translation=[0.0, 0.0, plane_height(trace, task)])
-    yield "world/effector", _marker(COLOUR_OF_ROBOT, 3.0)
+    yield "world/effector", _marker(ROBOT_COLOUR, 3.0)
     yield "world/plane/truth", _marker(_hex("truth", trace), 4.0)
-    if task.ghost is not None:
-        ghost = task.ghost(positions(trace)[0])
-        for name in ("truth", "fused") if knows_truth(trace) else ("fused",):
-            yield f"world/object/{name}", _object(_hex(name, trace), ghost, filled=name == "truth")
+    if task.outline is not None:
+        outline = task.outline(positions(trace)[0])
+        for name in ("truth", "fused") if has_truth(trace) else ("fused",):
+            yield f"world/object/{name}", _object(_hex(name, trace), outline, filled=name == "truth")
     yield (
         "contact",
         rr.StateConfiguration(
@@ -134,7 +134,7 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
         if trace.has_covariance:
             band = ["fused - 2 sigma", "fused + 2 sigma"]
             yield f"states/{component.name}/two_sigma", line(_hex("fused", trace), 1.0, *band, opacity=0.5)
-    for name in ("weights", "acting"):
+    for name in ("weights", "effective_weights"):
         values = getattr(trace, name)
         if values is None:
             continue
@@ -142,7 +142,7 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
             names = [modality]
             if values.shape[2] > 1:
                 names = [f"{modality}, {component.name}" for component in task.components]
-            # One hue a modality: its components tell apart by their strength.
+            # Components of a modality share its colour and differ in opacity.
             opacity = np.linspace(1.0, 0.35, len(names))
             yield f"{name}/{modality}", line(_hex(modality, trace), 2.0, *names, opacity=opacity)
     if trace.log_weights is not None:
@@ -150,7 +150,7 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
 
 
 def contact_changes(trace: Trace, span: slice) -> tuple[NDArray[np.int64], Any]:
-    """Those of the steps at which the contact begins or ends, the trace's first among them, and its columns there."""
+    """Steps at which contact begins or ends, including the trace's first step, and the columns of the states."""
     contact = trace.episode.contact
     steps = span.start + np.flatnonzero(np.concatenate([[True], contact[1:] != contact[:-1]])[span])
     return steps, rr.StateChange.columns(state=[CONTACT_NAMES[int(contact[step])] for step in steps])
@@ -158,8 +158,8 @@ def contact_changes(trace: Trace, span: slice) -> tuple[NDArray[np.int64], Any]:
 
 def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
     plane = list(task.map_indices)
-    known = knows_truth(trace, steps)
-    if known:
+    truth = has_truth(trace, steps)
+    if truth:
         yield "world/plane/truth", rr.Points3D.columns(positions=_lift(trace.episode.states[steps][:, plane]))
     effector = trace.episode.observations.get("effector_position")
     if effector is not None:
@@ -168,24 +168,24 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
         centre = mean[:, plane]
         yield f"world/plane/{source}/mean", rr.Points3D.columns(positions=_lift(centre))
         if trace.has_covariance:
-            axes, turn = _ellipses(covariance[:, plane][:, :, plane])
+            axes, quaternions = _ellipses(covariance[:, plane][:, :, plane])
             yield (
                 f"world/plane/{source}/ellipse",
-                rr.Ellipsoids3D.columns(centers=_lift(centre), half_sizes=_lift(axes), quaternions=turn),
+                rr.Ellipsoids3D.columns(centers=_lift(centre), half_sizes=_lift(axes), quaternions=quaternions),
             )
-    if task.ghost is not None:
-        drawn = {"fused": trace.estimate_mean} | ({"truth": trace.episode.states} if known else {})
-        for name, states in drawn.items():
-            ghost = task.ghost(states[steps])
-            outlined = rr.Cylinders3D if ghost.shape == "cylinder" else rr.Boxes3D
-            turned = np.roll(ghost.wxyz, -1, axis=-1)
-            yield f"world/object/{name}", outlined.columns(centers=ghost.position, quaternions=turned)
+    if task.outline is not None:
+        states_by_name = {"fused": trace.estimate_mean} | ({"truth": trace.episode.states} if truth else {})
+        for name, states in states_by_name.items():
+            outline = task.outline(states[steps])
+            archetype = rr.Cylinders3D if outline.shape == "cylinder" else rr.Boxes3D
+            quaternions = np.roll(outline.wxyz, -1, axis=-1)
+            yield f"world/object/{name}", archetype.columns(centers=outline.position, quaternions=quaternions)
     if trace.particles is not None and trace.log_weights is not None:
-        points = _lift(np.round(trace.particles[steps][:, :, plane] / DRAWN) * DRAWN)
+        points = _lift(np.round(trace.particles[steps][:, :, plane] / PARTICLE_GRID) * PARTICLE_GRID)
         rows, count = points.shape[:2]
         shades = _shades(trace.log_weights[steps], _hex("fused", trace))
-        both = rr.Points3D.columns(positions=points.reshape(-1, 3), colors=shades.ravel())
-        yield "world/plane/particles", both.partition([count] * rows)
+        particles = rr.Points3D.columns(positions=points.reshape(-1, 3), colors=shades.ravel())
+        yield "world/plane/particles", particles.partition([count] * rows)
 
 
 def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
@@ -207,32 +207,32 @@ def _errors(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
         distance = np.linalg.norm(error[:, plane], axis=1)
         yield f"errors/position/{source}", series(distance * SHOWN_SCALE["m"])
         for component in angles(task):
-            turn = error[:, task.index(component.name)]
-            shortest = np.abs(np.arctan2(np.sin(turn), np.cos(turn)))
+            angle = error[:, task.index(component.name)]
+            shortest = np.abs(np.arctan2(np.sin(angle), np.cos(angle)))
             yield f"errors/{component.name}/{source}", series(shortest * SHOWN_SCALE["rad"])
 
 
 def _estimates(trace: Trace, steps: slice) -> Iterator[tuple[str, Array, Array]]:
-    """(source, mean (T, n), covariance (T, n, n)) of the fused estimate and of each modality's."""
+    """(source, mean (T, n), covariance (T, n, n)) of the fused estimate and of each modality."""
     yield "fused", trace.estimate_mean[steps], trace.estimate_covariance[steps]
-    for k, modality in enumerate(trace.alone):
+    for k, modality in enumerate(trace.modalities_with_posterior):
         yield modality, trace.modality_mean[steps, k], trace.modality_covariance[steps, k]
 
 
 def _ellipses(covariance: Array) -> tuple[Array, Array]:
-    """Half axes (T, 2) at ``SIGMAS`` standard deviations and turns (T, 4, xyzw) of covariances (T, 2, 2)."""
-    axes, turn = contours(covariance)
-    zero = np.zeros_like(turn)
-    return SIGMAS * axes, np.stack([zero, zero, np.sin(turn / 2.0), np.cos(turn / 2.0)], axis=1)
+    """Half axes (T, 2) at ``SIGMAS`` standard deviations and quaternions (T, 4, xyzw) of covariances (T, 2, 2)."""
+    axes, angle = contours(covariance)
+    zero = np.zeros_like(angle)
+    return SIGMAS * axes, np.stack([zero, zero, np.sin(angle / 2.0), np.cos(angle / 2.0)], axis=1)
 
 
 def _lift(points: Array) -> Array:
-    """(..., 2) points of the plane as (..., 3)."""
+    """(..., 2) points on the plane as (..., 3)."""
     return np.concatenate([points, np.zeros_like(points[..., :1])], axis=-1).astype(np.float32)
 
 
 def _shades(log_weights: Array, hue: str) -> NDArray[np.uint32]:
-    """(T, M) RGBA from gray (no weight) to the hue (the step's greatest weight)."""
+    """(T, M) RGBA from gray (zero weight) to the colour (largest weight of the step)."""
     share = np.sqrt(np.exp(log_weights - log_weights.max(axis=1, keepdims=True)))[..., None]
     share = np.rint(share * SHADES) / SHADES
     gray, full = np.full(3, 150.0), np.array([int(hue[i : i + 2], 16) for i in (1, 3, 5)], float)
@@ -250,21 +250,21 @@ def rgba(hue: str, opacity: float = 1.0) -> int:
 
 
 def line(hue: str, width: float, *names: str, opacity: Array | float = 1.0) -> rr.SeriesLines:
-    """The look of the series of one entity: one colour, each its name and its opacity."""
+    """Style of the series of an entity: one colour, and a name and opacity per series."""
     count = len(names)
-    colours = np.array([rgba(hue, one) for one in np.broadcast_to(opacity, count)], np.uint32)
+    colours = np.array([rgba(hue, alpha) for alpha in np.broadcast_to(opacity, count)], np.uint32)
     return rr.SeriesLines(colors=colours, widths=[width] * count, names=list(names))
 
 
-def _object(hue: str, ghost: Ghost, filled: bool) -> rr.Boxes3D | rr.Cylinders3D:
-    look: dict[str, Any] = {
+def _object(hue: str, outline: Outline, filled: bool) -> rr.Boxes3D | rr.Cylinders3D:
+    style: dict[str, Any] = {
         "colors": rgba(hue),
         "fill_mode": "TransparentFillMajorWireframe" if filled else "MajorWireframe",
     }
-    x, _, z = ghost.size
-    if ghost.shape == "cylinder":
-        return rr.Cylinders3D.from_fields(lengths=[z], radii=[x / 2.0], line_radii=rr.Radius.ui_points(1.5), **look)
-    return rr.Boxes3D.from_fields(half_sizes=[np.array(ghost.size) / 2.0], radii=rr.Radius.ui_points(1.5), **look)
+    x, _, z = outline.size
+    if outline.shape == "cylinder":
+        return rr.Cylinders3D.from_fields(lengths=[z], radii=[x / 2.0], line_radii=rr.Radius.ui_points(1.5), **style)
+    return rr.Boxes3D.from_fields(half_sizes=[np.array(outline.size) / 2.0], radii=rr.Radius.ui_points(1.5), **style)
 
 
 def _marker(hue: str, points: float) -> rr.Points3D:
@@ -272,34 +272,36 @@ def _marker(hue: str, points: float) -> rr.Points3D:
 
 
 def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
-    """What is shown, in words: a recording is read by people who have nothing else at hand.
+    """Description of the recording for its viewers.
 
-    Args: trace: some steps of the run. steps: all of them, below 0 while that is not known.
+    Args:
+        trace: some steps of the run.
+        steps: number of all steps; negative if not known yet.
     """
-    senses = " and ".join(task.modalities if not trace.modalities else trace.modalities).replace("+", " with ")
-    weighs = ". It weighs its modalities anew at every step" if trace.weights is not None else ""
+    modalities = " and ".join(task.modalities if not trace.modalities else trace.modalities).replace("+", " with ")
+    weighted = ". It weights its modalities at every step" if trace.weights is not None else ""
     components = ", ".join(component.name for component in task.components)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
     length = f"{steps} steps" if steps >= 0 else "a live run, in steps"
-    begins = "It starts at the true state" if knows_truth(trace) else "The true state is not known"
-    broken = f"\nIts sensors are broken: `{trace.faults}`.\n" if trace.faults else ""
+    start = "It starts at the true state" if has_truth(trace) else "The true state is unknown"
+    faults = f"\nSensor faults: `{trace.faults}`.\n" if trace.faults else ""
     text = f"""# {task.name}, episode {trace.episode_index}, {trace.filter}
 
-{KINDS[trace.kind]} estimates {components} from {senses}: {length} of
-{trace.episode.dt:g} s. {begins}{weighs}.
-{broken}
-| name | colour | what it is |
+{KINDS[trace.kind]} estimates {components} from {modalities}: {length} of
+{trace.episode.dt:g} s. {start}{weighted}.
+{faults}
+| name | colour | meaning |
 | --- | --- | --- |
 {legend}
 
-* **Scene**: the object where it is and where the filter takes it to be. Contours are 2 sigma in
-  {task.map_components[0]} and {task.map_components[1]}. Brighter particles weigh more. Gray: the end
-  effector and where it came from.
-* **Likelihood maps**: bright where a modality finds the position likely, each against its own brightest cell; around
-  the truth, {200 * task.map_half_width:g} cm a side, {task.map_components[0]} to the right. Squares
-  frame the truth (large) and the estimate (small).
-* **Plots**: centimetres and degrees. Thin lines beside the fused estimate are 2 sigma away from it.
+* **Scene**: the true and the estimated pose of the object. Contours are 2 sigma in
+  {task.map_components[0]} and {task.map_components[1]}. Brighter particles have larger weights. Gray: the end
+  effector and its recent path.
+* **Likelihood maps**: likelihood of positions around the true one, relative to the maximum of each map;
+  {200 * task.map_half_width:g} cm per side, {task.map_components[0]} to the right. Squares
+  frame the true position (large) and the estimate (small).
+* **Plots**: in centimetres and degrees. Thin lines around the fused estimate are the 2 sigma band.
 
 * checkpoint `{trace.checkpoint_hash or "unknown"}`
 * data `{trace.data_hash or "unknown"}`

@@ -1,4 +1,4 @@
-"""Likelihood maps as Rerun columns: pictures of their own, and the fused one where it belongs in the scene."""
+"""Likelihood maps as Rerun columns: an image per layer, and the fused map in the 3D scene."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.rerun_log.entities import rgba, series, sources
 
 Array = NDArray[Any]
-PLANE_CELLS = 80  # a side at most in the scene: there the map is a carpet, and seen next to it in full
+PLANE_CELLS = 80  # maximum per side of the map in the scene; the image view has the full resolution
 
 
 def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
-    """What all maps of a recording have in common: size, colour table, markers."""
+    """Static properties of all maps of a recording: size, colour map, markers."""
     side = len(first.offsets_x)
     depth = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8")
     for layer in first.layers:
@@ -30,16 +30,16 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
         )
         yield f"maps/{layer}/truth", _frame(colour("truth", trace.modalities), side / 18)
         yield f"maps/{layer}/estimate", _frame(colour(layer, trace.modalities), side / 30)
-    laid = first.offsets_x[:: _thinning(first)]
-    gray = rr.components.ImageFormat(width=len(laid), height=len(laid), channel_datatype="U8", color_model="L")
+    cells = first.offsets_x[:: _stride(first)]
+    gray = rr.components.ImageFormat(width=len(cells), height=len(cells), channel_datatype="U8", color_model="L")
     yield (
         "world/plane/map",
-        rr.GridMap.from_fields(format=gray, cell_size=float(laid[1] - laid[0]), opacity=0.8, colormap="Inferno"),
+        rr.GridMap.from_fields(format=gray, cell_size=float(cells[1] - cells[0]), opacity=0.8, colormap="Inferno"),
     )
 
 
 def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
-    """A block of maps of one size, rows turned so that y grows upwards as on a chart."""
+    """Columns of maps of one size, flipped so that y points up."""
     x, y = task.map_indices
     steps = [m.step for m in maps]
     shares = np.stack([m.normalised() for m in maps])
@@ -53,22 +53,22 @@ def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iter
         yield f"maps/{layer}/estimate", rr.Boxes2D.columns(centers=_cells(maps, mean))
         truth = trace.episode.states[steps][:, [x, y]]
         yield f"maps/{layer}/truth", rr.Boxes2D.columns(centers=_cells(maps, truth))
-    first, thin = maps[0], _thinning(maps[0])
-    laid = shares[:, first.layers.index("fused"), ::thin, ::thin][:, ::-1].reshape(len(maps), -1)
-    half_cell = (first.offsets_x[thin] - first.offsets_x[0]) / 2.0
-    below = -0.002  # or the map and the contours drawn on it would flicker through each other
+    first, stride = maps[0], _stride(maps[0])
+    cells = shares[:, first.layers.index("fused"), ::stride, ::stride][:, ::-1].reshape(len(maps), -1)
+    half_cell = (first.offsets_x[stride] - first.offsets_x[0]) / 2.0
+    below = -0.002  # m below the contours, to avoid z-fighting
     corner = np.array([[m.centre[0] + m.offsets_x[0], m.centre[1] + m.offsets_y[0], below] for m in maps])
     corner[:, :2] -= half_cell
-    yield "world/plane/map", rr.GridMap.columns(data=list(laid), translation=corner)
+    yield "world/plane/map", rr.GridMap.columns(data=list(cells), translation=corner)
 
 
-def _thinning(one: LikelihoodMap) -> int:
-    """Of how many cells in a row one is laid in the scene."""
-    return -(-len(one.offsets_x) // PLANE_CELLS)
+def _stride(map_: LikelihoodMap) -> int:
+    """Stride at which cells are shown in the scene."""
+    return -(-len(map_.offsets_x) // PLANE_CELLS)
 
 
 def _cells(maps: Sequence[LikelihoodMap], points: Array) -> Array:
-    """World points (B, 2) as picture coordinates of their maps: cells from the upper left corner."""
+    """World points (B, 2) in image coordinates of their maps: cells from the upper left corner."""
     origin = np.array([[m.offsets_x[0], m.offsets_y[0]] for m in maps]) + np.array([m.centre for m in maps])
     spacing = np.array([[m.offsets_x[1] - m.offsets_x[0], m.offsets_y[1] - m.offsets_y[0]] for m in maps])
     cells = (points - origin) / spacing + 0.5
@@ -77,5 +77,5 @@ def _cells(maps: Sequence[LikelihoodMap], points: Array) -> Array:
 
 
 def _frame(hue: str, half: float) -> rr.Boxes2D:
-    """A hollow square about a position: a dot would hide the peak of a sharp map."""
+    """Hollow square around a position; a dot would hide the peak of a sharp map."""
     return rr.Boxes2D.from_fields(half_sizes=[[half, half]], colors=rgba(hue), radii=rr.Radius.ui_points(1.0))

@@ -1,8 +1,8 @@
-"""What a Rerun file says of itself. It may come from anywhere, so a server has it read in a process of its own.
+"""Metadata of a Rerun file. Files may be untrusted, so a server reads them in a separate process.
 
     python -m beliefscope.recordings.rerun_log.metadata FILE
 
-prints one JSON object: what ``describe`` gives, or ``{"error": one line}``. No memory and no time beyond its limits.
+prints one JSON object: the result of ``describe``, or ``{"error": message}``. Memory and CPU time are limited.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from rerun.chunk import RrdReader
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.schema import APPLICATION, EARLIER_PROPERTIES, FORMAT_VERSION, HEADER, PROPERTIES
 
-MEMORY = 4 * 2**30  # bytes of addresses, of which Rerun's libraries alone take 1.7 GB
-SECONDS = 120  # of CPU: some 10 GB
-TEXT = 200  # characters that are kept of a stranger's names
-LEFT_OUT = ("shapes", "episode", "versions", "modalities")  # properties that nobody has to know to list a recording
+MEMORY = 4 * 2**30  # bytes of address space; Rerun's libraries use 1.7 GB
+SECONDS = 120  # of CPU time, enough for about 10 GB
+TEXT = 200  # maximum length of names from the file
+OMITTED = ("shapes", "episode", "versions", "modalities")  # properties not needed to list a recording
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """What there is to know about a recording without its numbers. Every chunk is read once, one at a time.
+    """Describe a recording without its arrays. Reads every chunk once, one at a time.
 
     Returns:
-        ``application`` and ``title`` as the file names them, ``entities``, ``rows``; ``properties`` of ours, empty for
-        a stranger's; ``problem``: why no trace can be read out of it, empty where one can.
+        ``application`` and ``title`` from the file; numbers of ``entities`` and ``rows``; ``properties`` of a
+        Beliefscope recording, else empty; ``problem``: the reason why it contains no readable trace, or empty.
 
     Raises:
-        BadInput: not a whole Rerun recording.
+        BadInput: not a complete Rerun recording.
     """
     entities: set[str] = set()
     properties: dict[str, Any] = {}
@@ -44,43 +44,43 @@ def describe(path: str | Path) -> dict[str, Any]:
     with reading(path) as reader:
         stores = reader.recordings()
         if not stores:
-            raise BadInput(f"{path}: a Rerun file without a recording in it.")
-        ours = next((store for store in stores if store.application_id == APPLICATION), stores[0])
+            raise BadInput(f"{path}: a Rerun file without a recording.")
+        selected = next((store for store in stores if store.application_id == APPLICATION), stores[0])
         for chunk in (chunk for store in stores for chunk in reader.stream(store=store)):
             entities.add(chunk.entity_path)
             rows += chunk.num_rows
-            if chunk.entity_path == f"/{HEADER}" and ours.application_id == APPLICATION:
+            if chunk.entity_path == f"/{HEADER}" and selected.application_id == APPLICATION:
                 properties |= properties_of(chunk.to_record_batch())
             elif chunk.entity_path == "/__properties":
                 batch = chunk.to_record_batch()
                 if "RecordingInfo:name" in batch.schema.names:
                     title = str(_first(batch, "RecordingInfo:name"))
     return {
-        "application": ours.application_id[:TEXT],
+        "application": selected.application_id[:TEXT],
         "title": title[:TEXT],
         "entities": len(entities),
         "rows": rows,
-        "properties": {name: value for name, value in properties.items() if name not in LEFT_OUT},
-        "problem": _problem(ours.application_id[:TEXT], properties.get("format_version")),
+        "properties": {name: value for name, value in properties.items() if name not in OMITTED},
+        "problem": _problem(selected.application_id[:TEXT], properties.get("format_version")),
     }
 
 
 @contextmanager
 def reading(path: str | Path) -> Iterator[RrdReader]:
-    """Rerun's reader of a file. What it cannot read within the block is BadInput, in one line."""
+    """Yields Rerun's reader of a file. Its errors within the block are raised as BadInput with one line."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a file without a footer: a live run's, or one that was cut off
+            warnings.simplefilter("ignore")  # about missing footers of live or truncated files
             yield RrdReader(path)
     except BadInput:
         raise
     except (RuntimeError, ValueError, LookupError, TypeError) as error:
         reason = "".join(str(error).splitlines()[:1]).split(f"{path}: ")[-1]
-        raise BadInput(f"{path}: not a whole Rerun recording ({reason}).") from None
+        raise BadInput(f"{path}: not a complete Rerun recording ({reason}).") from None
 
 
 def properties_of(batch: pa.RecordBatch) -> dict[str, Any]:
-    """Properties of this schema, and of earlier ones, in a chunk of a recording's header."""
+    """Properties of this schema and earlier versions in a chunk of the header."""
     return {name: _first(batch, name) for name in batch.schema.names if name in (*PROPERTIES, *EARLIER_PROPERTIES)}
 
 
@@ -90,17 +90,17 @@ def _first(batch: pa.RecordBatch, name: str) -> Any:
 
 def _problem(application: str, version: Any) -> str:
     if application != APPLICATION or version is None:
-        return f"It was written by {application!r}, not by {APPLICATION}: Rerun shows it, but it holds no run."
+        return f"Written by {application!r}, not by {APPLICATION}: viewable in Rerun, but without a trace."
     if version != FORMAT_VERSION:
-        return f"Its format is {version!r}; this version of {APPLICATION} reads {FORMAT_VERSION}."
+        return f"Format {version!r}; this version of {APPLICATION} reads {FORMAT_VERSION}."
     return ""
 
 
 def main(path: str) -> int:
-    """Exit code: 0 where the file could be described or refused in a line."""
+    """Print the metadata or the error. Returns the exit code."""
     for limit, value in ((resource.RLIMIT_AS, MEMORY), (resource.RLIMIT_CPU, SECONDS)):
-        _, most = resource.getrlimit(limit)
-        resource.setrlimit(limit, (value if most == resource.RLIM_INFINITY else min(value, most), most))
+        _, hard = resource.getrlimit(limit)
+        resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
     try:
         print(json.dumps(describe(path)))
     except BadInput as error:

@@ -1,11 +1,13 @@
-"""How a fine-tuning goes, for Rerun: a file that grows look by look, and a viewer that is open beside it."""
+"""Curves of a fine-tuning run: a Rerun file that grows with each validation, a running viewer, and TensorBoard logs."""
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -16,20 +18,64 @@ from beliefscope.recordings.schema import APPLICATION, STEP
 
 ROOT = "tuning"
 
+Write = Callable[[int, Mapping[str, float]], None]
+"""Writes numbers by name at a step."""
+
+
+def tensorboard_writer(folder: Path) -> Any:
+    """A TensorBoard ``SummaryWriter``. Raises BadInput if tensorboardX is not installed."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise BadInput("TensorBoard logs need tensorboardX: pip install 'beliefscope[tensorboard]'") from None
+    return SummaryWriter(str(folder))
+
 
 @contextmanager
-def tuning_curves(folder: Path, viewer: str = "") -> Iterator[Callable[[int, Mapping[str, float]], None]]:
-    """Yields (step, numbers by name) -> None, which writes them under ``tuning/`` at that step, and flushes.
-
-    A number is called ``slice/measure``, such as ``nominal/position_cm``, or ``loss``; measures get a view each, with a
-    line a slice. A run that goes on after a kill writes the next file, ``run-2.rrd``, of the same recording:
-    ``rerun run-*.rrd`` shows both as one.
+def log_curves(
+    folder: Path | None, viewer: str = "", warn: Callable[[str], None] = lambda message: None
+) -> Iterator[Write]:
+    """Yields a function that writes to a Rerun file and, if tensorboardX is installed, to TensorBoard's event file.
 
     Args:
-        folder: made if new. viewer: address of a Rerun viewer to show them in as well; none where empty. One that is
-            not there, or goes, is warned of by Rerun; the run does not wait for it.
+        folder: of both files; None for no logs.
+        viewer: address of a Rerun viewer that receives the same numbers; empty for none.
+        warn: called with a message if there will be no TensorBoard logs.
+    """
+    if folder is None:
+        yield lambda step, numbers: None
+        return
+    with tuning_curves(folder, viewer) as record:
+        try:
+            writer = tensorboard_writer(folder)
+        except BadInput as error:
+            warn(f"no TensorBoard logs: {error}")
+            yield record
+            return
 
-    Raises BadInput for what is no address.
+        def write(step: int, numbers: Mapping[str, float]) -> None:
+            record(step, numbers)
+            for name, value in numbers.items():
+                writer.add_scalar(re.sub("[^a-zA-Z0-9/]+", "_", name), value, step)
+
+        with writer:
+            yield write
+
+
+@contextmanager
+def tuning_curves(folder: Path, viewer: str = "") -> Iterator[Write]:
+    """Yields a function that logs numbers under ``tuning/`` at a step and flushes.
+
+    Numbers are named ``slice/measure``, such as ``clean/position_cm``, or ``loss``. Each measure has a view with one
+    line per slice. A resumed run writes another file of the same recording, ``run-2.rrd``; ``rerun run-*.rrd`` shows
+    them together.
+
+    Args:
+        folder: created if missing.
+        viewer: address of a Rerun viewer; empty for none. Rerun warns if the viewer is unreachable, and the run
+            continues.
+
+    Raises BadInput for an invalid address.
     """
     number = 1 + sum(1 for _ in folder.glob("run-*.rrd"))
     recording = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
@@ -39,26 +85,24 @@ def tuning_curves(folder: Path, viewer: str = "") -> Iterator[Callable[[int, Map
             streams[1].connect_grpc(viewer)
         except (RuntimeError, ValueError):
             example = "rerun+http://127.0.0.1:9876/proxy"
-            raise BadInput(f"{viewer!r} is no address of a Rerun viewer; write it as {example}") from None
+            raise BadInput(f"{viewer!r} is not the address of a Rerun viewer, such as {example}") from None
     folder.mkdir(parents=True, exist_ok=True)
     streams[0].save(folder / f"run-{number}.rrd")
-    named: list[str] = []
+    names: list[str] = []
 
     def write(step: int, numbers: Mapping[str, float]) -> None:
-        parts = {name: name.rpartition("/") for name in numbers}
-        new = [name for name in parts if name not in named]
-        named.extend(new)
+        new = [name for name in numbers if name not in names]
+        names.extend(new)
         for stream in streams:
             for name in new:
-                of, _, measure = parts[name]
-                stream.log(_path(of, measure), rr.SeriesLines(names=of or measure), static=True)
+                slice_, _, measure = name.rpartition("/")
+                stream.log(_path(name), rr.SeriesLines(names=slice_ or measure), static=True)
             if new:
-                stream.send_blueprint(_layout([name.rpartition("/")[2] for name in named]))
+                stream.send_blueprint(_layout([name.rpartition("/")[2] for name in names]))
             stream.set_time(STEP, sequence=step)
             for name, value in numbers.items():
-                of, _, measure = parts[name]
-                stream.log(_path(of, measure), rr.Scalars(value))
-        streams[0].flush()  # the viewer is not waited for
+                stream.log(_path(name), rr.Scalars(value))
+        streams[0].flush()  # the file only: do not wait for the viewer
 
     try:
         yield write
@@ -67,10 +111,11 @@ def tuning_curves(folder: Path, viewer: str = "") -> Iterator[Callable[[int, Map
             stream.disconnect()
 
 
-def _path(of: str, measure: str) -> str:
-    return f"{ROOT}/{slug(measure)}/{slug(of) if of else 'run'}"
+def _path(name: str) -> str:
+    slice_, _, measure = name.rpartition("/")
+    return f"{ROOT}/{slug(measure)}/{slug(slice_) if slice_ else 'run'}"
 
 
 def _layout(measures: list[str]) -> rrb.Blueprint:
-    views = [rrb.TimeSeriesView(origin=f"{ROOT}/{slug(one)}", name=one) for one in dict.fromkeys(measures)]
+    views = [rrb.TimeSeriesView(origin=f"{ROOT}/{slug(measure)}", name=measure) for measure in dict.fromkeys(measures)]
     return rrb.Blueprint(rrb.Grid(*views), rrb.TimePanel(state="collapsed", timeline=STEP), auto_views=False)

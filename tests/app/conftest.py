@@ -1,4 +1,4 @@
-"""A small data set, two untrained filters, and servers that show them."""
+"""Fixtures: a small data set, two untrained filters, and servers that offer them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,13 @@ from typing import Any
 
 import pytest
 import uvicorn
+from fastapi.routing import APIRoute
+from pydantic import TypeAdapter
 from starlette.testclient import TestClient, WebSocketTestSession
 
-from beliefscope.app.server.main import Settings, create_app
+from beliefscope.app.api.models.catalog import Error
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.server.main import create_app
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import write_dataset
 from beliefscope.filters.batch import Steps
@@ -26,39 +30,57 @@ FILTERS = ("crossmodal-ekf", "crossmodal-pf")
 
 @pytest.fixture(scope="session")
 def steps() -> int:
-    """Of each episode."""
+    """Number of steps of each episode."""
     return 40
 
 
 @pytest.fixture(scope="session")
-def given(tmp_path_factory: pytest.TempPathFactory, steps: int) -> Settings:
-    """What the servers are given; its workspace is to be replaced by each test's own."""
-    folder = tmp_path_factory.mktemp("given")
+def base_settings(tmp_path_factory: pytest.TempPathFactory, steps: int) -> Settings:
+    """Settings shared by all tests; each test replaces the workspace."""
+    folder = tmp_path_factory.mktemp("inputs")
     simulate = DOOR.simulate
     assert simulate is not None
     episodes = [replace(simulate(0, index, steps), split=split) for index, split in enumerate(("train", "test"))]
     write_dataset(folder / "door.h5", DOOR, episodes)
     for name in FILTERS:
         filter_ = build(architecture("door", name))
-        filter_.statistics.fit(Steps.of(DOOR, episodes))
+        filter_.statistics.fit(Steps.from_episodes(DOOR, episodes))
         save_checkpoint(filter_, name, {"command": "none", "metrics": {"position_cm": 1.5}}, folder / name)
     checkpoints = {name: folder / name for name in FILTERS}
     return Settings(folder, data={"mine": folder / "door.h5"}, checkpoints=checkpoints, particles=30)
 
 
 @pytest.fixture
-def settings(given: Settings, tmp_path: Path) -> Settings:
-    return replace(given, workspace=tmp_path / "workspace")
+def settings(base_settings: Settings, tmp_path: Path) -> Settings:
+    return replace(base_settings, workspace=tmp_path / "workspace")
+
+
+def check_response(app: Any, method: str, response: Any) -> None:
+    """Validate a JSON response against the model that its route declares."""
+    if not response.headers.get("content-type", "").startswith("application/json"):
+        return
+    for route in app.routes:
+        if isinstance(route, APIRoute) and method in route.methods and route.path_regex.match(response.url.path):
+            declared = {str(status): answer.get("model") for status, answer in route.responses.items()}
+            model = Error if response.is_error else declared.get(str(response.status_code), route.response_model)
+            if model is not None:
+                TypeAdapter(model).validate_json(response.content, strict=True)
+            return
 
 
 class Browser(TestClient):
-    """The application without a network, asked by its own page."""
+    """Test client that sends the Origin header of the server's own page."""
 
     def __init__(self, settings: Settings, warm: bool = False) -> None:
         super().__init__(create_app(settings, warm), base_url=ORIGIN, headers={"Origin": ORIGIN})
 
+    def request(self, method: str, url: Any, *args: Any, **kwargs: Any) -> Any:
+        response = super().request(method, url, *args, **kwargs)
+        check_response(self.app, method, response)
+        return response
+
     def websocket_connect(self, url: str, *args: Any, **kwargs: Any) -> WebSocketTestSession:
-        # Starlette's own takes no notice of the base address.
+        # Starlette's implementation ignores the base URL.
         return super().websocket_connect(f"ws://{self.base_url.netloc.decode()}{url}", *args, **kwargs)
 
 
@@ -75,7 +97,7 @@ def client(settings: Settings) -> Iterator[TestClient]:
 
 @pytest.fixture
 def address(settings: Settings) -> Iterator[str]:
-    """``localhost:port`` of a real server in a thread."""
+    """``localhost:port`` of a server in a thread."""
     config = uvicorn.Config(create_app(settings, warm=False), port=0, log_level="error", ws_per_message_deflate=False)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
@@ -90,12 +112,12 @@ def address(settings: Settings) -> Iterator[str]:
 
 
 @pytest.fixture
-def traced(client: TestClient) -> str:
-    """Address of a trace that has been computed."""
+def trace_url(client: TestClient) -> str:
+    """URL of a trace that has been computed."""
     url = "/api/trace/door/crossmodal-pf/1"
     deadline = time.monotonic() + 30.0
-    while (answer := client.get(url)).status_code == 202:
-        assert 0.0 <= answer.json()["progress"] <= 1.0
+    while (response := client.get(url)).status_code == 202:
+        assert 0.0 <= response.json()["progress"] <= 1.0
         assert time.monotonic() < deadline
-    assert answer.status_code == 200, answer.text
+    assert response.status_code == 200, response.text
     return url

@@ -8,7 +8,7 @@ import pytest
 
 pytestmark = pytest.mark.browser
 
-FAULT_PRESETS = "() => document.querySelector('#compare .result').dataset.state === 'ready'"
+READY = "() => document.querySelector('#compare .result').dataset.state === 'ready'"
 RUN = "?filter=crossmodal-ekf&episode=9&step=45"
 
 
@@ -29,15 +29,15 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     keyboard.press("]")
     page.until("() => !document.querySelector('#compare').hidden")
     assert [form.locator(f"[name={name}]").input_value() for name in ("from", "last")] == ["45", "55"]
-    form.get_by_role("button", name="Run beside").click()
+    form.get_by_role("button", name="Compare").click()
     assert "Nothing is edited yet" in form.locator(".wrong").text_content()
     form.locator("[name=edit_faults]").select_option("blackout=0.8")
-    form.get_by_role("button", name="Run beside").click()
-    page.until(FAULT_PRESETS)
+    form.get_by_role("button", name="Compare").click()
+    page.until(READY)
     assert page.state["against"] == "from=45&to=56&faults=blackout=0.8"
     assert "over steps 45 to 55" in verdict(page)
     assert apart(page) > 0.0  # at the last edited step
-    assert page.page.locator("#against-key").text_content().strip() == "edited"
+    assert page.page.locator("#comparison-key").text_content().strip() == "edited"
     for _ in range(11):
         keyboard.press("ArrowLeft")
     page.until("() => beliefscope.state().step === 44 && document.querySelector('#readout b').textContent[0] === '4'")
@@ -45,7 +45,7 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     page.until("() => location.search.includes('against=') && location.search.includes('step=44')")
 
     second = open_page("?" + page.page.url.partition("?")[2], viewport={"width": 1440, "height": 900})
-    second.until(FAULT_PRESETS)
+    second.until(READY)
     assert second.state == page.state
     assert verdict(second) == verdict(page)
     second.picture("compare-edit")
@@ -53,18 +53,18 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     keyboard.press("Control+z")
     page.until("() => document.querySelector('#compare .result').dataset.state === 'empty'")
     assert page.state["against"] == ""
-    assert page.page.locator("#against-key").is_hidden()
+    assert page.page.locator("#comparison-key").is_hidden()
     keyboard.press("Control+Shift+Z")
-    page.until(FAULT_PRESETS)
+    page.until(READY)
     assert page.state["against"] == second.state["against"]
 
 
 def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
     page = open_page(f"{RUN}&tab=compare&against=filter%3Dcrossmodal-pf", color_scheme="dark")
-    page.until(FAULT_PRESETS)
+    page.until(READY)
     both = ["crossmodal-ekf", "crossmodal-pf"]
     assert all(name in verdict(page) for name in both)
-    assert page.page.locator("#against-key").text_content().strip() == "crossmodal-pf"
+    assert page.page.locator("#comparison-key").text_content().strip() == "crossmodal-pf"
     heads = page.page.locator("#compare .table th").all_text_contents()
     assert [head for head in heads if head in both] == both
     assert page.page.locator("#compare [name=filter]").input_value() == "crossmodal-pf"

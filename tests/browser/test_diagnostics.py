@@ -11,7 +11,7 @@ pytestmark = pytest.mark.browser
 
 EPISODE = 9
 TAB = f"?tab=diagnostics&episode={EPISODE}"
-FAULT_PRESETS = "() => document.querySelector('#diagnostics article').dataset.state === 'ready'"
+READY = "() => document.querySelector('#diagnostics article').dataset.state === 'ready'"
 
 
 def row(page: Any, title: str) -> Any:
@@ -20,7 +20,7 @@ def row(page: Any, title: str) -> Any:
 
 def opened(open_page: Any, name: str, more: str = "", **options: Any) -> Any:
     page = open_page(f"{TAB}&diagnostic={name}{more}", **options)
-    page.until(FAULT_PRESETS)
+    page.until(READY)
     return page
 
 
@@ -53,12 +53,12 @@ def test_one_is_opened_and_left_by_keyboard_and_kept_in_the_link(open_page: Any)
     page.until("() => document.querySelector('#diagnostics li[data-state=ready]')")
     row(page, "Consistency").get_by_role("button").first.focus()
     page.page.keyboard.press("Enter")
-    page.until(FAULT_PRESETS)
+    page.until(READY)
     page.until(
         "() => location.search.includes('tab=diagnostics') && location.search.includes('diagnostic=consistency')"
     )
     second = open_page("?" + page.page.url.partition("?")[2])
-    second.until(FAULT_PRESETS)
+    second.until(READY)
     assert second.state == page.state
     assert second.page.locator("#diagnostics article > .verdict").text_content().startswith("Consistent")
     page.page.keyboard.press("Enter")  # the way back has the focus
@@ -138,7 +138,7 @@ def test_a_slow_one_is_computed_and_survives_a_reload(open_page: Any) -> None:
         assert part in link
     page.page.keyboard.press("Escape")
     assert not page.page.locator("#jobs").is_visible()
-    page.until(FAULT_PRESETS)
+    page.until(READY)
     assert page.page.locator(".options input").input_value() == "21"
     assert "Long axis" in page.page.locator("#diagnostics article > .verdict").text_content()
     assert page.page.locator(".curves figure").count() >= 2
@@ -146,7 +146,7 @@ def test_a_slow_one_is_computed_and_survives_a_reload(open_page: Any) -> None:
 
 def test_over_all_held_out_it_is_a_job_that_can_be_cancelled(open_page: Any) -> None:
     page = open_page(f"{TAB}&diagnostic=weights")
-    page.until(FAULT_PRESETS)
+    page.until(READY)
     assert page.page.locator(".curves figure").count() > 0
     page.page.get_by_text("all held-out").click()
     page.until("() => document.querySelector('#diagnostics article').dataset.state === 'unasked'")
@@ -157,7 +157,7 @@ def test_over_all_held_out_it_is_a_job_that_can_be_cancelled(open_page: Any) -> 
     page.until("() => document.querySelector('#diagnostics article').dataset.state === 'ended'")
     assert article.locator("> .verdict").text_content() == "Cancelled."
     article.get_by_role("button", name="Try again").click()
-    page.until(FAULT_PRESETS, patience=180.0)
+    page.until(READY, patience=180.0)
     assert "Intervals need" not in article.locator("> .verdict").text_content()  # of one trajectory only
     assert page.page.locator(".curves figure").count() == 0
     page.picture("held-out")
@@ -183,7 +183,7 @@ FIGURES = {
         }
         for kind in ("line", "points", "bars")
     ],
-    "pictures": [
+    "images": [
         {"title": "signed", "values": [[-2.0, 0.0], [1.0, None]], "unit": "cm", "signed": True},
         {"title": "unsigned", "values": [[0.0, 4.0], [1.0, 2.0]], "unit": "", "signed": False},
     ],

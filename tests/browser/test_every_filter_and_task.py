@@ -24,7 +24,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
 def untrained(task: str, name: str, data: Path, path: Path) -> None:
     with open_dataset(data) as episodes:
         filter_ = build(architecture(task, name))
-        filter_.statistics.fit(Steps.of(find_task(task), [episodes[0]]))
+        filter_.statistics.fit(Steps.from_episodes(find_task(task), [episodes[0]]))
     save_checkpoint(filter_, name, {}, path)
 
 
@@ -43,25 +43,25 @@ def test_what_a_filter_has_not_is_said(open_page: Any, serve: Any, tmp_path: Pat
 
     assert page.state["filter"] == "my-feature-ekf"
     assert text("#heatmaps h3").all_text_contents() == ["image + haptics"]
-    assert text("#numbers tbody th").all_text_contents() == ["estimate"]
-    assert "go into one measurement model" in text("#timeline .why").text_content()
+    assert text("#step-table tbody th").all_text_contents() == ["estimate"]
+    assert "go into one measurement model" in text("#timeline .track-note").text_content()
     assert text("#data").locator("option").all_text_contents() == ["door", "sample"]
     page.picture("one-model")
 
     choose(page, "filter", "my-lstm")
     page.until("() => document.querySelector('#heatmaps').dataset.state === 'empty'")
     assert "an LSTM estimates the state" in text("#heatmaps .note").text_content()
-    assert text("#reading").text_content().endswith("how sure it is, this filter does not say.")
-    assert "\N{GREEK SMALL LETTER SIGMA}" not in text("#numbers thead").text_content()
-    assert not text("#slice-label").is_visible()
+    assert text("#step-summary").text_content().endswith("how sure it is, this filter does not say.")
+    assert "\N{GREEK SMALL LETTER SIGMA}" not in text("#step-table thead").text_content()
+    assert not text("#angle-label").is_visible()
     page.page.keyboard.press("ArrowRight")
     page.settle(1)
     page.picture("lstm")
 
     choose(page, "filter", "crossmodal-pf")
     page.until("() => document.querySelectorAll('#heatmaps h3').length === 3")
-    assert text("#numbers tbody th").all_text_contents() == ["image", "haptics", "fused"]
-    assert text("#slice-label").is_visible()
+    assert text("#step-table tbody th").all_text_contents() == ["image", "haptics", "fused"]
+    assert text("#angle-label").is_visible()
     choose(page, "data", "sample")
     page.until("() => location.search.includes('data=sample')")
     assert page.state["step"] == 0
@@ -83,13 +83,13 @@ def test_a_task_of_ones_own(open_page: Any, serve: Any, tmp_path: Path, monkeypa
     page = open_page(url=serve(0, "--task", f"{EXAMPLE}:TASK", "--data", str(data), "--filter", str(own)).url)
     text = page.page.locator
     assert page.state["task"] == name
-    assert text("#maps-what").text_content() == "position"
+    assert text("#maps-quantity").text_content() == "position"
     assert text("#heatmaps h3").all_text_contents() == ["image", "sound", "fused"]
-    assert not text("#slice-label").is_visible()
+    assert not text("#angle-label").is_visible()
     assert text("#camera figcaption").text_content() == "camera, 16 \N{MULTIPLICATION SIGN} 16"
     page.settle(0)
     page.picture("own-task")
     choose(page, "task", "door")
-    page.until("() => document.querySelector('#maps-what').textContent === 'hinge'")
+    page.until("() => document.querySelector('#maps-quantity').textContent === 'hinge'")
     assert page.state["component"] == "hinge_x"
-    assert text("#slice-label").is_visible()
+    assert text("#angle-label").is_visible()

@@ -39,9 +39,9 @@ def test_filters_from_outside(open_page: Any, serve: Any, tmp_path: Path) -> Non
     # A covariance, and nothing that tells modalities apart: one map, the Gaussian of the estimate.
     assert page.state["filter"] == "04_own_filter-build"
     assert text("#heatmaps h3").all_text_contents() == ["estimate"]
-    assert text("#numbers tbody th").all_text_contents() == ["estimate"]
-    assert "\N{GREEK SMALL LETTER SIGMA}" in text("#numbers thead").text_content()
-    assert "does not say which of its senses it follows" in text("#timeline .why").text_content()
+    assert text("#step-table tbody th").all_text_contents() == ["estimate"]
+    assert "\N{GREEK SMALL LETTER SIGMA}" in text("#step-table thead").text_content()
+    assert "does not say which of its senses it follows" in text("#timeline .track-note").text_content()
     page.page.keyboard.press("ArrowRight")
     page.settle(1)
     page.picture("foreign")
@@ -49,13 +49,13 @@ def test_filters_from_outside(open_page: Any, serve: Any, tmp_path: Path) -> Non
     text("#filter").select_option("mine-Blind")
     page.until("() => document.querySelector('#heatmaps').dataset.state === 'empty'")
     assert "does not say how likely others are" in text("#heatmaps .note").text_content()
-    assert text("#reading").text_content().endswith("how sure it is, this filter does not say.")
+    assert text("#step-summary").text_content().endswith("how sure it is, this filter does not say.")
 
     text("#filter").select_option("mine-Weighs")
-    page.until("() => document.querySelector('#numbers tbody th')?.textContent === 'fused'")
-    assert text("#timeline .why").count() == 0
+    page.until("() => document.querySelector('#step-table tbody th')?.textContent === 'fused'")
+    assert text("#timeline .track-note").count() == 0
     assert not text("#weights").is_visible()
-    assert "\N{GREEK SMALL LETTER BETA}" not in text("#numbers thead").text_content()
+    assert "\N{GREEK SMALL LETTER BETA}" not in text("#step-table thead").text_content()
     page.page.keyboard.press("ArrowRight")
     page.settle(2)
     page.picture("foreign-weights")

@@ -25,23 +25,23 @@ def looked(open_page: Any, more: str = "", **options: Any) -> Any:
 
 
 def chosen(page: Any, episode: int, step: int) -> None:
-    """Waits until the page's state is at a moment."""
+    """Waits until the page's state is at a event."""
     page.until(f"() => beliefscope.state().episode === {episode} && beliefscope.state().step === {step}")
 
 
 def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) -> None:
     page = looked(open_page, "&step=40", permissions=["clipboard-read", "clipboard-write"])
     scores = {score["name"]: score for score in page.page.request.get(page.url + API).json()["scores"]}
-    worst, second, *_ = moments = scores["error"]["moments"]
-    rows = page.page.locator("#failures .moments tbody tr")
-    assert rows.count() == len(moments)
+    worst, second, *_ = events = scores["error"]["events"]
+    rows = page.page.locator("#failures .events tbody tr")
+    assert rows.count() == len(events)
     rows.first.click()
     chosen(page, worst["episode"], worst["step"])
     page.settle(worst["step"])
     assert page.state["tab"] == "failures"
     assert rows.first.get_attribute("class") == "here"
     marked = page.page.locator("#marks button")
-    assert marked.count() == sum(m["episode"] == worst["episode"] for m in moments)
+    assert marked.count() == sum(m["episode"] == worst["episode"] for m in events)
     assert f"{100 * worst['value']:.2f} cm" in marked.first.get_attribute("aria-label")
     rows.first.get_by_role("button", name="Copy link").click()
     page.until("() => document.querySelector('#failures .link').textContent === '✓'")

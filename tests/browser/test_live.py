@@ -59,10 +59,10 @@ def test_a_run_fills_the_page_as_it_goes(open_page: Any, running: Any) -> None:
     assert page.page.locator("#failures .doing button").count() == 0
 
     running.kill()
-    page.until("() => /ended without closing at step [0-9]+/.test(document.querySelector('#messages').textContent)")
+    page.until("() => /stopped at step [0-9]+/.test(document.querySelector('#messages').textContent)")
     said = page.page.inner_text("#messages")
     assert f"at step {page.page.evaluate(f'() => {NEWEST}')}:" in said
     assert page.page.locator("#follow").is_hidden()
-    page.until("() => document.querySelectorAll('#failures .moments tbody tr').length > 0")
+    page.until("() => document.querySelectorAll('#failures .events tbody tr').length > 0")
     page.page.click("#tab-diagnostics")
     page.until("() => document.querySelectorAll('#diagnostics .list li').length > 3")

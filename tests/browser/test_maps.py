@@ -99,7 +99,7 @@ def check_probe(page: Any, told: LikelihoodMap) -> None:
     relative = np.exp(values - told.log_likelihood.max(axis=(1, 2)))
     for layer, caption in enumerate(page.page.locator("#heatmaps figcaption").all_text_contents()):
         assert numbers(caption) == pytest.approx([relative[layer], values[layer]], abs=0.0061)
-    assert "haptics" in page.page.locator("#maps-spoken").text_content()
+    assert "haptics" in page.page.locator("#maps-announcement").text_content()
     assert page.page.evaluate(heights) == before
     page.page.keyboard.press("Escape")
     assert page.page.locator("#maps-value").text_content() == ""
@@ -154,7 +154,7 @@ def test_looks_are_in_the_address_and_a_pinned_moment_is_what_others_gain_on(
 
 def test_a_moment_is_told_and_drawn_close_where_its_maps_fit(open_page: Any) -> None:
     page = open_page("?task=push&filter=crossmodal-ekf&episode=79&step=68")
-    assert page.page.locator("#reading").text_content().endswith("though image alone is 0.8 cm off.")
+    assert page.page.locator("#step-summary").text_content().endswith("though image alone is 0.8 cm off.")
     shown = {"fit": page.maps()}
     for zoom in ("4", "1"):
         page.page.evaluate(f"""() => document.querySelector('#maps-zoom input[value="{zoom}"]').click()""")

@@ -89,14 +89,14 @@ def test_dragging_scrubs(open_page: Any, record_property: Any) -> None:
 def test_wheel_zooms_and_double_click_resets(open_page: Any) -> None:
     page = open_page("?step=20")
     box = page.page.locator("#tracks").bounding_box()
-    whole = page.page.locator("#whole")
+    whole = page.page.locator("#reset-zoom")
     assert whole.is_disabled()
     page.page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 60)
     page.page.mouse.wheel(0, -600)
-    page.until("() => !document.querySelector('#whole').disabled")
+    page.until("() => !document.querySelector('#reset-zoom').disabled")
     assert page.state["step"] == 20
     page.page.mouse.dblclick(box["x"] + 0.5 * box["width"], box["y"] + 60)
-    page.until("() => document.querySelector('#whole').disabled")
+    page.until("() => document.querySelector('#reset-zoom').disabled")
 
 
 def test_wheel_over_a_map_steps_and_hover_tells_the_value(open_page: Any) -> None:
@@ -124,28 +124,28 @@ def test_a_slice_at_another_angle_changes_the_maps(open_page: Any) -> None:
     page = open_page("?step=20")
     page.settle(20)
     before = page.maps()
-    page.page.locator("#slice-label input").focus()
+    page.page.locator("#angle-label input").focus()
     for _ in range(30):
         page.page.keyboard.press("ArrowRight")
     page.until("() => location.search.includes('angle=')")
     page.settle(20)
     assert page.state["step"] == 20
     assert page.maps() != before
-    page.page.locator("#slice-true").click()
+    page.page.locator("#angle-reset").click()
     page.until("() => beliefscope.state().angle === null")
 
 
 def test_black_pictures_are_named(open_page: Any) -> None:
     page = open_page("?step=20")
-    assert not page.page.locator("#black-key").is_visible()
+    assert not page.page.locator("#blackout-key").is_visible()
     page.page.locator("#faults").select_option("blackout=0.8")
-    page.until("() => !document.querySelector('#black-key').hidden")
+    page.until("() => !document.querySelector('#blackout-key').hidden")
     for _ in range(30):
-        if page.page.locator(".black-out").is_visible():
+        if page.page.locator(".blackout").is_visible():
             break
         page.page.keyboard.press("ArrowRight")
         time.sleep(0.1)
-    assert page.page.locator(".black-out").is_visible()
+    assert page.page.locator(".blackout").is_visible()
     page.settle(page.state["step"])
     page.picture("black-out")
 
@@ -156,7 +156,7 @@ def test_a_ready_faults_breaks_a_sensor(open_page: Any) -> None:
     before, picture = page.maps(), page.page.evaluate(PICTURE)
     names = page.page.locator("#faults option").all_text_contents()
     assert names[0] == "as recorded"
-    assert {"40 % black pictures", "image frozen", "force drifting", "contact flipped", "haptics dropped"} <= {*names}
+    assert {"40 % image blackout", "image frozen", "force drifting", "contact flipped", "haptics dropped"} <= {*names}
     page.page.locator("#faults").select_option("image_frozen=20")
     wait_until(lambda: page.page.evaluate(PICTURE) != picture and page.maps()[0] != before[0])
     page.until("() => location.search.includes('faults=image_frozen%3D20')")
@@ -167,20 +167,20 @@ def test_a_ready_faults_breaks_a_sensor(open_page: Any) -> None:
 
 def test_any_faults_can_be_typed_and_a_bad_one_leaves_the_view(open_page: Any) -> None:
     own = "blackout=0.5,force_bias:x=5:from=20"
-    page = open_page("?step=40&faults=image_patch%3D16%3Ax%3D0%3Ay%3D0")
+    page = open_page("?step=40&faults=image_occluded%3D16%3Ax%3D0%3Ay%3D0")
     page.settle(40)
     faults = page.page.locator("#faults")
-    assert faults.input_value() == "image_patch=16:x=0:y=0"
+    assert faults.input_value() == "image_occluded=16:x=0:y=0"
     before = page.maps()
     faults.select_option("other")
     sheet, text = page.page.locator("#fault-dialog"), page.page.locator("#fault-dialog input")
-    assert text.input_value() == "image_patch=16:x=0:y=0"
+    assert text.input_value() == "image_occluded=16:x=0:y=0"
     assert sheet.locator("tr").count() == 15
     text.fill("blackout=1.5,force_bias:x=5")
     text.press("Enter")
     page.until("() => document.querySelector('#fault-dialog .wrong').textContent.includes(\"'probability' is 1.5\")")
     page.picture("faults-wrong")
-    assert page.state["faults"] == "image_patch=16:x=0:y=0"
+    assert page.state["faults"] == "image_occluded=16:x=0:y=0"
     assert page.maps() == before
     text.fill("blackout=0.5")
     sheet.get_by_role("button", name="force_bias").click()
@@ -215,7 +215,7 @@ def refused(page: Any) -> None:
 
 
 def test_a_link_opens_the_same_moment(open_page: Any) -> None:
-    first = open_page("?step=33&component=angle&weights=acting&angle=0.7")
+    first = open_page("?step=33&component=angle&weights=effective&angle=0.7")
     first.page.keyboard.press("ArrowRight")
     first.until("() => location.search.includes('step=34')")
     second = open_page("?" + first.page.url.partition("?")[2])
@@ -276,7 +276,7 @@ def test_the_scenes_own_slider_moves_the_page(open_page: Any) -> None:
     if not slider.is_visible():
         scene.get_by_text("Step", exact=True).first.click(timeout=60_000)
     slider.focus(timeout=60_000)
-    assert page.page.frames[-1].evaluate("() => drawing.pause(0)")  # the page's hold on viser's drawing
+    assert page.page.frames[-1].evaluate("() => frameThrottle.pause(0)")  # the page's hold on viser's drawing
     page.page.keyboard.press("ArrowRight")
     page.until("() => beliefscope.state().step === 21")
     page.settle(21)
@@ -286,7 +286,7 @@ def test_save_a_recording_open_it_and_move_both_ways(open_page: Any, tmp_path: P
     page = open_page("?step=12")
     with page.page.expect_download(timeout=120_000) as download:
         page.page.keyboard.press("s")
-        page.until("() => document.querySelector('#saved progress:not([hidden])')")
+        page.until("() => document.querySelector('#save-status progress:not([hidden])')")
         page.page.reload()  # its job goes on, and the page waits for it again
     download.value.save_as(tmp_path / "run.rrd")
     assert (tmp_path / "run.rrd").read_bytes()[:3] == b"RRF"

@@ -26,7 +26,7 @@ def test_a_bar_leads_to_the_worst_moment(open_page: Any) -> None:
         row = rows[name, int(black.split()[0]) / 100]
         each = ", ".join(f"seed {seed} {numbers['position_cm']:.2f}" for seed, numbers in row["each"].items())
         assert f": {row['mean']['position_cm']:.2f} ± {row['spread']['position_cm']:.2f} cm ({each}); " in told
-        assert linked == (name not in ("crossmodal-ukf", "lstm")) == told.endswith("opens the worst moments of seed 0")
+        assert linked == (name not in ("crossmodal-ukf", "lstm")) == told.endswith("opens the worst events of seed 0")
 
     head = panel.locator("thead button")
     head.get_by_text("80 % black").click()
@@ -47,7 +47,7 @@ def test_a_bar_leads_to_the_worst_moment(open_page: Any) -> None:
     page.until("() => document.querySelector('#failures').dataset.state === 'ready'", 120.0)
     address = f"{page.url}api/failures/door/crossmodal-ekf?faults=blackout%3D0.4&among=held-out"
     scores = {one["name"]: one for one in page.page.request.get(address).json()["scores"]}
-    worst = scores["angle"]["moments"][0]
+    worst = scores["angle"]["events"][0]
     page.until(f"() => beliefscope.state().step === {worst['step']}")
     wanted = {
         "tab": "failures",

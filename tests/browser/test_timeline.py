@@ -21,7 +21,7 @@ OTHER = """async () => {
   const task = (await api.catalog()).tasks.find((t) => t.name === name);
   const selection = { task: name, filter: 'unimodal-ekf', data, episode, faults: '' };
   const other = await api.loadTrace(task, selection, () => {}, new AbortController().signal);
-  beliefscope.timeline.against(other, 'unimodal-ekf');
+  beliefscope.timeline.compareWith(other, 'unimodal-ekf');
 }"""
 SHOWN = """(track) => {
   const rows = [];
@@ -57,7 +57,7 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     mouse, slider = page.page.mouse, page.page.locator("#tracks")
     nees = column(page, "nees")
     names = ("image", "haptics", "fused")
-    assert page.page.evaluate("() => document.querySelector('#whole').disabled") is False
+    assert page.page.evaluate("() => document.querySelector('#reset-zoom').disabled") is False
     assert {name: value for name, (value,) in told(page, 2).items()} == {
         n: pytest.approx(v, rel=6e-3) for n, v in zip(names, nees[40], strict=True)
     }
@@ -74,11 +74,11 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     )
     before = page.page.evaluate(rows)
     mouse.move(at(30, (20, 60)), box["y"] + 100)
-    assert page.page.locator("#told").text_content() == "pointer 30 · 3.0 s"
+    assert page.page.locator("#timeline-readout").text_content() == "pointer 30 · 3.0 s"
     assert told(page, 2)["fused"] == [pytest.approx(nees[30, 2], rel=6e-3)]
     assert page.page.evaluate(rows) == before
     mouse.move(box["x"] + 300, box["y"] - 200)
-    assert page.page.locator("#told").text_content() == "cursor 40 · 4.0 s"
+    assert page.page.locator("#timeline-readout").text_content() == "cursor 40 · 4.0 s"
 
     # Shift and drag: closer, the cursor staying; keys; the link opens the same stretch.
     page.page.keyboard.down("Shift")
@@ -120,7 +120,7 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     image, haptics = 100 * column(page, "innovation")[44, :, 0]
     assert told(page, 2) == {"image": [near(image)], "haptics": [near(haptics)]}
     page.page.locator("#track").select_option("particles")
-    page.until("() => document.querySelector('#tracks .why')?.textContent.includes('a Gaussian and no particles')")
+    page.until("() => document.querySelector('#tracks .track-note')?.textContent.includes('a Gaussian and no particles')")
     page.until("() => location.search.includes('track=particles')")
     page.picture("timeline-why-not")
 
@@ -150,8 +150,8 @@ def test_marked_moments_and_another_trace(open_page: Any) -> None:
     page.page.keyboard.press("0")
 
     page.page.evaluate(OTHER)
-    page.until("() => !document.querySelector('#against-key').hidden")
-    assert page.page.locator("#against-key").text_content() == "unimodal-ekf"
+    page.until("() => !document.querySelector('#comparison-key').hidden")
+    assert page.page.locator("#comparison-key").text_content() == "unimodal-ekf"
     here, there = (100 * column(page, "estimate_mean", f)[70, 0] for f in ("crossmodal-ekf", "unimodal-ekf"))
     assert told(page, 1)["fused"] == [near(here), near(there)]
     truth = 100 * column(page, "truth")[70, 0]
@@ -167,5 +167,5 @@ def test_marked_moments_and_another_trace(open_page: Any) -> None:
 
     # Of another episode neither the marks nor the other trace say anything.
     page.page.locator("#episode").select_option("8")
-    page.until("() => document.querySelector('#against-key').hidden && !document.querySelector('#marks button')")
+    page.until("() => document.querySelector('#comparison-key').hidden && !document.querySelector('#marks button')")
     assert len(told(page, 1)["fused"]) == 1

@@ -46,7 +46,7 @@ class Frame:
         return self.count() - before
 
     def pause(self, times: str) -> bool:
-        return self.page.evaluate(f"() => drawing.pause({times})")
+        return self.page.evaluate(f"() => frameThrottle.pause({times})")
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The shipped sample set: what is claimed of it in docs/data.md, and that it does not give the hinge away."""
+"""The door samples: properties stated in docs/data.md, and no leakage of the hinge position."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.simulation.door import HINGE_CENTRE, HINGE_HALF_RANGE, simulate_door
+from beliefscope.datasets.simulation.door import simulate_door
+from beliefscope.datasets.simulation.door_physics import HINGE_CENTRE, HINGE_HALF_RANGE
 from beliefscope.datasets.store import open_dataset, sample_path
 
 Array = NDArray[np.float64]
@@ -23,7 +24,7 @@ def stacked(episodes: list[Episode], key: str) -> Array:
     return np.concatenate([np.asarray(e.observations[key], float) for e in episodes])
 
 
-def test_it_is_small_enough_to_ship() -> None:
+def test_file_size() -> None:
     assert sample_path("door").stat().st_size <= 3_000_000
 
 
@@ -36,7 +37,7 @@ def test_splits_and_policies(episodes: list[Episode]) -> None:
         assert policies.count("pull") == policies.count("push") == count // 2
 
 
-def test_statistics_are_of_the_authors_scale(episodes: list[Episode]) -> None:
+def test_statistics_are_similar_to_the_paper(episodes: list[Episode]) -> None:
     states = np.concatenate([e.states for e in episodes]).astype(float)
     contact = np.concatenate([e.contact for e in episodes]).mean()
     assert 0.6 < contact < 0.72
@@ -48,12 +49,12 @@ def test_statistics_are_of_the_authors_scale(episodes: list[Episode]) -> None:
     assert (stacked(episodes, "effector_position").std(0) > (0.08, 0.1, 0.04)).all()
 
 
-def test_something_happens_in_every_trajectory(episodes: list[Episode]) -> None:
-    moved = [float(np.ptp(e.states[:, 2])) for e in episodes]
-    assert np.mean(moved) > 0.5
-    assert np.mean(np.array(moved) < 0.1) < 0.05
+def test_doors_move_and_are_touched(episodes: list[Episode]) -> None:
+    motion = [float(np.ptp(e.states[:, 2])) for e in episodes]
+    assert np.mean(motion) > 0.5
+    assert np.mean(np.array(motion) < 0.1) < 0.05
     pushes = [e for e in episodes if e.provenance["policy"] == "push"]
-    assert np.mean([np.diff(e.contact.astype(int)).clip(0).sum() for e in pushes]) > 1.3, "contacts made a trajectory"
+    assert np.mean([np.diff(e.contact.astype(int)).clip(0).sum() for e in pushes]) > 1.3, "contacts per trajectory"
     assert np.mean([e.contact.any() for e in pushes]) > 0.95
 
 
@@ -78,15 +79,15 @@ def hinge_error(train: list[Episode], test: list[Episode], contact: bool) -> Arr
     return np.array([np.sqrt((across**2).mean()), np.sqrt((along**2).mean())])
 
 
-def test_free_hand_does_not_give_the_hinge_away(episodes: list[Episode]) -> None:
-    """Nobody who knows only where the policy moves the hand finds the hinge better than by guessing its mean."""
+def test_free_hand_does_not_reveal_the_hinge(episodes: list[Episode]) -> None:
+    """Hand positions without contact predict the hinge no better than its mean."""
     pushes = [e for e in episodes if e.provenance["policy"] == "push"]
     error = hinge_error([e for e in pushes if e.split == "train"], [e for e in pushes if e.split != "train"], False)
     assert np.sqrt((error**2).mean()) > 0.9 * HINGE_HALF_RANGE / np.sqrt(3)
 
 
-def test_touch_tells_the_hinge_across_the_door_but_not_along_it(episodes: list[Episode]) -> None:
-    """The ridge of the paper's likelihood figure: a hand on the bar does not know how far from the hinge it is."""
+def test_contact_reveals_the_hinge_only_across_the_door(episodes: list[Episode]) -> None:
+    """The ridge in the paper's likelihood figure: the distance along the bar to the hinge is not observable."""
     pulls = [e for e in episodes if e.provenance["policy"] == "pull"]
     across, along = hinge_error(
         [e for e in pulls if e.split == "train"], [e for e in pulls if e.split != "train"], True
@@ -95,15 +96,15 @@ def test_touch_tells_the_hinge_across_the_door_but_not_along_it(episodes: list[E
     assert along > 0.03
 
 
-def test_pictures_tell_the_hinge(episodes: list[Episode]) -> None:
-    """A linear guess from single pictures already beats the mean by far."""
+def test_images_reveal_the_hinge(episodes: list[Episode]) -> None:
+    """Linear regression from single images is much better than the mean."""
     train, test = ([e for e in episodes if (e.split == "train") == t] for t in (True, False))
 
-    def pictures(episodes: list[Episode]) -> tuple[Array, Array]:
+    def inputs(episodes: list[Episode]) -> tuple[Array, Array]:
         x = np.concatenate([e.observations["image"][::10, :20].reshape(10, -1) for e in episodes]) / 255.0
         return x, np.concatenate([e.states[::10, :2] for e in episodes]) - np.array(HINGE_CENTRE)
 
-    (x, y), (xt, yt) = pictures(train), pictures(test)
+    (x, y), (xt, yt) = inputs(train), inputs(test)
     mean = x.mean(0)
     x, xt = x - mean, xt - mean
     dual = np.linalg.solve(x @ x.T + 1.0 * np.eye(len(x)), y)
@@ -111,10 +112,10 @@ def test_pictures_tell_the_hinge(episodes: list[Episode]) -> None:
     assert (error < 0.6 * yt.std(0)).all()
 
 
-def test_simulated_again_it_begins_the_same(episodes: list[Episode]) -> None:
-    """The hinge exactly; what physics adds, only nearly, because processors may round differently."""
+def test_simulation_reproduces_the_samples(episodes: list[Episode]) -> None:
+    """The hinge exactly; simulated values approximately, because processors round differently."""
     for index in (0, 1):
-        again, shipped = simulate_door(0, index, 5), episodes[index]
-        np.testing.assert_array_equal(again.states[:, :2], shipped.states[:5, :2])
-        np.testing.assert_allclose(again.qpos, shipped.qpos[:5], atol=1e-3)
-        assert np.abs(again.observations["image"].astype(int) - shipped.observations["image"][:5]).mean() < 0.5
+        simulated, stored = simulate_door(0, index, 5), episodes[index]
+        np.testing.assert_array_equal(simulated.states[:, :2], stored.states[:5, :2])
+        np.testing.assert_allclose(simulated.qpos, stored.qpos[:5], atol=1e-3)
+        assert np.abs(simulated.observations["image"].astype(int) - stored.observations["image"][:5]).mean() < 0.5

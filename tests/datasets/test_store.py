@@ -1,4 +1,4 @@
-"""Episodes survive the file; files that are not ours, or no longer whole, are told apart and named."""
+"""Dataset files: round trips, atomic writes, and error messages for invalid files."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import pytest
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.readers import hdf5_guard
-from beliefscope.datasets.readers.hdf5_guard import look_over
+from beliefscope.datasets.readers.hdf5_guard import mark_readable, probe
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 STEPS = 7
 
 
-def made_up(seed: int = 0, split: str = "train") -> Episode:
+def random_episode(seed: int = 0, split: str = "train") -> Episode:
     rng = np.random.default_rng(seed)
 
     def floats(*shape: int) -> np.ndarray:
@@ -51,7 +51,7 @@ def made_up(seed: int = 0, split: str = "train") -> Episode:
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     path = tmp_path / "set.h5"
-    write_dataset(path, DOOR, [made_up(0), made_up(1, "val")])
+    write_dataset(path, DOOR, [random_episode(0), random_episode(1, "val")])
     return path
 
 
@@ -60,53 +60,53 @@ def test_round_trip_is_exact(path: Path) -> None:
         assert len(data) == 2
         assert data.task is DOOR
         for i, split in enumerate(("train", "val")):
-            original, read = made_up(i, split), data[i]
+            original, read = random_episode(i, split), data[i]
             assert read.digest() == original.digest()
             assert read.provenance == original.provenance
             np.testing.assert_array_equal(read.observations["image"], original.observations["image"])
             assert read.contact.dtype == bool
         summary = data.summaries[1]
     assert (summary.index, summary.steps, summary.policy, summary.split, summary.seed) == (1, STEPS, "pull", "val", 1)
-    assert summary.contact_fraction == pytest.approx(made_up(1).contact.mean())
+    assert summary.contact_fraction == pytest.approx(random_episode(1).contact.mean())
 
 
-def test_same_episodes_same_bytes_and_same_hash(path: Path, tmp_path: Path) -> None:
-    again = tmp_path / "again.h5"
-    write_dataset(again, DOOR, [made_up(0), made_up(1, "val")])
-    assert again.read_bytes() == path.read_bytes()
-    with open_dataset(again) as a, open_dataset(path) as b:
+def test_same_episodes_give_the_same_bytes_and_hash(path: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.h5"
+    write_dataset(copy, DOOR, [random_episode(0), random_episode(1, "val")])
+    assert copy.read_bytes() == path.read_bytes()
+    with open_dataset(copy) as a, open_dataset(path) as b:
         assert a.hash == b.hash
-    write_dataset(again, DOOR, [made_up(0), made_up(2, "val")])
-    with open_dataset(again) as a, open_dataset(path) as b:
+    write_dataset(copy, DOOR, [random_episode(0), random_episode(2, "val")])
+    with open_dataset(copy) as a, open_dataset(path) as b:
         assert a.hash != b.hash
 
 
-def test_any_hdf5_reader_sees_plain_arrays(path: Path) -> None:
+def test_arrays_are_plain_hdf5(path: Path) -> None:
     with h5py.File(path) as file:
         image = file["trajectory0/observations/image"][()]
         assert image.shape == (STEPS, 32, 32)
         assert file["trajectory0"].attrs["split"] == "train"
 
 
-def test_a_writer_that_fails_leaves_what_was_there(path: Path) -> None:
+def test_failed_write_keeps_the_previous_file(path: Path) -> None:
     before = path.read_bytes()
 
     def failing() -> Iterator[Episode]:
-        yield made_up(5)
-        raise RuntimeError("the simulator fell over")
+        yield random_episode(5)
+        raise RuntimeError("simulator error")
 
-    with pytest.raises(RuntimeError, match="fell over"):
+    with pytest.raises(RuntimeError, match="simulator error"):
         write_dataset(path, DOOR, failing())
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
-def test_write_needs_its_folder(tmp_path: Path) -> None:
+def test_write_to_a_missing_folder(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"Folder .*missing does not exist: cannot write a\.h5 there"):
-        write_dataset(tmp_path / "missing" / "a.h5", DOOR, [made_up()])
+        write_dataset(tmp_path / "missing" / "a.h5", DOOR, [random_episode()])
 
 
-def refuse(path: Path, message: str) -> None:
+def check_rejected(path: Path, message: str) -> None:
     with pytest.raises(BadInput, match=message) as error, open_dataset(path) as data:
         list(data)
     assert "\n" not in str(error.value)
@@ -114,58 +114,65 @@ def refuse(path: Path, message: str) -> None:
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    refuse(tmp_path / "no.h5", "does not exist")
+    check_rejected(tmp_path / "no.h5", "does not exist")
 
 
-def test_folder(tmp_path: Path) -> None:
-    refuse(tmp_path, r"holds no data: expected files that end in \.json, \.h5 or \.hdf5")
+def test_empty_folder(tmp_path: Path) -> None:
+    check_rejected(tmp_path, r"has no data: expected files that end in \.json, \.h5 or \.hdf5")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_forbidden_file(path: Path) -> None:
+@pytest.mark.skipif(os.geteuid() == 0, reason="root can read all files")
+def test_file_without_permission(path: Path) -> None:
     path.chmod(0)
-    refuse(path, "No permission")
+    check_rejected(path, "No permission")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x89HDF\r\n\x1a", bytes(5000)])
 def test_not_hdf5(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.h5"
     path.write_bytes(content)
-    refuse(path, "is not an HDF5 file")
+    check_rejected(path, "is not an HDF5 file")
 
 
-@pytest.mark.parametrize("share", [0.01, 0.2, 0.5, 0.9, 0.999])
-def test_cut_short(path: Path, share: float) -> None:
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    refuse(path, "damaged or cut short|is not an HDF5 file")
+@pytest.mark.parametrize("fraction", [0.01, 0.2, 0.5, 0.9, 0.999])
+def test_truncated_file(path: Path, fraction: float) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(fraction * len(content))])
+    check_rejected(path, "damaged or cut short|is not an HDF5 file")
 
 
-def test_any_flipped_byte_is_noticed_or_harmless(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever a damaged byte does, it never gives wrong numbers, nor anything but BadInput."""
-    whole = path.read_bytes()
-    good = [made_up(0).digest(), made_up(1, "val").digest()]
+def test_flipped_bytes_are_detected_or_harmless(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A damaged byte never gives wrong numbers or an exception other than BadInput."""
+    content = path.read_bytes()
+    expected = [random_episode(0).digest(), random_episode(1, "val").digest()]
     rng = np.random.default_rng(0)
-    noticed, endless, others = 0, 0, []
-    for at in rng.integers(0, len(whole), 100):
-        damaged = bytearray(whole)
+    detected, endless, files = 0, 0, []
+    for at in rng.integers(0, len(content), 100):
+        damaged = bytearray(content)
         damaged[at] ^= 0xFF
-        others.append(path.with_name(f"{at}.h5"))
-        others[-1].write_bytes(damaged)
+        files.append(path.with_name(f"{at}.h5"))
+        files[-1].write_bytes(damaged)
     monkeypatch.setattr(hdf5_guard, "SECONDS", 0.5)
-    look_over(others)  # all at once
-    for other in others:
+    probe(files)  # in one process
+    for file in files:
         try:
-            with open_dataset(other) as data:
-                assert [e.digest() for e in data] == good
+            with open_dataset(file) as data:
+                assert [e.digest() for e in data] == expected
         except BadInput as error:
-            noticed += 1
+            detected += 1
             endless += "cannot be read as HDF5 within" in str(error)
-    assert noticed > 50
-    assert endless < 5, "libhdf5 takes nearly all"
+    assert detected > 50
+    assert endless < 5, "libhdf5 survives nearly all files"
 
 
 Edit = Callable[[h5py.File], None]
+
+
+def edit_file(path: Path, edit: Edit) -> None:
+    """Edit a file with h5py, which keeps it valid HDF5: it needs no probe."""
+    with h5py.File(path, "r+") as file:
+        edit(file)
+    mark_readable(path)
 
 
 def without(name: str) -> Edit:
@@ -203,11 +210,11 @@ def with_nan(shape: tuple[int, ...]) -> np.ndarray:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (no_attribute("/", "format"), r"not a set of episodes: its attribute 'format' is None, expected 'beliefscope-"),
-        (attribute("/", "format", 3), "not a set of episodes"),
+        (no_attribute("/", "format"), r"not a dataset: its attribute 'format' is None, expected 'beliefscope-"),
+        (attribute("/", "format", 3), "not a dataset"),
         (attribute("/", "version", 9), "version 9 of the layout; this release reads version 1"),
         (attribute("/", "task", "drawer"), r"of task 'drawer'\. Available: door"),
-        (lambda f: [f.__delitem__(k) for k in list(f)], "holds no trajectory"),
+        (lambda f: [f.__delitem__(k) for k in list(f)], "has no trajectory"),
         (without("trajectory0"), r"has 1 trajectories, but no group 'trajectory0'"),
         (replaced("trajectory1", np.zeros(3)), "no group 'trajectory1'"),
         (without("trajectory1/states"), r"trajectory1 has no 'states'\. It has: contact, controls"),
@@ -247,10 +254,9 @@ def with_nan(shape: tuple[int, ...]) -> np.ndarray:
         (attribute("trajectory1", "split", "test"), "the arrays of trajectory1 do not match its digest"),
     ],
 )
-def test_what_is_wrong_is_named(path: Path, edit: Edit, message: str) -> None:
-    with h5py.File(path, "r+") as file:
-        edit(file)
-    refuse(path, message)
+def test_errors_name_the_cause(path: Path, edit: Edit, message: str) -> None:
+    edit_file(path, edit)
+    check_rejected(path, message)
 
 
 @pytest.mark.parametrize(
@@ -263,42 +269,40 @@ def test_what_is_wrong_is_named(path: Path, edit: Edit, message: str) -> None:
         (attribute("trajectory0", "split", "val"), "the arrays of trajectory0 do not match its digest"),
     ],
 )
-def test_the_good_trajectories_of_a_bad_file_can_be_used(path: Path, edit: Edit, message: str) -> None:
-    with h5py.File(path, "r+") as file:
-        edit(file)
+def test_unusable_trajectories_are_skipped(path: Path, edit: Edit, message: str) -> None:
+    edit_file(path, edit)
     with open_dataset(path, skip_bad=True) as data:
-        (line,) = data.left_out
+        (line,) = data.skipped
         assert re.search(message, line)
         assert str(path) in line
-        assert [episode.digest() for episode in data] == [made_up(1, "val").digest()]
+        assert [episode.digest() for episode in data] == [random_episode(1, "val").digest()]
         assert [(s.index, s.split) for s in data.summaries] == [(0, "val")]
-    with h5py.File(path, "r+") as file:
-        del file["trajectory1/controls"]
-    with pytest.raises(BadInput, match=r"holds no trajectory that can be used\. The first: "):
+    edit_file(path, without("trajectory1/controls"))
+    with pytest.raises(BadInput, match=r"has no usable trajectory\. First error: "):
         open_dataset(path, skip_bad=True)
 
 
-def test_a_foreign_file_is_told_what_it_lacks(tmp_path: Path) -> None:
-    path = tmp_path / "theirs.h5"
+def test_external_hdf5_file_is_rejected(tmp_path: Path) -> None:
+    path = tmp_path / "external.h5"
     with h5py.File(path, "w") as file:
         file["trajectory0/object-state"] = np.zeros((5, 5), np.float32)
-    refuse(path, "is an HDF5 file, but not a set of episodes")
+    check_rejected(path, "is an HDF5 file, but not a dataset")
 
 
 @pytest.mark.parametrize("index", [-1, 2])
-def test_no_such_episode(path: Path, index: int) -> None:
+def test_unknown_episode(path: Path, index: int) -> None:
     with open_dataset(path) as data, pytest.raises(BadInput, match=f"Episode {index} is not in .* 0 to 1"):
         data[index]
 
 
-def test_no_such_task() -> None:
+def test_unknown_task() -> None:
     with pytest.raises(BadInput, match=r"task 'drawer' does not exist\. Available: door"):
         sample_path("drawer")
 
 
-def test_closed_after_use(path: Path) -> None:
+def test_file_is_closed_after_use(path: Path) -> None:
     with open_dataset(path) as data:
         episode = data[0]
     assert len(episode) == STEPS
     with h5py.File(path, "r+"):
-        pass  # would be refused while it is still open for reading
+        pass  # fails while the file is open for reading

@@ -1,4 +1,4 @@
-"""The shipped weights: where they come from is written in them, and they do what is claimed."""
+"""The pretrained checkpoints: their records, and the accuracy and fusion weights they achieve."""
 
 from __future__ import annotations
 
@@ -22,62 +22,57 @@ def held_out() -> list[Episode]:
         return [dataset[s.index] for s in dataset.summaries if s.split == "test"]
 
 
-SHIPPED = sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
+NAMES = sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
 
 
-def test_to_open_them_needs_no_compiler() -> None:
+def test_loading_does_not_import_the_compiler() -> None:
     code = (
         "import sys; from beliefscope.filters.checkpoint import *; "
-        "[load_checkpoint(path) for path in PRETRAINED.glob('*.safetensors')]; "
-        "assert 'torch._dynamo' not in sys.modules, 'it takes seconds of every process'"
+        "[load_checkpoint(shipped('door', f'crossmodal-{kind}')) for kind in ('ekf', 'pf')]; "
+        "assert 'torch._dynamo' not in sys.modules, 'its import takes seconds'"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-@pytest.fixture(scope="module", params=[name for name in SHIPPED if name.startswith("door-crossmodal")])
+@pytest.fixture(scope="module", params=[name for name in NAMES if name.startswith("door-crossmodal")])
 def checkpoint(request: pytest.FixtureRequest) -> Checkpoint:
     return load_checkpoint(PRETRAINED / f"{request.param}.safetensors")
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_the_record_says_how_to_make_it_again(name: str) -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_record_has_the_training_command(name: str) -> None:
     checkpoint = load_checkpoint(PRETRAINED / f"{name}.safetensors")
     record = checkpoint.record
     assert name == f"{checkpoint.task.name}-{checkpoint.name}"
     assert record["command"].startswith(f"beliefscope train {checkpoint.task.name} --filter {checkpoint.name}")
-    written = (PRETRAINED / "README.md").read_text()
-    assert checkpoint.hash in written
-    assert record["data_hash"] in written
-    assert record["command"] in written
+    readme = (PRETRAINED / "README.md").read_text()
+    assert checkpoint.hash in readme
+    assert record["data_hash"] in readme
+    assert record["command"] in readme
     assert {"seed", "plan", "metrics", "versions", "seconds"} <= record.keys()
 
 
-def test_recorded_metrics_are_those_of_these_weights(checkpoint: Checkpoint, held_out: list[Episode]) -> None:
-    """Recorded on 60 episodes that do not ship; on the sample set's 14 they come out alike."""
-    again = evaluate(checkpoint.filter, held_out)
-    recorded = checkpoint.record["metrics"]["0"]["fused"]
-    # The root mean square of 14 episodes' errors spreads by some 20 % around that of 60.
-    assert again.rmse["position_cm"] == pytest.approx(recorded["rmse"]["position_cm"], rel=0.5)
-    assert again.rmse["angle_deg"] == pytest.approx(recorded["rmse"]["angle_deg"], rel=0.5)
-
-
-@pytest.mark.parametrize("faults", ["", "blackout=0.4", "blackout=0.8"])
-def test_fused_is_no_worse_than_the_better_modality(
-    checkpoint: Checkpoint, held_out: list[Episode], faults: str
-) -> None:
-    """By more than 5 %, which 14 episodes cannot tell apart; on what moves, with most pictures black, it is better."""
-    fused = evaluate(checkpoint.filter, held_out, faults=Faults.parse(faults)).rmse
+@pytest.mark.parametrize("faults", ["", "blackout=0.8"])
+def test_accuracy(checkpoint: Checkpoint, held_out: list[Episode], faults: str) -> None:
+    """As recorded, and with fusion no worse than the better modality; with blackouts better for the moving angle."""
+    fused = evaluate(checkpoint.filter, held_out, faults=Faults.parse(faults), particles=100).rmse
+    if not faults:
+        # Recorded on 60 episodes that are not in the repository. The RMSE of 14 episodes varies by some 20 %.
+        recorded = checkpoint.record["metrics"]["0"]["fused"]["rmse"]
+        assert fused["position_cm"] == pytest.approx(recorded["position_cm"], rel=0.5)
+        assert fused["angle_deg"] == pytest.approx(recorded["angle_deg"], rel=0.5)
     for name in checkpoint.filter.names:
-        alone = evaluate(checkpoint.filter, held_out, faults=Faults.parse(faults), only=name).rmse
-        assert fused["angle_deg"] < (1.0 if "0.8" in faults else 1.05) * alone["angle_deg"]
-        assert fused["position_cm"] < 1.05 * alone["position_cm"]
+        single = evaluate(checkpoint.filter, held_out, faults=Faults.parse(faults), only=name, particles=100).rmse
+        # 14 episodes cannot resolve differences below 5 %.
+        assert fused["angle_deg"] < (1.0 if faults else 1.05) * single["angle_deg"]
+        assert fused["position_cm"] < 1.05 * single["position_cm"]
 
 
-def test_blackout_moves_beta_away_from_the_image(checkpoint: Checkpoint, held_out: list[Episode]) -> None:
-    """On what moves, the angle: of the hinge, which stands still, an EKF remembers what the picture said."""
+def test_blackout_reduces_the_weight_of_the_image(checkpoint: Checkpoint, held_out: list[Episode]) -> None:
+    """For the moving angle; the EKF's belief keeps earlier information on the hinge, which does not move."""
     traces = [trace(checkpoint, e, particles=50, faults=Faults.parse("blackout=0.5")) for e in held_out[:6]]
-    pictures = np.concatenate([t.episode.observations["image"] for t in traces])
+    images = np.concatenate([t.episode.observations["image"] for t in traces])
     beta = np.concatenate([t.weights[..., -1] for t in traces if t.weights is not None])
-    black = ~pictures.any(axis=(1, 2))
+    blackout = ~images.any(axis=(1, 2))
     image = traces[0].modalities.index("image")
-    assert beta[black, image].mean() < beta[~black, image].mean()
+    assert beta[blackout, image].mean() < beta[~blackout, image].mean()

@@ -1,4 +1,4 @@
-"""Standardised with their own statistics, data have zero mean and unit deviation; what never moved stays finite."""
+"""Data standardised with their own statistics have zero mean and unit deviation; constant channels stay finite."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Statistics, Steps
 
 
-def test_own_statistics_standardise() -> None:
+def test_data_are_standardised_by_their_own_statistics() -> None:
     with open_dataset(sample_path("door")) as data:
-        steps = Steps.of(DOOR, [data[i] for i in range(6)])
+        steps = Steps.from_episodes(DOOR, [data[i] for i in range(6)])
     steps = replace(steps, controls=torch.cat([steps.controls[:, :6], torch.full_like(steps.controls[:, 6:], 3.0)], 1))
     statistics = Statistics(DOOR)
     statistics.fit(steps)

@@ -1,4 +1,4 @@
-"""Wrong requests to the server: from its own OpenAPI description over HTTP, and messages of any shape to a view."""
+"""Invalid requests to the server: HTTP requests from its OpenAPI schema, and messages to a view's WebSocket."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from schemathesis import GenerationMode
 from starlette.testclient import TestClient, WebSocketTestSession
 
 from beliefscope.app.jobs.queue import Jobs
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.datasets.faults.injection import FAULT_PRESETS
-from beliefscope.filters.finetuning.finetune import FineTune
+from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.catalog import DIAGNOSTICS
 
 ORIGIN = "http://localhost:8000"
@@ -32,15 +32,15 @@ ORIGIN = "http://localhost:8000"
 
 @dataclass
 class Tally:
-    """How many were sent, how they were answered, and what went wrong: what -> an input that shows it."""
+    """Number of inputs, answers by kind, and failures: description -> an input that causes it."""
 
     inputs: int = 0
     answers: Counter[str] = field(default_factory=Counter)
     failures: dict[str, str] = field(default_factory=dict)
 
 
-class Heard(logging.Handler):
-    """What the server logs as an error."""
+class ErrorLog(logging.Handler):
+    """Collects errors logged by the server."""
 
     def __init__(self) -> None:
         super().__init__(logging.ERROR)
@@ -51,30 +51,30 @@ class Heard(logging.Handler):
 
 
 @contextmanager
-def served(given_: Settings) -> Iterator[tuple[TestClient, Heard]]:
-    """A server in this process, whose jobs wait and never run: what they are asked for is what is tried here."""
-    heard, start = Heard(), Jobs._start
-    Jobs._start = lambda self: None  # type: ignore[method-assign]
-    logging.getLogger("beliefscope.app").addHandler(heard)
+def running_server(settings_: Settings) -> Iterator[tuple[TestClient, ErrorLog]]:
+    """A server in this process whose jobs are queued but never run."""
+    log, start = ErrorLog(), Jobs._start_waiting
+    Jobs._start_waiting = lambda self: None  # type: ignore[method-assign]
+    logging.getLogger("beliefscope.app").addHandler(log)
     try:
-        application = create_app(given_, warm=False)
+        application = create_app(settings_, warm=False)
         client = TestClient(application, ORIGIN, raise_server_exceptions=False, headers={"Origin": ORIGIN})
         with client:
-            yield client, heard
+            yield client, log
     finally:
-        Jobs._start = start  # type: ignore[method-assign]
-        logging.getLogger("beliefscope.app").removeHandler(heard)
+        Jobs._start_waiting = start  # type: ignore[method-assign]
+        logging.getLogger("beliefscope.app").removeHandler(log)
 
 
-def description(client: TestClient) -> dict[str, Any]:
-    """The server's own, in which parameters know some of the values that exist, so that inputs get past the names."""
+def openapi_schema(client: TestClient) -> dict[str, Any]:
+    """OpenAPI schema with existing names as parameter values, so that requests pass the name lookup."""
     document = client.app.openapi()  # type: ignore[attr-defined]
     catalog = client.get("/api/catalog").json()["tasks"]
     texts = [text for text in mutate.TEXTS if text.isprintable()]
-    known: dict[str, list[Any]] = {
+    examples: dict[str, list[Any]] = {
         "task": [task["name"] for task in catalog],
-        "filter": [one["name"] for task in catalog for one in task["filters"]],
-        "data": [one["name"] for task in catalog for one in task["data"]],
+        "filter": [entry["name"] for task in catalog for entry in task["filters"]],
+        "data": [entry["name"] for task in catalog for entry in task["data"]],
         "episode": [0, 1],
         "faults": [*FAULT_PRESETS.values(), *map(str, mutate.NUMBERS), *(f"blackout={text}" for text in texts)],
         "against": ["faults=blackout", "filter=small", "from=2&to=5&faults=blackout", "from=2&to=4&weights=image=1"],
@@ -83,64 +83,63 @@ def description(client: TestClient) -> dict[str, Any]:
     for path in document["paths"].values():
         for operation in path.values():
             for parameter in operation.get("parameters", ()):
-                values = known.get(parameter["name"])
+                values = examples.get(parameter["name"])
                 if values:
                     parameter["schema"] = {"anyOf": [{"enum": values}, {"enum": values}, parameter["schema"]]}
-            if operation["operationId"].startswith("start"):  # of a fine-tuning: the settings are checked by ours
+            if operation["operationId"].startswith("start"):  # fine-tuning settings
                 properties = {name: {} for name in FineTune().to_json()}
                 body = operation["requestBody"]["content"]["application/json"]
                 body["schema"] = {"type": "object", "properties": properties}
     return document
 
 
-def ask_http(client: TestClient, heard: Heard, inputs: int, number: int) -> Tally:
-    """So many requests over all routes: half as the description says, half against it."""
+def fuzz_http(client: TestClient, log: ErrorLog, inputs: int, number: int) -> Tally:
+    """Send requests to all routes: half valid, half invalid according to the schema."""
     tally = Tally()
-    schema = schemathesis.openapi.from_dict(description(client))
+    schema = schemathesis.openapi.from_dict(openapi_schema(client))
     operations = [result.ok() for result in schema.get_all_operations()]
-    each = -(-inputs // sum(bool(one.definition.raw.keys() & {"parameters", "requestBody"}) for one in operations))
+    each = -(-inputs // sum(bool(o.definition.raw.keys() & {"parameters", "requestBody"}) for o in operations))
     jobs = client.app.state.jobs  # type: ignore[attr-defined]
-    for place, operation in enumerate(operations):
-        left = operation.method.upper(), operation.path
+    for index, operation in enumerate(operations):
+        route = f"{operation.method.upper()} {operation.path}"
 
-        def send(case: schemathesis.Case, left: tuple[str, str] = left) -> None:
-            sent = case.as_transport_kwargs(base_url=ORIGIN)
-            sent["headers"] = {"Origin": ORIGIN, **(sent.get("headers") or {})}
-            request = {k: sent[k] for k in ("headers", "params", "json", "data", "cookies") if sent.get(k) is not None}
+        def send(case: schemathesis.Case, route: str = route) -> None:
+            arguments = case.as_transport_kwargs(base_url=ORIGIN)
+            arguments["headers"] = {"Origin": ORIGIN, **(arguments.get("headers") or {})}
+            keys = ("headers", "params", "json", "data", "cookies")
+            request = {k: arguments[k] for k in keys if arguments.get(k) is not None}
             try:
-                answer = client.request(sent["method"], sent["url"], **request)
-            except (UnicodeError, ValueError, TypeError) as error:  # no client can send it
+                answer = client.request(arguments["method"], arguments["url"], **request)
+            except (UnicodeError, ValueError, TypeError) as error:  # clients cannot send it
                 tally.answers[f"not sent: {type(error).__name__}"] += 1
                 return
             tally.inputs += 1
             tally.answers[f"{answer.status_code // 100}xx"] += 1
             kind = answer.headers.get("content-type", "")
-            wrong = answer.status_code >= 500 or (
+            failed = answer.status_code >= 500 or (
                 answer.status_code >= 400 and (not kind.startswith("application/json") or "error" not in answer.json())
             )
-            if wrong or heard.records:
-                said = heard.records.pop() if heard.records else answer.text[:300]
-                tally.failures.setdefault(
-                    f"{' '.join(left)}: {answer.status_code} {said}", repr((sent, request))[:2000]
-                )
-                heard.records.clear()
+            if failed or log.records:
+                message = log.records.pop() if log.records else answer.text[:300]
+                tally.failures.setdefault(f"{route}: {answer.status_code} {message}", repr((arguments, request))[:2000])
+                log.records.clear()
             if len(jobs.all()) >= 12:
                 for job in jobs.all():
                     jobs.cancel(job.id)
 
         for mode, count in ((GenerationMode.POSITIVE, each - each // 2), (GenerationMode.NEGATIVE, each // 2)):
             try:
-                _drawn(operation.as_strategy(generation_mode=mode), count, number + place)(send)
+                _for_each(operation.as_strategy(generation_mode=mode), count, number + index)(send)
             except Exception as error:
                 if type(error).__name__ not in ("SkipTest", "Unsatisfiable", "InvalidArgument"):
                     raise
-                # Nothing can be wrong about a route that is told nothing: it is asked as it is.
-                _drawn(operation.as_strategy(), count, number + place)(send)
+                # A route without parameters has no invalid requests.
+                _for_each(operation.as_strategy(), count, number + index)(send)
     return tally
 
 
-def _drawn(strategy: st.SearchStrategy[Any], count: int, number: int) -> Callable[[Callable[[Any], None]], None]:
-    """Runs a function with that many values of a strategy, the same for the same number."""
+def _for_each(strategy: st.SearchStrategy[Any], count: int, number: int) -> Callable[[Callable[[Any], None]], None]:
+    """Return a function that calls another one with ``count`` values of a strategy; deterministic for a number."""
 
     def run(function: Callable[[Any], None]) -> None:
         @seed(number)
@@ -175,7 +174,11 @@ CURSOR: dict[str, Any] = {
     "scene": False,
     "beside": False,
 }
-WHOLE = (CURSOR, {"type": "theme", "dark": True}, {"type": "look", "hidden": ["particles"], "ground": "fused"})
+VALID_MESSAGES = (
+    CURSOR,
+    {"type": "theme", "dark": True},
+    {"type": "scene_layers", "hidden": ["particles"], "ground": "fused"},
+)
 
 VALUES = st.recursive(
     st.none()
@@ -190,9 +193,9 @@ VALUES = st.recursive(
 
 
 @st.composite
-def _edited(draw: st.DrawFn) -> str:
-    """A message that is right but for one or two of its fields."""
-    message = dict(draw(st.sampled_from(WHOLE)))
+def _edited_messages(draw: st.DrawFn) -> str:
+    """Valid messages with up to two modified fields."""
+    message = dict(draw(st.sampled_from(VALID_MESSAGES)))
     for _ in range(draw(st.integers(0, 2))):
         key = draw(st.sampled_from([*message, "other"]))
         if draw(st.booleans()):
@@ -203,43 +206,41 @@ def _edited(draw: st.DrawFn) -> str:
 
 
 MESSAGES: st.SearchStrategy[str | bytes] = st.one_of(
-    _edited(),
-    _edited(),
+    _edited_messages(),
+    _edited_messages(),
     VALUES.map(json.dumps),
     st.text(st.characters(exclude_categories=["Cs"])),
     st.sampled_from([raw.decode(errors="replace") for raw in mutate.RAW]),
     st.binary(max_size=64),
 )
-"""Nearly right cursors, JSON of any shape, huge and deep ones, text that is none, and what is not text at all."""
+"""Nearly valid messages, arbitrary, huge and deeply nested JSON, other text, and bytes."""
 
 
-def ask_socket(client: TestClient, heard: Heard, inputs: int, number: int) -> Tally:
-    """So many messages to a view, each followed by one whose answer says that the view still hears."""
+def fuzz_socket(client: TestClient, log: ErrorLog, inputs: int, number: int) -> Tally:
+    """Send messages to a view, each followed by one whose answer shows that the view still responds."""
     tally = Tally()
     view: dict[str, Any] = {}
 
-    def opened() -> WebSocketTestSession:
+    def connect() -> WebSocketTestSession:
         if not view:
-            made = client.post("/api/views").json()
-            view["name"] = made["view"]
-            view["socket"] = client.websocket_connect(
-                f"ws://localhost:8000{made['socket']}", headers={"Origin": ORIGIN}
-            )
+            addresses = client.post("/api/views").json()
+            url = f"ws://localhost:8000{addresses['socket']}"
+            view["socket"] = client.websocket_connect(url, headers={"Origin": ORIGIN})
             view["socket"].__enter__()
         return view["socket"]
 
-    def closed() -> None:
+    def disconnect() -> None:
         view.pop("socket").__exit__(None, None, None)
         view.clear()
 
     def send(message: str | bytes) -> None:
-        socket = opened()
+        socket = connect()
         tally.inputs += 1
         if isinstance(message, bytes):
             socket.send_bytes(message)
             while socket.receive()["type"] != "websocket.close":
-                pass  # a drawing that an earlier message asked for may still come
-            closed()
+                pass  # answers to earlier messages may still arrive
+            disconnect()
             tally.answers["closed"] += 1
             return
         socket.send_text(message)
@@ -250,31 +251,31 @@ def ask_socket(client: TestClient, heard: Heard, inputs: int, number: int) -> Ta
                 tally.failures.setdefault("closed", repr(message)[:2000])
                 view.clear()
                 return
-            said = json.loads(answer["text"]) if answer.get("text") else {"type": "maps"}
-            if said.get("serial") == -7:
+            reply = json.loads(answer["text"]) if answer.get("text") else {"type": "maps"}
+            if reply.get("serial") == -7:
                 break
-            tally.answers[said["type"]] += 1
-            if "The server failed" in str(said.get("error")):
-                tally.failures.setdefault(f"{said['error']} {heard.records}", repr(message)[:2000])
-                heard.records.clear()
+            tally.answers[reply["type"]] += 1
+            if "The server failed" in str(reply.get("error")):
+                tally.failures.setdefault(f"{reply['error']} {log.records}", repr(message)[:2000])
+                log.records.clear()
 
-    _drawn(MESSAGES, inputs, number)(send)
+    _for_each(MESSAGES, inputs, number)(send)
     if view:
-        closed()
-    for record in heard.records:
+        disconnect()
+    for record in log.records:
         tally.failures.setdefault(record, "")
-    heard.records.clear()
+    log.records.clear()
     return tally
 
 
-def left_over(workspace: Path) -> list[str]:
-    """Files that were begun and not finished."""
+def temporary_files(workspace: Path) -> list[str]:
+    """Temporary files that were not removed."""
     return [str(path.relative_to(workspace)) for path in workspace.rglob(".*") if path.is_file()]
 
 
-def threads_after(before: int, patience: float = 10.0) -> int:
-    """How many more threads there are than before, once they have had the time to end."""
-    until = time.monotonic() + patience
-    while threading.active_count() > before and time.monotonic() < until:
+def extra_threads(before: int, timeout: float = 10.0) -> int:
+    """Number of threads beyond ``before``, after waiting for threads to end."""
+    deadline = time.monotonic() + timeout
+    while threading.active_count() > before and time.monotonic() < deadline:
         time.sleep(0.05)
     return threading.active_count() - before

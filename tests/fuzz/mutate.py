@@ -1,4 +1,4 @@
-"""Files and documents gone wrong: seeded mutations of valid ones. All draw only from the generator given."""
+"""Seeded mutations of valid files and documents. All randomness comes from the ``rng`` argument."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ RAW = (
 )
 
 
-def value(rng: Random, depth: int = 3) -> Any:
-    """A JSON value of any shape."""
+def random_value(rng: Random, depth: int = 3) -> Any:
+    """Return a random JSON value."""
     kind = rng.randrange(8 if depth else 5)
     if kind == 0:
         return rng.choice((None, True, False))
@@ -76,127 +76,129 @@ def value(rng: Random, depth: int = 3) -> Any:
     if kind in (3, 4):
         return rng.choice(TEXTS)
     if kind == 5:
-        return [value(rng, depth - 1) for _ in range(rng.randrange(4))]
-    return {rng.choice(TEXTS): value(rng, depth - 1) for _ in range(rng.randrange(4))}
+        return [random_value(rng, depth - 1) for _ in range(rng.randrange(4))]
+    return {rng.choice(TEXTS): random_value(rng, depth - 1) for _ in range(rng.randrange(4))}
 
 
-def edited(document: Any, rng: Random) -> Any:
-    """A copy of a JSON document with one value in it replaced, left out or doubled."""
+def edit_document(document: Any, rng: Random) -> Any:
+    """Return a copy of a JSON document with one value replaced, removed or duplicated."""
     document = json.loads(json.dumps(document))
-    at, places = document, []
-    while isinstance(at, dict | list) and at:
-        key = rng.choice(list(at)) if isinstance(at, dict) else rng.randrange(len(at))
-        places.append((at, key))
+    node, path = document, []
+    while isinstance(node, dict | list) and node:
+        key = rng.choice(list(node)) if isinstance(node, dict) else rng.randrange(len(node))
+        path.append((node, key))
         if rng.random() < 0.3:
             break
-        at = at[key]
-    if not places:
-        return value(rng)
-    parent, key = places[-1]
+        node = node[key]
+    if not path:
+        return random_value(rng)
+    parent, key = path[-1]
     match rng.randrange(6):
         case 0:
             del parent[key]
         case 1 if isinstance(parent, list):
             parent.append(parent[key])
         case 2 if isinstance(parent, dict):
-            parent[rng.choice(TEXTS)] = value(rng)
+            parent[rng.choice(TEXTS)] = random_value(rng)
         case 3 if isinstance(parent[key], int | float | str):
             parent[key] = [parent[key]] if rng.random() < 0.5 else str(parent[key])
         case _:
-            parent[key] = value(rng)
+            parent[key] = random_value(rng)
     return document
 
 
-def spoiled_json(data: bytes, rng: Random) -> bytes:
-    """The text of a JSON document with something wrong in what it says, or in its bytes."""
+def corrupt_json(data: bytes, rng: Random) -> bytes:
+    """Corrupt the values or the bytes of a JSON document."""
     match rng.randrange(8):
         case 0:
-            return damaged(data, rng)
+            return corrupt_bytes(data, rng)
         case 1:
             return rng.choice(RAW)
-        case 2:  # a value of raw text, such as only a text can have: huge, deep, NaN
-            text = json.dumps(edited(json.loads(data), rng)).encode()
+        case 2:  # a value that only raw text can have: huge, deeply nested, NaN
+            text = json.dumps(edit_document(json.loads(data), rng)).encode()
             at = text.find(b": ")
             return text[: at + 2] + rng.choice(RAW) + b"}" if at >= 0 else text
         case _:
             document = json.loads(data)
             for _ in range(rng.randint(1, 3)):
-                document = edited(document, rng)
+                document = edit_document(document, rng)
             return json.dumps(document).encode()
 
 
-def damaged(data: bytes, rng: Random) -> bytes:
-    """Bytes with bits flipped, cut off, overwritten, moved or put in."""
+def corrupt_bytes(data: bytes, rng: Random) -> bytes:
+    """Flip, truncate, overwrite, move or insert bytes."""
     changed, size = bytearray(data), len(data)
     match rng.randrange(7):
         case 0 | 1:
             for _ in range(rng.choice((1, 1, 2, 8, 64))):
-                at = _place(rng, size)
+                at = _random_position(rng, size)
                 changed[at] ^= 1 << rng.randrange(8)
         case 2:
             del changed[rng.randrange(size) :]
         case 3:
-            at = _place(rng, size)
+            at = _random_position(rng, size)
             length = rng.choice((1, 4, 8, 64))
             changed[at : at + length] = rng.choice((b"\0", b"\xff", b"\x7f")) * length
         case 4:
-            at = _place(rng, size)
+            at = _random_position(rng, size)
             changed[at : at + 8] = struct.pack("<Q", rng.choice((0, 1, 2**31, 2**32, 2**48, 2**63 - 1, 2**64 - 1)))
         case 5:
-            at, source = _place(rng, size), _place(rng, size)
+            at, source = _random_position(rng, size), _random_position(rng, size)
             changed[at : at + 32] = changed[source : source + 32]
         case 6:
-            at = _place(rng, size)
+            at = _random_position(rng, size)
             changed[at:at] = rng.randbytes(rng.choice((1, 3, 16)))
     return bytes(changed)
 
 
-def _place(rng: Random, size: int) -> int:
-    """Headers lie at the front: half of the places are there."""
+def _random_position(rng: Random, size: int) -> int:
+    """Random position; half of the positions are near the start, where headers are."""
     return rng.randrange(min(size, 4096) if rng.random() < 0.5 else size)
 
 
-def spoiled_safetensors(data: bytes, rng: Random, key: str) -> bytes:
-    """A safetensors file whose bytes, header, stored document (under ``key``) or numbers are wrong."""
+def corrupt_safetensors(data: bytes, rng: Random, key: str) -> bytes:
+    """Corrupt the bytes, header, stored document (under ``key``) or numbers of a safetensors file."""
     if rng.random() < 0.35:
-        return damaged(data, rng)
+        return corrupt_bytes(data, rng)
     (size,) = struct.unpack("<Q", data[:8])
     header, body = json.loads(data[8 : 8 + size]), bytearray(data[8 + size :])
     tensors = [name for name in header if name != "__metadata__"]
-    one = header[rng.choice(tensors)]
+    tensor = header[rng.choice(tensors)]
     match rng.randrange(10):
         case 0 | 1 | 2 | 3:
             document = header["__metadata__"][key]
-            header["__metadata__"][key] = spoiled_json(document.encode(), rng).decode(errors="replace")
+            header["__metadata__"][key] = corrupt_json(document.encode(), rng).decode(errors="replace")
         case 4:
-            one["shape"] = rng.choice(
-                ([], [0], [1], [HUGE], [2**32, 2**32], [-1], one["shape"][::-1], [*one["shape"], 1])
+            tensor["shape"] = rng.choice(
+                ([], [0], [1], [HUGE], [2**32, 2**32], [-1], tensor["shape"][::-1], [*tensor["shape"], 1])
             )
         case 5:
-            one["dtype"] = rng.choice(("F64", "F16", "BF16", "I64", "I8", "BOOL", "F8_E4M3", "U64", "C64", "nonsense"))
+            tensor["dtype"] = rng.choice(
+                ("F64", "F16", "BF16", "I64", "I8", "BOOL", "F8_E4M3", "U64", "C64", "nonsense")
+            )
         case 6:
-            one["data_offsets"] = rng.choice(([0, 0], [0, HUGE], [8, 4], [0, len(body)], [2**63, 2**64 - 1]))
+            tensor["data_offsets"] = rng.choice(([0, 0], [0, HUGE], [8, 4], [0, len(body)], [2**63, 2**64 - 1]))
         case 7:
-            begin, end = one["data_offsets"]
+            begin, end = tensor["data_offsets"]
             number = rng.choice((math.nan, math.inf, 1e38, -1.0, 0.0))
             count = (end - begin) // 4
             body[begin : begin + 4 * count] = np.full(count, number, "<f4").tobytes()
         case 8:
-            whole = header.pop(rng.choice(tensors))
+            removed = header.pop(rng.choice(tensors))
             if rng.random() < 0.5:
-                header[rng.choice(TEXTS)] = whole
-        case 9:  # its shape is taken from another, whose numbers it gets as well: the file as such is sound
+                header[rng.choice(TEXTS)] = removed
+        case 9:  # swap two tensors: the file itself stays valid
             other = rng.choice(tensors)
             header[other], header[tensors[0]] = header[tensors[0]], header[other]
     text = json.dumps(header).encode()
-    lie = rng.choice((0, 2**63, len(text) + 1)) if rng.random() < 0.05 else len(text)
-    return struct.pack("<Q", lie) + text + bytes(body)
+    length = rng.choice((0, 2**63, len(text) + 1)) if rng.random() < 0.05 else len(text)
+    return struct.pack("<Q", length) + text + bytes(body)
 
 
-def spoiled_live(data: bytes, rng: Random) -> bytes:
-    """A live run whose bytes, header or blocks are wrong; the latter two with the checksums that belong to them."""
+def corrupt_live(data: bytes, rng: Random) -> bytes:
+    """Corrupt the bytes, header or blocks of a live file; for header and blocks with valid checksums."""
     if rng.random() < 0.4:
-        return damaged(data, rng)
+        return corrupt_bytes(data, rng)
     parts, at = [], 0
     while at < len(data):  # header, then blocks up to the end
         mark, number, _ = struct.unpack_from("<4sII", data, at)
@@ -204,51 +206,51 @@ def spoiled_live(data: bytes, rng: Random) -> bytes:
         following = following if following > 0 else len(data) - 12
         parts.append([mark, number, data[at + 12 : following]])
         at = following
-    one = parts[0] if rng.random() < 0.6 else rng.choice(parts[1:])
-    if one is parts[0]:
-        header, end = json.JSONDecoder().raw_decode(one[2].decode("latin-1"))
-        one[2] = spoiled_json(json.dumps(header).encode(), rng) + one[2][end:]
-        one[1] = len(one[2])
+    part = parts[0] if rng.random() < 0.6 else rng.choice(parts[1:])
+    if part is parts[0]:
+        header, end = json.JSONDecoder().raw_decode(part[2].decode("latin-1"))
+        part[2] = corrupt_json(json.dumps(header).encode(), rng) + part[2][end:]
+        part[1] = len(part[2])
     else:
         match rng.randrange(5):
             case 0:
-                one[1] = rng.choice((0, 1, 2**31, 2**32 - 1))
+                part[1] = rng.choice((0, 1, 2**31, 2**32 - 1))
             case 1:
-                one[2] = np.full(len(one[2]) // 4, rng.choice((math.nan, math.inf, 1e38)), "<f4").tobytes()
+                part[2] = np.full(len(part[2]) // 4, rng.choice((math.nan, math.inf, 1e38)), "<f4").tobytes()
             case 2:
-                one[0] = rng.choice((b"end\n", b"step", b"BsL\n", b"\0\0\0\0"))
+                part[0] = rng.choice((b"end\n", b"step", b"BsL\n", b"\0\0\0\0"))
             case 3:
-                parts.insert(rng.randrange(len(parts) + 1), list(one))
+                parts.insert(rng.randrange(len(parts) + 1), list(part))
             case 4:
-                one[2] = damaged(one[2] or b"\0", rng)
+                part[2] = corrupt_bytes(part[2] or b"\0", rng)
     sums = [zlib.crc32(content, zlib.crc32(struct.pack("<4sI", mark, number))) for mark, number, content in parts]
-    return b"".join(struct.pack("<4sII", *one[:2], checked) + one[2] for one, checked in zip(parts, sums, strict=True))
+    return b"".join(struct.pack("<4sII", *part[:2], crc) + part[2] for part, crc in zip(parts, sums, strict=True))
 
 
-def spoil_hdf5(path: Path, rng: Random) -> None:
-    """Changes an HDF5 file in place: its bytes, or what it says, in a file that is otherwise sound."""
+def corrupt_hdf5(path: Path, rng: Random) -> None:
+    """Corrupt the bytes of an HDF5 file, or its content with h5py, in place."""
     if rng.random() < 0.4:
-        path.write_bytes(damaged(path.read_bytes(), rng))
+        path.write_bytes(corrupt_bytes(path.read_bytes(), rng))
         return
     with h5py.File(path, "r+") as file:
-        groups = [file, *(one for one in file.values() if isinstance(one, h5py.Group))]
+        groups = [file, *(member for member in file.values() if isinstance(member, h5py.Group))]
         for _ in range(rng.randint(1, 2)):
             group = rng.choice(groups[1:] or groups) if rng.random() < 0.8 else file
-            (_spoil_attribute if rng.random() < 0.4 and group.attrs else _spoil_member)(group, rng)
+            (_corrupt_attribute if rng.random() < 0.4 and group.attrs else _corrupt_member)(group, rng)
 
 
-def _spoil_attribute(group: h5py.Group, rng: Random) -> None:
+def _corrupt_attribute(group: h5py.Group, rng: Random) -> None:
     name = rng.choice(list(group.attrs))
     if rng.random() < 0.2:
         del group.attrs[name]
         return
     if name == "provenance" and rng.random() < 0.7:
-        text = spoiled_json(group.attrs[name].encode(), rng)
+        text = corrupt_json(group.attrs[name].encode(), rng)
         group.attrs[name] = text.decode(errors="replace").replace("\0", "")[:30_000]
         return
     numbers = [n for n in NUMBERS if isinstance(n, float) or abs(n) < 2**63]
     texts = [t for t in TEXTS if "\0" not in t and "\ud800" not in t]
-    drawn: Callable[[], Any] = rng.choice(
+    create: Callable[[], Any] = rng.choice(
         (
             lambda: rng.choice(numbers),
             lambda: rng.choice(texts),
@@ -259,32 +261,32 @@ def _spoil_attribute(group: h5py.Group, rng: Random) -> None:
             lambda: np.array([b"a", b"b"]),
         )
     )
-    group.attrs[name] = drawn()
+    group.attrs[name] = create()
 
 
 def _members(group: h5py.Group) -> list[str]:
-    found: list[str] = []
-    group.visit(found.append)
-    return found
+    names: list[str] = []
+    group.visit(names.append)
+    return names
 
 
-def _spoil_member(group: h5py.Group, rng: Random) -> None:
+def _corrupt_member(group: h5py.Group, rng: Random) -> None:
     names = _members(group)
     if not names:
         return
     name = rng.choice(names)
     stored = group[name]
-    known = isinstance(stored, h5py.Dataset) and stored.dtype.kind in "biuf" and 0 < (stored.size or 0) < 10**6
-    array = stored[()] if known else np.zeros(3)
+    is_numeric = isinstance(stored, h5py.Dataset) and stored.dtype.kind in "biuf" and 0 < (stored.size or 0) < 10**6
+    array = stored[()] if is_numeric else np.zeros(3)
     del group[name]
     match rng.randrange(12):
         case 0:
             pass
         case 1:
-            broken = np.array(array)
-            if broken.dtype.kind == "f" and broken.size:
-                broken.flat[rng.randrange(broken.size)] = rng.choice((math.nan, math.inf, 1e38))
-            group[name] = broken
+            changed = np.array(array)
+            if changed.dtype.kind == "f" and changed.size:
+                changed.flat[rng.randrange(changed.size)] = rng.choice((math.nan, math.inf, 1e38))
+            group[name] = changed
         case 2:
             kind = rng.choice(("f8", "i1", "i8", "u8", "f2", ">f4", "c8", "S5", "?"))
             group[name] = np.nan_to_num(array).astype(kind)
@@ -292,11 +294,11 @@ def _spoil_member(group: h5py.Group, rng: Random) -> None:
             group[name] = array[..., :1] if array.ndim > 1 else array.reshape(-1)[: array.size // 2]
         case 4:
             group[name] = rng.choice((np.zeros(()), np.zeros((0, 3), "f4"), array[None], array[..., None]))
-        case 5:  # claims far more than it holds
+        case 5:  # declares far more than it stores
             shape = rng.choice(((HUGE,), (2**40, *array.shape[1:]), (2**20, 2**20), (2**62,)))
             kind = array.dtype if array.dtype.kind in "fui" else "f4"
             group.create_dataset(name, shape, kind, chunks=tuple(min(n, 4) for n in shape))
-        case 6:  # little on the disk, much in memory
+        case 6:  # small on disk, large in memory
             big = np.zeros((rng.choice((2**22, 2**26)),), "u1")
             group.create_dataset(name, data=big, chunks=(2**20,), compression="gzip", compression_opts=1)
         case 7:

@@ -1,6 +1,6 @@
-"""Every reader of files, what a valid file of it is, and how to make it wrong.
+"""File readers under test: how to write a valid file, corrupt it and read it.
 
-Only BadInput may come out of a reader; where none does, what was read must be of use: it can be shown as JSON.
+A reader may raise only BadInput. Otherwise its result must be usable, in particular serializable as JSON.
 """
 
 from __future__ import annotations
@@ -20,55 +20,62 @@ from typing import Any
 import mutate
 import numpy as np
 import torch
-from fastapi import HTTPException
-from valid_files import AUTHORS, episodes, make_authors, make_episodes, make_push
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+from valid_files import PAPER_LAYOUTS, episodes, write_episodes, write_paper_file, write_push
 
-from beliefscope.app.api.finetune import routes as tuned_routes
+from beliefscope.app.api.finetune import routes as finetune_routes
 from beliefscope.app.jobs.queue import Job, Jobs
-from beliefscope.app.runs import kept_filters
-from beliefscope.app.runs.trace_store import Library, Settings
+from beliefscope.app.runs import saved_filters
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import FAULT_PRESETS, Faults
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.training.plan import PLANS
 from beliefscope.filters.training.resume import Partial
-from beliefscope.filters.training.study import Cell, rows_of, to_csv, to_markdown
-from beliefscope.filters.training.train import PLANS, train
-from beliefscope.inspect.diagnostics.base import as_json
+from beliefscope.filters.training.study import Cell
+from beliefscope.filters.training.study_table import rows_of, to_csv, to_markdown
+from beliefscope.filters.training.train import train
+from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
-from beliefscope.inspect.traces.live_file import GrowingReader, GrowingWriter, load_live
+from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter, load_live
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
+
+Write = Callable[[Path], None]
+Corrupt = Callable[[Path, Random], None]
+Read = Callable[[Path], None]
 
 
 @dataclass(frozen=True)
 class Reader:
-    """How files of one kind are made, made wrong, and read.
+    """A reader under test.
 
     Attributes:
-        make: writes a valid one to the path. spoil: changes it there. read: as the program reads it; raises only
-            BadInput.
+        write: writes a valid file. corrupt: modifies it in place. read: reads it as the program does.
     """
 
-    make: Callable[[Path], None]
-    spoil: Callable[[Path, Random], None]
-    read: Callable[[Path], None]
+    write: Write
+    corrupt: Corrupt
+    read: Read
     suffix: str = ""
 
 
-def rewritten(change: Callable[[bytes, Random], bytes]) -> Callable[[Path, Random], None]:
-    """A file is read, changed, and written."""
+def corrupt_with(change: Callable[[bytes, Random], bytes]) -> Corrupt:
+    """Corrupt a file by changing its bytes."""
 
-    def spoil(path: Path, rng: Random) -> None:
+    def corrupt(path: Path, rng: Random) -> None:
         path.write_bytes(change(path.read_bytes(), rng))
 
-    return spoil
+    return corrupt
 
 
-def can_be_shown(value: Any) -> None:
-    """As the server sends it: neither NaN nor half a character."""
+def check_serializable(value: Any) -> None:
+    """Serialize as the server does: without NaN and lone surrogates."""
     json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
 
 
@@ -78,21 +85,21 @@ def can_be_shown(value: Any) -> None:
 def read_episodes(path: Path) -> None:
     for skip_bad in (False, True):
         with open_dataset(path, skip_bad=skip_bad) as data:
-            can_be_shown([asdict(summary) for summary in data.summaries])
+            check_serializable([asdict(summary) for summary in data.summaries])
             for episode in data:
-                can_be_shown(dict(episode.provenance))
-                Steps.of(data.task, [episode])
+                check_serializable(dict(episode.provenance))
+                Steps.from_episodes(data.task, [episode])
             assert len(data.hash) == 64
 
 
 def read_push(path: Path) -> None:
     with open_dataset(path) as data:
-        can_be_shown([asdict(summary) for summary in data.summaries])
+        check_serializable([asdict(summary) for summary in data.summaries])
         assert np.isfinite(data[0].states).all()
         assert np.isfinite(data[0].observations["force"]).all()
 
 
-# Filters and their runs.
+# Checkpoints, traces and live files.
 
 
 @cache
@@ -101,45 +108,45 @@ def checkpoint(name: str) -> Checkpoint:
 
 
 @cache
-def traced(name: str) -> Trace:
+def example_trace(name: str) -> Trace:
     return trace(checkpoint(name), episodes()[0], particles=7)
 
 
-def make_checkpoint(path: Path) -> None:
+def write_checkpoint(path: Path) -> None:
     small = replace(architecture("door", "crossmodal-ekf"), units=4, image_stride=4)
     filter_ = build(small)
-    filter_.statistics.fit(Steps.of(filter_.task, episodes()))
-    record = {"metrics": {"0": {"fused": {"rmse": {"angle_deg": 1.0}}}}, "seed": 0, "parent": {"hash": "0" * 64}}
+    filter_.statistics.fit(Steps.from_episodes(filter_.task, episodes()))
+    record = {"metrics": {"0": {"fused": {"rmse": {"angle_deg": 1.0}}}}, "seed": 0, "base": {"hash": "0" * 64}}
     save_checkpoint(filter_, "crossmodal-ekf", record, path)
 
 
 def read_checkpoint(path: Path) -> None:
-    found = load_checkpoint(path)
-    can_be_shown({"name": found.name, **found.record})
-    assert all(torch.isfinite(value).all() for value in found.filter.state_dict().values())
+    result = load_checkpoint(path)
+    check_serializable({"name": result.name, **result.record})
+    assert all(torch.isfinite(value).all() for value in result.filter.state_dict().values())
 
 
-def read_trace(read: Callable[[Path], Trace], path: Path) -> None:
-    found = read(path)
-    can_be_shown(as_json({name: getattr(found, name) for name in ("filter", "modalities", "settings", "seed")}))
-    assert len(found.estimate_mean) == len(found.episode.states) == len(found)
-    found.episode.digest()
+def read_trace(load: Callable[[Path], Trace], path: Path) -> None:
+    result = load(path)
+    check_serializable(as_json({name: getattr(result, name) for name in ("filter", "modalities", "settings", "seed")}))
+    assert len(result.estimate_mean) == len(result.episode.states) == len(result)
+    result.episode.digest()
 
 
-def make_live(path: Path) -> None:
-    writer = GrowingWriter(path, traced("crossmodal-pf"), expected=18)
+def write_live(path: Path) -> None:
+    writer = LiveFileWriter(path, example_trace("crossmodal-pf"), expected=18)
     for _ in range(3):
-        writer.append(traced("crossmodal-pf"))
+        writer.append(example_trace("crossmodal-pf"))
     writer.finish()
 
 
 def read_live(path: Path) -> None:
-    """As a page that follows it, up to where the damage begins; then as a command, which takes it whole or not."""
-    reader = GrowingReader(path)
+    """Read the valid part, as the page does, then the complete file, as the command line does."""
+    reader = LiveFileReader(path)
     try:
         with suppress(BadInput):
             reader.poll()
-        can_be_shown([reader.steps, reader.finished, reader.expected, reader.started, reader.alive])
+        check_serializable([reader.steps, reader.finished, reader.expected, reader.started, reader.alive])
         assert len(reader.part()) == reader.steps
         assert len(reader.part(0, stride=2)) == (reader.steps + 1) // 2
     finally:
@@ -147,7 +154,7 @@ def read_live(path: Path) -> None:
     read_trace(load_live, path)
 
 
-# What a study, a training, a server leave in their folders.
+# Files of studies, trainings and the server's workspace.
 
 
 @cache
@@ -156,51 +163,48 @@ def cell() -> Cell:
 
 
 @cache
-def document() -> dict[str, Any]:
+def cell_document() -> dict[str, Any]:
     trained = train(architecture("door", "haptics-ekf"), episodes(steps=20), data_hash="0" * 64, plan=PLANS["smoke"])
     trivial = {"hinge_x_cm": 1.0, "hinge_y_cm": 1.0, "angle_deg": 1.0, "position_cm": 1.0}
-    return trained.record | cell().depends_on() | {"checkpoint_hash": _sha(b"weights"), "trivial": trivial}
+    checkpoint_hash = hashlib.sha256(b"weights").hexdigest()
+    return trained.record | cell().inputs() | {"checkpoint_hash": checkpoint_hash, "trivial": trivial}
 
 
-def _sha(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
-
-
-def make_cell(path: Path) -> None:
-    path.write_text(json.dumps(document()))
+def write_cell(path: Path) -> None:
+    path.write_text(json.dumps(cell_document()))
 
 
 def read_cell(path: Path) -> None:
     folder = path.parent / "study"
-    there = cell().path(folder)
-    there.parent.mkdir(parents=True, exist_ok=True)
-    there.write_bytes(path.read_bytes())
+    target = cell().path(folder)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_bytes(path.read_bytes())
     cell().path(folder, ".safetensors").write_bytes(b"weights")
-    found = cell().document(folder)
-    rows = rows_of({cell(): found})
+    document = cell().document(folder)
+    rows = rows_of({cell(): document})
     to_csv(rows)
     to_markdown(rows)
-    if found is None:
-        raise BadInput("no cell of this study")
+    if document is None:
+        raise BadInput("not a cell of this study")
 
 
-def make_partial(path: Path) -> None:
+def write_partial(path: Path) -> None:
     tensors = {"now.weight": torch.arange(6.0).reshape(2, 3)}
     Partial(path, "key").save(tensors, {"done": ["dynamics"], "seconds": 1.5})
 
 
 def read_partial(path: Path) -> None:
-    """What is taken up must be what was put down: a training cannot tell wrong weights from right ones."""
-    found = Partial(path, "key").load()
-    if found is None:
-        raise BadInput("of no use")
-    assert torch.equal(found[0]["now.weight"], torch.arange(6.0).reshape(2, 3))
-    assert found[1]["done"] == ["dynamics"]
-    assert found[1]["seconds"] == 1.5
+    """Accepted content must be unchanged: a training cannot detect wrong weights."""
+    content = Partial(path, "key").load()
+    if content is None:
+        raise BadInput("unusable")
+    tensors, progress = content
+    assert torch.equal(tensors["now.weight"], torch.arange(6.0).reshape(2, 3))
+    assert (progress["done"], progress["seconds"]) == (["dynamics"], 1.5)
 
 
-def make_job(path: Path) -> None:
-    job = Job("job", "report", "A report", "done", 1.0, asked=1e9, started=1e9, ended=1e9, link="?tab=failures")
+def write_job(path: Path) -> None:
+    job = Job("job", "report", "A report", "done", 1.0, submitted=1e9, started=1e9, ended=1e9, link="?tab=failures")
     path.write_text(json.dumps(asdict(job)))
 
 
@@ -209,89 +213,77 @@ def read_job(path: Path) -> None:
     (folder / "job").mkdir(parents=True, exist_ok=True)
     shutil.copy(path, folder / "job" / "job.json")
     jobs = Jobs(folder).all()
-    can_be_shown([asdict(job) for job in jobs])
+    check_serializable([asdict(job) for job in jobs])
     if not jobs:
-        raise BadInput("no job of ours")
+        raise BadInput("not a job record")
 
 
-def make_children(path: Path) -> None:
-    own = kept_filters.Child("door", "mine", str(shipped("door", "image-ekf")), True)
-    path.write_text(json.dumps([asdict(own)]))
+def write_saved_filters(path: Path) -> None:
+    saved = saved_filters.SavedFilter("door", "mine", str(shipped("door", "image-ekf")), True)
+    path.write_text(json.dumps([asdict(saved)]))
 
 
-def read_children(path: Path) -> None:
-    shutil.copy(path, path.parent / kept_filters.FILE)
-    settings = kept_filters.with_children(Settings(path.parent))
-    can_be_shown(settings.to_json())
+def read_saved_filters(path: Path) -> None:
+    shutil.copy(path, path.parent / saved_filters.FILE)
+    settings = saved_filters.with_saved_filters(Settings(path.parent))
+    check_serializable(settings.to_json())
     if not settings.checkpoints:
-        raise BadInput("no child of ours")
+        raise BadInput("not a list of saved filters")
 
 
-RUN_FILES = ("run", "progress", "found")
+RUN_FILES = ("run", "progress", "result")
 
 
-def make_run(path: Path) -> None:
-    asked: dict[str, Any] = {"steps": 3}
-    about = {"run": "run", "task": "door", "filter": "haptics-ekf", "data": "sample", "settings": asked, "asked": 1.5}
-    look = {"step": 0, "loss": None, "slices": {"nominal": {"rmse": {}}}, "score": 1.0}
-    files = {"run": about, "progress": {"steps": 3, "losses": [[1, 0.5]], "looks": [look]}, "found": {"moments": []}}
-    path.write_text(json.dumps(files))
+def finetune_files() -> dict[str, Any]:
+    run = {"run": "run", "task": "door", "filter": "haptics-ekf", "data": "sample", "settings": {"steps": 3}}
+    validation = {"step": 0, "loss": None, "slices": {"clean": {"rmse": {}}}, "score": 1.0}
+    progress = {"steps": 3, "losses": [[1, 0.5]], "validations": [validation]}
+    return {"run": run | {"submitted": 1.5}, "progress": progress, "result": {"events": []}}
 
 
-def spoil_run(path: Path, rng: Random) -> None:
-    files = json.loads(path.read_bytes())
+def write_finetune(path: Path) -> None:
+    path.write_text(json.dumps(finetune_files()))
+
+
+def corrupt_finetune(path: Path, rng: Random) -> None:
     name = rng.choice(RUN_FILES)
     path.with_suffix(".name").write_text(name)
-    path.write_bytes(mutate.spoiled_json(json.dumps(files[name]).encode(), rng))
+    path.write_bytes(mutate.corrupt_json(json.dumps(finetune_files()[name]).encode(), rng))
 
 
 @cache
-def tuned() -> dict[str, Callable[..., Any]]:
-    """The routes of fine-tuning over an empty library, by name."""
-    folder = Path(_workspace())
-    library = Library(Settings(folder))
-    return {route.name: route.endpoint for route in tuned_routes(library, Jobs(folder / "jobs")).routes}  # type: ignore[attr-defined]
+def finetune_server() -> tuple[Path, TestClient]:
+    """An empty workspace and a server of its fine-tuning routes."""
+    folder, application = Path(tempfile.mkdtemp(prefix="workspace-")), FastAPI()
+    application.include_router(finetune_routes(TraceStore(Settings(folder)), Jobs(folder / "jobs")))
+    return folder, TestClient(application)
 
 
-@cache
-def _workspace() -> str:
-    return tempfile.mkdtemp(prefix="workspace-")
-
-
-def read_run(path: Path) -> None:
-    folder = Path(_workspace()) / "finetune" / "run"
+def read_finetune(path: Path) -> None:
+    workspace, client = finetune_server()
+    folder = workspace / "finetune" / "run"
     folder.mkdir(parents=True, exist_ok=True)
-    make_run(path.with_suffix(".whole"))
-    for name, content in json.loads(path.with_suffix(".whole").read_bytes()).items():
+    for name, content in finetune_files().items():
         (folder / f"{name}.json").write_text(json.dumps(content))
     if path.with_suffix(".name").exists():
         shutil.copy(path, folder / f"{path.with_suffix('.name').read_text()}.json")
-    shutil.copy(shipped("door", "haptics-ekf"), folder / "child.safetensors")
-    try:
-        can_be_shown(tuned()["how"]("run"))
-    except HTTPException as error:
-        raise BadInput(error.detail) from None
-
-
-def server(folder: Path) -> Settings:
-    """What a server is given that shall be quick: few steps, few particles, small networks."""
-    make_episodes(folder / "mine.h5")
-    make_checkpoint(folder / "small.safetensors")
-    data, checkpoints = {"mine": folder / "mine.h5"}, {"small": folder / "small.safetensors"}
-    return Settings(folder / "workspace", data, checkpoints, particles=7)
+    shutil.copy(shipped("door", "haptics-ekf"), folder / "finetuned.safetensors")
+    response = client.get("/api/tuned/run")
+    if response.is_error:
+        raise BadInput(response.text)
 
 
 # Fault injections: text and JSON.
 
 
-def make_faults(path: Path) -> None:
+def write_faults(path: Path) -> None:
     path.write_text(",".join(FAULT_PRESETS.values()))
 
 
-def spoil_faults(path: Path, rng: Random) -> None:
+def corrupt_faults(path: Path, rng: Random) -> None:
     text = ",".join(rng.sample(list(FAULT_PRESETS.values()), rng.randint(1, 3)))
     if rng.random() < 0.5:
-        text = mutate.spoiled_json(json.dumps(Faults.parse(text).to_json()).encode(), rng).decode(errors="replace")
+        text = mutate.corrupt_json(json.dumps(Faults.parse(text).to_json()).encode(), rng).decode(errors="replace")
     else:
         for _ in range(rng.randint(1, 3)):
             at = rng.randrange(len(text) + 1)
@@ -302,83 +294,91 @@ def spoil_faults(path: Path, rng: Random) -> None:
 
 def read_faults(path: Path) -> None:
     faults = Faults.parse(path.read_bytes().decode(errors="surrogatepass"))
-    can_be_shown(faults.to_json())
-    broken = faults.apply(episodes()[0])
-    assert np.isfinite(broken.observations["force"]).all()
-    assert Faults.parse(str(faults)) == faults == Faults.of(faults.to_json())
+    check_serializable(faults.to_json())
+    episode = faults.apply(episodes()[0])
+    assert np.isfinite(episode.observations["force"]).all()
+    assert Faults.parse(str(faults)) == faults == Faults.from_json(faults.to_json())
 
 
-CHECKPOINT, TRACE = "beliefscope", "beliefscope-trace"
+def corrupt_safetensors(key: str) -> Corrupt:
+    return corrupt_with(lambda data, rng: mutate.corrupt_safetensors(data, rng, key))
 
 
-def _with_header(key: str) -> Callable[[Path, Random], None]:
-    return rewritten(lambda data, rng: mutate.spoiled_safetensors(data, rng, key))
-
-
-HDF5 = ("episodes", "authors-door", "authors-push", "authors-real", "mit-hdf5")
+CORRUPT_JSON, CORRUPT_TRACE = corrupt_with(mutate.corrupt_json), corrupt_safetensors("beliefscope-trace")
 
 READERS: dict[str, Reader] = {
-    "episodes": Reader(make_episodes, mutate.spoil_hdf5, read_episodes, ".h5"),
-    "authors-door": Reader(partial(make_authors, keys=AUTHORS[0]), mutate.spoil_hdf5, read_episodes, ".hdf5"),
-    "authors-push": Reader(partial(make_authors, keys=AUTHORS[1]), mutate.spoil_hdf5, read_episodes, ".hdf5"),
-    "authors-real": Reader(partial(make_authors, keys=AUTHORS[2]), mutate.spoil_hdf5, read_episodes, ".hdf5"),
-    "mit-json": Reader(make_push, rewritten(mutate.spoiled_json), read_push, ".json"),
-    "mit-hdf5": Reader(make_push, mutate.spoil_hdf5, read_push, ".h5"),
-    "checkpoint": Reader(make_checkpoint, _with_header(CHECKPOINT), read_checkpoint, ".safetensors"),
+    "episodes": Reader(write_episodes, mutate.corrupt_hdf5, read_episodes, ".h5"),
+    **{
+        f"paper-{name}": Reader(partial(write_paper_file, keys=keys), mutate.corrupt_hdf5, read_episodes, ".hdf5")
+        for name, keys in PAPER_LAYOUTS.items()
+    },
+    "mit-json": Reader(write_push, CORRUPT_JSON, read_push, ".json"),
+    "mit-hdf5": Reader(write_push, mutate.corrupt_hdf5, read_push, ".h5"),
+    "checkpoint": Reader(write_checkpoint, corrupt_safetensors("beliefscope"), read_checkpoint, ".safetensors"),
     "trace-ekf": Reader(
-        lambda path: save_trace(traced("crossmodal-ekf"), path), _with_header(TRACE), partial(read_trace, load_trace)
+        lambda path: save_trace(example_trace("crossmodal-ekf"), path), CORRUPT_TRACE, partial(read_trace, load_trace)
     ),
     "trace-pf": Reader(
-        lambda path: save_trace(traced("crossmodal-pf"), path), _with_header(TRACE), partial(read_trace, load_trace)
+        lambda path: save_trace(example_trace("crossmodal-pf"), path), CORRUPT_TRACE, partial(read_trace, load_trace)
     ),
-    "live": Reader(make_live, rewritten(mutate.spoiled_live), read_live, ".live"),
+    "live": Reader(write_live, corrupt_with(mutate.corrupt_live), read_live, ".live"),
     "recording": Reader(
-        lambda path: write_recording(traced("crossmodal-pf"), path),
-        rewritten(mutate.damaged),
+        lambda path: write_recording(example_trace("crossmodal-pf"), path),
+        corrupt_with(mutate.corrupt_bytes),
         partial(read_trace, read_recording),
         ".rrd",
     ),
-    "faults": Reader(make_faults, spoil_faults, read_faults),
-    "study": Reader(make_cell, rewritten(mutate.spoiled_json), read_cell, ".json"),
-    "partial": Reader(make_partial, _with_header("kept"), read_partial),
-    "job": Reader(make_job, rewritten(mutate.spoiled_json), read_job, ".json"),
-    "children": Reader(make_children, rewritten(mutate.spoiled_json), read_children, ".json"),
-    "tuned run": Reader(make_run, spoil_run, read_run, ".json"),
+    "faults": Reader(write_faults, corrupt_faults, read_faults),
+    "study": Reader(write_cell, CORRUPT_JSON, read_cell, ".json"),
+    "partial": Reader(write_partial, corrupt_safetensors("kept"), read_partial),
+    "job": Reader(write_job, CORRUPT_JSON, read_job, ".json"),
+    "saved-filters": Reader(write_saved_filters, CORRUPT_JSON, read_saved_filters, ".json"),
+    "finetune": Reader(write_finetune, corrupt_finetune, read_finetune, ".json"),
 }
-"""What is read -> its reader. A new one is a line here."""
+"""Readers by name."""
+
+HDF5 = tuple(name for name, reader in READERS.items() if reader.corrupt is mutate.corrupt_hdf5)
 
 
-def check_whole(name: str, folder: Path) -> None:
-    """That the reader takes a valid file, or nothing would be tried here."""
-    path = folder / f"motion_surface=abs_shape=rect1_whole{READERS[name].suffix}"
-    READERS[name].make(path)
+def check_valid(name: str, folder: Path) -> None:
+    """Check that the reader accepts a valid file."""
+    path = folder / f"motion_surface=abs_shape=rect1_valid{READERS[name].suffix}"
+    READERS[name].write(path)
     READERS[name].read(path)
 
 
 @contextmanager
-def spoiled(name: str, seed: int, number: int, folder: Path) -> Iterator[Path]:
-    """The wrong file of this number: the same for the same seed."""
+def corrupted(name: str, seed: int, number: int, folder: Path) -> Iterator[Path]:
+    """The corrupt file with this number; deterministic for a seed."""
     reader = READERS[name]
-    whole, path = folder / f"whole{reader.suffix}", folder / f"motion_surface=abs_shape=rect1_{number}{reader.suffix}"
-    if not whole.exists():
-        reader.make(whole)
-    shutil.copy(whole, path)
+    valid, path = folder / f"valid{reader.suffix}", folder / f"motion_surface=abs_shape=rect1_{number}{reader.suffix}"
+    if not valid.exists():
+        reader.write(valid)
+    shutil.copy(valid, path)
     try:
-        reader.spoil(path, Random(f"{seed} {name} {number}"))
+        reader.corrupt(path, Random(f"{seed} {name} {number}"))
         yield path
     finally:
-        for left in folder.glob(f"{path.stem}.*"):
-            left.unlink()
+        for file in folder.glob(f"{path.stem}.*"):
+            file.unlink()
 
 
 def attempt(name: str, seed: int, number: int, folder: Path) -> str:
-    """``read`` or ``refused``. Raises whatever else comes out of the reader."""
-    with spoiled(name, seed, number, folder) as path:
+    """Read a corrupt file: ``read`` or ``refused``. Raises every exception except BadInput."""
+    with corrupted(name, seed, number, folder) as path:
         try:
             READERS[name].read(path)
         except BadInput as error:
-            said = str(error)
-            assert said, "an error without words"
-            assert "\n" not in said or name in ("recording",), f"more than one line: {said[:300]!r}"
+            message = str(error)
+            assert message, "empty error message"
+            assert "\n" not in message or name == "recording", f"more than one line: {message[:300]!r}"
             return "refused"
     return "read"
+
+
+def server_settings(folder: Path) -> Settings:
+    """Settings of a fast server: few steps, few particles, small networks."""
+    write_episodes(folder / "mine.h5")
+    write_checkpoint(folder / "small.safetensors")
+    data, checkpoints = {"mine": folder / "mine.h5"}, {"small": folder / "small.safetensors"}
+    return Settings(folder / "workspace", data, checkpoints, particles=7)

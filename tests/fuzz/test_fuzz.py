@@ -1,4 +1,4 @@
-"""A small part of ``python bench/fuzz.py``: the same inputs every time, of every reader, every route and the socket."""
+"""A short run of ``bench/fuzz.py`` with fixed inputs: all readers, routes and the view's WebSocket."""
 
 from __future__ import annotations
 
@@ -10,45 +10,43 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import http_fuzz as asked
+import http_fuzz
 import mutate
 import readers
 
 from beliefscope.datasets.readers import hdf5_guard
 
 SLOW = ("study", "mit-hdf5", "mit-json", "recording")
-"""Whose valid file takes a training to make, whose pictures are taken, or whose reader can end this process."""
+"""Readers whose files need a training or rendering, or that can crash the process."""
 
 
 @pytest.mark.parametrize("name", [name for name in readers.READERS if name not in SLOW])
-def test_nothing_but_bad_input_comes_out_of_a_reader(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if name in readers.HDF5:  # which another process goes over first: here they are only cut off, and edited
-        monkeypatch.setattr(hdf5_guard, "is_foreign", lambda path: False)
-        monkeypatch.setattr(mutate, "damaged", lambda data, rng: data[: rng.randrange(len(data))])
-    readers.check_whole(name, tmp_path)
-    came = [readers.attempt(name, seed=11, number=number, folder=tmp_path) for number in range(25)]
-    assert came.count("refused") > 5, "the inputs are wrong enough"
+def test_reader_raises_only_bad_input(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if name in readers.HDF5:  # without the probe, only truncated and edited files are safe to read
+        monkeypatch.setattr(hdf5_guard, "needs_probe", lambda path: False)
+        monkeypatch.setattr(mutate, "corrupt_bytes", lambda data, rng: data[: rng.randrange(len(data))])
+    readers.check_valid(name, tmp_path)
+    results = [readers.attempt(name, seed=11, number=number, folder=tmp_path) for number in range(25)]
+    assert results.count("refused") > 5, "enough inputs are invalid"
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SLOW[:3])
-def test_nothing_but_bad_input_comes_out_of_a_slow_reader(name: str, tmp_path: Path) -> None:
-    readers.check_whole(name, tmp_path)
+def test_slow_reader_raises_only_bad_input(name: str, tmp_path: Path) -> None:
+    readers.check_valid(name, tmp_path)
     for number in range(100):
         readers.attempt(name, seed=11, number=number, folder=tmp_path)
 
 
-def test_no_route_and_no_message_fails_and_nothing_is_left(tmp_path: Path) -> None:
-    before, given = threading.active_count(), readers.server(tmp_path)
-    with asked.served(given) as (client, heard):
-        http = asked.ask_http(client, heard, 250, 11)
-        socket = asked.ask_socket(client, heard, 100, 11)
+def test_server_survives_invalid_requests_and_messages(tmp_path: Path) -> None:
+    threads, settings = threading.active_count(), readers.server_settings(tmp_path)
+    with http_fuzz.running_server(settings) as (client, log):
+        http = http_fuzz.fuzz_http(client, log, 250, 11)
+        socket = http_fuzz.fuzz_socket(client, log, 100, 11)
     assert not http.failures
     assert not socket.failures
     assert http.inputs > 100
     assert http.answers["2xx"] > 5
     assert socket.inputs >= 100
-    assert not asked.left_over(given.workspace)
-    assert asked.threads_after(before) <= 0
+    assert not http_fuzz.temporary_files(settings.workspace)
+    assert http_fuzz.extra_threads(threads) <= 0

@@ -1,4 +1,4 @@
-"""Small valid files of every kind of data that can be read."""
+"""Small valid files of every data format."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 @cache
 def episodes(task: str = "door", steps: int = 6) -> tuple[Episode, ...]:
-    """The first steps of three episodes of the sample set, one of each split."""
+    """First steps of three sample episodes, one of each split."""
     with open_dataset(sample_path(task)) as data:
         first = {summary.split: summary.index for summary in reversed(data.summaries)}
         return tuple(_first(data[index], steps) for _, index in sorted(first.items()))
@@ -29,12 +29,12 @@ def _first(episode: Episode, steps: int) -> Episode:
     return replace(episode, **arrays, observations={k: v[:steps] for k, v in episode.observations.items()})
 
 
-def make_episodes(path: Path) -> None:
+def write_episodes(path: Path) -> None:
     write_dataset(path, DOOR, episodes())
 
 
-AUTHORS: tuple[dict[str, tuple[int, ...]], ...] = (
-    {
+PAPER_LAYOUTS: dict[str, dict[str, tuple[int, ...]]] = {
+    "door": {
         "object-state": (5,),
         "eef_pos": (3,),
         "ee-force-obs": (3,),
@@ -42,12 +42,13 @@ AUTHORS: tuple[dict[str, tuple[int, ...]], ...] = (
         "contact-obs": (),
         "image": (64, 64),
     },
-    {"Cylinder0_pos": (3,), "eef_pos": (3,), "force": (6,), "contact": (), "image": (32, 32)},
-    {"pos": (3,), "tip": (3,), "force": (3,), "contact": (), "image": (32, 32, 3)},
-)
+    "push": {"Cylinder0_pos": (3,), "eef_pos": (3,), "force": (6,), "contact": (), "image": (32, 32)},
+    "real": {"pos": (3,), "tip": (3,), "force": (3,), "contact": (), "image": (32, 32, 3)},
+}
+"""Layout of the paper's files -> key -> shape per step."""
 
 
-def make_authors(path: Path, keys: dict[str, tuple[int, ...]]) -> None:
+def write_paper_file(path: Path, keys: dict[str, tuple[int, ...]]) -> None:
     rng = np.random.default_rng(0)
     with h5py.File(path, "w") as file:
         for index in range(2):
@@ -56,7 +57,7 @@ def make_authors(path: Path, keys: dict[str, tuple[int, ...]]) -> None:
                 group[key] = rng.random((5, *shape), np.float32)
 
 
-def make_push(path: Path) -> None:
+def write_push(path: Path) -> None:
     clock = np.arange(40) / 100
     still = np.zeros(len(clock))
     rows = {

@@ -45,7 +45,7 @@ def test_particle_filter_maps_equal_the_naive_way(pf: MapEngine) -> None:
     map_ = pf.map(step, size=size)
     filter_ = pf.checkpoint.filter
     assert isinstance(filter_, ParticleFilter)
-    batch = Steps.of(filter_.task, [pf.trace.episode]).episode(0)
+    batch = Steps.from_episodes(filter_.task, [pf.trace.episode]).episode(0)
     observed = {
         m: v[step : step + 1].expand(1, size * size, *v.shape[2:]) for m, v in filter_.observations(batch).items()
     }

@@ -13,7 +13,7 @@ import torch
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.injection import WHOLE, Faults
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -40,7 +40,7 @@ def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
 
 def test_tracing_changes_no_bit_of_the_estimates(checkpoint: Checkpoint, episode: Episode, traced: Trace) -> None:
     filter_ = checkpoint.filter
-    batch = Steps.of(filter_.task, [episode]).episode(0)
+    batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
     error, covariance = run(filter_, batch, only=None, particles=100, seed=7)
     si = torch.from_numpy(traced.estimate_mean)
     assert torch.equal(si - batch.states[:, 0], error[:, 0])
@@ -64,9 +64,9 @@ def test_saved_and_loaded_without_loss(traced: Trace, tmp_path: Path) -> None:
 
 def test_shares_sum_to_one_and_covariances_are_definite(traced: Trace) -> None:
     assert traced.weights is not None
-    assert traced.acting is not None
+    assert traced.effective_weights is not None
     np.testing.assert_allclose(traced.weights.sum(1), 1.0, atol=1e-6)
-    np.testing.assert_allclose(traced.acting.sum(1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(traced.effective_weights.sum(1), 1.0, atol=1e-6)
     # Scaled to unit diagonal, so that m and rad compare; a particle set may hold a flat direction, to rounding.
     scale = np.sqrt(np.diagonal(traced.estimate_covariance, axis1=1, axis2=2)) + 1e-9
     correlation = traced.estimate_covariance / scale[:, :, None] / scale[:, None]
@@ -104,7 +104,7 @@ def test_a_broken_episode_is_kept_as_the_filter_saw_it(
     assert np.array_equal(broken.episode.states, traced.episode.states)
     save_trace(broken, tmp_path / "run.trace")
     assert load_trace(tmp_path / "run.trace").faults == faults
-    assert traced.faults == WHOLE
+    assert traced.faults == NO_FAULTS
 
 
 @pytest.mark.parametrize(("chance", "faults"), [(0.0, ""), (0.4, "blackout=0.4")])

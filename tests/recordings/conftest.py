@@ -1,4 +1,4 @@
-"""Traces made of smooth random arrays: every field of both kinds, no filter needed."""
+"""Synthetic traces of smooth random arrays, with every field of both kinds of filter."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _smooth(rng: np.random.Generator, steps: int, *shape: int) -> NDArray[np.flo
 
 
 def _covariances(rng: np.random.Generator, scale: NDArray[np.float32], *shape: int) -> NDArray[np.float32]:
-    """(*shape, n, n) symmetric positive definite, standard deviations about ``scale`` (n,)."""
+    """(*shape, n, n) symmetric positive definite matrices with standard deviations near ``scale`` (n,)."""
     factor = np.eye(len(scale)) + 0.5 * np.tril(rng.normal(size=(*shape, len(scale), len(scale))), -1)
     factor *= scale[:, None]
     return (factor @ np.swapaxes(factor, -1, -2)).astype(np.float32)
@@ -58,7 +58,7 @@ def _episode(rng: np.random.Generator, steps: int) -> Episode:
 
 
 def make_trace(kind: str, steps: int = 40, particles: int = 30, seed: int = 0) -> Trace:
-    """A trace whose numbers look like a filter's; K = 2 modalities, n = 3 components."""
+    """A trace with realistic values; K = 2 modalities, n = 3 components."""
     rng = np.random.default_rng(seed)
     episode = _episode(rng, steps)
     scale = np.array([0.02, 0.02, 0.03], np.float32)
@@ -86,7 +86,7 @@ def make_trace(kind: str, steps: int = 40, particles: int = 30, seed: int = 0) -
     if kind == "ekf":
         return Trace(
             weights=weights,
-            acting=weights,
+            effective_weights=weights,
             predicted_mean=episode.states[:, None] + 1.1 * noise,
             predicted_covariance=_covariances(rng, scale, steps, 2),
             observation_mean=episode.states[:, None] + 2 * noise,
@@ -100,7 +100,7 @@ def make_trace(kind: str, steps: int = 40, particles: int = 30, seed: int = 0) -
     normalised = total - np.log(np.exp(total).sum(axis=1, keepdims=True))
     return Trace(
         weights=weights[:, :, :1],
-        acting=weights[:, :, :1],
+        effective_weights=weights[:, :, :1],
         particles=cloud.astype(np.float32),
         prior_log_weights=np.full_like(total, -np.log(particles)),
         log_weights=normalised.astype(np.float32),
@@ -111,11 +111,11 @@ def make_trace(kind: str, steps: int = 40, particles: int = 30, seed: int = 0) -
 
 
 def make_map(trace: Trace, step: int, size: int = 41) -> LikelihoodMap:
-    """Gaussian bumps: a round one for the image, a ridge for haptics, their sum fused."""
+    """Gaussian maps: isotropic for the image, elongated for haptics, and their sum."""
     axis = np.linspace(-0.135, 0.135, size, dtype=np.float32)
     x, y = np.meshgrid(axis, axis)
-    turn = 0.02 * step
-    along, across = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+    angle = 0.02 * step
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
     image = -0.5 * (x**2 + y**2) / 0.03**2
     haptics = -0.5 * (along**2 / 0.08**2 + across**2 / 0.01**2)
     layers = np.stack([image, haptics, image + haptics]).astype(np.float32)
@@ -123,16 +123,16 @@ def make_map(trace: Trace, step: int, size: int = 41) -> LikelihoodMap:
     return LikelihoodMap(step, float(truth[2]), (*trace.modalities, "fused"), axis, axis, truth[:2], layers)
 
 
-def _assert_same(one: Trace, other: Trace) -> None:
+def _assert_same(first: Trace, second: Trace) -> None:
     for field in fields(Trace):
-        left, right = getattr(one, field.name), getattr(other, field.name)
+        left, right = getattr(first, field.name), getattr(second, field.name)
         if isinstance(left, np.ndarray):
             assert left.dtype == right.dtype, field.name
             np.testing.assert_array_equal(left, right, field.name)
         elif field.name != "episode":
             assert left == right, field.name
-    assert one.episode.digest() == other.episode.digest()
-    assert one.episode.provenance == other.episode.provenance
+    assert first.episode.digest() == second.episode.digest()
+    assert first.episode.provenance == second.episode.provenance
 
 
 @pytest.fixture(params=["ekf", "pf"])

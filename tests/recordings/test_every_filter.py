@@ -1,4 +1,4 @@
-"""Every filter of the catalog, with fresh weights on a real episode: traced, mapped, recorded, and read back."""
+"""Every filter of the catalog, untrained, on a simulated episode: trace, maps, recording, and import."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def checkpoint(
     request: pytest.FixtureRequest, episode: Episode, tmp_path_factory: pytest.TempPathFactory
 ) -> Checkpoint:
     filter_ = build(filters_of(DOOR)[request.param])
-    filter_.statistics.fit(Steps.of(DOOR, [episode]))
+    filter_.statistics.fit(Steps.from_episodes(DOOR, [episode]))
     path = tmp_path_factory.mktemp("checkpoint") / f"{request.param}.safetensors"
     save_checkpoint(filter_, request.param, {}, path)
     return load_checkpoint(path)
@@ -43,7 +43,7 @@ def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
     return trace(checkpoint, episode, particles=40)
 
 
-def test_a_trace_has_what_its_kind_knows(checkpoint: Checkpoint, traced: Trace) -> None:
+def test_trace_has_the_fields_of_its_kind(checkpoint: Checkpoint, traced: Trace) -> None:
     kind, names = checkpoint.kind, checkpoint.filter.names
     n, k = 3, 0 if kind == "lstm" else len(names)
     assert traced.modalities == (() if kind == "lstm" else names)
@@ -53,16 +53,16 @@ def test_a_trace_has_what_its_kind_knows(checkpoint: Checkpoint, traced: Trace) 
     assert (np.isnan if kind == "lstm" else np.isfinite)(traced.estimate_covariance).all()
     assert (traced.observation_mean is not None) == (kind in ("ekf", "ukf"))
     assert (traced.log_likelihood is not None) == (kind == "pf")
-    # What is weighed has shares, and they make a whole.
+    # Effective weights sum to one.
     assert (traced.weights is not None) == checkpoint.name.startswith("crossmodal")
-    assert (traced.acting is not None) == (k > 1)
-    if traced.acting is not None:
-        np.testing.assert_allclose(traced.acting.sum(1), 1.0, atol=1e-5)
+    assert (traced.effective_weights is not None) == (k > 1)
+    if traced.effective_weights is not None:
+        np.testing.assert_allclose(traced.effective_weights.sum(1), 1.0, atol=1e-5)
     if k == 1 and kind != "pf":
         np.testing.assert_array_equal(traced.modality_mean[:, 0], traced.estimate_mean)
 
 
-def test_maps_and_a_recording(
+def test_maps_and_recording_round_trip(
     checkpoint: Checkpoint, traced: Trace, assert_same: Callable[[Trace, Trace], None], tmp_path: Path
 ) -> None:
     maps = None
@@ -74,13 +74,13 @@ def test_maps_and_a_recording(
         assert maps[0].layers == (*traced.modalities, "fused")
         assert np.isfinite(maps[1].log_likelihood).all()
         if len(traced.modalities) == 1:
-            one, fused = maps[1].normalised().astype(int)
-            assert np.abs(one - fused).max() <= 1
+            unimodal, fused = maps[1].normalised().astype(int)
+            assert np.abs(unimodal - fused).max() <= 1
     save_trace(traced, tmp_path / "run.trace")
     assert_same(traced, load_trace(tmp_path / "run.trace"))
     path = write_recording(traced, tmp_path / "run.rrd", maps)
     assert_same(traced, read_recording(path))
-    drawn = {chunk.entity_path for chunk in RrdReader(path).stream()}
-    assert ("/world/plane/fused/ellipse" in drawn) == traced.has_covariance
-    assert ("/states/hinge_x/two_sigma" in drawn) == traced.has_covariance
-    assert ("/maps/fused" in drawn) == (maps is not None)
+    paths = {chunk.entity_path for chunk in RrdReader(path).stream()}
+    assert ("/world/plane/fused/ellipse" in paths) == traced.has_covariance
+    assert ("/states/hinge_x/two_sigma" in paths) == traced.has_covariance
+    assert ("/maps/fused" in paths) == (maps is not None)

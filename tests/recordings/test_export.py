@@ -1,4 +1,4 @@
-"""Traces for other tools and back from recordings: each file, read by its own reader, says what the trace says."""
+"""Export and import: files read with third-party readers equal the trace."""
 
 from __future__ import annotations
 
@@ -37,31 +37,31 @@ def run(request: pytest.FixtureRequest) -> Trace:
         return trace(load_checkpoint(shipped(task, name)), data[9], 9, particles=40, faults=faults)
 
 
-def array_of(made: Trace, name: str) -> Any:
-    return getattr(made if hasattr(made, name) else made.episode, name)
+def array_of(trace_: Trace, name: str) -> Any:
+    return getattr(trace_ if hasattr(trace_, name) else trace_.episode, name)
 
 
-def test_columns_hold_every_number_once_under_its_name(run: Trace) -> None:
-    found = {column.name: column.values for column in columns(run)}
+def test_columns_contain_every_number_once(run: Trace) -> None:
+    arrays = {column.name: column.values for column in columns(run)}
     whole = {name: a for name, a in arrays_of(run).items() if not name.startswith("start_") and a.size}
-    assert sum(values.size for values in found.values()) == sum(array.size for array in whole.values())
+    assert sum(values.size for values in arrays.values()) == sum(array.size for array in whole.values())
     components = ("hinge_x", "hinge_y", "angle") if run.episode.task == "door" else ("x", "y")
     for i, component in enumerate(components):
-        np.testing.assert_array_equal(found[f"states.{component}"], run.episode.states[:, i])
-        np.testing.assert_array_equal(found[f"estimate_mean.{component}"], run.estimate_mean[:, i])
+        np.testing.assert_array_equal(arrays[f"states.{component}"], run.episode.states[:, i])
+        np.testing.assert_array_equal(arrays[f"estimate_mean.{component}"], run.estimate_mean[:, i])
         for k, modality in enumerate(run.modalities):
-            np.testing.assert_array_equal(found[f"modality_mean.{modality}.{component}"], run.modality_mean[:, k, i])
+            np.testing.assert_array_equal(arrays[f"modality_mean.{modality}.{component}"], run.modality_mean[:, k, i])
         for j, other in enumerate(components):
             name = f"estimate_covariance.{component}.{other}"
-            np.testing.assert_array_equal(found[name], run.estimate_covariance[:, i, j])
+            np.testing.assert_array_equal(arrays[name], run.estimate_covariance[:, i, j])
         if run.particles is not None:
-            np.testing.assert_array_equal(found[f"particles.{component}"], run.particles[..., i])
+            np.testing.assert_array_equal(arrays[f"particles.{component}"], run.particles[..., i])
         if run.weights is not None and run.weights.shape[-1] > 1:
-            np.testing.assert_array_equal(found[f"weights.image.{component}"], run.weights[:, 0, i])
+            np.testing.assert_array_equal(arrays[f"weights.image.{component}"], run.weights[:, 0, i])
     if run.log_likelihood is not None:
-        np.testing.assert_array_equal(found["log_likelihood.haptics"], run.log_likelihood[:, 1])
+        np.testing.assert_array_equal(arrays["log_likelihood.haptics"], run.log_likelihood[:, 1])
         assert run.weights is not None
-        np.testing.assert_array_equal(found["weights.haptics"], run.weights[:, 1, 0])
+        np.testing.assert_array_equal(arrays["weights.haptics"], run.weights[:, 1, 0])
     assert {c.name: c.unit for c in columns(run)}[f"estimate_covariance.{components[0]}.{components[0]}"] == "m^2"
 
 
@@ -107,33 +107,33 @@ def test_npz(run: Trace, tmp_path: Path) -> None:
 
 
 def messages(path: Path) -> dict[str, list[tuple[int, dict[str, Any], dict[str, Any]]]]:
-    """Topic -> (time in ns, message, JSON schema), in the order of time."""
+    """Topic -> (time in ns, message, JSON schema), ordered by time."""
     reader = pytest.importorskip("mcap.reader").make_reader(io.BytesIO(path.read_bytes()))
-    found: dict[str, list[Any]] = {}
+    arrays: dict[str, list[Any]] = {}
     for schema, channel, message in reader.iter_messages():
         assert (channel.message_encoding, schema.encoding) == ("json", "jsonschema")
-        one = (message.log_time, json.loads(message.data), json.loads(schema.data))
-        found.setdefault(channel.topic, []).append(one)
-    return found
+        row = (message.log_time, json.loads(message.data), json.loads(schema.data))
+        arrays.setdefault(channel.topic, []).append(row)
+    return arrays
 
 
 def test_mcap(run: Trace, tmp_path: Path) -> None:
     export_trace(run, tmp_path / "run.mcap")
-    found = messages(tmp_path / "run.mcap")
-    pictures = found.pop("/observations/image")
-    clouds = found.pop("/particles", None)
-    for topic, rows in found.items():
+    arrays = messages(tmp_path / "run.mcap")
+    images = arrays.pop("/observations/image")
+    clouds = arrays.pop("/particles", None)
+    for topic, rows in arrays.items():
         assert [time for time, _, _ in rows] == [round(t * run.episode.dt * 1e9) for t in range(len(run))]
         assert rows[0][1].keys() == rows[0][2]["properties"].keys(), topic
     for column in columns(run):
-        topic = f"/{column.of}/{column.parts[0]}"
-        if topic in found:
-            values = [message for _, message, _ in found[topic]]
+        topic = f"/{column.group}/{column.parts[0]}"
+        if topic in arrays:
+            values = [message for _, message, _ in arrays[topic]]
             for part in column.parts[1:] or ("value",):
-                values = [one[part] for one in values]
+                values = [value[part] for value in values]
             np.testing.assert_array_equal(np.array(values).astype(column.values.dtype), column.values)
-    images = run.episode.observations["image"]
-    for (_, message, schema), image in zip(pictures, images, strict=True):
+    expected_images = run.episode.observations["image"]
+    for (_, message, schema), image in zip(images, expected_images, strict=True):
         assert (message["encoding"], message["height"], message["width"]) == ("mono8", *image.shape)
         assert base64.b64decode(message["data"]) == image.tobytes()
         assert schema["title"] == "foxglove.RawImage"
@@ -142,13 +142,15 @@ def test_mcap(run: Trace, tmp_path: Path) -> None:
         assert run.particles is not None
         assert run.log_weights is not None
         assert [field["name"] for field in clouds[0][1]["fields"]] == ["x", "y", "z", "weight"]
-        points = np.stack([np.frombuffer(base64.b64decode(one["data"]), "<f4").reshape(-1, 4) for _, one, _ in clouds])
+        points = np.stack(
+            [np.frombuffer(base64.b64decode(cloud["data"]), "<f4").reshape(-1, 4) for _, cloud, _ in clouds]
+        )
         np.testing.assert_array_equal(points[..., :2], run.particles[..., :2])
         np.testing.assert_allclose(points[..., 3].sum(1), 1.0, atol=1e-5)  # float32 over 40 particles
         np.testing.assert_allclose(points[..., 3], np.exp(run.log_weights), rtol=1e-6)
 
 
-def test_what_is_not_finite_is_null_in_json(run: Trace, tmp_path: Path) -> None:
+def test_non_finite_numbers_are_null_in_json(run: Trace, tmp_path: Path) -> None:
     odd = replace(run, estimate_covariance=np.full_like(run.estimate_covariance, np.nan))
     export_trace(odd, tmp_path / "odd.mcap")
     component = "hinge_x" if run.episode.task == "door" else "x"
@@ -156,8 +158,8 @@ def test_what_is_not_finite_is_null_in_json(run: Trace, tmp_path: Path) -> None:
     assert message[component][component] is None
 
 
-def test_without_the_package_mcap(run: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "mcap", None)  # as if it were not installed
+def test_missing_package_mcap(run: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mcap", None)  # as if not installed
     with pytest.raises(BadInput, match=r"pip install 'beliefscope\[export\]'"):
         export_trace(run, tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())
@@ -171,24 +173,25 @@ def command(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     return json.loads(capsys.readouterr().out)
 
 
-def test_what_comes_back_from_a_recording_says_the_same(
+def test_diagnostics_of_an_imported_recording_are_equal(
     run: Trace,
     assert_same: Compare,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """import gives the trace of the recording, diagnostics of it are the same, and so is what is exported of both."""
+    """The imported trace equals the recorded one, and so do its diagnostics and exports."""
     monkeypatch.chdir(tmp_path)
-    found = quick(run)
-    write_recording(run, "run.rrd", diagnostics=found)
-    save_trace(run, Path("made.trace"))
-    said = command("import run.rrd -o back.trace", monkeypatch, capsys)
-    assert (said["episode"], said["data_hash"]) == (9, run.data_hash)
-    again = load_trace(Path("back.trace"))
-    assert_same(run, again)
-    assert {name: one.to_dict() for name, one in quick(again).items()} == {n: d.to_dict() for n, d in found.items()}
-    for source, output in (("run.rrd", "one.parquet"), ("back.trace", "two.parquet"), ("made.trace", "three.parquet")):
-        command(f"export {source} -o {output}", monkeypatch, capsys)
-    one, two, three = (Path(f"{name}.parquet").read_bytes() for name in ("one", "two", "three"))
-    assert one == two == three
+    diagnostics = quick(run)
+    write_recording(run, "run.rrd", diagnostics=diagnostics)
+    save_trace(run, Path("original.trace"))
+    document = command("import run.rrd -o imported.trace", monkeypatch, capsys)
+    assert (document["episode"], document["data_hash"]) == (9, run.data_hash)
+    imported = load_trace(Path("imported.trace"))
+    assert_same(run, imported)
+    assert {n: d.to_dict() for n, d in quick(imported).items()} == {n: d.to_dict() for n, d in diagnostics.items()}
+    exports = set()
+    for source in ("run.rrd", "imported.trace", "original.trace"):
+        command(f"export {source} -o run.parquet", monkeypatch, capsys)
+        exports.add(Path("run.parquet").read_bytes())
+    assert len(exports) == 1

@@ -1,4 +1,4 @@
-"""Recordings: nothing is lost on the way, every path is as documented, and a file is whole or not there."""
+"""Writing recordings: exact round trip, documented paths, and atomic files."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ Compare = Callable[[Trace, Trace], None]
 
 
 def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
-    """The paths that one row of the schema stands for in this trace's recording."""
+    """Paths of one row of the schema in the recording of this trace."""
     task = find_task(trace.episode.task)
-    there = {
+    present = {
         "always": True,
         "modalities": len(trace.modalities) > 0,
         "covariance": trace.has_covariance,
         "weights": trace.weights is not None,
-        "acting": trace.acting is not None,
+        "effective_weights": trace.effective_weights is not None,
         "ekf": trace.kind in ("ekf", "ukf"),
         "pf": trace.kind == "pf",
         "maps": maps,
         "diagnostics": False,  # tests/recordings/rerun_log/test_diagnostics.py
         "replay": trace.episode.qpos.size > 0,
         "bodies": False,  # tests/recordings/rerun_log/test_bodies.py
-        "ghost": task.ghost is not None,
+        "outline": task.outline is not None,
     }
-    if not there[entity.needs]:
+    if not present[entity.needs]:
         return set()
     values = {
         "{component}": [c.name for c in task.components],
@@ -71,15 +71,15 @@ def test_round_trip_is_exact(trace: Trace, assert_same: Compare, tmp_path: Path)
 
 
 @pytest.mark.parametrize("steps", [0, 1, STEPS_PER_CHUNK, STEPS_PER_CHUNK + 1, 9_999, 10_001, 123_457])
-def test_all_steps_are_sent_once_and_in_few_parts(steps: int) -> None:
-    """Rerun keeps an index of every part in memory, so a long recording has no more of them."""
+def test_chunks_cover_all_steps_once(steps: int) -> None:
+    """Rerun keeps an index of every chunk in memory, so their number is limited."""
     parts = list(chunks(steps))
     assert [step for first, last in parts for step in range(first, last)] == list(range(steps))
     assert len(parts) <= CHUNKS
     assert all(last - first >= STEPS_PER_CHUNK for first, last in parts[:-1])
 
 
-def test_round_trip_over_several_chunks_and_of_odd_numbers(
+def test_round_trip_of_several_chunks_and_special_numbers(
     new_trace: Callable[..., Trace], assert_same: Compare, tmp_path: Path
 ) -> None:
     trace = new_trace("pf", steps=213, particles=7)
@@ -89,37 +89,40 @@ def test_round_trip_over_several_chunks_and_of_odd_numbers(
     assert_same(trace, read_recording(tmp_path / "run.rrd"))
 
 
-def test_a_trace_without_weights_or_replay(
+def test_trace_without_weights_and_joint_positions(
     new_trace: Callable[..., Trace], assert_same: Compare, tmp_path: Path
 ) -> None:
     trace = new_trace("ekf")
     trace = replace(
-        trace, weights=None, acting=None, episode=replace(trace.episode, qpos=np.zeros((len(trace), 0), np.float32))
+        trace,
+        weights=None,
+        effective_weights=None,
+        episode=replace(trace.episode, qpos=np.zeros((len(trace), 0), np.float32)),
     )
     write_recording(trace, tmp_path / "run.rrd")
-    again = read_recording(tmp_path / "run.rrd")
-    assert_same(trace, again)
-    assert again.weights is None
+    imported = read_recording(tmp_path / "run.rrd")
+    assert_same(trace, imported)
+    assert imported.weights is None
 
 
 @pytest.mark.parametrize("with_maps", [False, True])
-def test_paths_are_those_of_the_schema(trace: Trace, new_map: MapMaker, tmp_path: Path, with_maps: bool) -> None:
+def test_paths_match_the_schema(trace: Trace, new_map: MapMaker, tmp_path: Path, with_maps: bool) -> None:
     maps = [new_map(trace, step) for step in (0, 20)] if with_maps else None
     write_recording(trace, tmp_path / "run.rrd", maps)
-    found: dict[str, set[str]] = {}
+    recorded: dict[str, set[str]] = {}
     for path, columns in written(tmp_path / "run.rrd"):
-        found.setdefault(path, set()).update(columns)
-    assert set(PROPERTIES) <= found[HEADER]
+        recorded.setdefault(path, set()).update(columns)
+    assert set(PROPERTIES) <= recorded[HEADER]
     for entity in SCHEMA:
         for path in expected_paths(trace, entity, with_maps):
-            archetypes = {column.split(":")[0] for column in found.get(path, set())}
+            archetypes = {column.split(":")[0] for column in recorded.get(path, set())}
             assert archetypes & set(entity.archetype.split(" or ")), (path, archetypes)
-            assert entity.static or {STEP, TIME} <= found[path], path
-    known = {path for entity in SCHEMA for path in expected_paths(trace, entity, with_maps)}
-    assert {path for path in found if not path.startswith("__properties")} == known
+            assert entity.static or {STEP, TIME} <= recorded[path], path
+    expected = {path for entity in SCHEMA for path in expected_paths(trace, entity, with_maps)}
+    assert {path for path in recorded if not path.startswith("__properties")} == expected
 
 
-def test_time_is_the_step_times_dt(trace: Trace, tmp_path: Path) -> None:
+def test_time_is_step_times_dt(trace: Trace, tmp_path: Path) -> None:
     write_recording(trace, tmp_path / "run.rrd")
     for chunk in RrdReader(tmp_path / "run.rrd").stream().filter(content="/trace/states"):
         batch = chunk.to_record_batch()
@@ -127,10 +130,10 @@ def test_time_is_the_step_times_dt(trace: Trace, tmp_path: Path) -> None:
         np.testing.assert_allclose(seconds, batch.column(STEP).to_numpy() * trace.episode.dt, atol=1e-9)
 
 
-def test_maps_are_stored_as_stated(new_trace: Callable[..., Trace], new_map: MapMaker, tmp_path: Path) -> None:
+def test_precision_of_maps(new_trace: Callable[..., Trace], new_map: MapMaker, tmp_path: Path) -> None:
     trace = new_trace("pf")
-    one = new_map(trace, 12, size=41)
-    write_recording(trace, tmp_path / "run.rrd", iter([one]))
+    map_ = new_map(trace, 12, size=41)
+    write_recording(trace, tmp_path / "run.rrd", iter([map_]))
     values = {}
     for chunk in RrdReader(tmp_path / "run.rrd").stream().filter(content="/maps/haptics/**"):
         batch = chunk.to_record_batch()
@@ -140,16 +143,16 @@ def test_maps_are_stored_as_stated(new_trace: Callable[..., Trace], new_map: Map
                 values[name] = batch.column(name)
     shares = values["DepthImage:buffer"].flatten().flatten().to_numpy().reshape(41, 41)[::-1] / 255.0
     log_peak = values["Scalars:scalars"].flatten().to_numpy()[0]
-    likelihood = np.exp(one.log_likelihood[1].astype(float))
+    likelihood = np.exp(map_.log_likelihood[1].astype(float))
     assert np.abs(shares * np.exp(log_peak) - likelihood).max() <= likelihood.max() / 510 * 1.0001
 
 
-def test_the_viewer_finds_a_layout(trace: Trace, tmp_path: Path) -> None:
+def test_recording_has_one_layout(trace: Trace, tmp_path: Path) -> None:
     write_recording(trace, tmp_path / "run.rrd")
     assert len(RrdReader(tmp_path / "run.rrd").blueprints()) == 1
 
 
-def test_reruns_own_check_passes(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+def test_rerun_verifies_the_file(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
     path = write_recording(trace, tmp_path / "run.rrd", [new_map(trace, 3)])
     rerun = shutil.which("rerun", path=os.path.dirname(sys.executable)) or shutil.which("rerun")
     if rerun is None:
@@ -159,23 +162,23 @@ def test_reruns_own_check_passes(trace: Trace, new_map: MapMaker, tmp_path: Path
     assert done.returncode == 0, done.stderr
 
 
-def test_progress_goes_from_nothing_to_all(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+def test_progress_increases_to_one(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
     shares: list[float] = []
     write_recording(trace, tmp_path / "run.rrd", (new_map(trace, s) for s in range(0, 40, 2)), shares.append)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
 
 
-def test_a_failure_leaves_the_old_file_and_nothing_else(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+def test_failure_keeps_the_existing_file(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
     path = write_recording(trace, tmp_path / "run.rrd")
     before = path.read_bytes()
 
     def failing() -> Iterator[LikelihoodMap]:
         yield from (new_map(trace, step) for step in range(20))
         assert path.read_bytes() == before
-        raise RuntimeError("the maps' maker fails")
+        raise RuntimeError("map failure")
 
-    with pytest.raises(RuntimeError, match="maker fails"):
+    with pytest.raises(RuntimeError, match="map failure"):
         write_recording(trace, path, failing())
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -194,24 +197,24 @@ write_recording(trace, {path!r}, maps())
 """
 
 
-def test_a_killed_writer_leaves_no_file_of_that_name(tmp_path: Path) -> None:
+def test_killed_writer_leaves_no_file(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     script = KILLED.format(folder=str(Path(__file__).parent), path=str(path))
     assert subprocess.run([sys.executable, "-c", script]).returncode == -9
     assert not path.exists()
-    assert all(left.name.startswith(".run.rrd.") for left in tmp_path.iterdir())
+    assert all(path.name.startswith(".run.rrd.") for path in tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("where", ["nowhere/run.rrd", "folder"])
-def test_a_place_that_cannot_be_written(trace: Trace, tmp_path: Path, where: str) -> None:
+def test_unwritable_path(trace: Trace, tmp_path: Path, where: str) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(BadInput, match="cannot write"):
         write_recording(trace, tmp_path / where)
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
-def test_maps_that_do_not_fit(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="one size"):
+def test_inconsistent_maps(trace: Trace, new_map: MapMaker, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="same size and layers"):
         write_recording(trace, tmp_path / "run.rrd", [new_map(trace, 0), new_map(trace, 1, size=21)])
     with pytest.raises(BadInput, match="map of step 40: the trace has steps 0 to 39"):
         write_recording(trace, tmp_path / "run.rrd", [replace(new_map(trace, 0), step=40)])
@@ -231,22 +234,22 @@ for limit in {limits}:
         write_recording(trace, {path!r})
         sys.exit("written")
     except BadInput as error:
-        assert "could not write the file to its end" in str(error), error
+        assert "could not write the complete file" in str(error), error
 """
 
 
-def test_a_full_disk_is_noticed(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
+def test_full_disk_raises(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     size = write_recording(new_trace("pf", steps=300), path).stat().st_size
     path.unlink()
-    limits = [int(share * size) for share in (0.3, 0.98)]  # where chunks end differs by up to 0.3 % of the size
+    limits = [int(share * size) for share in (0.3, 0.98)]  # chunk boundaries vary by up to 0.3 % of the size
     script = FULL.format(folder=str(Path(__file__).parent), path=str(path), limits=limits)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_rerun_lets_go_of_a_recording_that_is_written(trace: Trace, tmp_path: Path) -> None:
+def test_threads_of_rerun_end(trace: Trace, tmp_path: Path) -> None:
     def threads() -> int:
         return len(os.listdir("/proc/self/task"))
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.cli.options import Json, Seed, TaskName, check, size, whole
 
 if TYPE_CHECKING:
     from beliefscope.datasets.statistics import Statistics
@@ -17,37 +16,33 @@ UNITS = ("cm", "mm", "deg", "N", "Nm")
 
 
 def collect(
-    task: TaskName,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.h5", help="Where to write them.")],
+    task: opt.TaskName,
+    output: opt.DatasetPath,
     episodes: Annotated[
         int | None,
         typer.Option(
-            "--episodes",
-            parser=whole(1),
-            metavar="N",
-            help="How many to simulate. Without it: as many as the paper's authors, door 600, push 1000.",
+            parser=opt.integer(1), metavar="N", help="Number of episodes. Default as in the paper: door 600, push 1000."
         ),
     ] = None,
     steps: Annotated[
         int | None,
         typer.Option(
-            "--steps",
-            parser=whole(2),
+            parser=opt.integer(2),
             metavar="T",
-            help="Length of each, 0.1 s a step. Without it: the authors', door 800, push 250.",
+            help="Steps of 0.1 s per episode. Default as in the paper: door 800, push 250.",
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option("--workers", parser=whole(1), metavar="W", help="Processes. Without it: one a core.")
+        int | None, typer.Option(parser=opt.integer(1), metavar="W", help="Processes. Default: one per CPU core.")
     ] = None,
-    seed: Seed = 0,
-    json: Json = None,
+    seed: opt.Seed = 0,
+    json: opt.Json = None,
 ) -> None:
-    """Simulate episodes into one HDF5 file.
+    """Simulate episodes and write them to an HDF5 file.
 
-    The same seed gives the same data, with any number of workers. A run that was killed goes on where it stopped
-    when it is started again. Of every ten episodes eight are for training, one is for validation and one for tests.
-    At the end the set's statistics stand beside those of the authors' data.
+    The same seed gives the same data with any number of workers. An interrupted run resumes when the same command is
+    run again. Of every ten episodes, eight are for training, one for validation and one for testing. The output
+    compares the statistics of the dataset with those of the paper's.
 
     \b
     Example:
@@ -55,16 +50,16 @@ def collect(
     """
     from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.simulation.collect import collect as simulate
-    from beliefscope.datasets.statistics import AUTHORS, scale, statistics
+    from beliefscope.datasets.statistics import PAPER_DATA, default_size, statistics
     from beliefscope.datasets.store import open_dataset
 
-    check(output, json)
+    opt.check_output(output)
     name = load_task(task).name
-    count, length = (given or usual for given, usual in zip((episodes, steps), scale(name), strict=True))
+    count, length = (value or default for value, default in zip((episodes, steps), default_size(name), strict=True))
     with console.progress(f"Simulating {name}") as advance:
-        simulate(task, count, length, seed, workers, output, lambda done, of: advance(done / of))
+        simulate(task, count, length, seed, workers, output, lambda done, total: advance(done / total))
     with open_dataset(output) as data:
-        ours, authors = statistics(data.task, data), AUTHORS[name].statistics if name in AUTHORS else {}
+        ours, paper = statistics(data.task, data), PAPER_DATA[name].statistics if name in PAPER_DATA else {}
         document = {
             "task": name,
             "episodes": len(data),
@@ -72,25 +67,25 @@ def collect(
             "seed": seed,
             "contact_fraction": ours["contact_fraction"],
             "statistics": ours,
-            "authors": authors,
+            "authors": paper,
             "data_hash": data.hash,
             "path": str(output),
             "bytes": output.stat().st_size,
         }
-    contact = f"{ours['contact_fraction']:.0%} in contact"
-    text = f"{size(output)}: {count} episodes of {length} steps, {contact}\n\n{_compared(ours, authors)}"
-    console.result(document, text, json)
+    summary = (
+        f"{opt.path_and_size(output)}: {count} episodes of {length} steps, {ours['contact_fraction']:.0%} in contact"
+    )
+    console.result(document, f"{summary}\n\n{_statistics_table(ours, paper)}", json)
 
 
-def _compared(ours: Statistics, authors: Statistics) -> str:
-    """A table of both and of their ratio, axis by axis."""
-    rows = [["", "this set", "authors", "ratio"]]
+def _statistics_table(ours: Statistics, paper: Statistics) -> str:
+    """Statistics of this dataset and of the paper's, and their ratio, per axis."""
+    rows = []
     for name, value in ours.items():
-        here, there = _axes(value), _axes(authors.get(name, []))
-        ratios = [a / b for a, b in zip(here, there, strict=False)]
-        rows.append([_label(name), _row(here, ".3g"), _row(there, ".3g"), _row(ratios, ".2f")])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+        left, right = _axes(value), _axes(paper.get(name, []))
+        ratios = [a / b for a, b in zip(left, right, strict=False)]
+        rows.append([_label(name), _join(left, ".3g"), _join(right, ".3g"), _join(ratios, ".2f")])
+    return console.grid("Statistics", ["", "this dataset", "paper", "ratio"], rows)
 
 
 def _label(name: str) -> str:
@@ -102,5 +97,5 @@ def _axes(value: float | list[float]) -> list[float]:
     return value if isinstance(value, list) else [value]
 
 
-def _row(numbers: list[float], form: str) -> str:
-    return " ".join(format(number, form) for number in numbers)
+def _join(numbers: list[float], number_format: str) -> str:
+    return " ".join(format(number, number_format) for number in numbers)

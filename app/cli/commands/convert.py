@@ -8,26 +8,24 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.cli.options import Json, SkipBad, TaskName, check, dataset, size
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
 
 
 def convert(
-    task: TaskName,
-    data: Annotated[
-        Path, typer.Option("--data", metavar="FILE|DIR", help="Files of others: see docs/data.md for which are known.")
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.h5", help="Where to write the episodes.")],
-    skip_bad: SkipBad = False,
-    json: Json = None,
+    task: opt.TaskName,
+    data: Annotated[Path, typer.Option(metavar="FILE|DIR", help="Files in a supported format (docs/data.md).")],
+    output: opt.DatasetPath,
+    skip_bad: opt.SkipBad = False,
+    json: opt.Json = None,
 ) -> None:
-    """Turn others' files into one HDF5 file of ours.
+    """Convert external data to a Beliefscope HDF5 file.
 
-    Every command takes them as they are; a converted file opens faster and has the same hash. Known are the pushes of
-    the MIT data set and the files of the paper's authors.
+    Every command also reads the external files directly; a converted file opens faster and has the same hash.
+    Supported are the MIT Push dataset and the files published with the paper.
 
     \b
     Examples:
@@ -37,22 +35,22 @@ def convert(
     from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.store import write_dataset
 
-    check(output, json)
-    known = load_task(task)
-    with dataset(known, data, skip_bad) as episodes, console.progress("Converting") as advance:
+    opt.check_output(output)
+    target = load_task(task)
+    with opt.open_episodes(target, data, skip_bad) as episodes, console.progress("Converting") as advance:
 
-        def counted() -> Iterator[Episode]:
+        def read() -> Iterator[Episode]:
             for index in range(len(episodes)):
                 yield episodes[index]
                 advance((index + 1) / len(episodes))
 
-        write_dataset(output, known, counted())
+        write_dataset(output, target, read())
         document = {
-            "task": known.name,
+            "task": target.name,
             "episodes": len(episodes),
-            "left_out": list(episodes.left_out),
+            "left_out": list(episodes.skipped),
             "data_hash": episodes.hash,
             "path": str(output),
             "bytes": output.stat().st_size,
         }
-    console.result(document, f"{size(output)}: {document['episodes']} episodes of {known.name}", json)
+    console.result(document, f"{opt.path_and_size(output)}: {document['episodes']} episodes of {target.name}", json)

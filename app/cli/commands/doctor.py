@@ -7,25 +7,23 @@ from typing import Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
-from beliefscope.app.cli.options import Json, check, whole
 
 
 def doctor(
-    workspace: Annotated[
-        Path, typer.Option("--workspace", metavar="DIR", help="Folder that a server would keep things in.")
-    ] = Path("workspace"),
-    host: Annotated[str, typer.Option("--host", help="Address that a server would listen on.")] = "127.0.0.1",
+    workspace: Annotated[Path, typer.Option(metavar="DIR", help="Workspace folder of the server.")] = Path("workspace"),
+    host: Annotated[str, typer.Option(help="Address the server would listen on.")] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option("--port", parser=whole(0, 65535), metavar="N", help="Port that a server would listen on.")
+        int, typer.Option(parser=opt.integer(0, 65535), metavar="N", help="Port the server would listen on.")
     ] = 8000,
-    json: Json = None,
+    json: opt.Json = None,
 ) -> None:
-    """Check this installation, and say what to do.
+    """Check the installation and suggest fixes.
 
-    Each part is tried: packages and their versions, PyTorch, the simulation and its camera, the hashes of what ships,
-    the page's files, the port, the workspace and its disk. Ends with 1 where something fails that is needed. The JSON
-    goes into a bug report; it holds no names of users.
+    Checks packages and their versions, PyTorch, the simulation and its camera, hashes of the built-in filters and
+    data, files of the dashboard, the port, the workspace and free disk space. Exits with 1 if a required check fails.
+    The JSON output is meant for bug reports and contains no user names.
 
     \b
     Examples:
@@ -33,16 +31,15 @@ def doctor(
       beliefscope doctor --workspace runs --port 9000
       beliefscope doctor --json -
     """
-    from beliefscope.app.cli.checks import Place, examined, report
+    from beliefscope.app.cli.checks import Place, report, run_checks
 
-    check(None, json)
-    found = examined(Place(workspace, host, port))
+    findings = run_checks(Place(workspace, host, port))
     lines = []
-    for name, one in found.items():
-        lines.append(f"{one.state:<8}{name:<11}{one.says}")
-        lines += [f"{'':<19}-> {one.do}"] if one.do else []
-    failed = sum(one.state == "failed" for one in found.values())
-    lines += ["", f"{failed} of {len(found)} failed" if failed else "All that is needed is there."]
-    output.result(report(found), "\n".join(lines), json)
+    for name, finding in findings.items():
+        lines.append(f"{finding.state:<8}{name:<11}{finding.message}")
+        lines += [f"{'':<19}-> {finding.advice}"] if finding.advice else []
+    failed = sum(finding.state == "failed" for finding in findings.values())
+    lines += ["", f"{failed} of {len(findings)} checks failed" if failed else "All required checks passed."]
+    output.result(report(findings), "\n".join(lines), json)
     if failed:
         raise typer.Exit(1)

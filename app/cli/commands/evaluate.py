@@ -7,45 +7,30 @@ from typing import Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
-from beliefscope.app.cli.options import (
-    DataPath,
-    FaultsText,
-    FilterName,
-    Json,
-    Particles,
-    Seed,
-    SkipBad,
-    TaskName,
-    check,
-    checkpoint,
-    dataset,
-    faults,
-    faults_text,
-)
 from beliefscope.datasets.errors import BadInput
 
 
 def evaluate(
-    task: TaskName,
-    filter_: FilterName,
-    data: DataPath = None,
-    skip_bad: SkipBad = False,
-    faults_: FaultsText = "",
+    task: opt.TaskName,
+    filter_: opt.FilterName,
+    data: opt.DataPath = None,
+    skip_bad: opt.SkipBad = False,
+    faults_: opt.FaultsText = "",
     only: Annotated[
-        str | None,
-        typer.Option("--only", metavar="MODALITY", help="Let one modality decide alone, whatever the weights say."),
+        str | None, typer.Option(metavar="MODALITY", help="Use only this modality, overriding the fusion weights.")
     ] = None,
-    particles: Particles = 300,
-    seed: Seed = 0,
-    json: Json = None,
+    particles: opt.Particles = 300,
+    seed: opt.Seed = 0,
+    json: opt.Json = None,
 ) -> None:
-    """Measure a filter on held-out episodes.
+    """Measure the accuracy of a filter on held-out episodes.
 
-    On the episodes kept for tests; on those for validation, or all, where there are none. Each starts at the true state
-    with covariance 0.1 I in standardised units, and its first 30 steps do not count. Over all other steps: RMSE; nll,
-    the negative log-likelihood of the truth in nats; nees, the normalised squared error, 1 where the covariance is
-    right; coverage95, the share of steps whose truth lies within the 95 % ellipsoid.
+    Uses the test episodes; if there are none, the validation episodes or all. Each run starts at the true state with
+    covariance 0.1 I in standardised units, and its first 30 steps are excluded. Reports the RMSE; nll, the negative
+    log-likelihood of the truth in nats; nees, the normalised estimation error squared per dimension, 1 for a
+    calibrated covariance; coverage95, the fraction of steps with the truth inside the 95 % ellipsoid.
 
     \b
     Examples:
@@ -55,18 +40,17 @@ def evaluate(
       beliefscope evaluate door --filter crossmodal-pf --faults delay=haptics:steps=5 --only haptics
     """
     from beliefscope.filters.evaluate import evaluate as measure
-    from beliefscope.filters.external.load import Foreign
+    from beliefscope.filters.external.load import ExternalFilter
 
-    check(None, json)
-    text, alone = without_only(faults_text(faults_))
-    tested = checkpoint(task, filter_)
-    broken, only = faults(text, tested.task), only or alone
-    with dataset(tested.task, data, skip_bad) as episodes, output.progress("Evaluating") as advance:
+    text, modality = _split_only(opt.read_faults(faults_))
+    checkpoint = opt.open_checkpoint(task, filter_)
+    faults, only = opt.parse_faults(text, checkpoint.task), only or modality
+    with opt.open_episodes(checkpoint.task, data, skip_bad) as episodes, output.progress("Evaluating") as advance:
         held_out = episodes.held_out()
         metrics = measure(
-            tested if isinstance(tested, Foreign) else tested.filter,
+            checkpoint if isinstance(checkpoint, ExternalFilter) else checkpoint.filter,
             [episodes[i] for i in held_out],
-            faults=broken,
+            faults=faults,
             only=only,
             particles=particles,
             seed=seed,
@@ -75,25 +59,26 @@ def evaluate(
         data_hash = episodes.hash
     document = {
         "task": task,
-        "filter": tested.name,
-        "checkpoint_hash": tested.hash,
+        "filter": checkpoint.name,
+        "checkpoint_hash": checkpoint.hash,
         "data_hash": data_hash,
         "episodes": len(held_out),
-        "faults": broken.to_json(),
+        "faults": faults.to_json(),
         "only": only,
-        "particles": particles if tested.kind == "pf" else None,
+        "particles": particles if checkpoint.kind == "pf" else None,
         "seed": seed,
         **metrics,
     }
-    rows = {f"rmse {name}": value for name, value in metrics["rmse"].items()}
-    rows |= {name: value for name, value in metrics.items() if name != "rmse"}
-    table = output.table({name: "none" if value is None else f"{value:.2f}" for name, value in rows.items()})
-    what = f"{tested.name} ({tested.hash[:12]}) on {len(held_out)} episodes" + (f" with {broken}" if broken else "")
-    output.result(document, f"{what}\n{table}", json)
+    values = {f"rmse {name}": value for name, value in metrics["rmse"].items()}
+    values |= {name: value for name, value in metrics.items() if name != "rmse"}
+    title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {len(held_out)} episodes"
+    rows = [[name, None if value is None else f"{value:8.2f}"] for name, value in values.items()]
+    table = output.grid(title + (f" with {faults}" if faults else ""), ["measure", "value"], rows)
+    output.result(document, table, json)
 
 
-def without_only(text: str) -> tuple[str, str | None]:
-    """A faults, and the modality of ``--only``, which older scripts name in the faults: ``{"only": "image"}``."""
+def _split_only(text: str) -> tuple[str, str | None]:
+    """Faults without, and value of, the former JSON key ``only``, which older scripts use instead of ``--only``."""
     try:
         value = json_format.loads(text)
     except (ValueError, RecursionError):
@@ -102,5 +87,5 @@ def without_only(text: str) -> tuple[str, str | None]:
         return text, None
     only = value.pop("only")
     if not isinstance(only, str):
-        raise BadInput(f"faults's 'only' is {only!r}, not a modality's name")
+        raise BadInput(f"key 'only' of the faults is {only!r}, not the name of a modality")
     return json_format.dumps(value), only

@@ -7,21 +7,21 @@ from typing import Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.cli.options import Json, check, described, title, trace_in
 
 
 def export(
-    source: Annotated[Path, typer.Argument(metavar="TRACE|RUN.rrd", help="File of beliefscope trace, or a recording.")],
+    source: Annotated[Path, typer.Argument(metavar="TRACE|RUN.rrd", help="Trace file or recording.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE", help="What to write: .parquet, .mcap or .npz.")
+        Path, typer.Option("-o", "--output", metavar="FILE", help="Output file: .parquet, .mcap or .npz.")
     ],
-    json: Json = None,
+    json: opt.Json = None,
 ) -> None:
-    """Write a trace for other tools.
+    """Export a trace to Parquet, MCAP or NumPy.
 
-    Parquet has one row a step and a column for each number, for pandas and its like. MCAP has a topic for each array,
-    pictures and particles as Foxglove shows them. npz has the arrays as they are. docs/recordings.md has the names.
+    Parquet has one row per step and one column per number, for pandas and similar tools. MCAP has one topic per array,
+    and images and particles in Foxglove's schemas. npz has the arrays unchanged. Names: docs/recordings.md.
 
     \b
     Examples:
@@ -30,8 +30,8 @@ def export(
     """
     from beliefscope.recordings.export import export_format, export_trace
 
-    check(output, json)
+    opt.check_output(output)
     export_format(output)
-    found = trace_in(source)
-    export_trace(found, output)
-    console.result(described(found, output), title(found, output), json)
+    trace = opt.open_trace(source)
+    export_trace(trace, output)
+    console.result(opt.trace_document(trace, output), opt.trace_summary(trace, output), json)

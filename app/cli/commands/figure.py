@@ -2,60 +2,44 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.cli.options import (
-    DataPath,
-    EpisodeIndex,
-    FaultsText,
-    FilterName,
-    Json,
-    Particles,
-    Seed,
-    SkipBad,
-    TaskName,
-    check,
-    described,
-    one_run,
-    title,
-    whole,
-)
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.datasets.errors import BadInput, unknown_name
 
 KINDS = ("maps", "weights")
 
 
 def figure(
-    kind: Annotated[str, typer.Argument(metavar="maps|weights", help="Which of the two figures.")],
-    task: TaskName,
-    filter_: FilterName,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FIGURE", help="A figure: .svg, .pdf or .png.")],
-    data: DataPath = None,
-    skip_bad: SkipBad = False,
-    episode: EpisodeIndex = None,
+    kind: Annotated[str, typer.Argument(metavar="maps|weights", help="Kind of figure.")],
+    task: opt.TaskName,
+    filter_: opt.FilterName,
+    output: opt.FigurePath,
+    data: opt.DataPath = None,
+    skip_bad: opt.SkipBad = False,
+    episode: opt.EpisodeIndex = None,
     steps: Annotated[
         list[int] | None,
         typer.Option(
             "--step",
-            parser=whole(0),
+            parser=opt.integer(0),
             metavar="T",
-            help="Of the maps, in place of the middle of the longest stretch: one in contact, one not, or both by "
-            "giving it twice.",
+            help="Step of a map: one in contact, one in free motion, or both (repeat the option). Default: the middle "
+            "of the longest stretch of each.",
         ),
     ] = None,
-    faults_: FaultsText = "",
-    particles: Particles = 300,
-    seed: Seed = 0,
-    json: Json = None,
+    faults_: opt.FaultsText = "",
+    particles: opt.Particles = 300,
+    seed: opt.Seed = 0,
+    json: opt.Json = None,
 ) -> None:
-    """Draw a figure of the paper from a filter's run.
+    """Draw a figure of the paper from a filter run.
 
-    maps: the likelihood of each modality over the square about the truth, of touch without contact and in contact.
-    weights: each modality's and the fused estimate over the steps, and the fusion weights below, with contact behind.
+    maps: likelihood of each modality around the true position, in free motion and in contact. weights: estimates of
+    each modality and of the fused filter over time, with the fusion weights below and contact shaded.
 
     \b
     Examples:
@@ -66,22 +50,22 @@ def figure(
     from beliefscope.inspect.figures import paper
     from beliefscope.inspect.likelihood import no_maps
 
-    check(output, json)
+    opt.check_output(output)
     if kind not in KINDS:
-        raise one_of("figure", kind, KINDS)
+        raise unknown_name("figure", kind, KINDS)
     figure_format(output)
     if kind == "weights" and steps:
-        raise BadInput(f"--step {steps[0]}: the weights are drawn over all steps; only maps have a step")
-    loaded, made = one_run(task, filter_, data, skip_bad, episode, faults_, particles, seed)
+        raise BadInput(f"--step {steps[0]}: the figure of weights covers all steps; only maps have a step")
+    checkpoint, trace = opt.run_filter(task, filter_, data, skip_bad, episode, faults_, particles, seed)
     document: dict[str, Any] = {"figure": kind}
     if kind == "maps":
-        if why := no_maps(loaded, made):
-            raise BadInput(why)
-        chosen = paper.steps_by_contact(made, steps or ())
-        if False not in chosen:
-            console.say(f"episode {made.episode_index} is in contact at every step: no map without")
-        write_figure(paper.maps_figure(loaded, made, chosen), output)
-        document["shown"] = {paper.STATES[state]: step for state, step in chosen.items()}
+        if reason := no_maps(checkpoint, trace):
+            raise BadInput(reason)
+        selection = paper.steps_by_contact(trace, steps or ())
+        if False not in selection:
+            console.note(f"episode {trace.episode_index} is in contact at every step: no map of free motion")
+        write_figure(paper.maps_figure(checkpoint, trace, selection), output)
+        document["shown"] = {paper.STATES[state]: step for state, step in selection.items()}
     else:
-        write_figure(paper.weights_figure(made), output)
-    console.result(document | described(made, output), title(made, output), json)
+        write_figure(paper.weights_figure(trace), output)
+    console.result(document | opt.trace_document(trace, output), opt.trace_summary(trace, output), json)

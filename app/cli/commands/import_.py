@@ -7,22 +7,19 @@ from typing import Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.cli.options import Json, check, described, recording_in, title
 
 
-def restore(
-    recording: Annotated[
-        Path, typer.Argument(metavar="RUN.rrd|RUN.live", help="File of beliefscope record or live, or of the page.")
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="TRACE", help="Where to write the trace.")],
-    json: Json = None,
+def import_(
+    recording: Annotated[Path, typer.Argument(metavar="RUN.rrd|RUN.live", help="Recording, or file of a live run.")],
+    output: opt.TracePath,
+    json: opt.Json = None,
 ) -> None:
-    """Get the trace out of a recording.
+    """Extract the trace from a recording.
 
-    The very numbers of the trace that the recording was made from, in their own types, so that all that is computed
-    from it is the same: beliefscope inspect says the same of both. Of a live run that goes on, or was killed: the steps
-    that there are.
+    The arrays equal those of the recorded trace, including their types, so all diagnostics give the same results. Of
+    a live run that is in progress or was killed, the complete steps are extracted.
 
     \b
     Examples:
@@ -31,10 +28,7 @@ def restore(
     """
     from beliefscope.inspect.trace import save_trace
 
-    check(output, json)
-    found = recording_in(recording)
-    save_trace(found, output)
-    console.result(described(found, output), title(found, output), json)
-
-
-restore.__name__ = "import"  # which no function can be defined as
+    opt.check_output(output)
+    trace = opt.open_recording(recording)
+    save_trace(trace, output)
+    console.result(opt.trace_document(trace, output), opt.trace_summary(trace, output), json)

@@ -6,109 +6,103 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
-from beliefscope.app.cli.options import FilterName, Json, TaskName, check, checkpoint, whole
 
 if TYPE_CHECKING:
     from beliefscope.filters.finetuning.module_selection import Node
 
 Freeze = Annotated[
     list[str] | None,
-    typer.Option(
-        "--freeze",
-        metavar="PATTERN",
-        help="Leave these parts as they are: dotted names, * for any text. May be given several times.",
-    ),
+    typer.Option(metavar="PATTERN", help="Freeze these modules: dotted names, * matches any text. Repeatable."),
 ]
 Train = Annotated[
     list[str] | None,
     typer.Option(
-        "--train",
-        "--preset",
         metavar="PRESET|PATTERN",
-        help="Train only these: haptics-only, image-only, weights-only, noise-only, dynamics-only, heads-only, all, or "
-        "patterns. May be given several times. Without it: all that is not frozen.",
+        help="Train only these modules: haptics-only, image-only, weights-only, noise-only, dynamics-only, heads-only, "
+        "all, or patterns. Repeatable. Default: all modules that are not frozen.",
     ),
 ]
 
 
 def modules(
-    task: TaskName,
-    filter_: FilterName,
+    task: opt.TaskName,
+    filter_: opt.FilterName,
     train: Train = None,
     freeze: Freeze = None,
-    depth: Annotated[int, typer.Option("--depth", parser=whole(0), metavar="N", help="So many levels.")] = 3,
-    json: Json = None,
+    depth: Annotated[int, typer.Option(parser=opt.integer(0), metavar="N", help="Levels to print.")] = 3,
+    json: opt.Json = None,
 ) -> None:
-    """Show what a filter is made of.
+    """Show the modules of a filter.
 
-    Every module by its dotted name, with its number of parameters, whether beliefscope finetune would train it with
-    the same options, and what it does. Of a fine-tuned filter also what its training did: the gradient's size, and how
-    far the weights went.
+    Lists every module by its dotted name with its number of parameters, its purpose, and whether beliefscope finetune
+    with the same options would train it. For a fine-tuned filter, also lists the gradient norm and the relative change
+    of the weights.
 
-    \\b
+    \b
     Examples:
       beliefscope modules door --filter crossmodal-ekf
       beliefscope modules door --filter crossmodal-pf --train haptics-only --train weights-only
       beliefscope modules door --filter crossmodal-ekf --freeze 'virtual_sensors.image' --freeze dynamics --json -
     """
-    from beliefscope.filters.external.load import Foreign
-    from beliefscope.filters.finetuning.module_selection import chosen, presets, tree
+    from beliefscope.filters.external.load import ExternalFilter
+    from beliefscope.filters.finetuning.module_selection import module_change, module_tree, presets, select_parameters
 
-    check(None, json)
-    loaded = checkpoint(task, filter_)
-    module = loaded.adapter.module if isinstance(loaded, Foreign) else loaded.filter
-    nodes, named = tree(module, chosen(module, train or (), freeze or ())), presets(module)
-    ran = loaded.record.get("parts", {})
+    checkpoint = opt.open_checkpoint(task, filter_)
+    module = checkpoint.adapter.module if isinstance(checkpoint, ExternalFilter) else checkpoint.filter
+    nodes, groups = module_tree(module, select_parameters(module, train or (), freeze or ())), presets(module)
+    parts = checkpoint.record.get("parts", {})
     document = {
         "task": task,
-        "filter": loaded.name,
-        "checkpoint_hash": loaded.hash,
-        "presets": {name: list(patterns) for name, patterns in named.items()},
-        "modules": [_as_json(node, ran) for node in nodes],
+        "filter": checkpoint.name,
+        "checkpoint_hash": checkpoint.hash,
+        "presets": {name: list(patterns) for name, patterns in groups.items()},
+        "modules": [
+            {
+                "name": node.name,
+                "class": node.kind,
+                "description": node.description,
+                "parameters": node.parameters,
+                "buffers": node.buffers,
+                "trained": node.trained,
+                "state": node.state,
+            }
+            | module_change(node.name, parts)
+            for node in nodes
+        ],
     }
-    what = f"{loaded.name} ({loaded.hash[:12]}): {nodes[0].parameters:,} parameters"
-    lines = [what, "", text([node for node in nodes if node.depth <= depth], ran), "", "Presets for --train"]
-    lines += [f"  {name}: {', '.join(patterns)}" for name, patterns in named.items()]
+    lines = [f"{checkpoint.name} ({checkpoint.hash[:12]}): {nodes[0].parameters:,} parameters", ""]
+    lines += [_table([node for node in nodes if node.depth <= depth], parts), "", "Presets for --train"]
+    lines += [f"  {name}: {', '.join(patterns)}" for name, patterns in groups.items()]
     output.result(document, "\n".join(lines), json)
 
 
-def _as_json(node: Node, ran: dict[str, list[float]]) -> dict[str, object]:
-    from beliefscope.filters.finetuning.module_selection import moved
-
-    values = {"name": node.name, "class": node.kind, "says": node.says, "parameters": node.parameters}
-    return values | {"buffers": node.buffers, "trained": node.trained, "state": node.state} | moved(node.name, ran)
-
-
-def text(nodes: list[Node], ran: dict[str, list[float]]) -> str:
-    """The tree, with columns that fit it."""
+def _table(nodes: list[Node], parts: dict[str, list[float]]) -> str:
+    """The module tree as a table. parts: gradient and weight change by parameter, if fine-tuned."""
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    from beliefscope.filters.finetuning.module_selection import moved
+    from beliefscope.filters.finetuning.module_selection import module_change
 
-    grid = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in ("module", "class"):
-        grid.add_column(name, no_wrap=True)
-    grid.add_column("parameters", justify="right")
-    grid.add_column("state")
-    for name in ("gradient", "change") if ran else ():
-        grid.add_column(name, justify="right")
-    grid.add_column("what it does", no_wrap=True)
+        table.add_column(name, no_wrap=True)
+    table.add_column("parameters", justify="right")
+    table.add_column("state")
+    for name in ("gradient", "change") if parts else ():
+        table.add_column(name, justify="right")
+    table.add_column("purpose", no_wrap=True)
     for node in nodes:
         label = Text("  " * node.depth + (node.name.rpartition(".")[2] or "(filter)"))
         size = f"{node.parameters:,}" if node.parameters else f"{node.buffers:,} fixed" if node.buffers else ""
         row: list[str | Text] = [label, node.kind, size, node.state]
-        if ran:
-            found = moved(node.name, ran)
+        if parts:
+            change = module_change(node.name, parts)
             row += [
-                f"{found['gradient']:.2g}" if found["gradient"] else "-",
-                f"{100 * found['change']:.2g} %" if found["change"] else "-",
+                f"{change['gradient']:.2g}" if change["gradient"] else "-",
+                f"{100 * change['change']:.2g} %" if change["change"] else "-",
             ]
-        grid.add_row(*row, Text(node.says))
-    view = Console(width=1000, color_system=None)
-    with view.capture() as capture:
-        view.print(grid)
-    return "\n".join(line.rstrip() for line in capture.get().strip("\n").splitlines())
+        table.add_row(*row, Text(node.description))
+    return output.render(table)

@@ -7,40 +7,32 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.cli.options import Json, described, of_one_run, title, whole
 
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.inspect.trace import Trace
 
 
-@of_one_run
+@opt.with_run_options
 def record(
     checkpoint: Checkpoint,
-    made: Trace,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN.rrd", help="Where to write the recording.")],
+    trace: Trace,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN.rrd", help="Output recording.")],
     maps: Annotated[
-        int,
-        typer.Option(
-            "--maps", parser=whole(0), metavar="STRIDE", help="Likelihood maps of each STRIDE-th step; 0: none."
-        ),
+        int, typer.Option(parser=opt.integer(0), metavar="STRIDE", help="Likelihood maps every STRIDE steps; 0: none.")
     ] = 10,
     map_size: Annotated[
-        int, typer.Option("--map-size", parser=whole(2, 1024), metavar="S", help="Cells along a side of each map.")
+        int, typer.Option(parser=opt.integer(2, 1024), metavar="S", help="Cells per side of a map.")
     ] = 135,
-    diagnostics: Annotated[
-        bool,
-        typer.Option(
-            "--diagnostics/--no-diagnostics", help="With every diagnostic that applies and is not slow, a tab for each."
-        ),
-    ] = True,
-    json: Json = None,
+    diagnostics: Annotated[bool, typer.Option(help="Include every applicable fast diagnostic, one tab each.")] = True,
+    json: opt.Json = None,
 ) -> None:
-    """Write one episode as a Rerun recording.
+    """Record a filter run over one episode as a Rerun recording.
 
-    Pictures, particles or ellipses, estimates beside the truth, fusion weights, contact, errors, likelihood maps and
-    diagnostics, with their layout. Open it with: rerun run.rrd.
+    Contains images, particles or covariance ellipses, estimates with the true state, fusion weights, contact, errors,
+    likelihood maps and diagnostics, and their layout. Open it with: rerun run.rrd
 
     \b
     Examples:
@@ -52,15 +44,13 @@ def record(
     from beliefscope.inspect.likelihood import MapEngine, no_maps
     from beliefscope.recordings.write import write_recording
 
-    if maps and (why := no_maps(checkpoint, made)):
-        console.say(f"without maps: {why}")
+    if maps and (reason := no_maps(checkpoint, trace)):
+        console.note(f"no likelihood maps: {reason}")
         maps = 0
-    layers = MapEngine(checkpoint, made).maps(range(0, len(made), maps), map_size) if maps else None
-    found = quick(made, checkpoint) if diagnostics else {}
+    layers = MapEngine(checkpoint, trace).maps(range(0, len(trace), maps), map_size) if maps else None
+    results = quick(trace, checkpoint) if diagnostics else {}
     with console.progress("Recording") as advance:
-        write_recording(made, output, maps=layers, progress=advance, diagnostics=found)
-    console.result(
-        described(made, output) | {"maps": maps, "map_size": map_size, "diagnostics": list(found)},
-        title(made, output),
-        json,
-    )
+        write_recording(trace, output, maps=layers, progress=advance, diagnostics=results)
+    document = opt.trace_document(trace, output)
+    document |= {"maps": maps, "map_size": map_size, "diagnostics": list(results)}
+    console.result(document, opt.trace_summary(trace, output), json)

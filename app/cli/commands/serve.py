@@ -4,78 +4,81 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
-from beliefscope.app.cli.options import Seed, is_code, whole
-from beliefscope.datasets.errors import BadInput, one_of
+from beliefscope.app.runs.command_lines import is_code
+from beliefscope.datasets.errors import unknown_name
+
+if TYPE_CHECKING:
+    from beliefscope.filters.checkpoint import Checkpoint
+
+Port = Annotated[int, typer.Option(parser=opt.integer(0, 65535), metavar="N", help="Port; 0 selects a free one.")]
+Host = Annotated[str, typer.Option(help="Address to listen on. Any but the loopback address requires a token.")]
+Token = Annotated[bool, typer.Option("--token", help="Require a token on the loopback address too (shared machines).")]
+ReadOnly = Annotated[
+    bool, typer.Option("--read-only", help="Read-only server: disable recording, computation, training and deletion.")
+]
+HostNames = Annotated[
+    list[str] | None,
+    typer.Option("--allow-host", metavar="NAME", help="Additional host name of this machine. Repeatable."),
+]
+Tasks = Annotated[
+    list[str] | None, typer.Option("--task", metavar="FILE.py:NAME", help="Custom task to serve. Repeatable.")
+]
+DataPaths = Annotated[
+    list[Path] | None, typer.Option("--data", metavar="FILE|DIR", help="Additional episodes to serve. Repeatable.")
+]
+Filters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--filter",
+        metavar="CHECKPOINT|MODULE:BUILD",
+        help="Additional filter to serve. Repeatable. An external filter (docs/own_filter.md) is for its own task or, "
+        "if it has none, for the one given with --task.",
+    ),
+]
+Studies = Annotated[
+    list[Path] | None, typer.Option("--study", metavar="DIR", help="Folder of a study to serve. Repeatable.")
+]
+Views = Annotated[int, typer.Option(parser=opt.integer(1, 1024), metavar="N", help="Maximum number of open pages.")]
+OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the dashboard in a browser.")]
+LogLevel = Annotated[
+    str, typer.Option(metavar="LEVEL", help="Log level on standard error: debug, info, warning or error.")
+]
+LogFormat = Annotated[str, typer.Option(metavar="NAME", help="Log format: text or json.")]
 
 
 def serve(
-    port: Annotated[
-        int, typer.Option("--port", parser=whole(0, 65535), metavar="N", help="0 takes any free one.")
-    ] = 8000,
-    host: Annotated[
-        str, typer.Option("--host", help="Address to listen on; one that others can reach demands a token.")
-    ] = "127.0.0.1",
-    token: Annotated[
-        bool, typer.Option("--token", help="Demand a token on this machine too, where others work on it.")
-    ] = False,
-    read_only: Annotated[
-        bool, typer.Option("--read-only", help="Show, but let nobody write, compute, train or delete anything.")
-    ] = False,
-    allow_host: Annotated[
-        list[str] | None,
-        typer.Option("--allow-host", metavar="NAME", help="Another name of this machine; may be given again."),
-    ] = None,
-    workspace: Annotated[
-        Path, typer.Option("--workspace", metavar="DIR", help="Folder for recordings and traces; made if missing.")
-    ] = Path("workspace"),
-    task: Annotated[
-        list[str] | None,
-        typer.Option("--task", metavar="FILE.py:NAME", help="A task of your own to show; may be given again."),
-    ] = None,
-    data: Annotated[
-        list[Path] | None,
-        typer.Option("--data", metavar="FILE|DIR", help="Episodes to show beside those that ship; may be given again."),
-    ] = None,
-    filter_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--filter",
-            "--checkpoint",
-            metavar="CHECKPOINT|MODULE:BUILD",
-            help="A filter to show beside those that ship; may be given again. One of your own (docs/own_filter.md) is "
-            "for the task that it names, or the one that --task does.",
-        ),
-    ] = None,
-    study: Annotated[
-        list[Path] | None,
-        typer.Option("--study", metavar="DIR", help="Folder of a study to show; may be given again."),
-    ] = None,
-    views: Annotated[
-        int,
-        typer.Option("--views", parser=whole(1, 1024), metavar="N", help="Pages that may be open at a time."),
-    ] = 32,
-    open_page: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = False,
-    log_level: Annotated[
-        str, typer.Option("--log-level", metavar="LEVEL", help="On standard error: debug, info, warning or error.")
-    ] = "warning",
-    log_format: Annotated[str, typer.Option("--log-format", metavar="NAME", help="text or json.")] = "text",
-    seed: Seed = 0,
+    port: Port = 8000,
+    host: Host = "127.0.0.1",
+    token: Token = False,
+    read_only: ReadOnly = False,
+    allow_host: HostNames = None,
+    workspace: opt.Workspace = Path("workspace"),
+    task: Tasks = None,
+    data: DataPaths = None,
+    filter_: Filters = None,
+    study: Studies = None,
+    views: Views = 32,
+    open_page: OpenPage = False,
+    log_level: LogLevel = "warning",
+    log_format: LogFormat = "text",
+    seed: opt.Seed = 0,
 ) -> None:
-    """Serve the page: replay, maps and weights.
+    """Serve the dashboard: replay, maps and weights.
 
-    Shows the filters and the episodes that ship, and before them those that are given. Prints the page's address on
-    one line once it listens; Ctrl-C ends it. For the page of another machine, leave the host as it is and forward
-    the port: ssh -L 8000:127.0.0.1:8000 MACHINE. With --host others can reach it too: the address that is printed then
-    holds a token, without which nobody is let in. BELIEFSCOPE_TOKEN in the environment is one of your own.
-    docs/security.md has what guards against what, docs/operations.md what a server needs that runs for days.
+    Serves the built-in filters and episodes and any others given. Prints the address once the server listens; stop it
+    with Ctrl-C. To use the dashboard from another machine, keep the default host and forward the port: ssh -L
+    8000:127.0.0.1:8000 MACHINE. Alternatively, --host makes the server reachable directly; the printed address then
+    contains the required token. Set BELIEFSCOPE_TOKEN in the environment to choose the token. Security:
+    docs/security.md; long-running servers: docs/operations.md.
 
     \b
     Examples:
@@ -87,67 +90,70 @@ def serve(
       beliefscope serve --task door --filter examples/04_own_filter.py:build
       beliefscope serve --task examples/own_task.py:TASK --data own.h5 --filter own.safetensors
     """
-    from beliefscope.app.api.studies import SHIPPED, Study
     from beliefscope.app.runs.catalog import SAMPLE, short_names
-    from beliefscope.app.runs.trace_store import Settings
+    from beliefscope.app.runs.settings import Settings
     from beliefscope.app.server import logs
-    from beliefscope.app.server.auth import LOOPBACK, Access, names_of, token_for
+    from beliefscope.app.server.auth import LOOPBACK, Access, host_names, token_for
     from beliefscope.app.server.main import serve as serve_until_signal
-    from beliefscope.datasets.catalog import TASKS, load_task
-    from beliefscope.filters.catalog import filters_of
-    from beliefscope.filters.external.load import load_foreign
+    from beliefscope.app.workspace.studies import SHIPPED, Study
 
-    check_workspace(workspace)
-
-    for what, value, available in (("log level", log_level, logs.LEVELS), ("log format", log_format, logs.FORMATS)):
+    opt.check_workspace(workspace)
+    for kind, value, available in (("log level", log_level, logs.LEVELS), ("log format", log_format, logs.FORMATS)):
         if value not in available:
-            raise one_of(what, value, available)
+            raise unknown_name(kind, value, available)
     access = Access(token_for(host, token, os.environ), read_only)
-    logs.begin(log_level, log_format, access.token)
-
-    named = [load_task(name).name for name in task or ()]
-    code = [name for name in filter_ or () if is_code(name)]
-    paths = [Path(name) for name in filter_ or () if not is_code(name)]
-    foreign = [load_foreign(name, unsaid=named[0] if len(named) == 1 else "") for name in code]
-    shipped = {name for known in TASKS.values() for name in filters_of(known)}
+    logs.configure(log_level, log_format, access.token)
     settings = Settings(
         workspace=workspace,
         data=short_names(data or (), {SAMPLE}),
-        checkpoints={**short_names(paths, shipped), **{one.name: one for one in foreign}},
-        hosts=(*names_of(host), *(allow_host or ())),
+        checkpoints=_checkpoints(filter_ or (), task or ()),
+        hosts=(*host_names(host), *(allow_host or ())),
         seed=seed,
         views=views,
         tasks=tuple(task or ()),
         studies=short_names(study or (), {SHIPPED}),
     )
     for name, folder in settings.studies.items():
-        Study(name, folder, checkpoints=True).read()  # or it is not served
-    with _opening(workspace, bool(access.token)) as open_in_browser:
+        Study(name, folder, has_checkpoints=True).read()  # raises BadInput early
+    with _browser_opener(workspace, bool(access.token)) as open_in_browser:
 
         def listening(url: str) -> None:
             if host not in LOOPBACK:
-                output.say(
-                    "warning: others can reach this server: who has its link can use it, and all goes unencrypted"
-                )
-            print(f"Beliefscope is at {url} (Ctrl-C ends it)", flush=True)
+                output.note("warning: anyone with the link can use this server, and the connection is not encrypted")
+            print(f"Beliefscope is at {url} (press Ctrl-C to stop)", flush=True)
             if open_page:
                 open_in_browser(url)
 
-        serve_until_signal(settings, host=host, port=port, listening=listening, access=access)
+        serve_until_signal(settings, host=host, port=port, on_start=listening, access=access)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # it has ended in peace; Python takes another moment for its own end
+        signal.signal(number, signal.SIG_IGN)  # the server has stopped; do not interrupt interpreter shutdown
+
+
+def _checkpoints(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path | Checkpoint]:
+    """Displayed name -> checkpoint file or external filter, of the filters and tasks on the command line."""
+    from beliefscope.app.runs.catalog import short_names
+    from beliefscope.datasets.catalog import TASKS, load_task
+    from beliefscope.filters.catalog import filters_of
+    from beliefscope.filters.external.load import load_external
+
+    names = [load_task(name).name for name in tasks]
+    default_task = names[0] if len(names) == 1 else ""
+    external = [load_external(name, default_task=default_task) for name in filters if is_code(name)]
+    paths = [Path(name) for name in filters if not is_code(name)]
+    pretrained = {name for task in TASKS.values() for name in filters_of(task)}
+    return {**short_names(paths, pretrained), **{checkpoint.name: checkpoint for checkpoint in external}}
 
 
 @contextmanager
-def _opening(workspace: Path, secret: bool) -> Iterator[Callable[[str], None]]:
-    """Gives what opens an address in the user's browser.
+def _browser_opener(workspace: Path, secret: bool) -> Iterator[Callable[[str], None]]:
+    """Yields a function that opens an address in the user's browser.
 
-    Where the address holds a token it goes through a file that only this user can read: every other user of the machine
-    sees what a browser is started with.
+    An address with a token is passed in a file that only this user can read, because other users of the machine can
+    see the browser's command line.
     """
     import webbrowser
 
-    from beliefscope.app.server.auth import onward_page
+    from beliefscope.app.server.auth import redirect_page
 
     page = workspace / f".open-{os.getpid()}.html"
 
@@ -156,18 +162,10 @@ def _opening(workspace: Path, secret: bool) -> Iterator[Callable[[str], None]]:
             webbrowser.open(url)
             return
         with open(os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
-            file.write(onward_page(url))
+            file.write(redirect_page(url))
         webbrowser.open(page.resolve().as_uri())
 
     try:
         yield open_
     finally:
         page.unlink(missing_ok=True)
-
-
-def check_workspace(workspace: Path) -> None:
-    """Raises BadInput where it is no folder, and none can be made there."""
-    if workspace.exists() and not workspace.is_dir():
-        raise BadInput(f"workspace {str(workspace)!r} is a file, not a folder")
-    if not workspace.absolute().parent.is_dir():
-        raise BadInput(f"folder {str(workspace.parent)!r} does not exist, so {workspace.name!r} cannot be made in it")

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
+from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.cli.options import Json, described, of_one_run, title
 
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.inspect.trace import Trace
 
 
-@of_one_run
-def trace(
-    checkpoint: Checkpoint,
-    made: Trace,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="TRACE", help="Where to write the trace.")],
-    json: Json = None,
-) -> None:
-    """Keep all a filter knew, step by step.
+@opt.with_run_options
+def trace(checkpoint: Checkpoint, trace: Trace, output: opt.TracePath, json: opt.Json = None) -> None:
+    """Save all internal quantities of a filter run.
 
-    Beliefs before and after each observation, what each modality alone believes, fusion weights as the network gave
-    them and as they acted, particles and their ancestors. The estimates are bit-identical to those of a run that
-    keeps nothing. In Python: beliefscope.inspect.trace.load_trace.
+    A trace contains, for every step, the beliefs before and after the observation, each modality's own update, fusion
+    weights as output by the network and effective weights, particles and their ancestors. Estimates are bit-identical
+    to those of a run without tracing. Read it in Python with beliefscope.inspect.trace.load_trace.
 
     \b
     Examples:
@@ -35,5 +27,5 @@ def trace(
     """
     from beliefscope.inspect.trace import save_trace
 
-    save_trace(made, output)
-    console.result(described(made, output), title(made, output), json)
+    save_trace(trace, output)
+    console.result(opt.trace_document(trace, output), opt.trace_summary(trace, output), json)

@@ -1,7 +1,11 @@
-/** What is copied for use elsewhere. */
+/** Access to the clipboard. */
 
-/** Into the clipboard; browsers allow it on this machine's own pages and over https. @returns {Promise<boolean>} */
-export async function copied(text) {
+/**
+ * Copies a text. Browsers without the clipboard interface, and pages that are not served securely, use a selection.
+ * @param {string} text
+ * @returns {Promise<boolean>} whether the text was copied
+ */
+export async function copyText(text) {
   try {
     await navigator.clipboard.writeText(text);
     return true;
@@ -10,8 +14,8 @@ export async function copied(text) {
     area.value = text;
     document.body.append(area);
     area.select();
-    const done = document.execCommand('copy');
+    const success = document.execCommand('copy');
     area.remove();
-    return done;
+    return success;
   }
 }

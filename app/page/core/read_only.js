@@ -1,16 +1,26 @@
-/** On a server that only shows: what would change something cannot be pressed, and says why. */
+/** Disables every control that changes something, on a read-only server. */
 
-const REASON = 'This server only shows: nothing can be computed, written or changed here';
-const CHANGES = '#save, #report, #jobs li > button, .doing > button, #finetune .start, #finetune .decide > button, #study .cells > button';
+const REASON = 'Read-only server: nothing can be computed, written or changed';
+const CONTROLS =
+  '#save, #report, #jobs li > button, .doing > button, #finetune .start, #finetune .decide > button, #study .cells > button';
 
-/** From now on. Panels make and free such buttons as they like; they are held again. @param {HTMLElement} root */
-export function hold(root) {
-  const again = () => {
-    for (const button of root.querySelectorAll(CHANGES)) {
+/**
+ * Disables the controls below an element, and those that panels add or enable later.
+ * @param {HTMLElement} root
+ */
+export function disableChanges(root) {
+  const disable = () => {
+    for (const button of root.querySelectorAll(CONTROLS)) {
+      if (!(button instanceof HTMLButtonElement)) continue;
       if (!button.disabled) button.disabled = true;
       if (button.title !== REASON) button.title = REASON;
     }
   };
-  again();
-  new MutationObserver(again).observe(root, { subtree: true, childList: true, attributes: true, attributeFilter: ['disabled', 'title'] });
+  disable();
+  new MutationObserver(disable).observe(root, {
+    subtree: true,
+    childList: true,
+    attributes: true,
+    attributeFilter: ['disabled', 'title'],
+  });
 }

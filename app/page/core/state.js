@@ -1,182 +1,350 @@
-/** The one state of the page, and its address: a pasted link opens the same moment. */
+/** The state of the page and its permalink: opening the link restores the state. */
 
-import { KINDS } from '../timeline/tracks.js';
-import { spoken } from './units.js';
+/** @import { Catalog } from '../data/api.js' */
+
+import { TRACKS } from '../timeline/tracks.js';
+import { SCENE_CHOICES } from './constants.js';
+import { displayName } from './units.js';
 
 /**
  * @typedef {object} State
- * @property {string} task @property {string} filter @property {string} data set of episodes
- * @property {number} episode index in it
- * @property {string} faults how the sensors are broken, as text (docs/data.md); empty where they are not
- * @property {string} against what differs in the other run that this one is compared with (docs/api.md); empty without one
- * @property {number} step @property {number | null} angle rad at which the maps are cut; null follows the truth
- * @property {'scene' | 'rerun' | 'diagnostics' | 'failures' | 'compare' | 'finetune' | 'study' | 'recordings'} tab
- * @property {string} component whose estimates are drawn @property {'raw' | 'acting'} weights
- * @property {string} track the lowest chart: a name of `KINDS` (tracks.js)
- * @property {string} window steps that the time line shows, as 20-60; empty for all of them
- * @property {string} diagnostic that is open, empty for the list of all
- * @property {string} options of the open one, as in an address: size=21
- * @property {'episode' | 'held-out'} over what diagnostics are made: this episode, or all that are held out
- * @property {'held-out' | 'all'} among which episodes failures are looked for @property {'moments' | 'episodes'} list what is listed of them
- * @property {string} by measure that ranks failures @property {string} group the only one that is listed, empty for all
- * @property {string} scale of the maps, `range`, `axes`, `colours`, `regions`, `cloud`, `zoom`: see `MAPS`
- * @property {string} hide layers of the 3D scene that are hidden, with commas @property {string} ground map on its floor @property {string} height it lies at @property {string} tint of particles
- * @property {string} run of fine-tuning that is open, empty for a new one
- * @property {string} study that is shown @property {string} quantity of it; empty for the first of each
- * @property {string} pin moment whose maps the shown ones are set against, as in an address; empty for none
- * @property {boolean} playing @property {number} speed
- * @property {boolean} follow whether the cursor stays at the newest step of a live run; a link without a step begins so
+ * @property {string} task
+ * @property {string} filter
+ * @property {string} data name of the data set
+ * @property {number} episode index in the data set
+ * @property {string} faults fault injection as text (docs/data.md), empty for none
+ * @property {string} against differences of the comparison run (docs/api.md), empty for none
+ * @property {number} step
+ * @property {number | null} angle rad, of the cross-section that the maps show; null for the true angle
+ * @property {string} tab one of `TABS`
+ * @property {string} component state component of the charts
+ * @property {string} weights `raw` for the fusion weights beta, or `effective`
+ * @property {string} track lowest chart: a key of `TRACKS`
+ * @property {string} window visible steps such as 20-60, empty for all
+ * @property {string} diagnostic selected diagnostic, empty for the list
+ * @property {string} options of the diagnostic, URL-encoded: size=21
+ * @property {string} over episodes of diagnostics: `episode` (the selected one) or `held-out`
+ * @property {string} among episodes searched for failures: `held-out` or `all`
+ * @property {string} list content of the list of failures: `events` or `episodes`
+ * @property {string} by score that ranks failures
+ * @property {string} phase of the failures in the list, empty for all
+ * @property {string} scale of the maps: `normalised` or `log`
+ * @property {string} range of the maps' colours: `own` of each map, or the `same` for all
+ * @property {string} axes of the maps: `offset` from the true position, or `world`
+ * @property {string} colours of the maps: `viridis` or `cividis`
+ * @property {string} regions of 50 and 95 % on the maps: `shown` or `hidden`
+ * @property {string} cloud of particles on the maps: `hidden` or `shown`
+ * @property {string} zoom of the maps: `fit`, `1` or `4`
+ * @property {string} beside maps of the comparison run: `alone` if they are not used, `gain` for the difference
+ * @property {string} hide hidden layers of the 3D scene, comma-separated
+ * @property {string} ground map on the floor of the 3D scene
+ * @property {string} height of that map: `floor` or `belief`
+ * @property {string} tint of the particles: `weight` or `share`
+ * @property {string} run selected fine-tuning run, empty for a new one
+ * @property {string} study selected study, empty for the first one
+ * @property {string} quantity of the study, empty for the first one
+ * @property {string} pin step whose maps are the reference of the displayed ones, URL-encoded; empty for none
+ * @property {boolean} playing
+ * @property {number} speed
+ * @property {boolean} follow whether the cursor stays at the newest step of a live run
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
-/** How likelihood maps are shown: the colours' scale, whether all share its range, the axes, what lies on top, what they gain on the other run. */
-const MAPS = { scale: ['normalised', 'log'], range: ['own', 'same'], axes: ['offset', 'world'], colours: ['viridis', 'cividis'], regions: ['shown', 'hidden'], zoom: ['fit', '1', '4'], cloud: ['hidden', 'shown'], beside: ['alone', 'gain'] };
-const CHOICES = { height: ['floor', 'belief'], tint: ['weight', 'share'], tab: ['scene', 'rerun', 'diagnostics', 'failures', 'compare', 'finetune', 'study', 'recordings'], weights: ['raw', 'acting'], track: Object.keys(KINDS), over: ['episode', 'held-out'], list: ['moments', 'episodes'], among: ['held-out', 'all'], ...MAPS };
-const FLOOR = 'fused'; // the map on the scene's floor where none is chosen
-const WORST = 'error'; // the measure that ranks failures where none is chosen
-/** Of the state: another one is another place in the browser's history. */
-const PLACES = ['task', 'filter', 'data', 'episode', 'faults', 'against', 'tab', 'diagnostic', 'run', 'study'];
-const ADDRESS_PAUSE = 250; // ms; browsers refuse pages that change their address all the time
+export const TABS = [
+  'scene',
+  'rerun',
+  'diagnostics',
+  'failures',
+  'compare',
+  'finetune',
+  'study',
+  'recordings',
+];
 
-/** Holds the state; tells listeners once a frame what has changed. */
+/** Keys with a fixed set of values, the default first. @type {Record<string, readonly string[]>} */
+const CHOICES = {
+  ...SCENE_CHOICES,
+  tab: TABS,
+  weights: ['raw', 'effective'],
+  track: Object.keys(TRACKS),
+  over: ['episode', 'held-out'],
+  list: ['events', 'episodes'],
+  among: ['held-out', 'all'],
+  axes: ['offset', 'world'],
+  regions: ['shown', 'hidden'],
+  zoom: ['fit', '1', '4'],
+  cloud: ['hidden', 'shown'],
+  beside: ['alone', 'gain'],
+};
+/** Keys with any text, and their defaults. */
+const TEXTS = {
+  faults: '',
+  against: '',
+  window: '',
+  diagnostic: '',
+  options: '',
+  run: '',
+  study: '',
+  quantity: '',
+  pin: '',
+  by: 'error',
+  phase: '',
+  hide: '',
+  ground: 'fused',
+};
+/** Keys that every permalink contains; it contains the others where they differ from their defaults. @type {(keyof State)[]} */
+const REQUIRED_KEYS = [
+  'task',
+  'filter',
+  'data',
+  'episode',
+  'step',
+  'component',
+  'weights',
+  'track',
+  'tab',
+];
+/** Keys and values in links from earlier versions. */
+const OLD_KEYS = { recipe: 'faults', group: 'phase' };
+/** @type {Record<string, string>} */
+const OLD_VALUES = { acting: 'effective', moments: 'events' };
+
+/** Keys whose changes add an entry to the browser's history. */
+const HISTORY_KEYS = [
+  'task',
+  'filter',
+  'data',
+  'episode',
+  'faults',
+  'against',
+  'tab',
+  'diagnostic',
+  'run',
+  'study',
+];
+const LINK_DELAY = 250; // ms; browsers limit how often a page may change its address
+
+/** @typedef {'page' | 'scene' | 'rerun' | 'clock' | 'live'} Origin of a change of the step */
+/** @typedef {(state: State, changed: Set<string>) => void} Listener */
+
+/** Holds the state and notifies listeners of changes once per frame. */
 export class Store {
   /** @type {State} */
   state;
-  /** Who moved the step last: `page`, `scene`, `rerun`, `clock`. */
+  /** Origin of the last change of the step. @type {string} */
   origin = 'page';
-  /** When the input came that moved the step last, ms; null where nobody's hand did. */
+  /** Time in ms of the input that changed the step last; null if no input did. @type {number | null} */
   inputTime = null;
+  /** @type {Listener[]} */
   #listeners = [];
+  /** @type {Set<string>} */
   #changed = new Set();
   #frame = 0;
-  #address;
-  #addressTimer = 0;
+  #link;
+  /** @type {number | undefined} */
+  #linkTimer;
 
   /** @param {State} state */
   constructor(state) {
     this.state = state;
-    this.#address = address(state);
+    this.#link = permalink(state);
   }
 
-  /** @param {(state: State, changed: Set<string>) => void} listener called in a frame after one or more changes. */
+  /** @param {Listener} listener called in a frame after one or more changes */
   listen(listener) {
     this.#listeners.push(listener);
   }
 
-  /** @param {Partial<State>} patch @param {{origin?: string, inputTime?: number | null}} [cause] */
+  /**
+   * @param {Partial<State>} patch
+   * @param {{origin?: Origin, inputTime?: number | null}} [cause]
+   */
   set(patch, { origin = 'page', inputTime = null } = {}) {
+    /** @type {Record<string, unknown>} */
+    const state = this.state;
     for (const [key, value] of Object.entries(patch)) {
-      if (this.state[key] === value) continue;
-      this.state[key] = value;
+      if (state[key] === value) continue;
+      state[key] = value;
       this.#changed.add(key);
       if (key === 'step') [this.origin, this.inputTime] = [origin, inputTime];
     }
     if (this.#changed.size && !this.#frame) this.#frame = requestAnimationFrame(() => this.flush());
   }
 
-  /** The browser has gone back, or on, to a place. @param {State} state of its address */
-  stand({ speed, ...state }) {
+  /**
+   * Restores the state of an entry of the browser's history.
+   * @param {State} state
+   */
+  restore({ speed, ...state }) {
     this.set(state);
     this.flush(true);
   }
 
-  /** Tells the listeners now. @param {boolean} stood whether the browser's history is at this place already */
-  flush(stood = false) {
+  /**
+   * Notifies the listeners at once.
+   * @param {boolean} restored whether the state comes from the browser's history
+   */
+  flush(restored = false) {
     cancelAnimationFrame(this.#frame);
     this.#frame = 0;
     if (!this.#changed.size) return;
     const changed = this.#changed;
     this.#changed = new Set();
     for (const listener of this.#listeners) listener(this.state, changed);
-    const before = this.#address;
-    this.#address = address(this.state);
-    clearTimeout(this.#addressTimer);
-    if (PLACES.some((key) => changed.has(key)) && !stood) {
-      history.replaceState(null, '', before);
-      history.pushState(null, '', this.#address);
-    } else this.#addressTimer = setTimeout(() => history.replaceState(null, '', this.#address), ADDRESS_PAUSE);
+    const previous = this.#link;
+    this.#link = permalink(this.state);
+    clearTimeout(this.#linkTimer);
+    if (HISTORY_KEYS.some((key) => changed.has(key)) && !restored) {
+      history.replaceState(null, '', previous);
+      history.pushState(null, '', this.#link);
+    } else {
+      this.#linkTimer = setTimeout(() => history.replaceState(null, '', this.#link), LINK_DELAY);
+    }
   }
 }
 
-/** @param {State} state @returns {string} what follows the `?` says all of it that a link should keep. */
-export function address(state) {
-  const { task, filter, data, episode, faults, step, angle, tab, component, weights, track, window, diagnostic, options, over, by, group } = state;
-  const kept = { task, filter, data, episode, step, component, weights, track, tab };
-  if (faults) kept.faults = faults;
-  if (state.against) kept.against = state.against;
-  if (window) kept.window = window;
-  if (diagnostic) kept.diagnostic = diagnostic;
-  if (options) kept.options = options;
-  if (over !== CHOICES.over[0]) kept.over = over;
-  for (const key of ['run', 'study', 'quantity', 'pin']) if (state[key]) kept[key] = state[key];
-  if (by !== WORST) kept.by = by;
-  if (group) kept.group = group;
-  if (state.hide) kept.hide = state.hide;
-  if (state.ground !== FLOOR) kept.ground = state.ground;
-  for (const key of ['list', 'among', 'height', 'tint', ...Object.keys(MAPS)]) if (state[key] !== CHOICES[key][0]) kept[key] = state[key];
-  if (angle !== null) kept.angle = Number(angle.toFixed(4));
-  return `?${new URLSearchParams(kept)}`;
+/**
+ * Returns the query string that restores a state.
+ * @param {State} state
+ */
+export function permalink(state) {
+  const values = new Map(REQUIRED_KEYS.map((key) => [/** @type {string} */ (key), state[key]]));
+  const choices = Object.entries(CHOICES).map(([key, options]) => [key, options[0]]);
+  for (const [key, fallback] of [...Object.entries(TEXTS), ...choices]) {
+    const value = state[/** @type {keyof State} */ (key)];
+    if (value !== fallback) values.set(key, value);
+  }
+  if (state.angle !== null) values.set('angle', Number(state.angle.toFixed(4)));
+  const pairs = [...values].map(([key, value]) => [key, String(value)]);
+  return `?${new URLSearchParams(pairs)}`;
 }
 
 /**
- * The state that an address asks for, as far as the catalog has it.
- * @param {string} search @param {import('../data/api.js').Catalog} catalog with at least one task.
- * @returns {{state: State, problems: string[]}} a line for each part that was not to be had.
+ * Reads the state from a permalink. Unknown names are replaced by defaults and reported.
+ * @param {string} search query string
+ * @param {Catalog} catalog with at least one task
+ * @returns {{state: State, problems: string[]}}
  */
-export function resolve(search, catalog) {
-  const asked = new URLSearchParams(search);
-  const problems = [];
-  const pick = (key, names, fallback, kind = key) => {
-    const name = asked.get(key);
-    if (name === null || names.includes(name)) return name ?? fallback;
-    problems.push(`The link asks for ${kind} “${name}”, which does not exist. Available: ${names.join(', ')}.`);
-    return fallback;
-  };
-  const pickOf = (key, all, fallback = all[0].name) => all.find(({ name }) => name === pick(key, all.map((one) => one.name), fallback));
-  const task = pickOf('task', catalog.tasks);
-  const data = pickOf('data', task.data);
+export function parsePermalink(search, catalog) {
+  const link = new LinkReader(search);
+  const task = link.named('task', catalog.tasks);
+  const data = link.named('data', task.data);
+  const filters = task.filters.filter(({ live }) => !live || live === data.name);
+  const angle = Number(link.query.get('angle') ?? NaN);
+  /** @type {Partial<State>} */
   const state = {
     task: task.name,
-    filter: pickOf('filter', task.filters.filter(({ live }) => !live || live === data.name), data.live?.filter).name,
+    filter: link.named('filter', filters, data.live?.filter).name,
     data: data.name,
-    episode: number(asked, 'episode', data.first, data.episodes.map((e) => e.index), problems),
-    faults: asked.get('faults')?.trim() ?? '',
-    against: asked.get('against') ?? '',
-    step: number(asked, 'step', 0, null, problems),
-    angle: asked.has('angle') && Number.isFinite(Number(asked.get('angle'))) ? Number(asked.get('angle')) : null,
-    component: pick('component', task.components.map((c) => c.name), task.map.x),
-    window: stretch(asked, problems),
-    diagnostic: asked.get('diagnostic') ?? '',
-    options: asked.get('options') ?? '',
-    by: asked.get('by') ?? WORST,
-    group: asked.get('group') ?? '',
-    hide: asked.get('hide') ?? '',
-    ground: asked.get('ground') ?? FLOOR,
-    run: asked.get('run') ?? '',
-    study: asked.get('study') ?? '',
-    quantity: asked.get('quantity') ?? '',
-    pin: asked.get('pin') ?? '',
+    episode: link.integer(
+      'episode',
+      data.first,
+      data.episodes.map(({ index }) => index),
+    ),
+    step: link.integer('step', 0),
+    angle: Number.isFinite(angle) ? angle : null,
+    component: link.choice(
+      'component',
+      task.components.map(({ name }) => name),
+      task.map.x,
+    ),
     playing: false,
     speed: 1,
-    follow: data.live?.state === 'running' && !asked.has('step'),
+    follow: data.live?.state === 'running' && !link.query.has('step'),
   };
-  for (const [key, values] of Object.entries(CHOICES)) state[key] = pick(key, values, values[0], spoken(key));
-  return { state, problems };
+  const texts = Object.entries(TEXTS).map(([key, fallback]) => [
+    key,
+    link.query.get(key)?.trim() ?? fallback,
+  ]);
+  const choices = Object.entries(CHOICES).map(([key, options]) => [
+    key,
+    link.choice(key, options, options[0]),
+  ]);
+  Object.assign(state, Object.fromEntries([...texts, ...choices]), { window: link.window() });
+  return { state: /** @type {State} */ (state), problems: link.problems };
 }
 
-function stretch(asked, problems) {
-  const text = asked.get('window') ?? '';
-  const [, from, to] = /^(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)$/.exec(text) ?? [];
-  if (!text || Number(from) < Number(to)) return text;
-  problems.push(`The link asks for window “${text}”, which cannot be shown. It is the first and the last step in view, as 20-60.`);
-  return '';
-}
+/** Reads values from a query string and collects problems. */
+class LinkReader {
+  /** @type {string[]} */
+  problems = [];
 
-function number(asked, key, fallback, allowed, problems) {
-  if (!asked.has(key)) return fallback;
-  const value = Number(asked.get(key));
-  if (Number.isInteger(value) && value >= 0 && (allowed === null || allowed.includes(value))) return value;
-  const range = allowed ? ` Available: ${Math.min(...allowed)} to ${Math.max(...allowed)}.` : ' It is an integer from 0.';
-  problems.push(`The link asks for ${key} “${asked.get(key)}”, which does not exist.${range}`);
-  return fallback;
+  /** @param {string} search */
+  constructor(search) {
+    this.query = new URLSearchParams(search);
+    for (const [old, key] of Object.entries(OLD_KEYS)) {
+      const value = this.query.get(old);
+      if (value !== null && !this.query.has(key)) this.query.set(key, value);
+    }
+  }
+
+  /**
+   * @param {string} key
+   * @param {readonly string[]} options
+   * @param {string} fallback
+   */
+  choice(key, options, fallback) {
+    const text = this.query.get(key);
+    if (text === null) return fallback;
+    const value = options.includes(text) ? text : OLD_VALUES[text];
+    if (options.includes(value)) return value;
+    this.#report(key, text, `Available: ${options.join(', ')}.`);
+    return fallback;
+  }
+
+  /**
+   * @template {{name: string}} T
+   * @param {string} key
+   * @param {T[]} items at least one
+   * @param {string} [fallback] the first one by default
+   * @returns {T}
+   */
+  named(key, items, fallback = items[0].name) {
+    const names = items.map(({ name }) => name);
+    const name = this.choice(key, names, fallback);
+    return items.find((item) => item.name === name) ?? items[0];
+  }
+
+  /**
+   * @param {string} key
+   * @param {number} fallback
+   * @param {number[]} [options] any integer from 0 by default
+   */
+  integer(key, fallback, options) {
+    const text = this.query.get(key);
+    if (text === null) return fallback;
+    const value = Number(text);
+    if (Number.isInteger(value) && value >= 0 && (!options || options.includes(value)))
+      return value;
+    this.#report(
+      key,
+      text,
+      options
+        ? `Available: ${Math.min(...options)} to ${Math.max(...options)}.`
+        : 'It must be an integer from 0.',
+    );
+    return fallback;
+  }
+
+  /** Reads the visible steps. */
+  window() {
+    const text = this.query.get('window') ?? '';
+    const [, from, to] = /^(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)$/.exec(text) ?? [];
+    if (!text || Number(from) < Number(to)) return text;
+    this.problems.push(
+      `The link has an invalid window “${text}”. It must name the first and the last visible step, such as 20-60.`,
+    );
+    return '';
+  }
+
+  /**
+   * @param {string} key
+   * @param {string} value
+   * @param {string} hint
+   */
+  #report(key, value, hint) {
+    this.problems.push(
+      `The link names ${displayName(key)} “${value}”, which does not exist. ${hint}`,
+    );
+  }
 }

@@ -1,49 +1,63 @@
-/** Undo and redo of what is looked at: an edit that was tried is taken back, with the moment that was shown. */
+/** Undo and redo of the selection, together with the step at that time. */
 
-const UNDONE = ['task', 'filter', 'data', 'episode', 'faults', 'against'];
-const ALONG = ['step', 'angle', 'component']; // come back with them
-const KEPT = 100;
+/** @import { State, Store } from './state.js' */
+
+/** @type {(keyof State)[]} */
+const SELECTION = ['task', 'filter', 'data', 'episode', 'faults', 'against'];
+/** Restored together with the selection. @type {(keyof State)[]} */
+const CURSOR = ['step', 'angle', 'component'];
+const MAX_ENTRIES = 100;
 
 export class Undo {
+  /** @type {Store} */
   #store;
-  #now;
+  /** @type {Partial<State>} */
+  #current;
+  /** @type {Partial<State>[]} */
   #past = [];
+  /** @type {Partial<State>[]} */
   #future = [];
-  #going = false;
+  #restoring = false;
 
-  /** @param {import('./state.js').Store} store */
+  /** @param {Store} store */
   constructor(store) {
     this.#store = store;
-    this.#now = this.#moment;
+    this.#current = this.#snapshot();
     store.listen((_, changed) => {
-      if (!this.#going && UNDONE.some((key) => changed.has(key))) {
-        this.#past = [...this.#past, this.#now].slice(-KEPT);
+      if (!this.#restoring && SELECTION.some((key) => changed.has(key))) {
+        this.#past = [...this.#past, this.#current].slice(-MAX_ENTRIES);
         this.#future = [];
       }
-      this.#now = this.#moment;
+      this.#current = this.#snapshot();
     });
   }
 
   undo() {
-    this.#go(this.#past, this.#future);
+    this.#restore(this.#past, this.#future);
   }
 
   redo() {
-    this.#go(this.#future, this.#past);
+    this.#restore(this.#future, this.#past);
   }
 
-  get #moment() {
-    return Object.fromEntries([...UNDONE, ...ALONG].map((key) => [key, this.#store.state[key]]));
+  /** @returns {Partial<State>} */
+  #snapshot() {
+    const { state } = this.#store;
+    return Object.fromEntries([...SELECTION, ...CURSOR].map((key) => [key, state[key]]));
   }
 
-  #go(from, to) {
-    this.#store.flush(); // what has just been changed is to be undone, too
-    const moment = from.pop();
-    if (!moment) return;
-    to.push(this.#now);
-    this.#going = true;
-    this.#store.set({ ...moment, playing: false });
+  /**
+   * @param {Partial<State>[]} from
+   * @param {Partial<State>[]} to
+   */
+  #restore(from, to) {
+    this.#store.flush(); // adds pending changes to the history
+    const entry = from.pop();
+    if (!entry) return;
+    to.push(this.#current);
+    this.#restoring = true;
+    this.#store.set({ ...entry, playing: false });
     this.#store.flush();
-    this.#going = false;
+    this.#restoring = false;
   }
 }

@@ -1,38 +1,76 @@
-/** From the wire's m and rad to the page's cm and degrees. */
+/** Number formats, and the conversion from the server's m and rad to the page's cm and degrees. */
 
-export const SHOWN = { m: { unit: 'cm', scale: 100 }, rad: { unit: '°', scale: 180 / Math.PI } };
+/** @typedef {{unit: 'cm' | '°', scale: number}} DisplayUnit scale: factor from the server's unit */
 
-/** @param {string} name as in the state: hinge_x. */
-export const spoken = (name) => name.replaceAll('_', ' ');
+/** @type {Record<'m' | 'rad', DisplayUnit>} */
+export const DISPLAY_UNITS = {
+  m: { unit: 'cm', scale: 100 },
+  rad: { unit: '°', scale: 180 / Math.PI },
+};
 
-/** A line as a sentence. */
-export const sentence = (line) => `${line[0].toUpperCase()}${line.slice(1)}${/[.!?]$/.test(line) ? '' : '.'}`;
+/**
+ * Replaces the underscores of a name such as hinge_x by spaces.
+ * @param {string} name
+ */
+export const displayName = (name) => name.replaceAll('_', ' ');
 
-/** A number with a true minus sign and a fixed number of digits; a dash where there is none. */
+/**
+ * Adds a capital and a full stop to a text that lacks them.
+ * @param {string} text
+ */
+export const sentence = (text) =>
+  `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? '' : '.'}`;
+
+/**
+ * Formats a number with fixed digits and a true minus sign; a dash for a missing number.
+ * @param {number | null | undefined} value
+ * @param {number} [digits]
+ */
 export function fixed(value, digits = 1) {
   if (value === null || value === undefined || !Number.isFinite(value)) return '–';
   const text = value.toFixed(digits);
   return /^-[0.]*$/.test(text) ? text.slice(1) : text.replace('-', '−');
 }
 
-/** As `fixed`, with the sign always written. */
-export const signed = (value, digits = 1) => (value > 0 && Number(value.toFixed(digits)) > 0 ? '+' : '') + fixed(value, digits);
+/**
+ * Formats a number as `fixed` does, with a sign also for positive numbers.
+ * @param {number} value
+ * @param {number} [digits]
+ */
+export const signed = (value, digits = 1) =>
+  (value > 0 && Number(value.toFixed(digits)) > 0 ? '+' : '') + fixed(value, digits);
 
-/** A number with three significant digits, an integer whole; a dash where there is none. */
+/**
+ * Formats a number with three significant digits, an integer without decimals; a dash for a missing number.
+ * @param {number | null | undefined} value
+ */
 export function significant(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return '–';
   const size = Math.abs(value);
   if (Number.isInteger(value) && size < 1e6) return fixed(value, 0);
-  if (size >= 1e6 || size < 1e-4) return value.toExponential(2).replaceAll('-', '−').replace('e+', 'e');
+  if (size >= 1e6 || size < 1e-4)
+    return value.toExponential(2).replaceAll('-', '−').replace('e+', 'e');
   return fixed(value, Math.max(0, 2 - Math.floor(Math.log10(size))));
 }
 
-export const percent = (share) => (Number.isFinite(share) ? `${Math.round(100 * share)} %` : '–');
+/**
+ * Formats a share from 0 to 1 in percent.
+ * @param {number | null | undefined} share
+ */
+export const percent = (share) =>
+  Number.isFinite(share) ? `${Math.round(100 * Number(share))} %` : '–';
 
-/** The difference of two angles in degrees, in -180..180. */
-export const wrapped = (degrees) => degrees - 360 * Math.round(degrees / 360);
+/**
+ * Wraps the difference of two angles to -180..180 degrees.
+ * @param {number} degrees
+ */
+export const wrapDegrees = (degrees) => degrees - 360 * Math.round(degrees / 360);
 
-export function bytes(count) {
-  const [size, unit] = [[1e9, 'GB'], [1e6, 'MB']].find(([least]) => count >= least) ?? [];
-  return size ? `${(count / size).toFixed(1)} ${unit}` : `${Math.round(count / 1e3)} kB`;
+/**
+ * Formats a size in bytes.
+ * @param {number} count
+ */
+export function formatBytes(count) {
+  if (count >= 1e9) return `${(count / 1e9).toFixed(1)} GB`;
+  return count >= 1e6 ? `${(count / 1e6).toFixed(1)} MB` : `${Math.round(count / 1e3)} kB`;
 }

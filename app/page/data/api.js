@@ -1,203 +1,371 @@
-/** What the page asks of its server over HTTP (docs/api.md). */
+/** Requests to the server (docs/api.md). */
 
-import { begun } from './live_stream.js';
+/** @import { State } from '../core/state.js' */
+
+import { loadLiveTrace } from './live_stream.js';
 import { Trace } from './trace.js';
 
 /**
- * @typedef {{name: string, unit: 'm' | 'rad'}} Component
- * @typedef {{index: number, steps: number, policy: string, split: string, seed: number, contact_fraction: number}} Summary
- * @typedef {object} Task
- * @property {string} name @property {Component[]} components @property {string[]} modalities @property {number} dt s
- * @property {{x: string, y: string, half_width: number}} map
- * @property {{name: string, kind: string, checkpoint_hash: string, live?: string}[]} filters `live`: known only by the live run of that name
- * @property {{name: string, first: number, episodes: Summary[], live?: import('../tabs/live_runs.js').Run}[]} data sets of episodes; the index to begin with
- * @property {{name: string, faults: string}[]} fault_presets
- * @typedef {{name: string, default: number | string | null, unit: string, meaning: string}} Parameter
- * @typedef {{fault: string, meaning: string, parameters: Parameter[]}} Fault
- * @typedef {{version: string, tasks: Task[], faults: Fault[], problems?: string[]}} Catalog
- * @typedef {{task: string, filter: string, data: string, episode: number, faults: string, against?: string}} Selection names of what is looked at;
- *   `against` makes it the other run that it is compared with, by what differs
- * @typedef {{name: string, url: string, bytes: number, seconds: number | null}} Recording seconds: null if it was there
+ * @typedef {import('../types/server.js').Catalog} Catalog
+ * @typedef {import('../types/server.js').Task} Task
+ * @typedef {import('../types/server.js').Component} Component
+ * @typedef {import('../types/server.js').Fault} Fault
+ * @typedef {import('../types/server.js').Selection} Selection
+ * @typedef {import('../types/server.js').TraceHeader} TraceHeader
+ * @typedef {import('../types/server.js').LiveRun} LiveRun
+ * @typedef {import('../types/server.js').Job} Job
+ * @typedef {import('../types/server.js').Recording} Recording
+ * @typedef {import('../types/server.js').DiagnosticEntry} DiagnosticEntry
+ * @typedef {import('../types/server.js').DiagnosticResult} DiagnosticResult
+ * @typedef {import('../types/server.js').PendingResult} PendingResult
+ * @typedef {import('../types/server.js').StartedJob} StartedJob
+ * @typedef {import('../types/server.js').Failures} Failures
+ * @typedef {import('../types/server.js').FailureEvent} FailureEvent
  */
+/** @typedef {Selection & {maps: number, automatic: boolean}} RecordingRequest maps: steps from one map to the next */
 
-const AGAIN = 150; // ms until a trace that is being computed is asked for again
-const RECORDED_MAPS = 40; // sets of maps that a recording holds: a few seconds to compute
+const POLL_INTERVAL = 150; // ms
+const MAPS_PER_RECORDING = 40; // computed within a few seconds
 
-/** An answer that says what is wrong, in a line that a person can read. */
+/** An error with a message for the user. */
 export class ServerError extends Error {}
 
-/** @param {string} url @param {RequestInit} [options] @returns {Promise<Response>} Raises ServerError. */
-async function ask(url, options) {
+/**
+ * Sends a request. Throws ServerError if it fails.
+ * @param {string} url
+ * @param {RequestInit} [options]
+ * @returns {Promise<Response>}
+ */
+async function request(url, options) {
   let response;
   try {
     response = await fetch(url, options);
   } catch (error) {
-    if (error.name === 'AbortError') throw error;
-    throw new ServerError('The server does not answer. Is `beliefscope serve` still running?');
+    if (error instanceof Error && error.name === 'AbortError') throw error;
+    throw new ServerError('The server does not respond. Is `beliefscope serve` still running?');
   }
   if (response.ok) return response;
   const body = await response.json().catch(() => ({}));
-  throw new ServerError(body.error ?? `The server answered ${response.status} ${response.statusText}.`);
+  throw new ServerError(
+    body.error ?? `The server responded with ${response.status} ${response.statusText}.`,
+  );
 }
 
-const post = (url, body, method = 'POST') =>
-  ask(url, { method, headers: { 'content-type': 'application/json' }, body: JSON.stringify(body) });
-
-/** @returns {Promise<Catalog>} */
-export const catalog = async () => (await ask('/api/catalog')).json();
-
-/** @returns {Promise<{runs: import('../tabs/live_runs.js').Run[], tasks: Task[]}>} live runs, the newest first; the tasks that they are of. */
-export const liveRuns = async () => (await ask('/api/live')).json();
-
-/** @param {boolean} dark @returns {Promise<{view: string, scene: string, socket: string}>} */
-export const openView = async (dark) => (await post('/api/views', { dark })).json();
-
-/** Raises ServerError where there is no such trace: an unknown name, or a faults that cannot be. @param {Selection} selection */
-export const check = (selection) => ask(traceUrl(selection));
-
-const traceUrl = ({ task, filter, data, episode, faults, against }, part = '') =>
-  `/api/trace/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}${part}?${new URLSearchParams({ data, faults, ...(against && { against }) })}`;
-
-/** A run and the other one side by side. @param {Selection} selection with `against` @returns {Promise<Found & {names: [string, string]}>} */
-export const comparison = ({ task, filter, data, episode, faults, against }, signal) =>
-  whole(`/api/compare/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, faults, against })}`, signal);
+/**
+ * @param {string} url
+ * @param {AbortSignal} [signal]
+ */
+const get = async (url, signal) => (await request(url, { signal })).json();
 
 /**
- * A trace with all its numbers and pictures; the server computes it first if need be.
- * @param {Task} task @param {Selection} selection
- * @param {(share: number) => void} progress @param {AbortSignal} signal
- * @returns {Promise<Trace>}
+ * @param {string} url
+ * @param {object} [body] JSON
+ * @param {string} [method]
  */
-export async function loadTrace(task, selection, progress, signal) {
-  const there = async (part) => {
-    let response = await ask(traceUrl(selection, part), { signal });
-    while (response.status === 202) {
-      progress((await response.json()).progress);
-      await new Promise((resolve) => setTimeout(resolve, AGAIN));
-      response = await ask(traceUrl(selection, part), { signal });
-    }
-    return response;
+async function send(url, body, method = 'POST') {
+  const json = body && {
+    headers: { 'content-type': 'application/json' },
+    body: JSON.stringify(body),
   };
-  const header = await (await there()).json();
-  if (header.live) return begun(task, selection, header, signal);
-  const buffer = async (part) => (await there(part)).arrayBuffer();
-  const [columns, pictures] = await Promise.all([buffer('/columns'), header.pictures && buffer('/images')]);
-  return new Trace(task, selection, header, columns, pictures);
+  return (await request(url, { method, ...json })).json();
 }
 
 /**
- * @typedef {{name: string, title: string, question: string, slow: boolean, why_not: string | null,
- *   options: {name: string, meaning: string, default: string}[]}} Entry of the catalog of diagnostics, for one trace
- * @typedef {{id: string, kind: string, title: string, state: string, progress: number, message: string, error: string, link: string,
- *   asked: number, started: number | null, ended: number | null}} Job
- * @typedef {{verdict: string, trajectories: number, tables: object[], curves: object[], bands: object, plots: object[], pictures: object[]}} Found
+ * Gets JSON, and waits while the server computes the trace that it depends on.
+ * @param {string} url
+ * @param {AbortSignal} [signal]
  */
-
-const diagnosticUrl = ({ task, filter, data, episode, faults }, name, query = {}) =>
-  `/api/diagnostics/${name ? `${encodeURIComponent(name)}/` : ''}${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, faults, ...query })}`;
-
-/** All diagnostics, and why those that do not apply do not. @returns {Promise<Entry[]>} */
-export const diagnostics = (selection, signal) => whole(diagnosticUrl(selection), signal);
-
-/** One diagnostic: what it found; or the job that finds it, null where nobody asked for it.
- *  @param {Record<string, string>} query its options, and `episodes` @returns {Promise<Found | {job: Job | null}>} */
-export const diagnostic = (selection, name, query, signal) => whole(diagnosticUrl(selection, name, query), signal);
-
-/** Has a diagnostic computed as a job. @returns {Promise<{job: Job}>} */
-export const compute = async (selection, name, query) => (await ask(diagnosticUrl(selection, name, query), { method: 'POST' })).json();
-
-/** Asks again while the trace that it is of is computed. */
-async function whole(url, signal) {
+async function poll(url, signal) {
   for (;;) {
-    const body = await (await ask(url, { signal })).json();
+    const body = await get(url, signal);
     if (!('progress' in body)) return body;
-    await new Promise((resolve) => setTimeout(resolve, AGAIN));
+    await pause();
   }
 }
 
-/**
- * @typedef {{episode: number, step: number, first: number, last: number, value: number, group: string, also: string[],
- *   error: (number | null)[], nees: number | null, ess: number | null, acting: number[] | null, link: string}} Moment
- * @typedef {object} Failures where a filter fails over a data set (docs/api.md) @property {string[]} layers
- * @property {{name: string, title: string, unit: string, why_not: string | null, verdict?: string, total?: number,
- *   counts?: Record<string, number>, groups?: object[], moments?: Moment[]}[]} scores
- * @property {{index: number, steps: number, rmse: number, worst: number, worst_step: number, error: number[], contact: boolean[]}[]} episodes
- */
+const pause = () => new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL));
 
+/**
+ * Joins parts of a path, encoded, and a query.
+ * @param {(string | number)[]} parts
+ * @param {Record<string, string>} [query]
+ */
+function path(parts, query) {
+  const text = parts.map((part) => encodeURIComponent(part)).join('/');
+  return query ? `/api/${text}?${new URLSearchParams(query)}` : `/api/${text}`;
+}
+
+/** @returns {Promise<Catalog>} */
+export const catalog = () => get('/api/catalog');
+
+/**
+ * Gets the live runs, the newest first, and their tasks.
+ * @returns {Promise<{runs: LiveRun[], tasks: Task[]}>}
+ */
+export const liveRuns = () => get('/api/live');
+
+/**
+ * Opens a view, which has its own 3D scene.
+ * @param {boolean} dark
+ * @returns {Promise<{view: string, scene: string, socket: string}>}
+ */
+export const openView = (dark) => send('/api/views', { dark });
+
+/**
+ * @param {Selection} selection
+ * @param {string} [part] of the trace
+ */
+function traceUrl({ task, filter, data, episode, faults, against }, part) {
+  const query = { data, faults, ...(against ? { against } : {}) };
+  return path(['trace', task, filter, episode, ...(part ? [part] : [])], query);
+}
+
+/**
+ * Checks that a trace can be computed. Throws ServerError for an unknown name or an invalid fault injection.
+ * @param {Selection} selection
+ */
+export const checkSelection = (selection) => request(traceUrl(selection));
+
+/**
+ * Compares a run with another one.
+ * @param {Selection} selection with `against`
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<DiagnosticResult>} with `names`
+ */
+export const comparison = ({ task, filter, data, episode, faults, against = '' }, signal) =>
+  poll(path(['compare', task, filter, episode], { data, faults, against }), signal);
+
+/**
+ * Loads a trace with its columns and images, and waits while the server computes it.
+ * @param {Task} task
+ * @param {Selection} selection
+ * @param {(share: number) => void} progress
+ * @param {AbortSignal} signal
+ * @returns {Promise<Trace>}
+ */
+export async function loadTrace(task, selection, progress, signal) {
+  /** @param {string} [part] */
+  const load = async (part) => {
+    let response = await request(traceUrl(selection, part), { signal });
+    while (response.status === 202) {
+      progress((await response.json()).progress);
+      await pause();
+      response = await request(traceUrl(selection, part), { signal });
+    }
+    return response;
+  };
+  /** @type {TraceHeader} */
+  const header = await (await load()).json();
+  if (header.live) return loadLiveTrace(task, selection, header, header.live, signal);
+  /** @param {string} part */
+  const buffer = async (part) => (await load(part)).arrayBuffer();
+  const [columns, images] = await Promise.all([
+    buffer('columns'),
+    header.pictures && buffer('images'),
+  ]);
+  return new Trace(task, selection, header, columns, images);
+}
+
+/**
+ * @param {Selection} selection
+ * @param {string[]} name of a diagnostic, or nothing
+ * @param {Record<string, string>} [query]
+ */
+const diagnosticUrl = ({ task, filter, data, episode, faults }, name, query = {}) =>
+  path(['diagnostics', ...name, task, filter, episode], { data, faults, ...query });
+
+/**
+ * Lists the diagnostics of a run.
+ * @param {Selection} selection
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<DiagnosticEntry[]>}
+ */
+export const diagnostics = (selection, signal) => poll(diagnosticUrl(selection, []), signal);
+
+/**
+ * Gets the result of a diagnostic, or its job.
+ * @param {Selection} selection
+ * @param {string} name
+ * @param {Record<string, string>} query options, and `episodes`
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<DiagnosticResult | PendingResult>}
+ */
+export const diagnostic = (selection, name, query, signal) =>
+  poll(diagnosticUrl(selection, [name], query), signal);
+
+/**
+ * Starts a diagnostic as a job.
+ * @param {Selection} selection
+ * @param {string} name
+ * @param {Record<string, string>} query options, and `episodes`
+ * @returns {Promise<StartedJob>}
+ */
+export const startDiagnostic = (selection, name, query) =>
+  send(diagnosticUrl(selection, [name], query));
+
+/** @typedef {Pick<State, 'task' | 'filter' | 'data' | 'faults' | 'among'>} FailureQuery */
+
+/** @param {FailureQuery} query */
 const failuresUrl = ({ task, filter, data, faults, among }) =>
-  `/api/failures/${encodeURIComponent(task)}/${encodeURIComponent(filter)}?${new URLSearchParams({ data, faults, among })}`;
-
-/** Where a filter fails; or the job that looks for it, null where nobody asked for it. @returns {Promise<Failures | {job: Job | null}>} */
-export const failures = (asked, signal) => whole(failuresUrl(asked), signal);
-
-/** Has it looked for as a job. @returns {Promise<{job: Job}>} */
-export const lookForFailures = async (asked) => (await ask(failuresUrl(asked), { method: 'POST' })).json();
-
-/** What the workspace keeps of recordings, and of reports (docs/api.md). */
-export const recordings = async () => (await ask('/api/recordings')).json();
-export const reports = async () => (await ask('/api/reports')).json();
-
-/** Gives a recording another name, or other tags, or keeps it. @param {{url: string}} file @param {{name?: string, tags?: string[], automatic?: false}} change */
-export const changeRecording = async ({ url }, change) => (await post(url, change, 'PATCH')).json();
-
-/** Has a recording read as a run of this workspace; the job's link opens it. @returns {Promise<{job: Job}>} */
-export const readRun = async ({ url }) => (await ask(`${url}/run`, { method: 'POST' })).json();
-
-/** Puts a recording or a report into the trash. @returns {Promise<{deleted: string}>} by which it is had back */
-export const discard = async ({ url }) => (await ask(url, { method: 'DELETE' })).json();
-
-/** Has it back. @param {'recordings' | 'reports'} of */
-export const restore = async (of, id) => (await ask(`/api/${of}/deleted/${encodeURIComponent(id)}`, { method: 'POST' })).json();
-
-/** Deletes for good what is in the trash. @returns {Promise<{freed: number}>} bytes */
-export const emptyTrash = async (of) => (await ask(`/api/${of}/deleted`, { method: 'DELETE' })).json();
-
-/** @returns {Promise<Job[]>} the newest first. */
-export const jobs = async () => (await ask('/api/jobs')).json();
-
-/** A job with its log. @returns {Promise<Job & {log: string}>} */
-export const job = async (id) => (await ask(`/api/jobs/${id}`)).json();
-
-/** Cancels a job that is under way, forgets one that has ended. @returns {Promise<Job>} */
-export const cancel = async (id) => (await ask(`/api/jobs/${id}`, { method: 'DELETE' })).json();
-
-/** Has a report of a run made. The job's link is where it lies. @param {{moments: number[], every: boolean, pdf: boolean, title: string}} wanted @returns {Promise<{job: Job}>} */
-export const report = async ({ task, filter, episode, data, faults }, wanted) =>
-  (await post(`/api/reports/${encodeURIComponent(task)}/${encodeURIComponent(filter)}/${episode}?${new URLSearchParams({ data, faults })}`, wanted)).json();
-
-/** What is asked for to record a trace, with maps at even steps. @param {Trace} trace @param {boolean} automatic whether it is to be looked at only */
-export const recorded = (trace, automatic = false) => ({ ...trace.selection, maps: Math.ceil(trace.steps / RECORDED_MAPS), automatic });
-
-/** Writes a recording; the job that makes it where that takes long: ask again when that is done. @returns {Promise<Recording | {job: Job}>} */
-export const record = async (asked) => (await post('/api/recordings', asked)).json();
+  path(['failures', task, filter], { data, faults, among });
 
 /**
- * @typedef {object} Run of fine-tuning (docs/api.md) @property {string} run @property {string} task @property {string} filter
- * @property {object} settings @property {Job | null} job @property {string | null} child @property {'kept' | 'default' | null} place
+ * Gets the failures of a filter over a data set, or the job of the search.
+ * @param {FailureQuery} query
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<Failures | PendingResult>}
  */
+export const failures = (query, signal) => poll(failuresUrl(query), signal);
 
-const finetuneUrl = ({ task, filter, data }) => `/api/finetune/${encodeURIComponent(task)}/${encodeURIComponent(filter)}?${new URLSearchParams({ data })}`;
+/**
+ * Starts the search for failures as a job.
+ * @param {FailureQuery} query
+ * @returns {Promise<StartedJob>}
+ */
+export const startFailureSearch = (query) => send(failuresUrl(query));
 
-/** What of a filter can be trained, on what, and the runs so far. */
-export const finetuning = async (selection, signal) => (await ask(finetuneUrl(selection), { signal })).json();
+/** Lists the recordings of the workspace. */
+export const recordings = () => get('/api/recordings');
 
-/** Has it trained further, or goes on with the run of the same settings. @returns {Promise<Run>} */
-export const startFinetune = async (selection, settings) => (await post(finetuneUrl(selection), settings)).json();
+/** Lists the reports of the workspace. */
+export const reports = () => get('/api/reports');
 
-/** A run, how far it is, and what it found. */
-export const tuned = async (run, signal) => (await ask(`/api/tuned/${encodeURIComponent(run)}`, { signal })).json();
+/**
+ * Renames a recording, changes its tags, or keeps an automatic one.
+ * @param {{url: string}} file
+ * @param {{name?: string, tags?: string[], automatic?: false}} change
+ */
+export const changeRecording = ({ url }, change) => send(url, change, 'PATCH');
 
-/** Which filters of a task were made from which. @returns {Promise<{members: object[]}>} */
-export const lineage = async (task, signal) => (await ask(`/api/lineage/${encodeURIComponent(task)}`, { signal })).json();
+/**
+ * Starts a job that imports the run of a recording; the job's link opens it.
+ * @param {{url: string}} file
+ * @returns {Promise<StartedJob>}
+ */
+export const importRun = ({ url }) => send(`${url}/run`);
 
-/** What studies found. @returns {Promise<{studies: object[], problems: string[]}>} */
-export const studies = async () => (await ask('/api/studies')).json();
+/**
+ * Moves a recording or a report to the trash.
+ * @param {{url: string}} file
+ * @returns {Promise<{deleted: string}>} ID in the trash
+ */
+export const deleteFile = ({ url }) => send(url, undefined, 'DELETE');
 
-/** Has a study's cells trained that are not yet. @returns {Promise<{job: Job}>} */
-export const runCells = async (study) => (await ask(`/api/studies/${encodeURIComponent(study)}/cells`, { method: 'POST' })).json();
+/**
+ * Restores a file from the trash.
+ * @param {'recordings' | 'reports'} kind
+ * @param {string} id
+ */
+export const restoreFile = (kind, id) => send(path([kind, 'deleted', id]));
 
-/** Puts a checkpoint that a study measured on the shelf. @returns {Promise<{filter: string}>} its name there */
-export const openMeasured = async (...parts) => (await ask(`/api/studies/${parts.map(encodeURIComponent).join('/')}`, { method: 'POST' })).json();
+/**
+ * Deletes the files in the trash permanently.
+ * @param {'recordings' | 'reports'} kind
+ * @returns {Promise<{freed: number}>} bytes
+ */
+export const emptyTrash = (kind) => send(path([kind, 'deleted']), undefined, 'DELETE');
 
-/** What becomes of a child. @param {'accept' | 'keep' | 'roll-back'} act @returns {Promise<Run>} */
-export const decide = async (run, act) => (await ask(`/api/tuned/${encodeURIComponent(run)}/${act}`, { method: 'POST' })).json();
+/** @returns {Promise<Job[]>} the newest first */
+export const jobs = () => get('/api/jobs');
+
+/**
+ * @param {string} id
+ * @returns {Promise<Job & {log: string}>}
+ */
+export const job = (id) => get(path(['jobs', id]));
+
+/**
+ * Cancels a waiting or running job; removes a finished one.
+ * @param {string} id
+ * @returns {Promise<Job>}
+ */
+export const cancelJob = (id) => send(path(['jobs', id]), undefined, 'DELETE');
+
+/** @typedef {{events: number[], slow: boolean, pdf: boolean, title: string}} ReportOptions */
+
+/**
+ * Starts a job that writes a report; the job's link opens it.
+ * @param {Selection} selection
+ * @param {ReportOptions} options
+ * @returns {Promise<StartedJob>}
+ */
+export const createReport = ({ task, filter, episode, data, faults }, options) =>
+  send(path(['reports', task, filter, episode], { data, faults }), options);
+
+/**
+ * Returns the request for a recording of a trace, with likelihood maps at regular steps.
+ * @param {Trace} trace
+ * @param {boolean} [automatic] whether the file may be deleted later
+ * @returns {RecordingRequest}
+ */
+export const recordingRequest = (trace, automatic = false) => ({
+  ...trace.selection,
+  maps: Math.ceil(trace.steps / MAPS_PER_RECORDING),
+  automatic,
+});
+
+/**
+ * Writes a recording. Returns the job that does it if it takes long; repeat the request once the job is done.
+ * @param {RecordingRequest} body
+ * @returns {Promise<Recording | StartedJob>}
+ */
+export const createRecording = (body) => send('/api/recordings', body);
+
+/** @param {Pick<Selection, 'task' | 'filter' | 'data'>} selection */
+const finetuneUrl = ({ task, filter, data }) => path(['finetune', task, filter], { data });
+
+/**
+ * Gets the modules and the slices for fine-tuning a filter, and the previous runs.
+ * @param {Pick<Selection, 'task' | 'filter' | 'data'>} selection
+ * @param {AbortSignal} [signal]
+ */
+export const finetuneOptions = (selection, signal) => get(finetuneUrl(selection), signal);
+
+/**
+ * Starts fine-tuning, or resumes the run with the same settings.
+ * @param {Pick<Selection, 'task' | 'filter' | 'data'>} selection
+ * @param {object} settings
+ */
+export const startFinetune = (selection, settings) => send(finetuneUrl(selection), settings);
+
+/**
+ * Gets a fine-tuning run with its progress and its results.
+ * @param {string} run
+ * @param {AbortSignal} [signal]
+ */
+export const finetuneRun = (run, signal) => get(path(['tuned', run]), signal);
+
+/**
+ * Promotes a fine-tuned checkpoint to the default filter, saves it, or discards it.
+ * @param {string} run
+ * @param {'promote' | 'save' | 'discard'} action
+ */
+export const decideFinetune = (run, action) => send(path(['tuned', run, action]));
+
+/**
+ * Gets the fine-tuned checkpoints of a task and their base checkpoints.
+ * @param {string} task
+ * @param {AbortSignal} [signal]
+ */
+export const lineage = (task, signal) => get(path(['lineage', task]), signal);
+
+/** Lists the studies with their results. */
+export const studies = () => get('/api/studies');
+
+/**
+ * Starts a job that trains the remaining cells of a study.
+ * @param {string} study
+ * @returns {Promise<StartedJob>}
+ */
+export const trainStudy = (study) => send(path(['studies', study, 'cells']));
+
+/**
+ * Adds a checkpoint of a study to the catalog.
+ * @param {string} study
+ * @param {string} task
+ * @param {string} filter
+ * @param {string | number} seed
+ * @returns {Promise<{filter: string}>} its name in the catalog
+ */
+export const addStudyFilter = (study, task, filter, seed) =>
+  send(path(['studies', study, task, filter, seed]));

@@ -1,23 +1,35 @@
-/** The steps of a live run as they come (docs/api.md): asked for one block at a time, so that none ever waits here. */
+/** The steps of a live run, received block by block on request (docs/api.md). */
+
+/** @import { LiveRun, Selection, Task, TraceHeader } from './api.js' */
+/** @import { ColumnHeader } from '../types/server.js' */
 
 import { Trace } from './trace.js';
 
-const AGAIN = 1000; // ms until a socket that has gone is opened anew
-const REFUSED = 4000; // code with which the server closes it where there is no such run
+const RECONNECT_DELAY = 1000; // ms
+const NOT_FOUND = 4000; // close code if the run does not exist
 
 /**
- * @typedef {object} Block of steps @property {number} first @property {number} steps @property {number} of how many there are by now
- * @property {{name: string, shape: number[], offset: number}[]} columns @property {ArrayBuffer} buffer that they lie in
- * @property {ArrayBuffer | null} pictures @property {number} written s since 1970 @property {string} state @property {string} told
+ * @typedef {object} Block of steps
+ * @property {number} first
+ * @property {number} steps
+ * @property {number} total steps of the run so far
+ * @property {ColumnHeader[]} columns
+ * @property {ArrayBuffer} buffer of the columns
+ * @property {ArrayBuffer | null} images
+ * @property {number} written time in s since 1970
+ * @property {string} state of the run
+ * @property {string} message about the state
  */
 
-export class Stream {
-  /** Why there are no steps to be had; empty while there may be. */
-  refused = '';
+export class LiveStream {
+  /** Why the run cannot be read; empty if it can. */
+  error = '';
   #url;
+  /** @type {WebSocket | null} */
   #socket = null;
   #closed = false;
-  #waiting = null;
+  /** @type {{resolve: (block: Block) => void, reject: (reason?: unknown) => void} | null} */
+  #pending = null;
 
   /** @param {string} name of the run */
   constructor(name) {
@@ -26,19 +38,21 @@ export class Stream {
   }
 
   /**
-   * The next steps as soon as there are any, or an empty block where none come for a while; null once it is closed.
-   * @param {number} first that is wanted @param {string} state of the run, as it is known here @returns {Promise<Block | null>}
+   * Returns the next steps once they exist, or an empty block after a timeout; null after `close`.
+   * @param {number} first
+   * @param {string} state last known state of the run
+   * @returns {Promise<Block | null>}
    */
   async next(first, state) {
     while (!this.#closed) {
       try {
-        await this.#open();
-        return await new Promise((...settle) => {
-          this.#waiting = settle;
-          this.#socket.send(JSON.stringify({ from: first, state }));
+        const socket = await this.#open();
+        return await new Promise((resolve, reject) => {
+          this.#pending = { resolve, reject };
+          socket.send(JSON.stringify({ from: first, state }));
         });
       } catch {
-        if (!this.#closed) await new Promise((resolve) => setTimeout(resolve, AGAIN));
+        if (!this.#closed) await new Promise((resolve) => setTimeout(resolve, RECONNECT_DELAY));
       }
     }
     return null;
@@ -49,45 +63,64 @@ export class Stream {
     this.#socket?.close();
   }
 
+  /** @returns {Promise<WebSocket>} */
   async #open() {
-    if (this.#socket?.readyState === WebSocket.OPEN) return;
+    if (this.#socket?.readyState === WebSocket.OPEN) return this.#socket;
     const socket = (this.#socket = new WebSocket(this.#url));
     socket.binaryType = 'arraybuffer';
-    socket.onmessage = ({ data }) => this.#waiting?.[0](block(data));
+    socket.onmessage = ({ data }) => this.#pending?.resolve(decodeBlock(data));
     await new Promise((resolve, reject) => {
       socket.onopen = resolve;
       socket.onclose = ({ code, reason }) => {
-        if (code === REFUSED) [this.#closed, this.refused] = [true, reason];
+        if (code === NOT_FOUND) [this.#closed, this.error] = [true, reason];
         reject();
-        this.#waiting?.[1]();
+        this.#pending?.reject();
       };
     });
+    return socket;
   }
 }
 
-/** @param {ArrayBuffer} message @returns {Block} */
-function block(message) {
+/**
+ * @param {ArrayBuffer} message
+ * @returns {Block}
+ */
+export function decodeBlock(message) {
   const length = new DataView(message).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
   const start = 4 + Math.ceil(length / 4) * 4;
-  const end = message.byteLength - header.pictures;
-  return { ...header, buffer: message.slice(start, end), pictures: header.pictures ? message.slice(end) : null };
+  const { pictures: imageBytes, ...block } = header;
+  const end = message.byteLength - imageBytes;
+  return {
+    ...block,
+    buffer: message.slice(start, end),
+    images: imageBytes ? message.slice(end) : null,
+  };
 }
 
 /**
- * The trace of a live run with the first of its steps; `trace.stream` has those that follow.
- * @param {import('./api.js').Task} task @param {import('./api.js').Selection} selection
- * @param {object} header as the server sent it @param {AbortSignal} signal @returns {Promise<Trace>}
+ * Loads the first steps of a live run; `trace.stream` provides the following ones.
+ * @param {Task} task
+ * @param {Selection} selection
+ * @param {TraceHeader} header
+ * @param {LiveRun} run
+ * @param {AbortSignal} signal
+ * @returns {Promise<Trace>}
  */
-export async function begun(task, selection, header, signal) {
-  const stream = new Stream(header.live.name);
+export async function loadLiveTrace(task, selection, header, run, signal) {
+  const stream = new LiveStream(run.name);
   signal.addEventListener('abort', () => stream.close());
-  let found = await stream.next(0, header.live.state);
-  while (found && !found.steps) found = await stream.next(0, found.state);
+  let block = await stream.next(0, run.state);
+  while (block && !block.steps) block = await stream.next(0, block.state);
   signal.throwIfAborted();
-  const trace = new Trace(task, selection, { ...header, steps: found.steps, columns: found.columns }, found.buffer, found.pictures);
-  return Object.assign(trace, { stream, live: { ...header.live, ...told(found) } });
+  if (!block) throw new Error(`The live run cannot be read: ${stream.error}.`);
+  const { steps, columns, buffer, images } = block;
+  const trace = new Trace(task, selection, { ...header, steps, columns }, buffer, images);
+  return Object.assign(trace, { stream, live: { ...run, ...liveStatus(block) } });
 }
 
-/** What a block says of its run. @param {Block} found */
-export const told = ({ state, told: line, of }) => ({ state, told: line, steps: of });
+/**
+ * Returns the state of a run as of a block.
+ * @param {Block} block
+ */
+export const liveStatus = ({ state, message, total }) => ({ state, message, steps: total });

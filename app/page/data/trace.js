@@ -1,254 +1,408 @@
-/** A trace's numbers as the page shows them: columns over time, in cm and degrees. */
+/** A trace as the page displays it: columns over time, in cm and degrees. */
 
-import { SHOWN, wrapped } from '../core/units.js';
+/** @import { ColumnHeader } from '../types/server.js' */
+/** @import { LiveRun, Selection, Task, TraceHeader } from './api.js' */
+/** @import { Block, LiveStream } from './live_stream.js' */
+
+import { DISPLAY_UNITS, wrapDegrees } from '../core/units.js';
 
 const FUSED = 'fused';
 
+/** @typedef {{data: Float32Array, shape: number[]}} Column steps first; `data` may have unused space at the end */
+/** @typedef {Float32Array} Series one value per step */
+
 export class Trace {
-  /** Whose steps are still coming: their stream (stream.js), and what is known of the run; else undefined. */
+  /** Source of further steps of a live run. @type {LiveStream | undefined} */
   stream;
+  /** @type {LiveRun | undefined} */
   live;
+  /** @type {Map<string, Column>} */
   #columns = new Map();
+  /** @type {Map<string, Series | undefined>} */
   #cache = new Map();
 
   /**
-   * @param {import('./api.js').Task} task @param {import('./api.js').Selection} selection
-   * @param {object} header as the server sent it @param {ArrayBuffer} buffer its columns, end to end
-   * @param {ArrayBuffer | null} pictures T x H x W bytes
+   * @param {Task} task
+   * @param {Selection} selection
+   * @param {TraceHeader} header
+   * @param {ArrayBuffer} buffer columns, end to end
+   * @param {ArrayBuffer | null} images T x H x W bytes
    */
-  constructor(task, selection, header, buffer, pictures) {
-    [this.task, this.selection, this.header] = [task, selection, header];
+  constructor(task, selection, header, buffer, images) {
+    this.task = task;
+    this.selection = selection;
+    this.header = header;
     this.steps = header.steps;
     this.dt = header.dt;
     this.components = header.components;
     this.modalities = header.modalities;
-    this.pictures = pictures && new Uint8Array(pictures);
+    this.images = images && new Uint8Array(images);
     for (const { name, shape, offset } of header.columns) {
       const size = shape.reduce((a, b) => a * b, 1);
       this.#columns.set(name, { data: new Float32Array(buffer, offset, size), shape });
     }
+    /** @param {string} name */
     const index = (name) => this.components.findIndex((c) => c.name === name);
-    /** Positions in the state of the two components that span the maps. */
+    /** Indices of the two state components that the maps show. */
     this.position = [index(task.map.x), index(task.map.y)];
     this.angles = this.components.map((c, i) => (c.unit === 'rad' ? i : -1)).filter((i) => i >= 0);
-    this.#derive(0);
+    /** Whether each step is in contact. @type {Series} */
+    this.contact = new Float32Array();
+    /** Whether the image of each step is blacked out. @type {Uint8Array} */
+    this.blackout = new Uint8Array();
+    this.#update(0);
   }
 
   /**
-   * More steps at the end. A column that comes late was not known before, one that stays away is not known now.
-   * @param {import('./live_stream.js').Block} block @returns {boolean} whether there are columns that were not there before
+   * Appends steps. Missing values of new columns, and of columns that the block lacks, are NaN.
+   * @param {Pick<Block, 'steps' | 'columns' | 'buffer' | 'images'>} block
+   * @returns {boolean} whether the block has new columns
    */
-  grow({ steps, columns, buffer, pictures }) {
+  grow({ steps, columns, buffer, images }) {
     const before = this.steps;
-    const given = new Map(columns.map((column) => [column.name, column]));
-    const late = columns.filter(({ name }) => !this.has(name));
-    for (const { name, shape } of late) this.#columns.set(name, { shape: [before, ...shape.slice(1)], data: new Float32Array(before * stride(shape)).fill(NaN) });
+    const headers = new Map(columns.map((column) => [column.name, column]));
+    const added = columns.filter(({ name }) => !this.has(name));
+    for (const { name, shape } of added)
+      this.#columns.set(name, {
+        shape: [before, ...shape.slice(1)],
+        data: new Float32Array(before * stride(shape)).fill(NaN),
+      });
     for (const [name, column] of this.#columns) {
-      const [used, more] = [before, steps].map((count) => count * stride(column.shape));
-      const found = given.get(name);
-      column.data = longer(column.data, used, found ? new Float32Array(buffer, found.offset, more) : new Float32Array(more).fill(NaN));
+      const [used, size] = [before, steps].map((count) => count * stride(column.shape));
+      const header = headers.get(name);
+      const values = header
+        ? new Float32Array(buffer, header.offset, size)
+        : new Float32Array(size).fill(NaN);
+      column.data = append(column.data, used, values);
       column.shape = [before + steps, ...column.shape.slice(1)];
     }
-    if (pictures) this.pictures = longer(this.pictures, (before * pictures.byteLength) / steps, new Uint8Array(pictures));
+    if (images && this.images) {
+      const used = (before * images.byteLength) / steps;
+      this.images = append(this.images, used, new Uint8Array(images));
+    }
     this.steps += steps;
     this.#cache.clear();
-    this.#derive(before);
-    return late.length > 0;
+    this.#update(before);
+    return added.length > 0;
   }
 
-  /** Whose estimates there are: each modality alone where it is known, and all of them; one alone is the same as all. */
+  /** Names of the estimates: the image-only and haptics-only updates if the filter has them, and the fused one. */
   get sources() {
     return this.fuses && this.has('modality_mean') ? [...this.modalities, FUSED] : [FUSED];
   }
 
-  /** Whether the truth of a step is known. */
-  knows(step) {
+  /**
+   * Returns whether the true position is known.
+   * @param {number} step
+   */
+  hasTruth(step) {
     return this.position.every((i) => Number.isFinite(this.truth(i)[step]));
   }
 
-  /** Whether several modalities are fused, or one measurement model, or none, decides alone. */
+  /** Whether the filter fuses several modalities. */
   get fuses() {
     return this.modalities.length > 1;
   }
 
-  /** What a source is called. */
-  called(source) {
+  /**
+   * Returns the label of an estimate.
+   * @param {string} source
+   */
+  label(source) {
     return source === FUSED && !this.fuses ? 'estimate' : source;
   }
 
-  /** Whether another trace is of the same episode, step by step; filter and faults may differ. */
-  alongside({ selection, steps }) {
-    return steps === this.steps && ['task', 'data', 'episode'].every((key) => selection[key] === this.selection[key]);
+  /**
+   * Returns whether another trace has the same episode; filter and faults may differ.
+   * @param {Trace} other
+   */
+  hasSameEpisode({ selection, steps }) {
+    const { task, data, episode } = this.selection;
+    return (
+      steps === this.steps &&
+      selection.task === task &&
+      selection.data === data &&
+      selection.episode === episode
+    );
   }
 
-  /** First and last step of each edit of the run. @returns {[number, number][]} */
-  get edited() {
+  /** First and last step of each intervention. @returns {[number, number][]} */
+  get edits() {
     return (this.header.settings?.edits ?? []).map(({ from, to }) => [from, to - 1]);
   }
 
+  /** @param {string} column */
   has(column) {
     return this.#columns.has(column);
   }
 
-  /** The number of weights a modality has: one, or one for each component. */
+  /** Number of weights of each modality: one, or one per state component. */
   get weightWidth() {
-    return (this.#columns.get('weights') ?? this.#columns.get('acting'))?.shape[2] ?? 0;
+    const column = this.#columns.get('weights') ?? this.#columns.get('effective_weights');
+    return column?.shape[2] ?? 0;
   }
 
-  /** The state component's unit as shown, and what m or rad must be multiplied by. */
-  shown(component) {
-    return SHOWN[this.components[component].unit];
+  /**
+   * Returns the display unit of a state component.
+   * @param {number} component
+   */
+  unitOf(component) {
+    return DISPLAY_UNITS[this.components[component].unit];
   }
 
-  /** (T,) */
+  /**
+   * @param {number} component
+   * @returns {Series}
+   */
   truth(component) {
-    return this.#scaled('truth', component, component);
+    return this.#scaled('truth', component, component) ?? new Float32Array();
   }
 
-  /** (T,) What a source believes. @param {string} source a modality or `fused`. */
+  /**
+   * Returns the mean of an estimate; undefined if the filter has no such estimate.
+   * @param {string} source a modality or `fused`
+   * @param {number} component
+   */
   mean(source, component) {
-    return this.#of('mean', source, component);
+    return this.#estimate('mean', source, component);
   }
 
-  /** (T,) Its standard deviation; undefined where the filter knows none, as `radius` and `surprise`. */
+  /**
+   * Returns the predicted standard deviation; undefined for a filter without a covariance.
+   * @param {string} source
+   * @param {number} component
+   */
   sigma(source, component) {
-    return this.#of('sigma', source, component);
+    return this.#estimate('sigma', source, component);
   }
 
-  /** (T,) or undefined: beta as the network gave it (`raw`), or the share that acted (`acting`). */
+  /**
+   * Returns the weights of a modality; undefined for a filter without weights.
+   * @param {string} kind `raw`: fusion weight beta, the output of the network; `effective`: its share in the posterior
+   * @param {string} modality
+   * @param {number} component
+   */
   weight(kind, modality, component) {
-    const name = kind === 'raw' ? 'weights' : 'acting';
-    const k = this.modalities.indexOf(modality);
-    if (!this.has(name) || k < 0) return undefined;
-    const { shape } = this.#columns.get(name);
-    return this.#slice(name, k, shape[2] > 1 ? component : 0);
+    const name = kind === 'raw' ? 'weights' : 'effective_weights';
+    const index = this.modalities.indexOf(modality);
+    const column = this.#columns.get(name);
+    if (!column || index < 0) return undefined;
+    return this.#slice(name, index, column.shape[2] > 1 ? component : 0);
   }
 
-  /** (T,) or undefined: number of particles that still carry weight. */
-  get particles() {
+  /** Effective sample size; undefined for a filter without particles. */
+  get effectiveSampleSize() {
     return this.#slice('effective_sample_size');
   }
 
-  /** (T,) or undefined: squared error over the claimed covariance, over the number of components; 1 on average. */
+  /**
+   * Returns the NEES divided by the number of components; undefined without a covariance.
+   * @param {string} source
+   */
   nees(source) {
-    const k = this.modalities.indexOf(source);
-    return this.#slice('nees', k < 0 ? this.modalities.length : k);
+    const index = this.modalities.indexOf(source);
+    return this.#slice('nees', index < 0 ? this.modalities.length : index);
   }
 
-  /** (T,) or undefined: what a modality measured less what was predicted. */
+  /**
+   * Returns the innovation of a modality; undefined if the filter has none.
+   * @param {string} modality
+   * @param {number} component
+   */
   innovation(modality, component) {
     return this.#scaled('innovation', component, this.modalities.indexOf(modality), component);
   }
 
-  /** (T,) or undefined: the standard deviation that prediction and measurement claim together. */
+  /**
+   * Returns the predicted standard deviation of the innovation.
+   * @param {string} modality
+   * @param {number} component
+   */
   innovationSigma(modality, component) {
-    return this.#scaled('innovation_sigma', component, this.modalities.indexOf(modality), component);
+    const index = this.modalities.indexOf(modality);
+    return this.#scaled('innovation_sigma', component, index, component);
   }
 
-  /** (T,) A source's estimate less the truth; angles wrapped. */
+  /**
+   * Returns the difference between an estimate and the true value, with angles wrapped.
+   * @param {string} source
+   * @param {number} component
+   */
   offset(source, component) {
-    return this.#cached(`offset ${source} ${component}`, () =>
-      difference(this.mean(source, component), this.truth(component), this.shown(component).unit),
+    return this.#cached(`offset ${source} ${component}`, () => {
+      const [mean, truth] = [this.mean(source, component), this.truth(component)];
+      const isAngle = this.unitOf(component).unit === '°';
+      return mean?.map((v, t) => (isAngle ? wrapDegrees(v - truth[t]) : v - truth[t]));
+    });
+  }
+
+  /**
+   * Returns the absolute error of an estimate: the distance in cm, or an angle in degrees.
+   * @param {string} source
+   * @param {number | 'position'} quantity a state component or the position
+   */
+  error(source, quantity) {
+    return this.#cached(`error ${source} ${quantity}`, () => {
+      if (quantity !== 'position') return this.offset(source, quantity)?.map(Math.abs);
+      return norm(this.position.map((i) => this.offset(source, i)));
+    });
+  }
+
+  /**
+   * Returns the predicted standard deviation of the position: the root of the summed variances, in cm.
+   * @param {string} source
+   */
+  positionSigma(source) {
+    return this.#cached(`position sigma ${source}`, () =>
+      norm(this.position.map((i) => this.sigma(source, i))),
     );
   }
 
-  /** (T,) Distance of a source's position to the true one, cm; of an angle, degrees. @param {number | 'position'} what */
-  error(source, what) {
-    return this.#cached(`error ${source} ${what}`, () => {
-      if (what !== 'position') return this.offset(source, what).map(Math.abs);
-      const [x, y] = this.position.map((i) => this.offset(source, i));
-      return x.map((dx, t) => Math.hypot(dx, y[t]));
-    });
-  }
-
-  /** (T,) Radius that a source claims for its position: the root of the summed variances, cm. */
-  radius(source) {
-    return this.#cached(`radius ${source}`, () => {
-      const [x, y] = this.position.map((i) => this.sigma(source, i));
-      return x?.map((sx, t) => Math.hypot(sx, y[t]));
-    });
-  }
-
-  /** The fused belief's largest error of any component at a step, in its own standard deviations, and whose it is. */
-  surprise(step) {
+  /**
+   * Returns the largest error of a component of the fused estimate, in predicted standard deviations.
+   * @param {number} step
+   * @returns {{sigmas: number, component: string} | undefined} undefined without a covariance
+   */
+  largestDeviation(step) {
     if (!this.has('estimate_sigma')) return undefined;
-    const each = this.components.map(({ name }, i) => {
-      return [Math.abs(this.offset(FUSED, i)[step]) / this.sigma(FUSED, i)[step], name];
+    const deviations = this.components.map(({ name }, i) => {
+      const [offset, sigma] = [this.offset(FUSED, i), this.sigma(FUSED, i)];
+      return {
+        sigmas: Math.abs(offset?.[step] ?? NaN) / (sigma?.[step] ?? NaN),
+        component: name,
+      };
     });
-    return each.sort((a, b) => b[0] - a[0])[0];
+    return deviations.sort((a, b) => b.sigmas - a.sigmas)[0];
   }
 
-  /** The picture of a step, H x W bytes, or null. */
-  picture(step) {
+  /**
+   * Returns the camera image of a step, H x W bytes.
+   * @param {number} step
+   */
+  image(step) {
     const [height, width] = this.header.pictures ?? [0, 0];
-    return this.pictures && this.pictures.subarray(step * height * width, (step + 1) * height * width);
+    return this.images && this.images.subarray(step * height * width, (step + 1) * height * width);
   }
 
-  #of(kind, source, component) {
-    const k = this.modalities.indexOf(source);
-    return k < 0 ? this.#scaled(`estimate_${kind}`, component, component) : this.#scaled(`modality_${kind}`, component, k, component);
+  /**
+   * @param {'mean' | 'sigma'} kind
+   * @param {string} source
+   * @param {number} component
+   */
+  #estimate(kind, source, component) {
+    const index = this.modalities.indexOf(source);
+    return index < 0
+      ? this.#scaled(`estimate_${kind}`, component, component)
+      : this.#scaled(`modality_${kind}`, component, index, component);
   }
 
+  /**
+   * Returns a slice of a column in the display unit of a component.
+   * @param {string} name
+   * @param {number} component
+   * @param {...number} index
+   */
   #scaled(name, component, ...index) {
-    const { scale } = this.shown(component);
-    return this.#cached(`${name} ${index}`, () => this.#slice(name, ...index)?.map((v) => v * scale));
+    const { scale } = this.unitOf(component);
+    return this.#cached(`${name} ${index}`, () =>
+      this.#slice(name, ...index)?.map((v) => v * scale),
+    );
   }
 
-  /** (T,) of a column: one place of its other axes. */
+  /**
+   * Returns the values over time at an index of the other axes; undefined if there is no such column.
+   * @param {string} name
+   * @param {...number} index
+   */
   #slice(name, ...index) {
     const column = this.#columns.get(name);
     if (!column) return undefined;
-    return this.#cached(`slice ${name} ${index}`, () => {
-      const [steps, ...rest] = column.shape;
-      const [values, width] = [new Float32Array(steps), stride(column.shape)];
-      let at = index.reduce((sum, i, axis) => sum * rest[axis] + i, 0);
-      for (let t = 0; t < steps; t++, at += width) values[t] = column.data[at];
-      return values;
-    });
+    return this.#cached(`slice ${name} ${index}`, () => slice(column, index));
   }
 
+  /**
+   * @param {string} key
+   * @param {() => Series | undefined} compute
+   */
   #cached(key, compute) {
     if (!this.#cache.has(key)) this.#cache.set(key, compute());
     return this.#cache.get(key);
   }
 
-  /** Contact, and which pictures are black; of the steps from `first` on. */
-  #derive(first) {
+  /**
+   * Updates the contact and the blackouts of the steps from `first`.
+   * @param {number} first
+   */
+  #update(first) {
     this.contact = this.#slice('contact') ?? new Float32Array(this.steps);
-    const black = new Uint8Array(this.steps);
-    if (first) black.set(this.black);
-    if (this.pictures) for (let t = first; t < this.steps; t++) black[t] = Number(this.picture(t).every((v) => v === 0));
-    this.black = black;
+    const blackout = new Uint8Array(this.steps);
+    blackout.set(this.blackout.subarray(0, first));
+    for (let t = first; t < this.steps; t++)
+      blackout[t] = Number(this.image(t)?.every((v) => v === 0) ?? false);
+    this.blackout = blackout;
   }
 }
 
-/** Numbers that a step has in a column of this shape. */
+/**
+ * Returns the number of values of a step in a column.
+ * @param {number[]} shape
+ */
 const stride = ([, ...rest]) => rest.reduce((a, b) => a * b, 1);
 
-/** An array with more behind the `used` first of its values; it has room for as many again. */
-function longer(array, used, more) {
-  const all = used + more.length;
-  if (array.length < all) {
-    const before = array;
-    array = new before.constructor(2 * all);
-    array.set(before.subarray(0, used));
+/**
+ * Returns the values of a column over time at an index of the other axes.
+ * @param {Column} column
+ * @param {number[]} index
+ */
+export function slice({ data, shape }, index) {
+  const [steps, ...rest] = shape;
+  const [values, width] = [new Float32Array(steps), stride(shape)];
+  let position = index.reduce((sum, i, axis) => sum * rest[axis] + i, 0);
+  for (let t = 0; t < steps; t++, position += width) values[t] = data[position];
+  return values;
+}
+
+/**
+ * Returns an array with more values after the first `used` ones. It doubles its space if needed.
+ * @template {Float32Array | Uint8Array} T
+ * @param {T} array
+ * @param {number} used
+ * @param {T} values
+ * @returns {T}
+ */
+function append(array, used, values) {
+  const size = used + values.length;
+  if (array.length < size) {
+    const previous = array;
+    const Kind = /** @type {new (length: number) => T} */ (previous.constructor);
+    array = new Kind(2 * size);
+    array.set(previous.subarray(0, used));
   }
-  array.set(more, used);
+  array.set(values, used);
   return array;
 }
 
-function difference(a, b, unit) {
-  return a.map((value, t) => (unit === '°' ? wrapped(value - b[t]) : value - b[t]));
+/**
+ * Returns the length of two-dimensional vectors over time.
+ * @param {(Series | undefined)[]} components
+ */
+function norm([x, y]) {
+  return x?.map((value, t) => Math.hypot(value, y?.[t] ?? NaN));
 }
 
-/** First and last step of each stretch where `flags` is true. @returns {[number, number][]} */
-export function stretches(flags) {
-  const found = [];
+/**
+ * Returns the first and the last step of each interval where flags are set.
+ * @param {ArrayLike<number | boolean>} flags
+ * @returns {[number, number][]}
+ */
+export function intervals(flags) {
+  /** @type {[number, number][]} */
+  const result = [];
   for (let t = 0; t < flags.length; t++) {
     if (!flags[t]) continue;
     const start = t;
     while (t + 1 < flags.length && flags[t + 1]) t++;
-    found.push([start, t]);
+    result.push([start, t]);
   }
-  return found;
+  return result;
 }

@@ -1,113 +1,165 @@
-/** The view's socket: sends the cursor, receives maps (docs/api.md). Never more than one cursor in flight. */
+/** The socket of a view: sends the cursor and receives maps (docs/api.md). At most one cursor is in flight. */
 
-import { openView } from './api.js';
+/** @import { Maps } from '../maps/map_values.js' */
+/** @import { Selection } from './api.js' */
+
+import { MAP_SIZE } from '../core/constants.js';
+import { messageOf } from '../core/dom.js';
 import { readMaps } from '../maps/map_values.js';
+import { openView } from './api.js';
 
 /**
- * @typedef {import('./api.js').Selection & {step: number, angle: number | null, size: number}} Cursor
- * @typedef {import('../maps/map_values.js').Maps} Maps
+ * @typedef {Selection & {step: number, angle: number | null, beside?: boolean}} Cursor
+ * @typedef {Cursor & {size: number, scene: boolean}} Message
+ * @typedef {{size?: number, inputTime?: number | null}} Cause of an answer: the cursor's map size and input
  * @typedef {object} Handlers
- * @property {(view: {view: string, scene: string}) => void} view a new view has been opened
- * @property {(times: number) => boolean} pace of the scene: see frame.js
- * @property {(maps: Maps, inputTime: number | null) => void} maps @property {(step: number, cause: object) => void} drawn
- * @property {(step: number, size: number) => void} noMaps of a filter that has none @property {(step: number) => void} moved in the 3D scene
- * @property {(line: string) => void} error @property {(problem: string | null) => void} connection
+ * @property {(view: {view: string, scene: string}) => void} view a view was opened
+ * @property {(factor: number) => boolean} pace sets the pause of the 3D scene, and returns whether it may render now
+ * @property {(maps: Maps, inputTime: number | null) => void} maps
+ * @property {(step: number, size: number | undefined) => void} noMaps the filter has no maps
+ * @property {(step: number, cause: Cause) => void} drawn the 3D scene shows the step
+ * @property {(step: number) => void} moved the step was changed in the 3D scene
+ * @property {(line: string) => void} error
+ * @property {(problem: string | null) => void} connection
  */
 
-const COARSE = 41;
-const FINE = 135;
-const REST = 120; // ms without a move after which the fine maps are asked for
-const PATIENCE = 10_000; // ms until an answer is taken for lost
-/** Where the scene is drawn slowly, it waits so many times as long as it takes: for a hand until it rests. */
-const PAUSE = { hand: Infinity, clock: 3, rest: 0 };
-const RETRY = { first: 500, most: 8000 }; // ms
+const FINE_DELAY = 120; // ms after the last change of the cursor
+const RESPONSE_TIMEOUT = 10_000; // ms
+/** Pause between renderings of a slow 3D scene, as a multiple of their duration. */
+const PACE = { scrubbing: Infinity, playing: 3, idle: 0 };
+const RETRY_DELAY = { first: 500, max: 8000 }; // ms
 
 export class ViewSocket {
   #handlers;
   #dark;
-  #look;
+  #sceneOptions;
+  /** @type {{view: string, scene: string, socket: string} | null} */
   #view = null;
+  /** @type {WebSocket | null} */
   #socket = null;
   #serial = 0;
-  #wanted = null;
-  #asked = null; // {cursor, done, serial}: maps of another moment, between two cursors
+  /** Next message. @type {{cursor: Message, inputTime: number | null} | null} */
+  #next = null;
+  /** Request for the maps of another step, between two cursors. @type {{cursor: Message, resolve: (maps: Maps) => void, serial: number} | null} */
+  #request = null;
   #newest = 0; // serial of the newest cursor
+  /** @type {number | null} */
   #inFlight = null;
+  /** @type {Map<number, Cause>} */
   #sent = new Map();
+  /** @type {Cursor | null} */
   #last = null;
-  #beside = null; // the other run's maps, which come before this one's
-  #rest = 0;
-  #lost = 0;
-  #pause = RETRY.first;
+  /** Maps of the comparison run, which arrive first. @type {Maps | null} */
+  #comparison = null;
+  /** @type {number | undefined} */
+  #fineTimer;
+  /** @type {number | undefined} */
+  #responseTimer;
+  #retryDelay = RETRY_DELAY.first;
 
-  /** @param {Handlers} handlers @param {() => boolean} dark @param {() => object} look of the scene */
-  constructor(handlers, dark, look) {
-    [this.#handlers, this.#dark, this.#look] = [handlers, dark, look];
+  /**
+   * @param {Handlers} handlers
+   * @param {() => boolean} dark
+   * @param {() => object} sceneOptions
+   */
+  constructor(handlers, dark, sceneOptions) {
+    this.#handlers = handlers;
+    this.#dark = dark;
+    this.#sceneOptions = sceneOptions;
     this.#connect();
   }
 
-  /** The cursor has moved: coarse maps now; fine ones and the scene when it rests. @param {Cursor} cursor without its size. */
+  /**
+   * Moves the cursor: requests coarse maps now, and fine maps and the scene when it stops.
+   * @param {Cursor} cursor
+   * @param {number | null} [inputTime]
+   */
   move(cursor, inputTime = null) {
     this.#last = cursor;
-    const scene = this.#handlers.pace(inputTime === null ? PAUSE.clock : PAUSE.hand);
-    this.#want({ ...cursor, size: COARSE, scene }, inputTime);
-    clearTimeout(this.#rest);
-    this.#rest = setTimeout(() => this.#want({ ...cursor, size: FINE, scene: true }, null), REST);
+    const scene = this.#handlers.pace(inputTime === null ? PACE.playing : PACE.scrubbing);
+    this.#enqueue({ ...cursor, size: MAP_SIZE.coarse, scene }, inputTime);
+    clearTimeout(this.#fineTimer);
+    this.#fineTimer = setTimeout(
+      () => this.#enqueue({ ...cursor, size: MAP_SIZE.fine, scene: true }, null),
+      FINE_DELAY,
+    );
   }
 
-  /** The fine maps of another moment; the cursor stays where it is. @param {object} cursor without its size. @returns {Promise<Maps>} */
-  ask(cursor) {
-    return new Promise((done) => {
-      this.#asked = { cursor: { against: '', ...cursor, size: FINE, scene: false }, done, serial: 0 };
-      this.#pump();
+  /**
+   * Requests the fine maps of another step without moving the cursor.
+   * @param {Cursor} cursor
+   * @returns {Promise<Maps>}
+   */
+  requestMaps(cursor) {
+    return new Promise((resolve) => {
+      const message = { ...cursor, against: '', size: MAP_SIZE.fine, scene: false };
+      this.#request = { cursor: message, resolve, serial: 0 };
+      this.#flush();
     });
   }
 
-  /** The page's colours have changed. */
-  theme(dark) {
+  /** @param {boolean} dark */
+  setTheme(dark) {
     this.#send({ type: 'theme', dark });
   }
 
-  /** The scene is to be looked at in another way. @param {object} look see scenelook.js */
-  look(look) {
-    this.#send({ type: 'look', ...look });
+  /**
+   * Sets layers and colours of the 3D scene.
+   * @param {object} options see scene_menu.js
+   */
+  setScene(options) {
+    this.#send({ type: 'scene_layers', ...options });
   }
 
-  /** The eye in the scene is to move. @param {'first' | 'above' | 'camera'} at */
-  stand(at) {
-    this.#send({ type: 'stand', at });
+  /**
+   * Moves the camera of the 3D scene.
+   * @param {string} at one of `VIEWPOINTS`
+   */
+  setViewpoint(at) {
+    this.#send({ type: 'viewpoint', at });
   }
 
-  #want(cursor, inputTime) {
-    // A coarse cursor that was overtaken by its own fine one must not lose when its input came.
-    const before = this.#wanted;
-    this.#wanted = { cursor, inputTime: inputTime ?? (before?.cursor.step === cursor.step ? before.inputTime : null) };
-    this.#pump();
+  /**
+   * @param {Message} cursor
+   * @param {number | null} inputTime
+   */
+  #enqueue(cursor, inputTime) {
+    // A fine cursor that replaces the coarse one of its step keeps the time of the input.
+    const replaced = this.#next?.cursor.step === cursor.step ? this.#next.inputTime : null;
+    this.#next = { cursor, inputTime: inputTime ?? replaced };
+    this.#flush();
   }
 
-  #pump() {
+  #flush() {
     if (this.#inFlight !== null || this.#socket?.readyState !== WebSocket.OPEN) return;
-    const asked = this.#asked && !this.#asked.serial;
-    if (!asked && !this.#wanted) return;
-    const { cursor, inputTime } = asked ? this.#asked : this.#wanted;
-    this.#inFlight = ++this.#serial;
-    if (asked) this.#asked.serial = this.#serial;
-    else {
-      this.#wanted = null;
-      this.#newest = this.#serial;
-      this.#sent.set(this.#serial, { ...cursor, inputTime });
+    if (this.#request && !this.#request.serial) {
+      this.#request.serial = ++this.#serial;
+      this.#sendCursor(this.#request.cursor);
+    } else if (this.#next) {
+      const { cursor, inputTime } = this.#next;
+      this.#next = null;
+      this.#newest = ++this.#serial;
+      this.#sent.set(this.#serial, { size: cursor.size, inputTime });
+      this.#sendCursor(cursor);
     }
-    this.#send({ type: 'cursor', serial: this.#serial, ...cursor });
-    this.#lost = setTimeout(() => this.#answered(this.#inFlight), PATIENCE);
   }
 
+  /** @param {Message} cursor */
+  #sendCursor(cursor) {
+    const serial = (this.#inFlight = this.#serial);
+    this.#send({ type: 'cursor', serial, ...cursor });
+    this.#responseTimer = setTimeout(() => this.#answered(serial), RESPONSE_TIMEOUT);
+  }
+
+  /** @param {number} serial */
   #answered(serial) {
     if (serial !== this.#inFlight) return;
-    clearTimeout(this.#lost);
+    clearTimeout(this.#responseTimer);
     this.#inFlight = null;
-    this.#pump();
+    this.#flush();
   }
 
+  /** @param {object} message */
   #send(message) {
     if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(message));
   }
@@ -119,7 +171,7 @@ export class ViewSocket {
         this.#handlers.view(this.#view);
       }
     } catch (error) {
-      this.#retry(error.message);
+      this.#retry(messageOf(error));
       return;
     }
     const url = new URL(this.#view.socket, location.href);
@@ -129,68 +181,72 @@ export class ViewSocket {
     let opened = false;
     socket.onopen = () => {
       opened = true;
-      this.#pause = RETRY.first;
+      this.#retryDelay = RETRY_DELAY.first;
       this.#handlers.connection(null);
-      this.look(this.#look());
+      this.setScene(this.#sceneOptions());
       if (this.#last) this.move(this.#last);
     };
-    socket.onmessage = (event) => this.#heard(event.data);
+    socket.onmessage = ({ data }) =>
+      data instanceof ArrayBuffer ? this.#receiveMaps(data) : this.#receive(JSON.parse(data));
     socket.onclose = () => {
-      if (this.#socket !== socket) return;
-      // A view whose socket does not even open has gone with its server.
-      if (!opened) this.#view = null;
-      clearTimeout(this.#lost);
-      this.#inFlight = null;
-      if (this.#asked) this.#asked.serial = 0;
-      this.#sent.clear();
-      this.#handlers.pace(PAUSE.rest);
-      this.#retry('The server has gone.');
+      if (this.#socket === socket) this.#disconnected(opened);
     };
     this.#socket = socket;
   }
 
-  #retry(problem) {
-    const seconds = this.#pause / 1000;
-    this.#handlers.connection(`${problem} Trying again every ${seconds < 1 ? 'moment' : `${Math.round(seconds)} s`} …`);
-    setTimeout(() => this.#connect(), this.#pause);
-    this.#pause = Math.min(2 * this.#pause, RETRY.most);
+  /** @param {boolean} opened whether the socket had been open */
+  #disconnected(opened) {
+    // If the socket cannot even be opened, the server no longer has the view.
+    if (!opened) this.#view = null;
+    clearTimeout(this.#responseTimer);
+    this.#inFlight = null;
+    if (this.#request) this.#request.serial = 0;
+    this.#sent.clear();
+    this.#handlers.pace(PACE.idle);
+    this.#retry('The connection to the server is lost.');
   }
 
-  #heard(data) {
-    if (data instanceof ArrayBuffer) {
-      const maps = readMaps(data);
-      if (maps.serial === this.#asked?.serial) {
-        this.#asked.done(maps);
-        this.#asked = null;
-        this.#answered(maps.serial);
-        return;
-      }
-      if (maps.other) {
-        this.#beside = maps;
-        return;
-      }
-      maps.beside = this.#beside?.serial === maps.serial ? this.#beside : null;
-      const sent = this.#sent.get(maps.serial);
-      this.#handlers.maps(maps, sent?.inputTime ?? null);
-      this.#answered(maps.serial);
+  /** @param {string} problem */
+  #retry(problem) {
+    const seconds = Math.max(1, Math.round(this.#retryDelay / 1000));
+    this.#handlers.connection(`${problem} Retrying every ${seconds} s …`);
+    setTimeout(() => this.#connect(), this.#retryDelay);
+    this.#retryDelay = Math.min(2 * this.#retryDelay, RETRY_DELAY.max);
+  }
+
+  /** @param {ArrayBuffer} data */
+  #receiveMaps(data) {
+    const maps = readMaps(data);
+    if (this.#request && maps.serial === this.#request.serial) {
+      this.#request.resolve(maps);
+      this.#request = null;
+    } else if (maps.other) {
+      this.#comparison = maps;
       return;
+    } else {
+      maps.beside = this.#comparison?.serial === maps.serial ? this.#comparison : null;
+      this.#handlers.maps(maps, this.#sent.get(maps.serial)?.inputTime ?? null);
     }
-    const message = JSON.parse(data);
-    if (message.type === 'cursor') this.#handlers.moved(message.step);
-    if (message.type === 'no_maps') {
-      this.#handlers.noMaps(message.step, this.#sent.get(message.serial)?.size);
-      this.#answered(message.serial);
+    this.#answered(maps.serial);
+  }
+
+  /** @param {{type: string, serial: number, step: number, error: string}} message */
+  #receive({ type, serial, step, error }) {
+    const cause = this.#sent.get(serial) ?? {};
+    if (type === 'cursor') this.#handlers.moved(step);
+    if (type === 'no_maps') {
+      this.#handlers.noMaps(step, cause.size);
+      this.#answered(serial);
     }
-    if (message.type === 'drawn') {
-      const sent = this.#sent.get(message.serial) ?? {};
-      if (sent.size === FINE && message.serial === this.#newest) this.#handlers.pace(PAUSE.rest);
-      this.#handlers.drawn(message.step, sent);
-      for (const serial of this.#sent.keys()) if (serial <= message.serial) this.#sent.delete(serial);
+    if (type === 'drawn') {
+      if (cause.size === MAP_SIZE.fine && serial === this.#newest) this.#handlers.pace(PACE.idle);
+      this.#handlers.drawn(step, cause);
+      for (const key of this.#sent.keys()) if (key <= serial) this.#sent.delete(key);
     }
-    if (message.type === 'error') {
-      this.#handlers.error(message.error);
-      this.#sent.delete(message.serial);
-      this.#answered(message.serial);
+    if (type === 'error') {
+      this.#handlers.error(error);
+      this.#sent.delete(serial);
+      this.#answered(serial);
     }
   }
 }

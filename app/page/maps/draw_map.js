@@ -1,172 +1,325 @@
-/** One likelihood map on a pen: the context of a canvas, or an `SvgPen` with the same strokes. */
+/** Draws one likelihood map on a canvas or as SVG. */
 
-import { TABLES, em, line } from '../core/palette.js';
+/** @import { ColourMap, LineStyle } from '../core/palette.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Maps, Shade } from './map_values.js' */
+/** @import { SvgContext } from './svg_context.js' */
+
+import { COLOUR_TABLES, lineStyle, scaled } from '../core/palette.js';
+import { context2d } from '../core/dom.js';
 import { fixed } from '../core/units.js';
 
-export const MARGIN = { left: em(38), bottom: em(30), top: 1, right: em(5), gap: em(9) }; // px around a map's square
-const SPACINGS = [1, 2, 5, 10, 20, 50, 100]; // cm between ticks
-const APART = em(26); // px between them at least
-const HALO = ['rgb(255 255 255 / 0.55)', 3.5];
-const FONT = `${em(10)}px system-ui, sans-serif`;
-const PARTICLE = em(22) / 10; // px radius of one with the mean weight
-const STRENGTHS = [0.95, 0.5]; // of the regions' borders, the smallest first
-
 /**
- * @typedef {object} Drawn one layer, ready to be drawn
- * @property {string} name @property {number} layer @property {import('./map_values.js').Maps} maps @property {import('../data/trace.js').Trace} trace
- * @property {HTMLCanvasElement} cells @property {number[][]} borders of regions, see `mapvalues.borders`
- * @typedef {{axes: 'offset' | 'world', zoom: number, cloud: boolean, text: string, withY: boolean, hover: number[] | null}} Look text: its colour
+ * @typedef {CanvasRenderingContext2D | SvgContext} Context
+ * @typedef {object} Layer of the displayed maps
+ * @property {string} name
+ * @property {number} index
+ * @property {Maps} maps
+ * @property {Trace} trace
+ * @property {HTMLCanvasElement} cells
+ * @property {Shade} shade
+ * @property {ColourMap} colourMap
+ * @property {number[][]} borders of regions, see `borders` in map_values.js
+ *
+ * @typedef {object} MapOptions
+ * @property {string} axes `offset` from the true position, or `world`
+ * @property {number} zoom
+ * @property {boolean} cloud whether particles are drawn
+ * @property {string} textColour
+ * @property {boolean} withY whether the y axis has labels
+ * @property {number[] | null} hover m, offset of the crosshair
+ *
+ * @typedef {(position: number[]) => number[]} Projection from m to px
  */
 
-/** Colours of the cells, turned over so that y is up. @param {import('./map_values.js').Shade} shade */
-export function paint(canvas, { values, low, high }, size, colours) {
+/** px around the square of a map. */
+export const MARGIN = {
+  left: scaled(38),
+  bottom: scaled(30),
+  top: 1,
+  right: scaled(5),
+  gap: scaled(9),
+};
+const TICK_SPACINGS = [1, 2, 5, 10, 20, 50, 100]; // cm
+const MIN_TICK_DISTANCE = scaled(26); // px
+const FONT = `${scaled(10)}px system-ui, sans-serif`;
+const PARTICLE_RADIUS = scaled(22) / 10; // px, for the mean weight
+const BORDER_OPACITIES = [0.95, 0.5]; // the smallest region first
+
+/** @typedef {[colour: string, width: number]} Stroke */
+/** @type {Stroke} */
+const HALO = ['rgb(255 255 255 / 0.55)', 3.5];
+const DIRECTIONS = [
+  [1, 0],
+  [0, 1],
+  [-1, 0],
+  [0, -1],
+];
+
+/**
+ * Colours the cells of a layer. Rows are reversed, so that y is up.
+ * @param {HTMLCanvasElement} canvas
+ * @param {Shade} shade
+ * @param {number} size cells along a side
+ * @param {ColourMap} colourMap
+ */
+export function paintCells(canvas, { values, low, high }, size, colourMap) {
   if (canvas.width !== size || canvas.height !== size) [canvas.width, canvas.height] = [size, size];
-  const pen = canvas.getContext('2d');
-  const image = pen.createImageData(size, size);
+  const context = context2d(canvas);
+  const image = context.createImageData(size, size);
   const pixels = new Uint32Array(image.data.buffer);
-  const [table, steps] = [TABLES[colours], 255.99 / (high - low)];
+  const [table, scale] = [COLOUR_TABLES[colourMap], 255.99 / (high - low)];
   for (let row = 0; row < size; row++) {
-    const to = (size - 1 - row) * size;
+    const target = (size - 1 - row) * size;
     for (let column = 0; column < size; column++) {
-      const place = (values[row * size + column] - low) * steps;
-      pixels[to + column] = table[place < 0 ? 0 : place > 255 ? 255 : place | 0];
+      const index = (values[row * size + column] - low) * scale;
+      pixels[target + column] = table[index < 0 ? 0 : index > 255 ? 255 : index | 0];
     }
   }
-  pen.putImageData(image, 0, 0);
+  context.putImageData(image, 0, 0);
 }
 
-/** A map with its axes and marks; its square's upper left corner is the pen's origin. @param {Drawn} drawn @param {Look} look */
-export function drawMap(pen, drawn, side, look) {
-  const { cells } = drawn;
-  const cut = cells.width / look.zoom; // of the cells, in the middle
-  pen.drawImage(cells, (cells.width - cut) / 2, (cells.width - cut) / 2, cut, cut, 0, 0, side, side);
-  drawAxes(pen, drawn, side, look);
-  pen.save();
-  pen.beginPath();
-  pen.rect(0, 0, side, side);
-  pen.clip();
-  drawn.borders.forEach((segments, i) => drawBorder(pen, segments, side, look.zoom, STRENGTHS[i]));
-  drawMarks(pen, drawn, side, look);
-  pen.restore();
+/**
+ * Draws a map with its axes and marks. The upper left corner of its square is the origin.
+ * @param {Context} context
+ * @param {Layer} layer
+ * @param {number} side px of the square
+ * @param {MapOptions} options
+ */
+export function drawMap(context, layer, side, options) {
+  const { cells } = layer;
+  const visible = cells.width / options.zoom;
+  const start = (cells.width - visible) / 2;
+  context.drawImage(cells, start, start, visible, visible, 0, 0, side, side);
+  drawAxes(context, layer.maps, side, options);
+  context.save();
+  context.beginPath();
+  context.rect(0, 0, side, side);
+  context.clip();
+  layer.borders.forEach((segments, i) =>
+    drawBorder(context, segments, side, options.zoom, BORDER_OPACITIES[i]),
+  );
+  drawMarks(context, layer, side, options);
+  context.restore();
 }
 
-function drawAxes(pen, { maps }, side, { axes, zoom, text, withY }) {
+/**
+ * @param {Context} context
+ * @param {Maps} maps
+ * @param {number} side
+ * @param {MapOptions} options
+ */
+function drawAxes(context, maps, side, { axes, zoom, textColour, withY }) {
   const half = (100 * maps.half_width) / zoom;
-  const spacing = SPACINGS.find((cm) => (cm / (2 * half)) * side > APART) ?? 2 * half;
-  const middle = axes === 'world' ? maps.centre.map((m) => 100 * m) : [0, 0];
-  pen.font = FONT;
-  pen.fillStyle = pen.strokeStyle = text;
-  pen.lineWidth = 1;
-  pen.textBaseline = 'top';
-  pen.textAlign = 'center';
-  pen.beginPath();
-  for (const [cm, at] of ticks(middle[0], half, spacing, side)) {
-    pen.moveTo(at, side);
-    pen.lineTo(at, side + 3);
-    pen.fillText(fixed(cm, 0), at, side + em(5));
+  const spacing =
+    TICK_SPACINGS.find((cm) => (cm / (2 * half)) * side > MIN_TICK_DISTANCE) ?? 2 * half;
+  const world = axes === 'world';
+  const middle = world ? maps.centre.map((m) => 100 * m) : [0, 0];
+  context.font = FONT;
+  context.fillStyle = context.strokeStyle = textColour;
+  context.lineWidth = 1;
+  context.textBaseline = 'top';
+  context.textAlign = 'center';
+  context.beginPath();
+  for (const [cm, x] of ticks(middle[0], half, spacing, side)) {
+    context.moveTo(x, side);
+    context.lineTo(x, side + 3);
+    context.fillText(fixed(cm, 0), x, side + scaled(5));
   }
   if (withY) {
-    pen.textAlign = 'right';
-    pen.textBaseline = 'middle';
-    for (const [cm, at] of ticks(middle[1], half, spacing, side)) {
-      pen.moveTo(0, side - at);
-      pen.lineTo(-3, side - at);
-      pen.fillText(fixed(cm, 0), -5, side - at);
+    context.textAlign = 'right';
+    context.textBaseline = 'middle';
+    for (const [cm, y] of ticks(middle[1], half, spacing, side)) {
+      context.moveTo(0, side - y);
+      context.lineTo(-3, side - y);
+      context.fillText(fixed(cm, 0), -5, side - y);
     }
   }
-  pen.stroke();
-  pen.textAlign = 'center';
-  pen.textBaseline = 'top';
-  const called = axes === 'world' ? ['x (cm)', 'y (cm)'] : ['Δx (cm)', 'Δy (cm)'];
-  pen.fillText(called[0], side / 2, side + em(18));
+  context.stroke();
+  context.textAlign = 'center';
+  context.textBaseline = 'top';
+  context.fillText(world ? 'x (cm)' : 'Δx (cm)', side / 2, side + scaled(18));
   if (!withY) return;
-  pen.save();
-  pen.translate(-MARGIN.left + 1, side / 2);
-  pen.rotate(-Math.PI / 2);
-  pen.fillText(called[1], 0, 0);
-  pen.restore();
+  context.save();
+  context.translate(-MARGIN.left + 1, side / 2);
+  context.rotate(-Math.PI / 2);
+  context.fillText(world ? 'y (cm)' : 'Δy (cm)', 0, 0);
+  context.restore();
 }
 
-/** Round values along an axis and where they are, px. @returns {[number, number][]} */
+/**
+ * Returns the values of the ticks of an axis in cm and their positions in px.
+ * @param {number} middle cm
+ * @param {number} half cm
+ * @param {number} spacing cm
+ * @param {number} side px
+ */
 function ticks(middle, half, spacing, side) {
-  const found = [];
-  for (let cm = Math.ceil((middle - half) / spacing) * spacing; cm <= middle + half; cm += spacing) {
-    found.push([cm, Math.round(((cm - middle + half) / (2 * half)) * side) + 0.5]);
-  }
-  return found;
+  /** @type {[number, number][]} */
+  const result = [];
+  const first = Math.ceil((middle - half) / spacing) * spacing;
+  for (let cm = first; cm <= middle + half; cm += spacing)
+    result.push([cm, Math.round(((cm - middle + half) / (2 * half)) * side) + 0.5]);
+  return result;
 }
 
-function drawBorder(pen, segments, side, zoom, strength) {
-  const at = (share) => ((share - 0.5) * zoom + 0.5) * side;
-  outlined(pen, [['rgb(0 0 0 / 0.3)', 2.25], [`rgb(255 255 255 / ${strength})`, 1]], () => {
+/**
+ * @param {Context} context
+ * @param {number[]} segments
+ * @param {number} side
+ * @param {number} zoom
+ * @param {number} opacity
+ */
+function drawBorder(context, segments, side, zoom, opacity) {
+  /** @param {number} share */
+  const position = (share) => ((share - 0.5) * zoom + 0.5) * side;
+  /** @type {Stroke[]} */
+  const strokes = [
+    ['rgb(0 0 0 / 0.3)', 2.25],
+    [`rgb(255 255 255 / ${opacity})`, 1],
+  ];
+  strokeAll(context, strokes, () => {
     for (let i = 0; i < segments.length; i += 4) {
-      pen.moveTo(at(segments[i]), at(1 - segments[i + 1]));
-      pen.lineTo(at(segments[i + 2]), at(1 - segments[i + 3]));
+      context.moveTo(position(segments[i]), position(1 - segments[i + 1]));
+      context.lineTo(position(segments[i + 2]), position(1 - segments[i + 3]));
     }
   });
 }
 
-/** Particles, truth, estimates and, in contact, the line to the end effector; y is up. */
-function drawMarks(pen, drawn, side, { cloud, zoom, hover }) {
-  const { maps, trace, name } = drawn;
+/**
+ * Draws particles, truth, estimates, the line to the end effector in contact, and the crosshair.
+ * @param {Context} context
+ * @param {Layer} layer
+ * @param {number} side
+ * @param {MapOptions} options
+ */
+function drawMarks(context, layer, side, { cloud, zoom, hover }) {
+  const { maps, trace, name } = layer;
   const { centre, estimate, effector, step } = maps;
   const half = maps.half_width / zoom;
-  const place = ([x, y]) => [((x - centre[0] + half) / (2 * half)) * side, ((centre[1] - y + half) / (2 * half)) * side];
-  const [tx, ty] = place(centre);
-  if (effector && trace.contact[step]) {
-    pen.setLineDash([4, 4]);
-    outlined(pen, [['rgb(255 255 255 / 0.8)', 1]], () => (pen.moveTo(tx, ty), pen.lineTo(...place(effector))));
-    pen.setLineDash([]);
-  }
-  if (cloud) drawCloud(pen, drawn, place);
-  // Open in the middle: a sharp peak is no larger than a mark.
-  if (maps.truth[0] !== null) outlined(pen, [['rgb(0 0 0 / 0.6)', 3.5], ['#fff', 1.5]], () => {
-    for (const [dx, dy] of [[1, 0], [0, 1], [-1, 0], [0, -1]]) {
-      pen.moveTo(tx + 4 * dx, ty + 4 * dy);
-      pen.lineTo(tx + 10 * dx, ty + 10 * dy);
+  /** @type {Projection} */
+  const project = ([x, y]) => [
+    ((x - centre[0] + half) / (2 * half)) * side,
+    ((centre[1] - y + half) / (2 * half)) * side,
+  ];
+  const centrePx = project(centre);
+  if (effector && trace.contact[step]) drawEffectorLine(context, centrePx, project(effector));
+  if (cloud) drawParticles(context, layer, project);
+  if (maps.truth[0] !== null) drawTruth(context, centrePx);
+  const single = name !== 'fused' && trace.fuses;
+  const mean = single ? trace.position.map((i) => trace.mean(name, i)?.[step] ?? NaN) : [];
+  if (single) drawModalityEstimate(context, project(mean.map((cm) => cm / 100)), lineStyle(name));
+  drawEstimate(context, project(trace.position.map((i) => estimate[i])));
+  if (hover) drawCrosshair(context, project(hover.map((d, i) => centre[i] + d)), side);
+}
+
+/**
+ * @param {Context} context
+ * @param {number[]} from px
+ * @param {number[]} to px
+ */
+function drawEffectorLine(context, [x, y], to) {
+  context.setLineDash([4, 4]);
+  strokeAll(context, [['rgb(255 255 255 / 0.8)', 1]], () => {
+    context.moveTo(x, y);
+    context.lineTo(to[0], to[1]);
+  });
+  context.setLineDash([]);
+}
+
+/**
+ * Draws a cross that is open in the middle, so that it does not cover a sharp peak.
+ * @param {Context} context
+ * @param {number[]} position px
+ */
+function drawTruth(context, [x, y]) {
+  /** @type {Stroke[]} */
+  const strokes = [
+    ['rgb(0 0 0 / 0.6)', 3.5],
+    ['#fff', 1.5],
+  ];
+  strokeAll(context, strokes, () => {
+    for (const [dx, dy] of DIRECTIONS) {
+      context.moveTo(x + 4 * dx, y + 4 * dy);
+      context.lineTo(x + 10 * dx, y + 10 * dy);
     }
   });
-  if (name !== 'fused' && trace.fuses) {
-    const [x, y] = place(trace.position.map((i) => trace.mean(name, i)[step] / 100));
-    outlined(pen, [HALO, [line(name).stroke, 2]], () => pen.arc(x, y, 5, 0, 2 * Math.PI));
-  }
-  const [x, y] = place(trace.position.map((i) => estimate[i]));
-  outlined(pen, [HALO, [line('fused').stroke, 2]], () => {
-    pen.moveTo(x, y - 9);
-    for (const [dx, dy] of [[9, 0], [0, 9], [-9, 0], [0, -9]]) pen.lineTo(x + dx, y + dy);
-  });
-  if (!hover) return;
-  const [hx, hy] = place([centre[0] + hover[0], centre[1] + hover[1]]);
-  outlined(pen, [['rgb(0 0 0 / 0.35)', 2.5], ['rgb(255 255 255 / 0.8)', 1]], () => {
-    pen.moveTo(0, hy);
-    pen.lineTo(side, hy);
-    pen.moveTo(hx, 0);
-    pen.lineTo(hx, side);
+}
+
+/**
+ * @param {Context} context
+ * @param {number[]} position px
+ * @param {LineStyle} style
+ */
+function drawModalityEstimate(context, [x, y], { stroke }) {
+  strokeAll(context, [HALO, [stroke, 2]], () => context.arc(x, y, 5, 0, 2 * Math.PI));
+}
+
+/**
+ * Draws a diamond.
+ * @param {Context} context
+ * @param {number[]} position px
+ */
+function drawEstimate(context, [x, y]) {
+  strokeAll(context, [HALO, [lineStyle('fused').stroke, 2]], () => {
+    context.moveTo(x, y - 9);
+    for (const [dx, dy] of DIRECTIONS) context.lineTo(x + 9 * dx, y + 9 * dy);
   });
 }
 
-/** Particles: their area is their weight as the layer sets it, and those without fade. */
-function drawCloud(pen, { maps, layer }, place) {
-  const weights = maps.weights[layer];
-  pen.lineWidth = 0.75;
+/**
+ * @param {Context} context
+ * @param {number[]} position px
+ * @param {number} side
+ */
+function drawCrosshair(context, [x, y], side) {
+  /** @type {Stroke[]} */
+  const strokes = [
+    ['rgb(0 0 0 / 0.35)', 2.5],
+    ['rgb(255 255 255 / 0.8)', 1],
+  ];
+  strokeAll(context, strokes, () => {
+    context.moveTo(0, y);
+    context.lineTo(side, y);
+    context.moveTo(x, 0);
+    context.lineTo(x, side);
+  });
+}
+
+/**
+ * Draws the particles with areas proportional to their weights in the layer.
+ * @param {Context} context
+ * @param {Layer} layer
+ * @param {Projection} project
+ */
+function drawParticles(context, { maps, index }, project) {
+  const weights = maps.weights[index];
+  context.lineWidth = 0.75;
   weights.forEach((weight, i) => {
-    const share = weight * weights.length; // of the mean weight
-    const [x, y] = place([maps.positions[2 * i], maps.positions[2 * i + 1]]);
+    const share = weight * weights.length; // 1 for the mean weight
+    const [x, y] = project([maps.positions[2 * i], maps.positions[2 * i + 1]]);
     const alpha = Math.min(0.12 + 0.5 * share, 0.75).toFixed(2);
-    pen.fillStyle = `rgb(255 255 255 / ${alpha})`;
-    pen.strokeStyle = `rgb(0 0 0 / ${alpha})`;
-    pen.beginPath();
-    pen.arc(x, y, Math.min(Math.max(PARTICLE * Math.sqrt(share), 0.8), 9), 0, 2 * Math.PI);
-    pen.fill();
-    pen.stroke();
+    const radius = Math.min(Math.max(PARTICLE_RADIUS * Math.sqrt(share), 0.8), 9);
+    context.fillStyle = `rgb(255 255 255 / ${alpha})`;
+    context.strokeStyle = `rgb(0 0 0 / ${alpha})`;
+    context.beginPath();
+    context.arc(x, y, radius, 0, 2 * Math.PI);
+    context.fill();
+    context.stroke();
   });
 }
 
-function outlined(pen, strokes, draw) {
-  for (const [style, width] of strokes) {
-    [pen.strokeStyle, pen.lineWidth] = [style, width];
-    pen.beginPath();
-    draw();
-    pen.stroke();
+/**
+ * Strokes the same path with several styles.
+ * @param {Context} context
+ * @param {Stroke[]} strokes
+ * @param {() => void} path
+ */
+function strokeAll(context, strokes, path) {
+  for (const [colour, width] of strokes) {
+    [context.strokeStyle, context.lineWidth] = [colour, width];
+    context.beginPath();
+    path();
+    context.stroke();
   }
 }

@@ -1,152 +1,206 @@
-/** The maps as files: a picture (PNG, SVG) or a table (CSV), made here in the browser. */
+/** Exports of the likelihood maps: images (PNG, SVG) and tables (CSV), made in the browser. */
 
-import { MARGIN, drawMap } from './draw_map.js';
-import { digits, ends, log } from './map_values.js';
-import { TABLES } from '../core/palette.js';
-import { SvgPen } from './svg_context.js';
+/** @import { Context, Layer } from './draw_map.js' */
+/** @import { DisplayedMaps } from './map_panel.js' */
+
+import { context2d, create, element, html, messageOf } from '../core/dom.js';
+import { COLOUR_TABLES } from '../core/palette.js';
 import { fixed } from '../core/units.js';
+import { MARGIN, drawMap } from './draw_map.js';
+import { logLikelihood, rangeDigits, rangeLabels } from './map_values.js';
+import { SvgContext } from './svg_context.js';
 
 const SIDE = 300; // px of a map's square
-const SHEET = { pad: 14, title: 24, bar: 8, foot: 40, sharp: 2 };
+const SHEET = { padding: 14, title: 24, bar: 8, footer: 40, pixelRatio: 2 };
 const INK = '#222';
+const COLUMN = SIDE + MARGIN.left + MARGIN.right;
 
-/** @param {HTMLElement} host with buttons and an output @param {() => object} shown as `Heatmaps.shown` has it */
-export function saving(host, shown) {
-  const [choice, output] = [host.querySelector('select'), host.querySelector('output')];
-  const picked = () => {
-    const all = shown();
-    const only = all.figures.filter(({ name }) => name === choice.value);
-    return { ...all, figures: only.length ? only : all.figures };
-  };
-  const actions = {
-    png: async (sheet, name) => download(await png(sheet), `${name}.png`),
-    svg: async (sheet, name) => download(new Blob([svg(sheet)], { type: 'image/svg+xml' }), `${name}.svg`),
-    csv: async (sheet, name) => download(new Blob([csv(sheet)], { type: 'text/csv' }), `${name}.csv`),
-    copy: async (sheet) => {
-      await navigator.clipboard.write([new ClipboardItem({ 'image/png': png(sheet) })]);
-      return 'Copied as a picture.';
-    },
-  };
+/** @type {Record<string, (sheet: DisplayedMaps, name: string) => Promise<string> | string>} */
+const ACTIONS = {
+  png: async (sheet, name) => download(await png(sheet), `${name}.png`),
+  svg: (sheet, name) => download(new Blob([svg(sheet)], { type: 'image/svg+xml' }), `${name}.svg`),
+  csv: (sheet, name) => download(new Blob([csv(sheet)], { type: 'text/csv' }), `${name}.csv`),
+  copy: async (sheet) => {
+    await navigator.clipboard.write([new ClipboardItem({ 'image/png': png(sheet) })]);
+    return 'Image copied.';
+  },
+};
+
+/**
+ * Connects the buttons of the export.
+ * @param {HTMLElement} host
+ * @param {() => DisplayedMaps | null} displayed
+ * @returns {(layers: string[]) => void} sets the layers to choose from
+ */
+export function bindExport(host, displayed) {
+  const select = element('select', HTMLSelectElement, host);
+  const output = html('output', host);
   host.addEventListener('click', async ({ target }) => {
-    const action = actions[target.dataset?.as];
-    if (!action) return;
-    const sheet = picked();
-    if (!sheet.maps) return;
+    const action = target instanceof HTMLElement && ACTIONS[target.dataset.as ?? ''];
+    const sheet = displayed();
+    if (!action || !sheet) return;
+    const selected = sheet.layers.filter(({ name }) => name === select.value);
+    const layers = selected.length ? selected : sheet.layers;
     try {
-      output.textContent = (await action(sheet, named(sheet, choice.value))) ?? 'Saved.';
+      output.textContent = await action({ ...sheet, layers }, fileName(sheet, select.value));
     } catch (error) {
-      output.textContent = `Not done: ${error.message}`;
+      output.textContent = `Export failed: ${messageOf(error)}`;
     }
   });
   return (layers) => {
-    const before = choice.value;
-    choice.replaceChildren(new Option('all maps', ''), ...layers.map((name) => new Option(name)));
-    choice.value = layers.includes(before) ? before : '';
+    const { value } = select;
+    select.replaceChildren(new Option('all maps', ''), ...layers.map((name) => new Option(name)));
+    select.value = layers.includes(value) ? value : '';
     output.textContent = '';
   };
 }
 
-function named({ trace, maps }, layer) {
+/**
+ * @param {DisplayedMaps} sheet
+ * @param {string} layer
+ */
+function fileName({ trace, maps }, layer) {
   const { task, filter, episode } = trace.selection;
-  return [task, filter, `episode${episode}`, `step${maps.step}`, layer || 'maps'].join('-').replaceAll(/[^\w.-]+/g, '-');
+  return [task, filter, `episode${episode}`, `step${maps.step}`, layer || 'maps']
+    .join('-')
+    .replaceAll(/[^\w.-]+/g, '-');
 }
 
-function described({ trace, maps, title }) {
+/** @param {DisplayedMaps} sheet */
+function caption({ trace, maps }) {
   const { task, filter, data, episode, faults } = trace.selection;
-  const angle = maps.angle === null ? '' : `, cut at ${fixed((maps.angle * 180) / Math.PI, 1)}°`;
-  return `${task}, ${filter}, ${data} episode ${episode}, ${faults ? `sensors ${faults}, ` : ''}step ${maps.step}${angle}: ${title}`;
+  const angle =
+    maps.angle === null ? '' : `, cross-section at ${fixed((maps.angle * 180) / Math.PI, 1)}°`;
+  return `${task}, ${filter}, ${data} episode ${episode}, ${faults ? `faults ${faults}, ` : ''}step ${maps.step}${angle}`;
 }
 
-/** A cell a row. @returns {string} */
+/**
+ * Writes a table with one row per cell.
+ * @param {DisplayedMaps} sheet
+ */
 export function csv(sheet) {
-  const { maps, figures } = sheet;
-  const logs = figures.map(({ layer }) => log(maps, layer));
+  const { maps, layers } = sheet;
+  const logs = layers.map(({ index }) => logLikelihood(maps, index));
   const { size, half_width: half, centre } = maps;
-  const middle = (index) => 100 * (((index + 0.5) / size) * 2 - 1) * half;
-  const deepest = figures.map(({ name, layer }) => `${name} ${fixed(maps.log_max[layer] - maps.log_range[layer], 3)}`).join(' / ');
+  /** @param {number} index */
+  const offset = (index) => 100 * (((index + 0.5) / size) * 2 - 1) * half;
+  const lowest = layers.map(
+    ({ name, index }) => `${name} ${fixed(maps.log_max[index] - maps.log_range[index], 3)}`,
+  );
+  const comments = [
+    `# Beliefscope: ${caption(sheet)}: natural logarithm of the likelihood`,
+    `# dx and dy: offset from the true position; x and y: world position. Values are clipped at: ${lowest.join(' / ')}`,
+  ];
+  const names = layers.map(({ name }) => `${name}_ln_likelihood_nats`);
   const rows = [
-    `# Beliefscope: ${described({ ...sheet, title: 'natural logarithm of the likelihood' })}`.replaceAll('\u2212', '-'),
-    `# dx and dy: offset from the true position; x and y: position in the world. Lowest value told, or less: ${deepest}`.replaceAll('\u2212', '-'),
-    ['dx_cm', 'dy_cm', 'x_cm', 'y_cm', ...figures.map(({ name }) => `${name}_ln_likelihood_nats`)].join(','),
+    ...comments.map((line) => line.replaceAll('−', '-')),
+    ['dx_cm', 'dy_cm', 'x_cm', 'y_cm', ...names].join(','),
   ];
   for (let i = 0; i < size * size; i++) {
-    const offset = [middle(i % size), middle(Math.floor(i / size))];
-    const places = [...offset, ...offset.map((d, axis) => d + 100 * centre[axis])];
-    rows.push([...places.map((cm) => cm.toFixed(3)), ...logs.map((values) => values[i].toFixed(4))].join(','));
+    const offsets = [offset(i % size), offset(Math.floor(i / size))];
+    const positions = [...offsets, ...offsets.map((d, axis) => d + 100 * centre[axis])];
+    rows.push(
+      [...positions.map((cm) => cm.toFixed(3)), ...logs.map((values) => values[i].toFixed(4))].join(
+        ',',
+      ),
+    );
   }
   return `${rows.join('\n')}\n`;
 }
 
-/** @returns {string} */
-export function svg(sheet) {
-  const pen = new SvgPen();
-  const [width, height] = extent(sheet);
-  drawSheet(pen, sheet, width, height);
-  return pen.document(width, height);
+/** @param {DisplayedMaps} sheet */
+function svg(sheet) {
+  const context = new SvgContext();
+  const [width, height] = sheetSize(sheet);
+  drawSheet(context, sheet, width, height);
+  return context.document(width, height);
 }
 
+/**
+ * @param {DisplayedMaps} sheet
+ * @returns {Promise<Blob>}
+ */
 async function png(sheet) {
-  const canvas = document.createElement('canvas');
-  const [width, height] = extent(sheet);
-  [canvas.width, canvas.height] = [SHEET.sharp * width, SHEET.sharp * height];
-  const pen = canvas.getContext('2d');
-  pen.scale(SHEET.sharp, SHEET.sharp);
-  drawSheet(pen, sheet, width, height);
+  const [width, height] = sheetSize(sheet);
+  const { pixelRatio } = SHEET;
+  const canvas = create('canvas', { width: pixelRatio * width, height: pixelRatio * height });
+  const context = context2d(canvas);
+  context.scale(pixelRatio, pixelRatio);
+  drawSheet(context, sheet, width, height);
   return new Promise((resolve, reject) => {
-    canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error('the picture is too large'))), 'image/png');
+    canvas.toBlob(
+      (blob) => (blob ? resolve(blob) : reject(new Error('the image is too large'))),
+      'image/png',
+    );
   });
 }
 
-const column = SIDE + MARGIN.left + MARGIN.right;
-
-function extent({ figures }) {
-  return [2 * SHEET.pad + figures.length * column, SHEET.pad + SHEET.title + SIDE + MARGIN.bottom + SHEET.foot + SHEET.pad];
+/** @param {DisplayedMaps} sheet */
+function sheetSize({ layers }) {
+  const { padding, title, footer } = SHEET;
+  return [
+    2 * padding + layers.length * COLUMN,
+    padding + title + SIDE + MARGIN.bottom + footer + padding,
+  ];
 }
 
-function drawSheet(pen, sheet, width, height) {
-  pen.fillStyle = '#fff';
-  pen.beginPath();
-  pen.rect(0, 0, width, height);
-  pen.fill();
-  sheet.figures.forEach((figure, i) => {
-    pen.save();
-    pen.translate(SHEET.pad + i * column + MARGIN.left, SHEET.pad + SHEET.title);
-    pen.fillStyle = INK;
-    pen.font = '600 13px system-ui, sans-serif';
-    [pen.textAlign, pen.textBaseline] = ['left', 'alphabetic'];
-    pen.fillText(figure.name, 0, -8);
-    drawBar(pen, figure);
-    drawMap(pen, figure, SIDE, { ...sheet.look, text: INK, withY: true, hover: null });
-    pen.restore();
+/**
+ * @param {Context} context
+ * @param {DisplayedMaps} sheet
+ * @param {number} width
+ * @param {number} height
+ */
+function drawSheet(context, sheet, width, height) {
+  const { padding, title } = SHEET;
+  context.fillStyle = '#fff';
+  context.beginPath();
+  context.rect(0, 0, width, height);
+  context.fill();
+  sheet.layers.forEach((layer, i) => {
+    context.save();
+    context.translate(padding + i * COLUMN + MARGIN.left, padding + title);
+    context.fillStyle = INK;
+    context.font = '600 13px system-ui, sans-serif';
+    [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
+    context.fillText(layer.name, 0, -8);
+    drawColourBar(context, layer);
+    const options = { ...sheet.options, textColour: INK, withY: true, hover: null };
+    drawMap(context, layer, SIDE, options);
+    context.restore();
   });
-  pen.fillStyle = INK;
-  pen.font = '10px system-ui, sans-serif';
-  [pen.textAlign, pen.textBaseline] = ['left', 'alphabetic'];
-  const words = described(sheet).split(': ');
-  pen.fillText(words[0], SHEET.pad, height - SHEET.pad - 12);
-  pen.fillText(`Colour: ${words.slice(1).join(': ')}`, SHEET.pad, height - SHEET.pad);
+  context.fillStyle = INK;
+  context.font = '10px system-ui, sans-serif';
+  [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
+  context.fillText(caption(sheet), padding, height - padding - 12);
+  context.fillText(`Colour: ${sheet.title}`, padding, height - padding);
 }
 
-/** The colour bar, above the map's right end. */
-function drawBar(pen, { shade, table }) {
-  const canvas = document.createElement('canvas');
-  [canvas.width, canvas.height] = [256, 1];
+/**
+ * Draws the colour bar above the right end of a map.
+ * @param {Context} context
+ * @param {Layer} layer
+ */
+function drawColourBar(context, { shade, colourMap }) {
+  const canvas = create('canvas', { width: 256, height: 1 });
   const image = new ImageData(256, 1);
-  new Uint32Array(image.data.buffer).set(TABLES[table]);
-  canvas.getContext('2d').putImageData(image, 0, 0);
-  const [low, high] = ends(shade, digits(shade));
-  pen.font = '10px system-ui, sans-serif';
-  pen.drawImage(canvas, SIDE - 130, -8 - SHEET.bar, 90, SHEET.bar);
-  pen.textAlign = 'right';
-  pen.fillText(low, SIDE - 134, -8);
-  pen.textAlign = 'left';
-  pen.fillText(high, SIDE - 36, -8);
+  new Uint32Array(image.data.buffer).set(COLOUR_TABLES[colourMap]);
+  context2d(canvas).putImageData(image, 0, 0);
+  const [low, high] = rangeLabels(shade, rangeDigits(shade));
+  context.font = '10px system-ui, sans-serif';
+  context.drawImage(canvas, SIDE - 130, -8 - SHEET.bar, 90, SHEET.bar);
+  context.textAlign = 'right';
+  context.fillText(low, SIDE - 134, -8);
+  context.textAlign = 'left';
+  context.fillText(high, SIDE - 36, -8);
 }
 
+/**
+ * @param {Blob} blob
+ * @param {string} name
+ */
 function download(blob, name) {
-  const link = document.createElement('a');
-  link.href = URL.createObjectURL(blob);
-  link.download = name;
+  const link = create('a', { href: URL.createObjectURL(blob), download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  return 'Saved.';
 }

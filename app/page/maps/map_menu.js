@@ -1,57 +1,124 @@
-/** How the maps are shown, what lies on top of them, and the ways to take them along: a sheet behind one button. */
+/** The menu of the likelihood maps: display options, the pinned step and exports. */
 
-import { saving } from './export_map.js';
+/** @import { State, Store } from '../core/state.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { MapPanel } from './map_panel.js' */
+
+import { create, element, html } from '../core/dom.js';
 import { choice } from '../widgets/pickers.js';
+import { bindExport } from './export_map.js';
 
-/** Of the state: the question, and the answers with what they are called. */
-const LOOKS = {
-  scale: ['Colour', [['normalised', 'likelihood / peak'], ['log', 'log-likelihood']]],
-  range: ['Peak and range', [['own', 'each its own'], ['same', 'of all maps']]],
-  colours: ['Colour map', [['viridis', 'viridis'], ['cividis', 'cividis']]],
-  zoom: ['Square', [['fit', 'as fits'], ['1', 'whole'], ['4', 'middle, 4 ×']]],
-  axes: ['Axes', [['offset', 'offset from truth'], ['world', 'world']]],
-  regions: ['50 and 95 % regions', [['shown', 'shown'], ['hidden', 'hidden']]],
-  cloud: ['Particles', [['hidden', 'hidden'], ['shown', 'by weight']]],
-};
+const GAP = 6; // px between the menu and the panel
+
+/** @type {{key: keyof State, label: string, options: [value: string, label: string][]}[]} */
+const OPTIONS = [
+  {
+    key: 'scale',
+    label: 'Quantity',
+    options: [
+      ['normalised', 'likelihood / peak'],
+      ['log', 'log-likelihood'],
+    ],
+  },
+  {
+    key: 'range',
+    label: 'Colour range',
+    options: [
+      ['own', 'per map'],
+      ['same', 'common'],
+    ],
+  },
+  {
+    key: 'colours',
+    label: 'Colour map',
+    options: [
+      ['viridis', 'viridis'],
+      ['cividis', 'cividis'],
+    ],
+  },
+  {
+    key: 'zoom',
+    label: 'Zoom',
+    options: [
+      ['fit', 'automatic'],
+      ['1', 'full'],
+      ['4', 'centre, 4 ×'],
+    ],
+  },
+  {
+    key: 'axes',
+    label: 'Axes',
+    options: [
+      ['offset', 'offset from truth'],
+      ['world', 'world'],
+    ],
+  },
+  {
+    key: 'regions',
+    label: '50 and 95 % regions',
+    options: [
+      ['shown', 'visible'],
+      ['hidden', 'hidden'],
+    ],
+  },
+  {
+    key: 'cloud',
+    label: 'Particles',
+    options: [
+      ['hidden', 'hidden'],
+      ['shown', 'by weight'],
+    ],
+  },
+];
 
 /**
- * @param {HTMLElement} sheet a popover @param {HTMLElement} button that opens it
- * @param {import('../core/state.js').Store} store @param {import('./maps.js').Heatmaps} heatmaps
- * @returns {(trace: import('../data/trace.js').Trace) => void} for another trace
+ * Fills the menu.
+ * @param {HTMLElement} menu a popover
+ * @param {HTMLElement} button that opens it
+ * @param {Store} store
+ * @param {MapPanel} maps
+ * @returns {(trace: Trace) => void} adapts the menu to a trace
  */
-export function mapTools(sheet, button, store, heatmaps) {
-  const rows = sheet.querySelector('.looks');
-  const hosts = Object.entries(LOOKS).map(([key, [question]]) => {
-    const [row, name, host] = ['div', 'span', 'div'].map((tag) => document.createElement(tag));
-    name.textContent = question;
-    Object.assign(host, { id: `maps-${key}`, className: 'choice' });
-    host.setAttribute('role', 'radiogroup');
-    host.setAttribute('aria-label', question);
-    row.append(name, host);
-    rows.append(row);
-    return [key, row, host];
-  });
-  const show = () => {
-    for (const [key, , host] of hosts) choice(host, LOOKS[key][1], store.state[key], (value) => store.set({ [key]: value }));
+export function mapMenu(menu, button, store, maps) {
+  const rows = OPTIONS.map((option) => optionRow(option, store));
+  html('.map-options', menu).append(...rows);
+  const pin = element('.pin', HTMLButtonElement, menu);
+  pin.addEventListener('click', () => maps.togglePin());
+  maps.changed = () => {
+    pin.textContent = maps.pinned
+      ? `Release step ${maps.pinned.maps.step}`
+      : 'Show change from this step';
   };
-  show();
-  store.listen((state, changed) => {
-    for (const [key, , host] of hosts) {
-      if (changed.has(key)) for (const input of host.querySelectorAll('input')) input.checked = input.value === state[key];
-    }
-  });
-  const pin = sheet.querySelector('.pin');
-  pin.addEventListener('click', () => heatmaps.pin());
-  heatmaps.changed = () => (pin.textContent = heatmaps.pinned ? `Let step ${heatmaps.pinned.maps.step} go` : 'Show change from this step');
-  const fill = saving(sheet.querySelector('.save'), () => heatmaps.shown);
-  sheet.addEventListener('beforetoggle', ({ newState }) => {
-    if (newState !== 'open') return;
-    // Beside the maps, so that they can be seen.
-    const { top, left } = button.closest('.panel').getBoundingClientRect();
-    [sheet.style.top, sheet.style.right] = [`${top}px`, `${innerWidth - left + 6}px`];
-    fill(heatmaps.shown.figures.map(({ name }) => name));
+  const setLayers = bindExport(html('.export', menu), () => maps.displayed);
+  menu.addEventListener('beforetoggle', (event) => {
+    if (/** @type {ToggleEvent} */ (event).newState !== 'open') return;
+    const { top, left } = html('#maps').getBoundingClientRect(); // the maps stay visible
+    [menu.style.top, menu.style.right] = [`${top}px`, `${innerWidth - left + GAP}px`];
+    setLayers(maps.displayed?.layers.map(({ name }) => name) ?? []);
   });
   return (trace) => {
-    for (const [key, row] of hosts) if (key === 'cloud') row.hidden = trace.header.kind !== 'pf';
+    OPTIONS.forEach(({ key }, i) => {
+      if (key === 'cloud') rows[i].hidden = trace.header.kind !== 'pf';
+    });
   };
+}
+
+/**
+ * @param {typeof OPTIONS[number]} option
+ * @param {Store} store
+ */
+function optionRow({ key, label, options }, store) {
+  const host = create('div', {
+    id: `maps-${key}`,
+    className: 'choice',
+    role: 'radiogroup',
+    ariaLabel: label,
+  });
+  const show = () =>
+    choice(host, options, String(store.state[key]), (value) => store.set({ [key]: value }));
+  show();
+  store.listen((_, changed) => {
+    if (changed.has(key)) show();
+  });
+  return create('div', {}, create('span', { textContent: label }), host);
 }

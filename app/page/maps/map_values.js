@@ -1,146 +1,274 @@
-/** The likelihood maps as they arrive (docs/api.md), and what is made of their cells: shades, ranges, regions, differences. */
+/** Likelihood maps as the server sends them (docs/api.md), and the values that the page displays: colours, regions, differences. */
 
+import { CELL_STEPS, LOG_RANGE } from '../core/constants.js';
 import { fixed, signed } from '../core/units.js';
 
 /**
+ * @typedef {object} MapStatistics measures of each layer; null where a measure does not exist
+ * @property {(number | null)[]} truth log-likelihood at the true position, relative to the peak
+ * @property {number[]} entropy nats, of a density per m²
+ * @property {number[]} area50 m²
+ * @property {number[]} area95 m²
+ * @property {(number | null)[]} axis rad, direction of the long axis
+ * @property {number[]} elongation length of the long axis over the short one
+ * @property {(number | null)[]} off_line rad between the long axis and the line to the end effector
+ * @property {(number | null)[][]} divergence nats, from layer to layer
+ * @property {(number | null)[][]} overlap
+ *
  * @typedef {object} Maps of one step
- * @property {number} serial @property {boolean} other whether they are of the other run @property {Maps | null} beside the other run's at this step
- * @property {number} step @property {number} size cells a side, S @property {number | null} angle rad
- * @property {string[]} layers L names @property {number} half_width m @property {number[]} centre m @property {number[]} truth
- * @property {number[]} estimate @property {number[]} log_max @property {number[]} log_range nats below the peak that are told apart
- * @property {number[][]} peak m, offsets @property {number[] | null} effector m
- * @property {Record<string, any>} numbers of `MapNumbers`, by layer
- * @property {Float32Array} positions M x 2 m, of particles @property {Float32Array[]} weights (M,) by layer
- * @property {Uint16Array[]} cells S x S by layer; row 0 is the smallest y offset
+ * @property {number} serial
+ * @property {boolean} other whether they belong to the comparison run
+ * @property {Maps | null} beside maps of the comparison run at the same step
+ * @property {number} step
+ * @property {number} size S, cells along a side
+ * @property {number | null} angle rad
+ * @property {string[]} layers L names
+ * @property {number} half_width m
+ * @property {number[]} centre m
+ * @property {(number | null)[]} truth state
+ * @property {number[]} estimate state
+ * @property {number[]} log_max log-likelihood of the peaks
+ * @property {number[]} log_range nats from the peak to the lowest cell
+ * @property {number[][]} peak m, offsets from the centre
+ * @property {number[] | null} effector m
+ * @property {MapStatistics} numbers
+ * @property {number} particles M
+ * @property {Float32Array} positions M x 2 m, of the particles
+ * @property {Float32Array[]} weights L x M
+ * @property {Uint16Array[]} cells L x S x S; row 0 has the smallest y offset
+ *
+ * @typedef {'normalised' | 'log'} Scale likelihood relative to the peak, or its logarithm
+ * @typedef {'own' | 'same'} Range of the colours: of each layer, or common to all
+ * @typedef {{values: Float32Array, low: number, high: number, clipped: boolean}} Shade
+ *   values of a layer and the ends of its colours; clipped: some values are below `low`
  */
 
-const STEPS = 65535;
-const DEEPEST = 64; // nats: a layer with this range has cells that are as deep or deeper
+const MAX_RANGE = { log: 40, ratio: 12 }; // nats between the ends of the colours
 const decoder = new TextDecoder();
 
-/** @param {ArrayBuffer} buffer @returns {Maps} */
+/**
+ * Decodes a message with maps.
+ * @param {ArrayBuffer} buffer
+ * @returns {Maps}
+ */
 export function readMaps(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const maps = JSON.parse(decoder.decode(new Uint8Array(buffer, 4, length)));
-  let at = 4 + Math.ceil(length / 4) * 4;
-  const take = (Kind, count) => {
-    const array = new Kind(buffer, at, count);
-    at += array.byteLength;
+  const { particles, layers, size } = maps;
+  let offset = 4 + Math.ceil(length / 4) * 4;
+  /** @param {number} count */
+  const floats = (count) => {
+    const array = new Float32Array(buffer, offset, count);
+    offset += array.byteLength;
     return array;
   };
-  const { particles, layers, size } = maps;
-  maps.positions = take(Float32Array, 2 * particles);
-  maps.weights = layers.map(() => take(Float32Array, particles));
-  maps.cells = layers.map(() => take(Uint16Array, size * size));
-  return maps;
+  const positions = floats(2 * particles);
+  const weights = layers.map(() => floats(particles));
+  /** @type {Uint16Array[]} */
+  const cells = layers.map(
+    (/** @type {string} */ _, /** @type {number} */ layer) =>
+      new Uint16Array(buffer, offset + 2 * layer * size * size, size * size),
+  );
+  return { ...maps, positions, weights, cells, beside: null };
 }
 
-/** What the cells of one layer are shown as. @typedef {{values: Float32Array, low: number, high: number, deep: boolean}} Shade deep: some lie below `low` */
-
-const SHOWN = { log: 40, ratio: 12 }; // nats between the ends of the colours at most
-
 /**
- * The layers as they are coloured.
- * @param {Maps} maps @param {'normalised' | 'log'} scale likelihood relative to the peak, or its logarithm
- * @param {'own' | 'same'} range each layer its own, or all that of the highest @param {Maps | null} pinned to take the ratio to
+ * Returns the values and the colour range of each layer.
+ * @param {Maps} maps
+ * @param {Scale} scale
+ * @param {Range} range
+ * @param {Maps | null} reference for likelihood ratios; null for likelihoods
  * @returns {Shade[]}
  */
-export function shades(maps, scale, range, pinned) {
-  if (pinned) return ratios(maps, pinned, range);
-  const logs = maps.cells.map((_, layer) => log(maps, layer));
+export function shades(maps, scale, range, reference) {
+  if (reference) return ratios(maps, reference, range);
+  const logs = maps.cells.map((_, layer) => logLikelihood(maps, layer));
   const top = Math.max(...maps.log_max);
-  const bottom = Math.min(...maps.log_max.map((max, l) => max - maps.log_range[l]));
-  return logs.map((values, l) => {
-    const peak = range === 'same' ? top : maps.log_max[l];
-    if (scale === 'normalised') return { values: values.map((v) => Math.exp(v - peak)), low: 0, high: 1, deep: false };
-    const lowest = range === 'same' ? bottom : peak - maps.log_range[l];
-    const low = Math.max(lowest, peak - SHOWN.log);
-    return { values, low, high: peak, deep: low > lowest || maps.log_range[l] >= DEEPEST };
+  const bottom = Math.min(...maps.log_max.map((max, layer) => max - maps.log_range[layer]));
+  return logs.map((values, layer) => {
+    const high = range === 'same' ? top : maps.log_max[layer];
+    if (scale === 'normalised')
+      return { values: values.map((v) => Math.exp(v - high)), low: 0, high: 1, clipped: false };
+    const lowest = range === 'same' ? bottom : high - maps.log_range[layer];
+    const low = Math.max(lowest, high - MAX_RANGE.log);
+    return { values, low, high, clipped: low > lowest || maps.log_range[layer] >= LOG_RANGE };
   });
 }
 
-/** (S x S) log-likelihood, nats. @param {Maps} maps */
-export function log(maps, layer) {
+/**
+ * Returns the log-likelihood of the cells of a layer.
+ * @param {Maps} maps
+ * @param {number} layer
+ */
+export function logLikelihood(maps, layer) {
   const [cells, max, span] = [maps.cells[layer], maps.log_max[layer], maps.log_range[layer]];
   const values = new Float32Array(cells.length);
-  for (let i = 0; i < cells.length; i++) values[i] = max + span * (cells[i] / STEPS - 1);
+  for (let i = 0; i < cells.length; i++) values[i] = max + span * (cells[i] / CELL_STEPS - 1);
   return values;
 }
 
-/** How much more likely a place is than in the pinned maps: the logarithm of two densities' ratio, over the offsets from the truth. */
-function ratios(maps, pinned, range) {
-  const found = maps.layers.map((_, l) => {
-    const [now, then] = [log(maps, l), log(pinned, l)];
-    const constant = Math.log(mass(then)) - 2 * Math.log(pinned.size) - Math.log(mass(now)) + 2 * Math.log(maps.size);
-    return now.map((v, i) => v - then[same(i, maps.size, pinned.size)] + constant);
+/**
+ * Returns the logarithm of the ratio of two densities at the same offsets from the truth.
+ * @param {Maps} maps
+ * @param {Maps} reference
+ * @param {Range} range
+ * @returns {Shade[]}
+ */
+function ratios(maps, reference, range) {
+  const layers = maps.layers.map((_, layer) => {
+    const logs = logLikelihood(maps, layer);
+    const referenceLogs = logLikelihood(reference, layer);
+    const constant =
+      Math.log(mass(referenceLogs)) -
+      2 * Math.log(reference.size) -
+      Math.log(mass(logs)) +
+      2 * Math.log(maps.size);
+    return logs.map(
+      (v, i) => v - referenceLogs[matchingCell(i, maps.size, reference.size)] + constant,
+    );
   });
-  const most = found.map((values) => values.reduce((high, v) => Math.max(high, Math.abs(v)), 1e-3));
-  return found.map((values, l) => {
-    const wanted = range === 'same' ? Math.max(...most) : most[l];
-    const high = Math.min(wanted, SHOWN.ratio);
-    return { values, low: -high, high, deep: wanted > high };
+  const extremes = layers.map((values) =>
+    values.reduce((max, v) => Math.max(max, Math.abs(v)), 1e-3),
+  );
+  return layers.map((values, layer) => {
+    const extreme = range === 'same' ? Math.max(...extremes) : extremes[layer];
+    const high = Math.min(extreme, MAX_RANGE.ratio);
+    return { values, low: -high, high, clipped: extreme > high };
   });
 }
 
+/** @param {Float32Array} logs */
 const mass = (logs) => logs.reduce((sum, v) => sum + Math.exp(v), 0);
 
-/** The cell of a map with another number of cells that lies at the same place. */
-function same(cell, size, other) {
-  const at = (index) => Math.min(Math.floor(((index + 0.5) / size) * other), other - 1);
-  return at(Math.floor(cell / size)) * other + at(cell % size);
+/**
+ * Returns the cell at the same place of a map of another size.
+ * @param {number} cell
+ * @param {number} size
+ * @param {number} otherSize
+ */
+function matchingCell(cell, size, otherSize) {
+  /** @param {number} index */
+  const match = (index) => Math.min(Math.floor(((index + 0.5) / size) * otherSize), otherSize - 1);
+  return match(Math.floor(cell / size)) * otherSize + match(cell % size);
 }
 
-/** The cell at an offset. @param {number[]} offset m from the truth */
-export function cellAt(maps, [dx, dy]) {
-  const at = (d) => Math.min(Math.max(Math.floor(((d + maps.half_width) / (2 * maps.half_width)) * maps.size), 0), maps.size - 1);
-  return at(dy) * maps.size + at(dx);
+/**
+ * Returns the cell at an offset from the truth.
+ * @param {Pick<Maps, 'size' | 'half_width'>} maps
+ * @param {number[]} offset m
+ */
+export function cellAt({ size, half_width: half }, [dx, dy]) {
+  /** @param {number} d */
+  const index = (d) =>
+    Math.min(Math.max(Math.floor(((d + half) / (2 * half)) * size), 0), size - 1);
+  return index(dy) * size + index(dx);
 }
 
-/** What stands at the ends of a shade's colour bar. @returns {[string, string]} */
-export function ends({ low, high, deep }, digits) {
+/**
+ * Returns the labels of both ends of a colour bar.
+ * @param {Shade} shade
+ * @param {number} digits
+ * @returns {[string, string]}
+ */
+export function rangeLabels({ low, high, clipped }, digits) {
   if (low === 0) return ['0', '1'];
-  const beyond = deep && high === -low ? '≥' : ''; // a ratio
-  return [`${deep ? '≤' : ''}${fixed(low, digits)}`, `${beyond}${low === -high ? signed(high, digits) : fixed(high, digits)}`];
+  const isRatio = low === -high;
+  const top = isRatio ? signed(high, digits) : fixed(high, digits);
+  return [`${clipped ? '≤' : ''}${fixed(low, digits)}`, `${clipped && isRatio ? '≥' : ''}${top}`];
 }
 
-/** Digits that tell the ends of a shade's colours apart. @param {Shade} shade */
-export const digits = ({ low, high }) => (high - low < 0.2 ? 3 : high - low < 2 ? 2 : high - low < 8 ? 1 : 0);
+/**
+ * Returns the number of digits that distinguishes both ends of a colour bar.
+ * @param {Shade} shade
+ */
+export function rangeDigits({ low, high }) {
+  const span = high - low;
+  if (span < 0.2) return 3;
+  return span < 2 ? 2 : span < 8 ? 1 : 0;
+}
 
-/** One cell's value. @returns {{log: number, relative: number, deep: boolean}} deep: it may be less */
+/**
+ * Returns the value of a cell.
+ * @param {Maps} maps
+ * @param {number} layer
+ * @param {number} cell
+ * @returns {{log: number, relative: number, clipped: boolean}} relative to the peak; clipped: the value may be lower
+ */
 export function valueAt(maps, layer, cell) {
-  const below = maps.log_range[layer] * (maps.cells[layer][cell] / STEPS - 1);
-  const deep = maps.cells[layer][cell] === 0 && maps.log_range[layer] >= DEEPEST;
-  return { log: maps.log_max[layer] + below, relative: Math.exp(below), deep };
+  const [value, range] = [maps.cells[layer][cell], maps.log_range[layer]];
+  const below = range * (value / CELL_STEPS - 1);
+  const clipped = value === 0 && range >= LOG_RANGE;
+  return { log: maps.log_max[layer] + below, relative: Math.exp(below), clipped };
 }
 
-/** The borders of the smallest regions that hold such shares of the likelihood, as line segments x0, y0, x1, y1 from 0 to 1, y up.
- *  @param {number[]} shares @returns {number[][]} */
+/**
+ * Returns the borders of the smallest regions that contain given shares of the likelihood.
+ * @param {Maps} maps
+ * @param {number} layer
+ * @param {number[]} shares
+ * @returns {number[][]} line segments x0, y0, x1, y1 of each region, from 0 to 1 with y up
+ */
 export function borders(maps, layer, shares) {
   const [cells, span] = [maps.cells[layer], maps.log_range[layer]];
-  const ordered = cells.slice().sort();
-  const likelihood = new Float64Array(ordered.length);
-  let total = 0;
-  for (let i = 0; i < ordered.length; i++) total += likelihood[i] = Math.exp(span * (ordered[i] / STEPS - 1));
+  const sorted = cells.slice().sort();
+  const likelihood = Float64Array.from(sorted, (value) =>
+    Math.exp(span * (value / CELL_STEPS - 1)),
+  );
+  const total = likelihood.reduce((a, b) => a + b, 0);
   return shares.map((share) => {
-    let [held, i] = [0, ordered.length];
-    while (i > 0 && held < share * total) held += likelihood[--i];
-    return contour(cells, maps.size, ordered[i] - 0.5);
+    let [sum, i] = [0, sorted.length];
+    while (i > 0 && sum < share * total) sum += likelihood[--i];
+    return contour(cells, maps.size, sorted[i] - 0.5);
   });
 }
 
-/** Sides of a square between four cell centres that a border crosses, by which corners lie inside (1, 2, 4, 8 from below left, round). */
-const CROSSED = [[], [3, 0], [0, 1], [3, 1], [1, 2], [3, 0, 1, 2], [0, 2], [3, 2], [2, 3], [2, 0], [0, 1, 2, 3], [2, 1], [1, 3], [1, 0], [0, 3], []];
+/**
+ * Pairs of sides of a square between four cell centres that the contour crosses.
+ * Indexed by the bits of the corners inside: 1, 2, 4, 8, counterclockwise from the lower left.
+ */
+const CROSSED_SIDES = [
+  [],
+  [3, 0],
+  [0, 1],
+  [3, 1],
+  [1, 2],
+  [3, 0, 1, 2],
+  [0, 2],
+  [3, 2],
+  [2, 3],
+  [2, 0],
+  [0, 1, 2, 3],
+  [2, 1],
+  [1, 3],
+  [1, 0],
+  [0, 3],
+  [],
+];
 
-/** Marching squares. */
+/**
+ * Finds a contour by marching squares.
+ * @param {Uint16Array} cells
+ * @param {number} size
+ * @param {number} level
+ */
 function contour(cells, size, level) {
+  /** @param {number} from @param {number} to */
+  const crossing = (from, to) => 0.5 + (level - from) / (to - from);
+  /** @param {number} value @param {number} bit */
+  const inside = (value, bit) => (value > level ? bit : 0);
   const segments = [];
   for (let row = 0; row < size - 1; row++) {
     for (let column = 0; column < size - 1; column++) {
       const i = row * size + column;
       const [a, b, c, d] = [cells[i], cells[i + 1], cells[i + size + 1], cells[i + size]];
-      for (const side of CROSSED[(a > level) | ((b > level) << 1) | ((c > level) << 2) | ((d > level) << 3)]) {
-        const between = (from, to) => 0.5 + (level - from) / (to - from);
-        const [x, y] = [[between(a, b), 0.5], [1.5, between(b, c)], [between(d, c), 1.5], [0.5, between(a, d)]][side];
+      const corners = inside(a, 1) | inside(b, 2) | inside(c, 4) | inside(d, 8);
+      for (const side of CROSSED_SIDES[corners]) {
+        const [x, y] = [
+          [crossing(a, b), 0.5],
+          [1.5, crossing(b, c)],
+          [crossing(d, c), 1.5],
+          [0.5, crossing(a, d)],
+        ][side];
         segments.push((column + x) / size, (row + y) / size);
       }
     }

@@ -1,33 +1,44 @@
-/** The picture as the filter sees it at a step: small and gray, enlarged; a black-out is named. */
+/** The camera image of a step, at the filter's resolution. */
+
+/** @import { Trace } from '../data/trace.js' */
+
+import { context2d, element, html } from '../core/dom.js';
 
 export class Camera {
   #figure;
-  #pen;
+  #context;
+  /** @type {Trace | null} */
   #trace = null;
 
   /** @param {HTMLElement} figure */
   constructor(figure) {
     this.#figure = figure;
-    this.#pen = figure.querySelector('canvas').getContext('2d', { willReadFrequently: true }); // drawn by the processor: no waiting for the scene's
+    // Drawn by the processor, so that it does not wait for the 3D scene.
+    this.#context = context2d(element('canvas', HTMLCanvasElement, figure), {
+      willReadFrequently: true,
+    });
   }
 
-  /** @param {import('../data/trace.js').Trace} trace */
+  /** @param {Trace} trace */
   show(trace) {
     this.#trace = trace;
-    this.#figure.hidden = !trace.pictures;
-    if (!trace.pictures) return;
+    this.#figure.hidden = !trace.images;
+    if (!trace.header.pictures) return;
     const [height, width] = trace.header.pictures;
-    Object.assign(this.#pen.canvas, { height, width });
-    this.#figure.querySelector('figcaption').textContent = `camera, ${width} × ${height}`;
+    Object.assign(this.#context.canvas, { height, width });
+    html('figcaption', this.#figure).textContent = `camera, ${width} × ${height}`;
   }
 
+  /** @param {number} step */
   move(step) {
-    const picture = this.#trace?.picture(step);
-    if (!picture) return;
-    const { width, height } = this.#pen.canvas;
+    const gray = this.#trace?.image(step);
+    if (!gray) return;
+    const { width, height } = this.#context.canvas;
     const image = new ImageData(width, height);
-    new Uint32Array(image.data.buffer).set(Uint32Array.from(picture, (gray) => 0xff000000 | (gray * 0x010101)));
-    this.#pen.putImageData(image, 0, 0);
-    this.#figure.querySelector('.black-out').hidden = !this.#trace.black[step];
+    new Uint32Array(image.data.buffer).set(
+      Uint32Array.from(gray, (value) => 0xff000000 | (value * 0x010101)),
+    );
+    this.#context.putImageData(image, 0, 0);
+    html('.blackout', this.#figure).hidden = !this.#trace?.blackout[step];
   }
 }

@@ -1,133 +1,198 @@
-/** What the 3D scene shows: a sheet of its layers, with the legend, and the places to look from (docs/api.md). */
+/** The menu of the 3D scene: layers, colours, legend and viewpoints (docs/api.md). */
 
-import { sample, swatch } from '../core/palette.js';
+/** @import { State, Store } from '../core/state.js' */
+/** @import { Trace } from '../data/trace.js' */
+
+import { SCENE_LAYERS, VIEWPOINTS } from '../core/constants.js';
+import { create } from '../core/dom.js';
+import { lineSample, swatch } from '../core/palette.js';
 import { choice } from '../widgets/pickers.js';
 
-const LAYERS = ['replay', 'objects', 'estimates', 'contours', 'particles', 'force', 'map', 'camera'];
-const PLACES = [['first', 'at first'], ['above', 'from above'], ['camera', 'at camera']];
-/** Of the state: the answers to each choice, and what they are called. */
-const CHOICES = {
-  tint: [['weight', 'by weight'], ['share', 'by modality']],
-  height: [['floor', 'on the floor'], ['belief', 'under the belief']],
-};
-/** Parts of the state that make up a look. */
-const PARTS = ['hide', 'ground', 'height', 'tint', 'scale', 'range', 'colours'];
+/** @typedef {typeof SCENE_LAYERS[number]} SceneLayer */
+/** @typedef {[value: string, label: string]} Option */
 
-export class SceneLook {
+/** @type {Record<SceneLayer, string>} */
+const LABELS = {
+  replay: 'Replay: robot and object',
+  objects: 'Object, true and estimated',
+  estimates: 'Position, true and estimated',
+  contours: '2σ contours',
+  particles: 'Particles',
+  force: 'Contact force',
+  map: 'Likelihood map',
+  camera: 'Camera and its image',
+};
+/** Options of layers: a key of the state, and the label. @type {Partial<Record<SceneLayer, [string, string][]>>} */
+const LAYER_OPTIONS = {
+  particles: [['tint', 'Colour of the particles']],
+  map: [
+    ['ground', 'Likelihood map'],
+    ['height', 'Height of the map'],
+  ],
+};
+/** @type {Record<'tint' | 'height', Option[]>} */
+const CHOICES = {
+  tint: [
+    ['weight', 'by weight'],
+    ['share', 'by modality'],
+  ],
+  height: [
+    ['floor', 'on the floor'],
+    ['belief', 'below the belief'],
+  ],
+};
+/** @type {Record<typeof VIEWPOINTS[number], string>} */
+const VIEWPOINT_LABELS = { first: 'initial', above: 'top', camera: 'camera' };
+/** Keys of the state that the scene depends on. @type {(keyof State)[]} */
+const STATE_KEYS = ['hide', 'ground', 'height', 'tint', 'scale', 'range', 'colours'];
+
+export class SceneMenu {
   #store;
-  #rows = {};
-  #choices = {};
-  #places = {};
-  #legend = element('p', { className: 'swatches' });
+  /** @type {Map<SceneLayer, {row: HTMLElement, box: HTMLInputElement}>} */
+  #rows = new Map();
+  /** @type {Map<string, HTMLElement>} */
+  #choices = new Map();
+  /** @type {Map<string, HTMLButtonElement>} */
+  #viewpoints = new Map();
+  #legend = create('p', { className: 'swatches' });
+  /** @type {Trace | null} */
   #trace = null;
 
   /**
-   * @param {HTMLElement} host of the scene @param {import('../core/state.js').Store} store
-   * @param {(look: object) => void} tell the server @param {(at: string) => void} stand elsewhere in the scene
+   * @param {HTMLElement} host of the scene
+   * @param {Store} store
+   * @param {(options: object) => void} setScene
+   * @param {(at: string) => void} setViewpoint
    */
-  constructor(host, store, tell, stand) {
+  constructor(host, store, setScene, setViewpoint) {
     this.#store = store;
-    const button = element('button', { id: 'scene-layers', type: 'button', className: 'text', textContent: 'Layers…', title: 'What the scene shows, in which colours, and from where' });
-    const sheet = element('div', { id: 'scene-options', popover: 'auto' });
-    sheet.setAttribute('role', 'dialog');
-    sheet.setAttribute('aria-label', 'Layers of the scene');
-    button.popoverTargetElement = sheet;
-    button.setAttribute('aria-haspopup', 'dialog');
-    host.append(button, sheet);
-    sheet.append(...LAYERS.map((layer) => this.#row(layer)), this.#legend, this.#footer(stand));
-    sheet.addEventListener('beforetoggle', ({ newState }) => {
-      if (newState !== 'open') return;
+    const button = create('button', {
+      id: 'scene-layers',
+      type: 'button',
+      className: 'text',
+      textContent: 'Layers…',
+      title: 'Layers, colours and viewpoint of the scene',
+      ariaHasPopup: 'dialog',
+    });
+    const menu = create('div', {
+      id: 'scene-options',
+      popover: 'auto',
+      role: 'dialog',
+      ariaLabel: 'Layers of the scene',
+    });
+    button.popoverTargetElement = menu;
+    host.append(button, menu);
+    menu.append(
+      ...SCENE_LAYERS.map((layer) => this.#row(layer)),
+      this.#legend,
+      this.#footer(setViewpoint),
+    );
+    menu.addEventListener('beforetoggle', (event) => {
+      if (/** @type {ToggleEvent} */ (event).newState !== 'open') return;
       const { bottom, left } = button.getBoundingClientRect();
-      [sheet.style.top, sheet.style.left] = [`${bottom + 4}px`, `${left}px`];
+      [menu.style.top, menu.style.left] = [`${bottom + 4}px`, `${left}px`];
     });
     store.listen((_, changed) => {
-      if (!PARTS.some((part) => changed.has(part))) return;
-      this.#draw();
-      tell(this.look);
+      if (!STATE_KEYS.some((key) => changed.has(key))) return;
+      this.#update();
+      setScene(this.options);
     });
   }
 
-  /** As the server is told it. */
-  get look() {
-    const { hide, ...look } = Object.fromEntries(PARTS.map((part) => [part, this.#store.state[part]]));
-    return { hidden: hidden(hide), ...look };
+  /** Options of the scene as the server receives them. */
+  get options() {
+    const { state } = this.#store;
+    const { hide, ...options } = Object.fromEntries(STATE_KEYS.map((key) => [key, state[key]]));
+    return { hidden: hiddenLayers(state.hide), ...options };
   }
 
-  /** @param {import('../data/trace.js').Trace} trace whose layers there are */
+  /** @param {Trace} trace */
   show(trace) {
     this.#trace = trace;
-    this.#draw();
+    this.#update();
   }
 
-  #draw() {
+  #update() {
     const [trace, { state }] = [this.#trace, this.#store];
     if (!trace) return;
-    const there = trace.header.scene ?? LAYERS;
-    for (const layer of LAYERS) {
-      const { row, box } = this.#rows[layer];
-      row.hidden = !there.includes(layer);
-      box.checked = !hidden(state.hide).includes(layer);
+    const available = trace.header.scene ?? SCENE_LAYERS;
+    for (const [layer, { row, box }] of this.#rows) {
+      row.hidden = !available.includes(layer);
+      box.checked = !hiddenLayers(state.hide).includes(layer);
     }
-    this.#legend.replaceChildren(...['truth', ...trace.sources].map((name) => keyed(swatch(name), trace.called(name))));
-    for (const [at, button] of Object.entries(this.#places)) button.hidden = at === 'camera' && !there.includes('camera');
-    const layers = trace.fuses ? [...trace.modalities, 'fused'] : [];
-    const ground = layers.includes(state.ground) ? state.ground : 'fused';
-    const set = (name) => (value) => this.#store.set({ [name]: value });
-    choice(this.#choices.ground, layers.map((name) => [name, name]), ground, set('ground'));
-    choice(this.#choices.height, CHOICES.height, state.height, set('height'));
-    choice(this.#choices.tint, trace.has('acting') ? CHOICES.tint : [], state.tint, set('tint'));
+    this.#legend.replaceChildren(
+      ...['truth', ...trace.sources].map((name) => legendEntry(swatch(name), trace.label(name))),
+    );
+    for (const [at, button] of this.#viewpoints)
+      button.hidden = at === 'camera' && !available.includes('camera');
+    const maps = trace.fuses ? [...trace.modalities, 'fused'] : [];
+    const ground = maps.includes(state.ground) ? state.ground : 'fused';
+    this.#choose(
+      'ground',
+      maps.map((name) => [name, name]),
+      ground,
+    );
+    this.#choose('height', CHOICES.height, state.height);
+    this.#choose('tint', trace.has('effective_weights') ? CHOICES.tint : [], state.tint);
   }
 
+  /**
+   * @param {'ground' | 'height' | 'tint'} key
+   * @param {Option[]} options
+   * @param {string} value
+   */
+  #choose(key, options, value) {
+    const host = this.#choices.get(key);
+    if (host) choice(host, options, value, (text) => this.#store.set({ [key]: text }));
+  }
+
+  /** @param {SceneLayer} layer */
   #row(layer) {
-    const [row, label] = ['div', 'label'].map((tag) => element(tag));
-    const box = element('input', { type: 'checkbox', value: layer });
+    const box = create('input', { type: 'checkbox', value: layer });
     box.addEventListener('change', () => {
-      const others = hidden(this.#store.state.hide).filter((one) => one !== layer);
+      const others = hiddenLayers(this.#store.state.hide).filter((name) => name !== layer);
       this.#store.set({ hide: [...others, ...(box.checked ? [] : [layer])].join(',') });
     });
-    label.append(box, NAMES[layer]);
-    row.append(label);
-    if (layer === 'force') row.append(keyed(sample('--contact', [], 2.5), '4 cm for 10 N'));
-    for (const [name, question] of QUESTIONS[layer] ?? []) {
-      const host = (this.#choices[name] = element('div', { id: `scene-${name}`, className: 'choice' }));
-      host.setAttribute('role', 'radiogroup');
-      host.setAttribute('aria-label', question);
+    const row = create('div', {}, create('label', {}, box, LABELS[layer]));
+    if (layer === 'force')
+      row.append(legendEntry(lineSample('--contact', [], 2.5), '4 cm per 10 N'));
+    for (const [key, label] of LAYER_OPTIONS[layer] ?? []) {
+      const host = create('div', {
+        id: `scene-${key}`,
+        className: 'choice',
+        role: 'radiogroup',
+        ariaLabel: label,
+      });
+      this.#choices.set(key, host);
       row.append(host);
     }
-    this.#rows[layer] = { row, box };
+    this.#rows.set(layer, { row, box });
     return row;
   }
 
-  #footer(stand) {
-    const row = element('div', { className: 'places' });
-    for (const [at, text] of PLACES) {
-      const button = (this.#places[at] = element('button', { type: 'button', textContent: text }));
-      button.addEventListener('click', () => stand(at));
+  /** @param {(at: string) => void} setViewpoint */
+  #footer(setViewpoint) {
+    const row = create('div', { className: 'viewpoints' });
+    row.append(create('span', { textContent: 'View' }));
+    for (const at of VIEWPOINTS) {
+      const button = create('button', { type: 'button', textContent: VIEWPOINT_LABELS[at] });
+      button.addEventListener('click', () => setViewpoint(at));
+      this.#viewpoints.set(at, button);
       row.append(button);
     }
-    row.prepend(element('span', { textContent: 'Look' }));
     return row;
   }
 }
 
-const NAMES = {
-  replay: 'Replay: robot and object', objects: 'Object, true and estimated', estimates: 'Position, true and estimated', contours: '2σ contours',
-  particles: 'Particles', force: 'Force in contact', map: 'Likelihood', camera: 'Camera and its picture',
-};
-/** What can be chosen of a layer: a part of the state, and the question. */
-const QUESTIONS = {
-  particles: [['tint', 'What the colour of particles tells']],
-  map: [['ground', 'Which map lies there'], ['height', 'Where it lies']],
-};
+/**
+ * @param {SVGElement} sample
+ * @param {string} text
+ */
+const legendEntry = (sample, text) => create('span', { className: 'key' }, sample, text);
 
-const element = (tag, properties = {}) => Object.assign(document.createElement(tag), properties);
-
-/** A line as it is drawn, and what it means. */
-function keyed(sample, text) {
-  const key = element('span', { className: 'key' });
-  key.append(sample, text);
-  return key;
-}
-
-/** @param {string} hide of the state @returns {string[]} the layers that are hidden */
-const hidden = (hide) => hide.split(',').filter((layer) => LAYERS.includes(layer));
+/**
+ * Returns the hidden layers that the state names.
+ * @param {string} hide
+ * @returns {string[]}
+ */
+const hiddenLayers = (hide) => SCENE_LAYERS.filter((layer) => hide.split(',').includes(layer));

@@ -1,50 +1,61 @@
 /**
- * Runs in the scene's frame before viser does, as a plain script, and hands viser its animation frames. They are the
- * page's too: without a GPU each of viser's drawings holds everything up for 0.3 s, and viser draws once a second even
- * where nothing moves. So drawings are timed, and where they are slow the page may have them wait: `drawing.pause`.
+ * Throttles viser's animation frames. A plain script that runs in the frame of the 3D scene before viser.
+ *
+ * The frame shares its thread with the page. Without a GPU each rendering blocks both for 0.3 s, and viser renders
+ * once a second even without changes. Renderings are therefore timed, and where they are slow the page can set a
+ * pause between them: `frameThrottle.pause`.
  */
 (() => {
-  const SLOW = 60; // ms from a drawing to the next frame; less counts as nothing
-  const MOST = 600; // ms that are believed: the first picture takes longer than any after it
-  const FORGOTTEN = 1000; // ms after which an endless pause ends if nobody asks for it again
-  const frame = window.requestAnimationFrame.bind(window);
-  const waiting = new Map(); // viser's callbacks by their handles
+  const SLOW = 60; // ms from a rendering to the next frame; less counts as fast
+  const MAX_COST = 600; // ms; the first rendering takes longer than the following ones
+  const PAUSE_TIMEOUT = 1000; // ms until an endless pause ends unless it is renewed
+  const requestFrame = window.requestAnimationFrame.bind(window);
+  /** Pending callbacks by handle. @type {Map<number, FrameRequestCallback>} */
+  const callbacks = new Map();
   let handle = 0;
-  let asked = false; // whether a frame is
-  let timer = 0;
-  let drew = false; // whether one of the callbacks of the last frame has
-  let [began, ended] = [0, 0]; // the last drawing
-  let costs = [0, 0]; // ms of the last two drawings
-  let [times, until] = [0, 0]; // what follows a drawing: a pause of so many times its cost, and when that is over
+  let requested = false;
+  /** @type {number | undefined} */
+  let timer;
+  let rendered = false; // whether a callback of the last frame rendered
+  let [start, end] = [0, 0]; // ms, of the last rendering
+  let costs = [0, 0]; // ms, of the last two renderings
+  let [factor, pauseEnd] = [0, 0];
 
-  /** ms; the lesser of two, because one may have been another's fault. */
+  // The minimum of two, because other work may have delayed one of them.
   const cost = () => Math.min(...costs);
 
-  function ask() {
+  function schedule() {
     clearTimeout(timer);
-    if (asked || !(waiting.size || drew)) return;
-    const rest = drew ? 0 : until - performance.now(); // the frame after a drawing tells how long it took
-    if (rest > 0) timer = setTimeout(ask, rest);
-    else [asked] = [true, frame(tick)];
-  }
-
-  function tick(now) {
-    if (drew) {
-      ended = performance.now();
-      costs = [costs[1], ended - began > SLOW ? Math.min(ended - began, MOST) : 0];
-      drew = false;
-      drawing.told?.(drawing.slow());
-      pause(times);
+    if (requested || !(callbacks.size || rendered)) return;
+    // The frame after a rendering measures its duration, and is not delayed.
+    const delay = rendered ? 0 : pauseEnd - performance.now();
+    if (delay > 0) {
+      timer = window.setTimeout(schedule, delay);
+    } else {
+      requested = true;
+      requestFrame(tick);
     }
-    if (performance.now() >= until) run(now);
-    asked = false;
-    ask();
   }
 
+  /** @param {number} now */
+  function tick(now) {
+    if (rendered) {
+      end = performance.now();
+      costs = [costs[1], end - start > SLOW ? Math.min(end - start, MAX_COST) : 0];
+      rendered = false;
+      throttle.changed?.(throttle.slow());
+      pause(factor);
+    }
+    if (performance.now() >= pauseEnd) run(now);
+    requested = false;
+    schedule();
+  }
+
+  /** @param {number} now */
   function run(now) {
-    began = performance.now();
-    for (const [key, callback] of [...waiting]) {
-      if (!waiting.delete(key)) continue; // one before it has cancelled it
+    start = performance.now();
+    for (const [key, callback] of [...callbacks]) {
+      if (!callbacks.delete(key)) continue; // cancelled by an earlier callback
       try {
         callback(now);
       } catch (error) {
@@ -53,37 +64,42 @@
     }
   }
 
-  /** From now on a pause of so many times its cost follows each slow drawing. Whether the next may be at once. */
-  function pause(wanted) {
-    times = wanted;
-    const endless = times === Infinity;
-    until = !cost() || !times ? 0 : endless ? performance.now() + FORGOTTEN : ended + times * cost();
-    ask();
-    return performance.now() >= until;
+  /** @param {number} value */
+  function pause(value) {
+    factor = value;
+    if (!cost() || !factor) pauseEnd = 0;
+    else if (factor === Infinity) pauseEnd = performance.now() + PAUSE_TIMEOUT;
+    else pauseEnd = end + factor * cost();
+    schedule();
+    return performance.now() >= pauseEnd;
   }
 
   window.requestAnimationFrame = (callback) => {
-    waiting.set(++handle, callback);
-    ask();
+    callbacks.set(++handle, callback);
+    schedule();
     return handle;
   };
-  window.cancelAnimationFrame = (key) => void waiting.delete(key);
-  const { clear } = WebGL2RenderingContext.prototype; // every drawing begins with it
-  WebGL2RenderingContext.prototype.clear = function (mask) {
-    drew = true;
+  window.cancelAnimationFrame = (key) => void callbacks.delete(key);
+  const { clear } = WebGL2RenderingContext.prototype; // the first call of every rendering
+  WebGL2RenderingContext.prototype.clear = function (/** @type {number} */ mask) {
+    rendered = true;
     return clear.call(this, mask);
   };
-  // To a hidden page viser applies what it is told as it comes, else as it draws, and then the first picture is half old.
-  const { get: hidden } = Object.getOwnPropertyDescriptor(Document.prototype, 'hidden');
-  Object.defineProperty(document, 'hidden', { get: () => drawing.slow() || hidden.call(document) });
-  // viser warns of drawing without a GPU, across the scene, each time; the page says what follows from it.
+  // On a hidden page viser applies messages as they arrive, otherwise while it renders: a slow rendering would show
+  // only a part of them.
+  const hidden = Object.getOwnPropertyDescriptor(Document.prototype, 'hidden')?.get;
+  Object.defineProperty(document, 'hidden', {
+    get: () => throttle.slow() || hidden?.call(document),
+  });
+  // Disables viser's warning about software rendering; the page has its own.
   const { getExtension } = WebGL2RenderingContext.prototype;
-  WebGL2RenderingContext.prototype.getExtension = function (name) {
+  WebGL2RenderingContext.prototype.getExtension = function (/** @type {string} */ name) {
     return name === 'WEBGL_debug_renderer_info' ? null : getExtension.call(this, name);
   };
-  // Where the frame is narrow, viser takes it for a telephone's screen and covers a quarter of it with its panel.
+  // Disables viser's layout for phones, whose panel covers a quarter of a narrow frame.
   const { matchMedia } = window;
-  window.matchMedia = (query) => matchMedia.call(window, query.includes('max-width') ? 'not all' : query);
-  /** `told`, if somebody sets it, is called after each drawing with whether drawing is slow. */
-  const drawing = (window.drawing = { pause, slow: () => cost() > 0, told: null });
+  window.matchMedia = (query) =>
+    matchMedia.call(window, query.includes('max-width') ? 'not all' : query);
+  /** @type {import('./scene_frame.js').FrameThrottle} */
+  const throttle = (window.frameThrottle = { pause, slow: () => cost() > 0, changed: null });
 })();

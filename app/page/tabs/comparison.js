@@ -5,7 +5,8 @@ import { Edit } from './comparison_form.js';
 import { Figures } from '../widgets/figures.js';
 import { say } from '../widgets/panel_state.js';
 
-const NOTHING = 'Nothing to compare with yet. Choose another filter, other sensors or an edit over some steps, and run it beside this one.';
+const NOTHING =
+  'Nothing to compare with yet. Choose another filter, other sensors or an edit over some steps, and run it beside this one.';
 
 export class Compare {
   #catalog;
@@ -31,10 +32,14 @@ export class Compare {
     [this.#catalog, this.#store, this.#overlay] = [catalog, store, overlay];
     this.#result = host.querySelector('.result');
     this.#gain = host.querySelector('.gain');
-    this.#gain.addEventListener('change', ({ target }) => store.set({ beside: target.checked ? 'gain' : 'alone' }));
+    this.#gain.addEventListener('change', ({ target }) =>
+      store.set({ beside: target.checked ? 'gain' : 'alone' }),
+    );
     store.listen((_, changed) => changed.has('beside') && this.#showGain());
     this.#figures = new Figures(host.querySelector('.figures'), store);
-    this.#form = new Edit(host.querySelector('form'), catalog, store, sheet, (against) => api.check({ ...store.state, against }));
+    this.#form = new Edit(host.querySelector('form'), catalog, store, sheet, (against) =>
+      api.checkSelection({ ...store.state, against }),
+    );
     say(this.#result, 'loading', 'Loading …');
     this.#showGain();
   }
@@ -121,7 +126,8 @@ export class Compare {
 
 /** Why the maps of two runs cannot be set against each other, in a line; null where they can. */
 function whyNoGain(trace, other) {
-  if (trace.header.no_maps || other.header.no_maps) return `No gain in the maps: ${trace.header.no_maps ?? other.header.no_maps}.`;
+  if (trace.header.no_maps || other.header.no_maps)
+    return `No gain in the maps: ${trace.header.no_maps ?? other.header.no_maps}.`;
   if (trace.modalities.join() === other.modalities.join()) return null;
   return 'No gain in the maps: the runs do not have the same modalities.';
 }

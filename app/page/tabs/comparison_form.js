@@ -4,16 +4,27 @@ import { choice } from '../widgets/pickers.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { fixed, sentence } from '../core/units.js';
 
-const KINDS = [['filter', 'another filter'], ['faults', 'other sensors'], ['edit', 'an edit of some steps']];
+const KINDS = [
+  ['filter', 'another filter'],
+  ['faults', 'other sensors'],
+  ['edit', 'an edit of some steps'],
+];
 const FIRST_SPAN = 20; // steps of an edit, until somebody chooses others
 
 /** `a=1&b=2`, as an address has it, with as few signs escaped as can be. */
-const joined = (pairs) => pairs.map(([key, value]) => `${key}=${String(value).replace(/[%&+#]/g, encodeURIComponent)}`).join('&');
+const joined = (pairs) =>
+  pairs
+    .map(([key, value]) => `${key}=${String(value).replace(/[%&+#]/g, encodeURIComponent)}`)
+    .join('&');
 
 /** What an other run is: `filter`, `faults` or `edit`. @param {string} against as in the state */
 const kindOf = (against) => {
   const asked = new URLSearchParams(against);
-  return asked.has('from') ? 'edit' : asked.has('faults') && !asked.has('filter') ? 'faults' : 'filter';
+  return asked.has('from')
+    ? 'edit'
+    : asked.has('faults') && !asked.has('filter')
+      ? 'faults'
+      : 'filter';
 };
 
 export class Edit {
@@ -36,7 +47,11 @@ export class Edit {
    */
   constructor(form, catalog, store, sheet, check) {
     [this.#form, this.#catalog, this.#store] = [form, catalog, store];
-    const pick = (name, set, of) => faultPicker(form.elements[name], sheet, { ...of, choose: (faults) => (set(faults), this.#tell('')) });
+    const pick = (name, set, of) =>
+      faultPicker(form.elements[name], sheet, {
+        ...of,
+        choose: (faults) => (set(faults), this.#tell('')),
+      });
     this.#showFaults = pick('faults', (faults) => (this.#faults = faults), {
       none: 'as recorded',
       chosen: () => this.#faults,
@@ -50,8 +65,11 @@ export class Edit {
     form.addEventListener('submit', (event) => (event.preventDefault(), this.#run()));
     form.addEventListener('input', () => this.#tell(''));
     form.querySelector('.clear').addEventListener('click', () => store.set({ against: '' }));
-    form.querySelector('.release').addEventListener('click', () => (this.#held.clear(), this.#showBetas()));
-    for (const name of ['from', 'last']) form.elements[name].addEventListener('change', () => this.#showBetas());
+    form
+      .querySelector('.release')
+      .addEventListener('click', () => (this.#held.clear(), this.#showBetas()));
+    for (const name of ['from', 'last'])
+      form.elements[name].addEventListener('change', () => this.#showBetas());
   }
 
   /** Another trace, or another other run, from a link or undone: the form says what is so. @param {import('../data/trace.js').Trace} trace */
@@ -65,7 +83,8 @@ export class Edit {
     fields.filter.replaceChildren(...others.map((other) => new Option(other, other)));
     for (const field of ['from', 'last']) fields[field].max = String(trace.steps - 1);
     if (fresh) this.#setSpan(this.#store.state.step, this.#store.state.step + FIRST_SPAN - 1);
-    for (const held of this.#held.keys()) if (!trace.modalities.includes(held)) this.#held.delete(held);
+    for (const held of this.#held.keys())
+      if (!trace.modalities.includes(held)) this.#held.delete(held);
     if (against) this.#read(against);
     else if (!others.length && this.#kind === 'filter') this.#kind = 'edit';
     this.#form.querySelector('.clear').disabled = !against;
@@ -79,7 +98,9 @@ export class Edit {
   mark(end, step) {
     if (!this.#trace) return;
     const at = { from: this.#step('from'), last: this.#step('last'), [end]: step };
-    if (at.from > at.last) at[end === 'from' ? 'last' : 'from'] = end === 'from' ? step + FIRST_SPAN - 1 : Math.max(0, step - FIRST_SPAN + 1);
+    if (at.from > at.last)
+      at[end === 'from' ? 'last' : 'from'] =
+        end === 'from' ? step + FIRST_SPAN - 1 : Math.max(0, step - FIRST_SPAN + 1);
     this.#setSpan(at.from, at.last);
     this.#kind = 'edit';
     this.#showKind();
@@ -91,17 +112,24 @@ export class Edit {
     const asked = new URLSearchParams(against);
     this.#kind = kindOf(against);
     const { filter } = this.#form.elements;
-    if ([...filter.options].some(({ value }) => value === asked.get('filter'))) filter.value = asked.get('filter');
+    if ([...filter.options].some(({ value }) => value === asked.get('filter')))
+      filter.value = asked.get('filter');
     if (this.#kind === 'faults') this.#faults = asked.get('faults');
     if (this.#kind !== 'edit') return;
     this.#setSpan(Number(asked.get('from')), Number(asked.get('to')) - 1);
     this.#editFaults = asked.get('faults') ?? '';
-    const pairs = (asked.get('weights') ?? '').split(',').filter(Boolean).map((part) => part.split('='));
+    const pairs = (asked.get('weights') ?? '')
+      .split(',')
+      .filter(Boolean)
+      .map((part) => part.split('='));
     this.#held = new Map(pairs.map(([name, beta]) => [name, Number(beta)]));
   }
 
   get #span() {
-    return [['from', this.#step('from')], ['to', this.#step('last') + 1]];
+    return [
+      ['from', this.#step('from')],
+      ['to', this.#step('last') + 1],
+    ];
   }
 
   #step(field) {
@@ -122,14 +150,27 @@ export class Edit {
   /** The other run as the fields have it; empty, with the reason said, where they have none. */
   #text() {
     const { filter, from, last } = this.#form.elements;
-    if (this.#kind === 'filter') return filter.value ? joined([['filter', filter.value]]) : this.#tell('There is no other filter of this task.');
+    if (this.#kind === 'filter')
+      return filter.value
+        ? joined([['filter', filter.value]])
+        : this.#tell('There is no other filter of this task.');
     if (this.#kind === 'faults') {
-      return this.#faults === this.#store.state.faults ? this.#tell('This run has these sensors. Choose others.') : joined([['faults', this.#faults]]);
+      return this.#faults === this.#store.state.faults
+        ? this.#tell('This run has these sensors. Choose others.')
+        : joined([['faults', this.#faults]]);
     }
-    if (!(from.valueAsNumber <= last.valueAsNumber)) return this.#tell('The last step of the edit comes before its first.');
+    if (!(from.valueAsNumber <= last.valueAsNumber))
+      return this.#tell('The last step of the edit comes before its first.');
     const weights = [...this.#held].map(([name, beta]) => `${name}=${beta}`).join(',');
-    if (!this.#editFaults && !weights) return this.#tell('Nothing is edited yet: choose how the sensors are broken, or move a weight.');
-    return joined([...this.#span, ...(this.#editFaults ? [['faults', this.#editFaults]] : []), ...(weights ? [['weights', weights]] : [])]);
+    if (!this.#editFaults && !weights)
+      return this.#tell(
+        'Nothing is edited yet: choose how the sensors are broken, or move a weight.',
+      );
+    return joined([
+      ...this.#span,
+      ...(this.#editFaults ? [['faults', this.#editFaults]] : []),
+      ...(weights ? [['weights', weights]] : []),
+    ]);
   }
 
   #tell(line) {
@@ -138,33 +179,56 @@ export class Edit {
   }
 
   #showKind(others = [...this.#form.elements.filter.options]) {
-    choice(this.#form.querySelector('#against-kind'), KINDS, this.#kind, (kind) => ((this.#kind = kind), this.#showParts()));
-    this.#form.querySelector('[data-kind="filter"] .why-not').textContent = others.length ? '' : 'There is no other filter of this task: give one to the server with --filter.';
+    choice(
+      this.#form.querySelector('#against-kind'),
+      KINDS,
+      this.#kind,
+      (kind) => ((this.#kind = kind), this.#showParts()),
+    );
+    this.#form.querySelector('[data-kind="filter"] .why-not').textContent = others.length
+      ? ''
+      : 'There is no other filter of this task: give one to the server with --filter.';
     this.#form.elements.filter.disabled = !others.length;
     this.#showParts();
   }
 
   #showParts() {
     this.#tell('');
-    for (const part of this.#form.querySelectorAll('[data-kind]')) part.hidden = part.dataset.kind !== this.#kind;
-    const foreign = this.#trace.header.kind === 'foreign';
-    const refused = foreign && `${this.#trace.header.filter} is a filter from outside, whose steps cannot be taken again one by one: it cannot be edited.`;
-    this.#form.querySelector('[data-kind="edit"] > .why-not').textContent = refused ? sentence(refused) : '';
-    this.#form.querySelector('.betas').hidden = foreign;
-    for (const field of this.#form.querySelectorAll('[data-kind="edit"] :is(input, select)')) field.disabled = foreign;
-    this.#form.querySelector('.run').disabled = (this.#kind === 'edit' && foreign) || (this.#kind === 'filter' && this.#form.elements.filter.disabled);
+    for (const part of this.#form.querySelectorAll('[data-kind]'))
+      part.hidden = part.dataset.kind !== this.#kind;
+    const external = this.#trace.header.kind === 'external';
+    const refused =
+      external &&
+      `${this.#trace.header.filter} is a filter from outside, whose steps cannot be taken again one by one: it cannot be edited.`;
+    this.#form.querySelector('[data-kind="edit"] > .why-not').textContent = refused
+      ? sentence(refused)
+      : '';
+    this.#form.querySelector('.betas').hidden = external;
+    for (const field of this.#form.querySelectorAll('[data-kind="edit"] :is(input, select)'))
+      field.disabled = external;
+    this.#form.querySelector('.run').disabled =
+      (this.#kind === 'edit' && external) ||
+      (this.#kind === 'filter' && this.#form.elements.filter.disabled);
   }
 
   /** A slider for each modality, where the filter weighs them by beta. */
   #buildBetas() {
     const trace = this.#trace;
-    const weighed = trace.has('weights') && trace.header.kind !== 'foreign';
-    this.#form.querySelector('.betas .why-not').textContent = weighed || trace.header.kind === 'foreign' ? '' : `${sentence(trace.header.filter).slice(0, -1)} weighs nothing by beta, so there is none to set.`;
+    const weighed = trace.has('weights') && trace.header.kind !== 'external';
+    this.#form.querySelector('.betas .why-not').textContent =
+      weighed || trace.header.kind === 'external'
+        ? ''
+        : `${sentence(trace.header.filter).slice(0, -1)} weighs nothing by beta, so there is none to set.`;
     if (!weighed) this.#held.clear();
     this.#form.querySelector('.sliders').replaceChildren(
       ...(weighed ? trace.modalities : []).map((name) => {
         const label = document.createElement('label');
-        const input = Object.assign(document.createElement('input'), { type: 'range', min: '0', max: '1', step: '0.01' });
+        const input = Object.assign(document.createElement('input'), {
+          type: 'range',
+          min: '0',
+          max: '1',
+          step: '0.01',
+        });
         input.dataset.modality = name;
         input.addEventListener('input', () => this.#hold(name, input.valueAsNumber));
         label.append(`β ${name}`, input, document.createElement('output'));
@@ -177,7 +241,8 @@ export class Edit {
   /** A weight set by hand. One modality is always left to take the rest; no sum is above one. */
   #hold(name, beta) {
     this.#held.delete(name);
-    if (this.#held.size === this.#trace.modalities.length - 1) this.#held.delete(this.#held.keys().next().value);
+    if (this.#held.size === this.#trace.modalities.length - 1)
+      this.#held.delete(this.#held.keys().next().value);
     const others = [...this.#held.values()].reduce((a, b) => a + b, 0);
     this.#held.set(name, Number(Math.min(beta, 1 - others).toFixed(2)));
     this.#showBetas();
@@ -187,22 +252,33 @@ export class Edit {
   #showBetas() {
     const sliders = [...this.#form.querySelectorAll('.sliders input')];
     const rest = 1 - [...this.#held.values()].reduce((a, b) => a + b, 0);
-    const usual = new Map(sliders.map(({ dataset: { modality } }) => [modality, this.#usual(modality)]));
-    const free = [...usual].filter(([name]) => !this.#held.has(name)).reduce((sum, [, beta]) => sum + beta, 0);
+    const usual = new Map(
+      sliders.map(({ dataset: { modality } }) => [modality, this.#usual(modality)]),
+    );
+    const free = [...usual]
+      .filter(([name]) => !this.#held.has(name))
+      .reduce((sum, [, beta]) => sum + beta, 0);
     for (const input of sliders) {
       const { modality } = input.dataset;
       const held = this.#held.has(modality);
-      const beta = held ? this.#held.get(modality) : free > 0 ? (rest * usual.get(modality)) / free : 0;
+      const beta = held
+        ? this.#held.get(modality)
+        : free > 0
+          ? (rest * usual.get(modality)) / free
+          : 0;
       if (document.activeElement !== input || held) input.value = String(beta);
       input.parentElement.classList.toggle('held', held);
-      input.parentElement.querySelector('output').textContent = `${fixed(beta, 2)} ${held ? 'by hand' : this.#held.size ? 'the rest' : 'the network’s'}`;
+      input.parentElement.querySelector('output').textContent =
+        `${fixed(beta, 2)} ${held ? 'by hand' : this.#held.size ? 'the rest' : 'the network’s'}`;
     }
     this.#form.querySelector('.release').hidden = !this.#held.size;
   }
 
   /** Mean of the network's beta over the edited steps, first component. */
   #usual(modality) {
-    const beta = this.#trace.weight('raw', modality, 0).slice(this.#step('from') || 0, (this.#step('last') || 0) + 1);
+    const beta = this.#trace
+      .weight('raw', modality, 0)
+      .slice(this.#step('from') || 0, (this.#step('last') || 0) + 1);
     return beta.length ? beta.reduce((a, b) => a + b, 0) / beta.length : 0;
   }
 }

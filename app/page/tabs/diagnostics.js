@@ -7,13 +7,16 @@ import { say } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
 import { sentence } from '../core/units.js';
 
-const OVER = [['episode', 'this episode'], ['held-out', 'all held-out']];
+const OVER = [
+  ['episode', 'this episode'],
+  ['held-out', 'all held-out'],
+];
 const KEPT = 48; // results
 
 /**
  * @typedef {object} Result what is known of one diagnostic, with one choice of options, of one trace or of all held out
  * @property {'loading' | 'ready' | 'unasked' | 'working' | 'ended' | 'error'} state
- * @property {api.Found} [found] @property {api.Job} [job] @property {string} [error]
+ * @property {api.DiagnosticResult} [found] @property {api.Job} [job] @property {string} [error]
  */
 
 export class Diagnostics {
@@ -40,7 +43,9 @@ export class Diagnostics {
       store.flush();
       this.#rows.get(diagnostic)?.querySelector('.title').focus();
     });
-    host.querySelector('form').addEventListener('submit', (event) => (event.preventDefault(), this.#takeOptions()));
+    host
+      .querySelector('form')
+      .addEventListener('submit', (event) => (event.preventDefault(), this.#takeOptions()));
     host.querySelector('form').addEventListener('change', () => this.#takeOptions());
     jobs.listen((list) => this.#hear(list));
     say(host, 'loading', 'Loading …');
@@ -78,7 +83,12 @@ export class Diagnostics {
     this.#loading.abort();
     this.#loading = new AbortController();
     const trace = this.#trace;
-    if (trace.live?.state === 'running') return say(this.#host, 'empty', 'The run goes on. Diagnostics are made of all its steps once it has ended, and show here by themselves.');
+    if (trace.live?.state === 'running')
+      return say(
+        this.#host,
+        'empty',
+        'The run goes on. Diagnostics are made of all its steps once it has ended, and show here by themselves.',
+      );
     try {
       this.#entries = await api.diagnostics(trace.selection, this.#loading.signal);
     } catch (error) {
@@ -109,7 +119,12 @@ export class Diagnostics {
     if (!this.#results.has(key)) this.#keep(key, { state: 'loading' });
     this.#draw(entry);
     try {
-      const body = await api.diagnostic(this.#trace.selection, entry.name, this.#query(entry), signal);
+      const body = await api.diagnostic(
+        this.#trace.selection,
+        entry.name,
+        this.#query(entry),
+        signal,
+      );
       this.#keep(key, result(body));
     } catch (error) {
       if (error.name === 'AbortError') return;
@@ -121,7 +136,10 @@ export class Diagnostics {
   async #compute(entry) {
     const key = this.#key(entry);
     try {
-      this.#keep(key, result(await api.compute(this.#trace.selection, entry.name, this.#query(entry))));
+      this.#keep(
+        key,
+        result(await api.startDiagnostic(this.#trace.selection, entry.name, this.#query(entry))),
+      );
     } catch (error) {
       this.#keep(key, { state: 'error', error: error.message });
     }
@@ -166,7 +184,12 @@ export class Diagnostics {
   #key(entry) {
     const { episode, ...selection } = this.#trace.selection;
     const { over } = this.#store.state;
-    return JSON.stringify([selection, over === 'episode' && episode, entry.name, this.#query(entry)]);
+    return JSON.stringify([
+      selection,
+      over === 'episode' && episode,
+      entry.name,
+      this.#query(entry),
+    ]);
   }
 
   /** A row for each, made once; what is in it changes. */
@@ -174,7 +197,8 @@ export class Diagnostics {
     if (this.#rows.size) return;
     for (const entry of this.#entries) {
       const row = document.createElement('li');
-      row.innerHTML = '<button type="button" class="title"></button><p class="question"></p><p class="verdict"></p><div class="doing"></div>';
+      row.innerHTML =
+        '<button type="button" class="title"></button><p class="question"></p><p class="verdict"></p><div class="doing"></div>';
       row.querySelector('.title').textContent = entry.title;
       row.querySelector('.question').textContent = entry.question;
       row.querySelector('.title').addEventListener('click', () => {
@@ -196,12 +220,14 @@ export class Diagnostics {
       const line = `The link asks for diagnostic “${state.diagnostic}”, which does not exist. Available: ${names}.`;
       this.#host.querySelector('.top h3').textContent = line;
     } else {
-      this.#host.querySelector('.top h3').textContent = open ? open.title : 'What the numbers say';
+      this.#host.querySelector('.top h3').textContent = open ? open.title : 'Diagnostics of this run';
     }
     this.#host.querySelector('.list').hidden = Boolean(open);
     this.#host.querySelector('article').hidden = !open;
     this.#host.querySelector('#all-diagnostics').hidden = !open;
-    choice(this.#host.querySelector('#over'), OVER, state.over, (over) => this.#store.set({ over }));
+    choice(this.#host.querySelector('#over'), OVER, state.over, (over) =>
+      this.#store.set({ over }),
+    );
     if (open) {
       this.#host.querySelector('article .question').textContent = open.question;
       this.#host.querySelector('article').scrollTop = 0;
@@ -222,29 +248,44 @@ export class Diagnostics {
       ...entry.options.map(({ name, default: usual }) => {
         const label = document.createElement('label');
         const input = document.createElement('input');
-        Object.assign(input, { name, placeholder: usual, value: chosen.get(name) ?? '', autocomplete: 'off', spellcheck: false });
+        Object.assign(input, {
+          name,
+          placeholder: usual,
+          value: chosen.get(name) ?? '',
+          autocomplete: 'off',
+          spellcheck: false,
+        });
         label.textContent = name;
         label.append(input);
         if (name !== 'step') return label;
         const here = document.createElement('button');
         [here.type, here.className, here.textContent] = ['button', 'text quiet', 'at the cursor'];
-        here.addEventListener('click', () => ((input.value = String(this.#store.state.step)), this.#takeOptions()));
+        here.addEventListener(
+          'click',
+          () => ((input.value = String(this.#store.state.step)), this.#takeOptions()),
+        );
         label.append(here);
         return label;
       }),
-      Object.assign(document.createElement('p'), { textContent: entry.options.map(({ name, meaning }) => `${name}: ${meaning}`).join('\n') }),
+      Object.assign(document.createElement('p'), {
+        textContent: entry.options.map(({ name, meaning }) => `${name}: ${meaning}`).join('\n'),
+      }),
     );
     if (focused) form.elements[focused]?.focus();
   }
 
   #takeOptions() {
-    const given = [...new FormData(this.#host.querySelector('form'))].filter(([, text]) => text.trim());
+    const given = [...new FormData(this.#host.querySelector('form'))].filter(([, text]) =>
+      text.trim(),
+    );
     this.#store.set({ options: String(new URLSearchParams(given)) });
   }
 
   /** Writes what is known of one into its row and, if it is open, into the page. */
   #draw(entry) {
-    const known = entry.why_not ? { state: 'refused', error: entry.why_not } : (this.#results.get(this.#key(entry)) ?? { state: 'loading' });
+    const known = entry.why_not
+      ? { state: 'refused', error: entry.why_not }
+      : (this.#results.get(this.#key(entry)) ?? { state: 'loading' });
     this.#tell(this.#rows.get(entry.name), entry, known);
     if (entry !== this.#opened) return;
     const article = this.#host.querySelector('article');
@@ -264,7 +305,12 @@ export class Diagnostics {
       const focused = doing.contains(document.activeElement);
       doing.replaceChildren(...(acts ? [this.#button(acts, entry)] : []));
       if (known.state === 'working') doing.prepend(document.createElement('progress'));
-      if (focused) (doing.querySelector('button') ?? host.querySelector('.title') ?? this.#host.querySelector('#all-diagnostics')).focus();
+      if (focused)
+        (
+          doing.querySelector('button') ??
+          host.querySelector('.title') ??
+          this.#host.querySelector('#all-diagnostics')
+        ).focus();
     }
     const progress = doing.querySelector('progress');
     if (!progress) return;

@@ -1,19 +1,26 @@
-/** Where the filter fails over the whole data set: moments by rank, the worst first, or its episodes. The search is a job. */
+/** Where the filter fails over the whole data set: events by rank, the worst first, or its episodes. The search is a job. */
 
 import * as api from '../data/api.js';
-import { copied } from '../core/clipboard.js';
+import { copyText } from '../core/clipboard.js';
 import { Episodes } from './episodes.js';
 import { result, told, underWay } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
 import { stopAt, walk } from '../widgets/row_navigation.js';
-import { SHOWN, fixed, percent, sentence, significant } from '../core/units.js';
+import { DISPLAY_UNITS, fixed, percent, sentence, significant } from '../core/units.js';
 
-const LISTS = [['moments', 'Moments'], ['episodes', 'Episodes']];
-const AMONG = [['held-out', 'held-out'], ['all', 'all']];
+const LISTS = [
+  ['events', 'Events'],
+  ['episodes', 'Episodes'],
+];
+const AMONG = [
+  ['held-out', 'held-out'],
+  ['all', 'all'],
+];
 const NAMES = { nees: 'NEES', ess: 'ESS' };
 const UNITS = { sigma: 'σ', x: '×' };
 const TOLD = 1500; // ms
-const LINK = '<svg viewBox="0 0 16 16" aria-hidden="true"><path d="m6.3 9.7 3.4-3.4M7 4.6l1.4-1.3a2.9 2.9 0 0 1 4.2 4.1L11.2 8.8M9 11.4l-1.4 1.3a2.9 2.9 0 0 1-4.2-4.1L4.8 7.2"/></svg>';
+const LINK =
+  '<svg viewBox="0 0 16 16" aria-hidden="true"><path d="m6.3 9.7 3.4-3.4M7 4.6l1.4-1.3a2.9 2.9 0 0 1 4.2 4.1L11.2 8.8M9 11.4l-1.4 1.3a2.9 2.9 0 0 1-4.2-4.1L4.8 7.2"/></svg>';
 const KEPT = 8; // results
 
 /**
@@ -32,19 +39,19 @@ export class Failures {
   /** @type {Map<string, Result>} */
   #results = new Map();
   #loading = new AbortController();
-  #rows = []; // of the moments, as they were listed last: {moment, row, button}
-  #last = -1; // place of the moment that was gone to last
+  #rows = []; // of the events, as they were listed last: {failure, row, button}
+  #last = -1; // place of the failure that was gone to last
   #listed = ''; // what the rows are of
-  #sought = ''; // the key of what the worst moment is waited for
+  #sought = ''; // the key of what the worst failure is waited for
 
   /**
    * @param {HTMLElement} host @param {import('../core/state.js').Store} store @param {import('../widgets/jobs.js').Jobs} jobs
-   * @param {import('../timeline/timeline.js').TimeLine} timeline that gets the marks @param {api.Catalog} catalog
+   * @param {import('../timeline/timeline.js').Timeline} timeline that gets the marks @param {api.Catalog} catalog
    */
   constructor(host, store, jobs, timeline, catalog) {
     [this.#host, this.#store, this.#jobs, this.#timeline] = [host, store, jobs, timeline];
     this.#episodes = new Episodes(this.#part('.episodes'), store, catalog);
-    walk(this.#part('.moments tbody'));
+    walk(this.#part('.events tbody'));
     jobs.listen((list) => this.#hear(list));
     this.load();
   }
@@ -60,12 +67,12 @@ export class Failures {
   /** Marks the row at the cursor. */
   move(step) {
     const { episode } = this.#store.state;
-    const at = (moment) => moment.episode === episode && moment.step === step;
-    const place = this.#moments.findIndex(at);
+    const at = (failure) => failure.episode === episode && failure.step === step;
+    const place = this.#events.findIndex(at);
     if (place >= 0) this.#last = place;
     if (this.#host.hidden) return;
-    this.#rows.forEach(({ moment, row, button }) => {
-      const here = at(moment);
+    this.#rows.forEach(({ failure, row, button }) => {
+      const here = at(failure);
       if (here === row.classList.contains('here')) return;
       row.classList.toggle('here', here);
       if (here) button.setAttribute('aria-current', 'true');
@@ -94,17 +101,18 @@ export class Failures {
     this.#seek();
   }
 
-  /** Goes to the next moment of the list, or the one before. @param {1 | -1} by */
+  /** Goes to the next failure of the list, or the one before. @param {1 | -1} by */
   go(by, inputTime) {
-    const moments = this.#moments;
-    if (!moments.length) return this.#store.set({ tab: 'failures' });
-    this.#last = Math.min(Math.max(this.#last + by, 0), moments.length - 1);
-    this.#open(moments[this.#last], inputTime);
-    const table = this.#part('.moments');
-    if (table.checkVisibility()) stopAt(this.#rows[this.#last].row, table.contains(document.activeElement));
+    const events = this.#events;
+    if (!events.length) return this.#store.set({ tab: 'failures' });
+    this.#last = Math.min(Math.max(this.#last + by, 0), events.length - 1);
+    this.#open(events[this.#last], inputTime);
+    const table = this.#part('.events');
+    if (table.checkVisibility())
+      stopAt(this.#rows[this.#last].row, table.contains(document.activeElement));
   }
 
-  /** Goes to the worst moment of all as soon as it is known; has it looked for where nobody did. */
+  /** Goes to the worst failure of all as soon as it is known; has it looked for where nobody did. */
   worst() {
     this.#sought = this.#key;
     this.#seek();
@@ -128,17 +136,24 @@ export class Failures {
     const set = (key) => (value) => this.#store.set({ [key]: value });
     choice(this.#part('#list'), LISTS, state.list, set('list'));
     choice(this.#part('#among'), this.#live ? [] : AMONG, state.among, set('among'));
-    this.#part('.moments').hidden = state.list !== 'moments';
+    this.#part('.events').hidden = state.list !== 'events';
     this.#part('.episodes').hidden = state.list !== 'episodes';
     this.#host.dataset.state = known.state;
-    this.#host.setAttribute('aria-busy', String(known.state === 'loading' || known.state === 'working'));
+    this.#host.setAttribute(
+      'aria-busy',
+      String(known.state === 'loading' || known.state === 'working'),
+    );
     this.#doing(known);
     const score = this.#score;
     this.#measures(known.found?.scores ?? []);
-    const line = score ? (score.why_not ? `None by ${called(score)}: ${score.why_not}.` : score.verdict) : said(known);
+    const line = score
+      ? score.why_not
+        ? `None by ${called(score)}: ${score.why_not}.`
+        : score.verdict
+      : said(known);
     const verdict = this.#part('.verdict');
     if (verdict.textContent !== line) verdict.textContent = verdict.title = line;
-    this.#groups(score);
+    this.#phases(score);
     this.#list(score);
     this.#episodes.show(known.found ?? null, score && !score.why_not ? score : null);
   }
@@ -175,12 +190,14 @@ export class Failures {
     return scores?.find(({ name }) => name === this.#store.state.by) ?? scores?.[0];
   }
 
-  /** The moments of the chosen measure and group; of all groups where the measure has no such. */
-  get #moments() {
+  /** The events of the chosen measure and phase; of all phases where the measure has no such. */
+  get #events() {
     const score = this.#score;
-    const { group } = this.#store.state;
-    if (!score?.moments) return [];
-    return score.groups.some((g) => g.name === group) ? score.moments.filter((m) => m.group === group) : score.moments;
+    const { phase } = this.#store.state;
+    if (!score?.events) return [];
+    return score.phases.some((g) => g.name === phase)
+      ? score.events.filter((m) => m.phase === phase)
+      : score.events;
   }
 
   #keep(key, kept) {
@@ -192,7 +209,7 @@ export class Failures {
   async #look() {
     const key = this.#key;
     try {
-      this.#keep(key, result(await api.lookForFailures(this.#store.state)));
+      this.#keep(key, result(await api.startFailureSearch(this.#store.state)));
     } catch (error) {
       this.#keep(key, { state: 'error', error: error.message });
     }
@@ -216,12 +233,22 @@ export class Failures {
   /** The button that asks, tries again or cancels, and how far it is. */
   #doing({ state, job }) {
     const doing = this.#part('.doing');
-    const acts = { unasked: 'Look for failures', ended: 'Try again', error: 'Try again', working: 'Cancel' }[state];
+    const acts = {
+      unasked: 'Look for failures',
+      ended: 'Try again',
+      error: 'Try again',
+      working: 'Cancel',
+    }[state];
     if (doing.dataset.acts !== (acts ?? '')) {
       const focused = doing.contains(document.activeElement);
       doing.dataset.acts = acts ?? '';
       doing.replaceChildren(...(state === 'working' ? [document.createElement('progress')] : []));
-      if (acts) doing.append(button(acts, 'text', () => (underWay(this.#known.job ?? {}) ? this.#jobs.cancel(this.#known.job.id) : this.#look())));
+      if (acts)
+        doing.append(
+          button(acts, 'text', () =>
+            underWay(this.#known.job ?? {}) ? this.#jobs.cancel(this.#known.job.id) : this.#look(),
+          ),
+        );
       if (focused) (doing.querySelector('button') ?? this.#part('.scroll')).focus();
     }
     const progress = doing.querySelector('progress');
@@ -233,85 +260,125 @@ export class Failures {
   /** Those that the filter lacks can be chosen too: then it is said why. */
   #measures(scores) {
     const host = this.#part('#by');
-    choice(host, scores.map((score) => [score.name, called(score)]), this.#score?.name, (by) => this.#store.set({ by, ...drawn(by, this.#trace) }));
+    choice(
+      host,
+      scores.map((score) => [score.name, called(score)]),
+      this.#score?.name,
+      (by) => this.#store.set({ by, ...drawn(by, this.#trace) }),
+    );
     scores.forEach(({ title, why_not: why }, i) => {
       host.children[i].title = why ? `${sentence(title)} None: ${why}.` : `Rank by ${title}`;
       host.children[i].classList.toggle('lacking', Boolean(why));
     });
   }
 
-  #groups(score) {
-    const host = this.#part('#group');
-    const groups = (score?.groups ?? []).filter((g) => g.moments);
-    const chosen = groups.some((g) => g.name === this.#store.state.group) ? this.#store.state.group : '';
-    const options = [['', `all ${score?.total ?? ''}`], ...groups.map((g) => [g.name, `${g.name} ${g.moments}${g.telling ? ` · ${fixed(g.lift)}×` : ''}`])];
-    choice(host, options, chosen, (group) => this.#store.set({ group }));
-    host.hidden = !groups.length || this.#store.state.list !== 'moments';
-    groups.forEach((g, i) => {
-      host.children[i + 1].classList.toggle('telling', g.telling);
-      host.children[i + 1].title = `${percent(g.share)} of the steps, ${percent(g.failures)} of the moments: ${fixed(g.lift)} times its share. Chance gives so many in ${significant(100 * g.chance)} %.`;
+  #phases(score) {
+    const host = this.#part('#phase');
+    const phases = (score?.phases ?? []).filter((g) => g.events);
+    const chosen = phases.some((g) => g.name === this.#store.state.phase)
+      ? this.#store.state.phase
+      : '';
+    const options = [
+      ['', `all ${score?.total ?? ''}`],
+      ...phases.map((g) => [
+        g.name,
+        `${g.name} ${g.events}${g.over_represented ? ` · ${fixed(g.lift)}×` : ''}`,
+      ]),
+    ];
+    choice(host, options, chosen, (phase) => this.#store.set({ phase }));
+    host.hidden = !phases.length || this.#store.state.list !== 'events';
+    phases.forEach((g, i) => {
+      host.children[i + 1].classList.toggle('over-represented', g.over_represented);
+      host.children[i + 1].title =
+        `${percent(g.share)} of the steps, ${percent(g.event_share)} of the events: ${fixed(g.lift)} times its share. Chance gives so many in ${significant(100 * g.p_value)} %.`;
     });
   }
 
-  /** A row for each moment, made anew only when others are listed. */
+  /** A row for each failure, made anew only when others are listed. */
   #list(score) {
     const { found } = this.#known;
-    const moments = this.#moments;
-    const listed = found ? `${this.#key} ${score.name} ${this.#store.state.group}` : '';
+    const events = this.#events;
+    const listed = found ? `${this.#key} ${score.name} ${this.#store.state.phase}` : '';
     if (listed !== this.#listed) {
       this.#listed = listed;
-      const columns = score?.moments ? momentColumns(found, score) : [];
+      const columns = score?.events ? eventColumns(found, score) : [];
       const top = document.createElement('tr');
-      top.append(...columns.map(({ title, help, number }) => Object.assign(document.createElement('th'), { scope: 'col', className: number ? 'number' : '', textContent: title, title: help ?? '' })));
-      if (columns.length) top.append(Object.assign(document.createElement('th'), { scope: 'col', ariaLabel: 'Link' }));
-      this.#part('.moments thead').replaceChildren(...(columns.length ? [top] : []));
-      this.#rows = moments.map((moment, i) => this.#row(columns, moment, score, i));
-      this.#part('.moments tbody').replaceChildren(...this.#rows.map(({ row }) => row));
+      top.append(
+        ...columns.map(({ title, help, number }) =>
+          Object.assign(document.createElement('th'), {
+            scope: 'col',
+            className: number ? 'number' : '',
+            textContent: title,
+            title: help ?? '',
+          }),
+        ),
+      );
+      if (columns.length)
+        top.append(
+          Object.assign(document.createElement('th'), { scope: 'col', ariaLabel: 'Link' }),
+        );
+      this.#part('.events thead').replaceChildren(...(columns.length ? [top] : []));
+      this.#rows = events.map((failure, i) => this.#row(columns, failure, score, i));
+      this.#part('.events tbody').replaceChildren(...this.#rows.map(({ row }) => row));
       this.#part('.scroll').scrollTop = 0;
       this.#last = -1;
     }
-    const group = score?.groups?.find((g) => g.name === this.#store.state.group);
-    const all = group ? group.moments : (score?.total ?? 0);
-    const left = `${moments.length} of ${all} are listed: those among the worst ${score?.moments?.length} of all.`;
-    this.#part('.rest').textContent = moments.length < all ? left : '';
+    const phase = score?.phases?.find((g) => g.name === this.#store.state.phase);
+    const all = phase ? phase.events : (score?.total ?? 0);
+    const left = `${events.length} of ${all} are listed: those among the worst ${score?.events?.length} of all.`;
+    this.#part('.rest').textContent = events.length < all ? left : '';
     this.move(this.#store.state.step);
   }
 
-  #row(columns, moment, score, i) {
+  #row(columns, failure, score, i) {
     const row = document.createElement('tr');
-    const go = button('', 'title', (event) => this.#open(moment, event.timeStamp));
-    const what = `${score.title} ${withUnit(moment.value, score.unit)}`;
-    go.setAttribute('aria-label', `Episode ${moment.episode}, step ${moment.step}: ${what}, ${moment.group}`);
+    const go = button('', 'title', (event) => this.#open(failure, event.timeStamp));
+    const what = `${score.title} ${withUnit(failure.value, score.unit)}`;
+    go.setAttribute(
+      'aria-label',
+      `Episode ${failure.episode}, step ${failure.step}: ${what}, ${failure.phase}`,
+    );
     columns.forEach(({ text, hint, number }, c) => {
       const cell = row.insertCell();
       if (number) cell.className = 'number';
-      if (hint) cell.title = hint(moment);
-      if (c) cell.textContent = text(moment);
+      if (hint) cell.title = hint(failure);
+      if (c) cell.textContent = text(failure);
       else cell.append(go);
     });
-    go.textContent = columns[0].text(moment);
+    go.textContent = columns[0].text(failure);
     const copy = button('', 'quiet link', async () => {
-      copy.textContent = (await copied(new URL(moment.link, location.href).href)) ? '✓' : 'not allowed';
+      copy.textContent = (await copyText(new URL(failure.link, location.href).href))
+        ? '✓'
+        : 'not allowed';
       setTimeout(() => (copy.innerHTML = LINK), TOLD);
     });
     copy.innerHTML = LINK;
-    copy.setAttribute('aria-label', (copy.title = `Copy link to episode ${moment.episode}, step ${moment.step}`));
+    copy.setAttribute(
+      'aria-label',
+      (copy.title = `Copy link to episode ${failure.episode}, step ${failure.step}`),
+    );
     go.tabIndex = copy.tabIndex = i ? -1 : 0;
     row.insertCell().append(copy);
-    return { moment, row, button: go };
+    return { failure, row, button: go };
   }
 
   #open({ episode, step }, inputTime) {
     this.#store.set({ episode, step, playing: false }, { inputTime });
   }
 
-  /** The listed moments of the episode that is shown, on the time line. */
+  /** The listed events of the episode that is shown, on the time line. */
   #mark() {
     if (!this.#trace) return;
     const score = this.#score;
     const { episode } = this.#trace.selection;
-    const of = this.#moments.filter((moment) => moment.episode === episode);
-    this.#timeline.mark(of.map((m) => ({ step: m.step, label: `${score.title} ${withUnit(m.value, score.unit)}, ${m.group}`, measure: score.title })));
+    const of = this.#events.filter((failure) => failure.episode === episode);
+    this.#timeline.mark(
+      of.map((m) => ({
+        step: m.step,
+        label: `${score.title} ${withUnit(m.value, score.unit)}, ${m.phase}`,
+        measure: score.title,
+      })),
+    );
   }
 }
 
@@ -320,19 +387,28 @@ const called = ({ name }) => NAMES[name] ?? name.replaceAll('_', ' ');
 /** What the time line has to draw for a measure. */
 function drawn(by, trace) {
   if (trace?.components.some(({ name }) => name === by)) return { component: by, track: 'error' };
-  return { error: { track: 'error' }, nees: { track: 'nees' }, ess: { track: 'particles' }, regret: { weights: 'acting' } }[by] ?? {};
+  return (
+    {
+      error: { track: 'error' },
+      nees: { track: 'nees' },
+      ess: { track: 'particles' },
+      regret: { weights: 'effective' },
+    }[by] ?? {}
+  );
 }
 
 function said({ state, job, error }) {
   if (state === 'error') return sentence(error);
   if (state === 'working' || state === 'ended') return told(job);
-  if (state === 'waits') return 'The run goes on. Its failures are looked for in all its steps once it has ended; that shows here by itself.';
-  if (state === 'unasked') return 'Nobody has looked yet. The filter has to run over all these episodes, so it is done only when asked for.';
+  if (state === 'waits')
+    return 'The run goes on. Its failures are looked for in all its steps once it has ended; that shows here by itself.';
+  if (state === 'unasked')
+    return 'Nobody has looked yet. The filter has to run over all these episodes, so it is done only when asked for.';
   return 'Loading …';
 }
 
 function shownUnit(unit) {
-  return SHOWN[unit] ?? { unit: UNITS[unit] ?? unit, scale: 1 };
+  return DISPLAY_UNITS[unit] ?? { unit: UNITS[unit] ?? unit, scale: 1 };
 }
 
 function withUnit(value, name) {
@@ -341,34 +417,68 @@ function withUnit(value, name) {
 }
 
 /** @param {api.Failures} found @param {object} score */
-function momentColumns(found, score) {
+function eventColumns(found, score) {
   const { unit } = shownUnit(score.unit);
   const own = shownUnit(score.unit).scale;
   const number = true;
   const columns = [
     { title: 'episode', text: (m) => String(m.episode) },
-    { title: 'step', text: (m) => String(m.step), number, hint: (m) => `Of steps ${m.first} to ${m.last}, in which it stays high` },
-    { title: unit ? `${score.title} ${unit}` : score.title, text: (m) => significant(own * m.value), number },
-    { title: 'what was happening', text: (m) => m.group, hint: (m) => [m.group, ...m.also].join(', ') },
+    {
+      title: 'step',
+      text: (m) => String(m.step),
+      number,
+      hint: (m) => `Of steps ${m.first} to ${m.last}, in which it stays high`,
+    },
+    {
+      title: unit ? `${score.title} ${unit}` : score.title,
+      text: (m) => significant(own * m.value),
+      number,
+    },
+    {
+      title: 'phase',
+      text: (m) => m.phase,
+      hint: (m) => [m.phase, ...m.other_phases].join(', '),
+    },
   ];
   const modalities = found.layers.slice(0, -1);
   found.layers.forEach((layer, i) => {
     if (layer === 'fused' && score.name === 'error') return;
     const name = modalities.length > 1 ? layer : 'error';
-    if (modalities.length > 1 || layer === 'fused') columns.push({ title: `${name} cm`, text: (m) => fixed(100 * m.error[i], 2), number, help: 'Distance of its position from the truth' });
+    if (modalities.length > 1 || layer === 'fused')
+      columns.push({
+        title: `${name} cm`,
+        text: (m) => fixed(100 * m.error[i], 2),
+        number,
+        help: 'Distance of its position from the truth',
+      });
   });
-  if (score.name !== 'nees' && score.moments[0]?.nees !== null) columns.push({ title: 'NEES', text: (m) => fixed(m.nees), number, help: 'Normalised squared error: mean 1 where the covariance is right' });
-  if (modalities.length > 1 && score.moments[0]?.acting) columns.push({ title: 'follows', text: (m) => leading(modalities, m.acting), help: 'The modality that decides most, with its share as it acted: the mean over the components' });
+  if (score.name !== 'nees' && score.events[0]?.nees !== null)
+    columns.push({
+      title: 'NEES',
+      text: (m) => fixed(m.nees),
+      number,
+      help: 'Normalised squared error: mean 1 where the covariance is right',
+    });
+  if (modalities.length > 1 && score.events[0]?.effective_weights)
+    columns.push({
+      title: 'dominant',
+      text: (m) => leading(modalities, m.effective_weights),
+      help: 'The modality that decides most, with its share as it acted: the mean over the components',
+    });
   return columns;
 }
 
-function leading(modalities, acting) {
-  const most = acting.indexOf(Math.max(...acting));
-  return `${modalities[most]} ${percent(acting[most])}`;
+function leading(modalities, shares) {
+  const most = shares.indexOf(Math.max(...shares));
+  return `${modalities[most]} ${percent(shares[most])}`;
 }
 
 function button(text, kind, act) {
-  const made = Object.assign(document.createElement('button'), { type: 'button', className: kind, textContent: text });
+  const made = Object.assign(document.createElement('button'), {
+    type: 'button',
+    className: kind,
+    textContent: text,
+  });
   made.addEventListener('click', act);
   return made;
 }

@@ -7,19 +7,31 @@ import { told, underWay } from '../widgets/jobs.js';
 import { ModuleTree } from './module_tree.js';
 import { say } from '../widgets/panel_state.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
-import { address } from '../core/state.js';
-import { fixed, sentence, spoken } from '../core/units.js';
+import { permalink } from '../core/state.js';
+import { fixed, sentence, displayName } from '../core/units.js';
 
 const OWN = 'own'; // a choice of parts, or a slice, that has no name
 const DEFAULT = { preset: 'haptics-only', slice: 'blackout 0.8' }; // of a first run, where the filter has them
-const STEPS = [['', 'all steps'], ['yes', 'in contact'], ['no', 'out of contact']];
-const PLACES = { kept: 'The child is on the shelf, beside its parent.', default: 'The child is on the shelf, and what this server shows first.' };
+const STEPS = [
+  ['', 'all steps'],
+  ['yes', 'in contact'],
+  ['no', 'out of contact'],
+];
+const PLACES = {
+  saved: 'The child is on the shelf, beside its parent.',
+  default: 'The child is on the shelf, and what this server shows first.',
+};
 const NUMBERS = [
-  ['nominal', 'Share of nominal data', 0.05, 'Of the loss: data as they are hold the rest in place'],
+  [
+    'clean_weight',
+    'Share of nominal data',
+    0.05,
+    'Of the loss: data as they are hold the rest in place',
+  ],
   ['steps', 'Training steps', 1, 'Of the optimiser, at most'],
   ['length', 'Window, steps', 1, 'Steps of each piece of a trajectory that is learned from'],
   ['rate', 'Learning rate', 'any', 'Of Adam'],
-  ['pull', 'Pull to the parent', 'any', 'How strongly weights are drawn back to the parent’s'],
+  ['l2_sp', 'Pull to the parent', 'any', 'How strongly weights are drawn back to the parent’s'],
   ['seed', 'Seed', 1, 'Of all that is drawn'],
 ];
 
@@ -75,7 +87,10 @@ export class Finetune {
   constructor(host, catalog, store, jobs, sheet) {
     [this.#host, this.#catalog, this.#store, this.#jobs] = [host, catalog, store, jobs];
     host.innerHTML = FORM;
-    this.#tree = new ModuleTree(this.#part('.tree'), () => ((this.#field('preset').value = OWN), this.#count()));
+    this.#tree = new ModuleTree(
+      this.#part('.tree'),
+      () => ((this.#field('preset').value = OWN), this.#count()),
+    );
     this.#descent = new Descent(this.#part('.descent'), store);
     this.#live = new Figures(this.#part('.live'), store);
     this.#report = new Figures(this.#part('.report'), store);
@@ -85,15 +100,28 @@ export class Finetune {
       none: 'as recorded',
       chosen: () => this.#faults,
       choose: (faults) => ((this.#faults = faults), (this.#field('slice').value = OWN)),
-      check: (faults) => api.check({ ...store.state, faults, against: '' }),
+      check: (faults) => api.checkSelection({ ...store.state, faults, against: '' }),
     });
-    for (const name of ['contact', 'only']) this.#field(name).addEventListener('change', () => (this.#field('slice').value = OWN));
+    for (const name of ['contact', 'only'])
+      this.#field(name).addEventListener('change', () => (this.#field('slice').value = OWN));
     this.#field('preset').addEventListener('change', () => this.#takePreset());
     this.#field('slice').addEventListener('change', () => this.#takeSlice());
-    this.#field('past').addEventListener('change', () => store.set({ run: this.#field('past').value }));
-    this.#part('.back').addEventListener('click', () => (store.set({ run: '' }), store.flush(), this.#field('preset').focus()));
-    this.#part('.act').addEventListener('click', () => (underWay(this.#run.job ?? {}) ? jobs.cancel(this.#run.job.id) : this.#start(this.#run.settings, this.#run)));
-    this.#part('form').addEventListener('submit', (event) => (event.preventDefault(), this.#start(this.#settings())));
+    this.#field('past').addEventListener('change', () =>
+      store.set({ run: this.#field('past').value }),
+    );
+    this.#part('.back').addEventListener(
+      'click',
+      () => (store.set({ run: '' }), store.flush(), this.#field('preset').focus()),
+    );
+    this.#part('.act').addEventListener('click', () =>
+      underWay(this.#run.job ?? {})
+        ? jobs.cancel(this.#run.job.id)
+        : this.#start(this.#run.settings, this.#run),
+    );
+    this.#part('form').addEventListener(
+      'submit',
+      (event) => (event.preventDefault(), this.#start(this.#settings())),
+    );
     jobs.listen((list) => this.#hear(list));
   }
 
@@ -118,14 +146,18 @@ export class Finetune {
     try {
       if (key !== this.#loaded) {
         say(this.#host, 'loading', 'Looking into the filter …');
-        this.#offer = await api.finetuning(this.#store.state, signal);
+        this.#offer = await api.finetuneOptions(this.#store.state, signal);
         this.#loaded = key;
         this.#showOffer();
         await this.#descent.load(signal);
       }
-      this.#run = run ? await api.tuned(run, signal) : null;
+      this.#run = run ? await api.finetuneRun(run, signal) : null;
       this.#show();
-      say(this.#host, this.#offer.why_not && !run ? 'empty' : 'ready', this.#offer.why_not && sentence(this.#offer.why_not));
+      say(
+        this.#host,
+        this.#offer.why_not && !run ? 'empty' : 'ready',
+        this.#offer.why_not && sentence(this.#offer.why_not),
+      );
     } catch (error) {
       if (error.name === 'AbortError') return;
       if (!(error instanceof api.ServerError)) console.error(error);
@@ -151,16 +183,34 @@ export class Finetune {
     const task = this.#catalog.tasks.find(({ name }) => name === this.#store.state.task);
     this.#tree.show(modules, this.#all);
     const known = (list, name) => (list.some((one) => one.name === name) ? name : list[0]?.name);
-    fill(this.#field('preset'), [...presets.map(({ name }) => [name, spoken(name).replace('-only', ' only')]), [OWN, 'as ticked']]);
+    fill(this.#field('preset'), [
+      ...presets.map(({ name }) => [name, displayName(name).replace('-only', ' only')]),
+      [OWN, 'as ticked'],
+    ]);
     this.#field('preset').value = known(presets, DEFAULT.preset) ?? OWN;
-    fill(this.#field('only'), [['', 'all'], ...slices.filter((s) => s.only.length).map((s) => [s.only.join('+'), `only ${s.only.join(' + ')}`])]);
-    fill(this.#field('slice'), [...slices.map(({ name }) => [name, name]), ['', 'nothing but nominal data'], [OWN, 'as chosen here']]);
+    fill(this.#field('only'), [
+      ['', 'all'],
+      ...slices
+        .filter((s) => s.only.length)
+        .map((s) => [s.only.join('+'), `only ${s.only.join(' + ')}`]),
+    ]);
+    fill(this.#field('slice'), [
+      ...slices.map(({ name }) => [name, name]),
+      ['', 'nothing but nominal data'],
+      [OWN, 'as chosen here'],
+    ]);
     this.#field('slice').value = known(slices, DEFAULT.slice) ?? '';
     this.#showFaults(task.fault_presets);
     for (const [name] of NUMBERS) this.#field(name).value = settings[name];
     const past = this.#part('.past');
     past.hidden = !runs.length;
-    fill(this.#field('past'), [['', 'choose …'], ...runs.map((run) => [run.run, `${run.filter}: ${learned(run)}${run.child ? ` → ${run.child}` : ''}`])]);
+    fill(this.#field('past'), [
+      ['', 'choose …'],
+      ...runs.map((run) => [
+        run.run,
+        `${run.filter}: ${learned(run)}${run.finetuned ? ` → ${run.finetuned}` : ''}`,
+      ]),
+    ]);
     this.#takePreset();
     this.#takeSlice();
   }
@@ -173,7 +223,8 @@ export class Finetune {
 
   #count() {
     const [trained, all] = this.#tree.count;
-    this.#part('.count').textContent = `${trained.toLocaleString('en')} of ${all.toLocaleString('en')} parameters; the rest is frozen`;
+    this.#part('.count').textContent =
+      `${trained.toLocaleString('en')} of ${all.toLocaleString('en')} parameters; the rest is frozen`;
   }
 
   /** Shows what a slice with a name is. */
@@ -183,8 +234,11 @@ export class Finetune {
     const slice = this.#offer.slices.find((one) => one.name === name);
     const faults = slice?.text.match(/faults=(.*?)(?=$|:contact=|:only=)/)?.[1] ?? '';
     this.#faults = faults;
-    this.#showFaults(this.#catalog.tasks.find((task) => task.name === this.#store.state.task).fault_presets);
-    this.#field('contact').value = slice?.contact === true ? 'yes' : slice?.contact === false ? 'no' : '';
+    this.#showFaults(
+      this.#catalog.tasks.find((task) => task.name === this.#store.state.task).fault_presets,
+    );
+    this.#field('contact').value =
+      slice?.contact === true ? 'yes' : slice?.contact === false ? 'no' : '';
     this.#field('only').value = slice?.only.join('+') ?? '';
   }
 
@@ -194,18 +248,22 @@ export class Finetune {
     const preset = value('preset');
     const settings = Object.fromEntries(NUMBERS.map(([name]) => [name, Number(value(name))]));
     settings.train = preset === OWN ? this.#tree.trained : [preset];
-    settings.moments = value('moments').split(/[\s,]+/).filter(Boolean);
+    settings.events = value('moments')
+      .split(/[\s,]+/)
+      .filter(Boolean);
     const [contact, only] = [value('contact'), value('only')];
     const named = this.#offer.slices.find((one) => one.name === value('slice'));
     if (named) settings.mix = [{ slice: plain(named), share: 1 }];
-    else if (value('slice') === OWN && (this.#faults || contact || only)) settings.mix = [{ slice: own(this.#faults, contact, only), share: 1 }];
+    else if (value('slice') === OWN && (this.#faults || contact || only))
+      settings.mix = [{ slice: own(this.#faults, contact, only), share: 1 }];
     return settings;
   }
 
   async #start(settings, of = this.#store.state) {
     const wrong = this.#part('.wrong');
     wrong.textContent = '';
-    if (!settings.train.length) return (wrong.textContent = 'Nothing is ticked: there is nothing to train.');
+    if (!settings.train.length)
+      return (wrong.textContent = 'Nothing is ticked: there is nothing to train.');
     try {
       const run = await api.startFinetune(of, settings);
       this.#loaded = ''; // it is among the runs now
@@ -232,38 +290,62 @@ export class Finetune {
     this.#part('form').hidden = Boolean(run);
     this.#part('article').hidden = !run;
     if (!run) return;
-    const { job, found, progress } = run;
-    this.#part('h3').textContent = `${run.filter}: ${run.settings.train.map((name) => name.replace('-only', '')).join(', ') || 'all'} on ${learned(run)}`;
-    this.#part('.verdict').textContent = found ? found.change.verdict : job ? said(job) : 'Its job is forgotten. It goes on where it stood.';
-    this.#part('article').dataset.state = found ? 'ready' : job && (underWay(job) || job.state === 'cancelled') ? 'working' : 'ended';
+    const { job, result: found, progress } = run;
+    this.#part('h3').textContent =
+      `${run.filter}: ${run.settings.train.map((name) => name.replace('-only', '')).join(', ') || 'all'} on ${learned(run)}`;
+    this.#part('.verdict').textContent = found
+      ? found.comparison.verdict
+      : job
+        ? said(job)
+        : 'Its job is forgotten. It goes on where it stood.';
+    this.#part('article').dataset.state = found
+      ? 'ready'
+      : job && (underWay(job) || job.state === 'cancelled')
+        ? 'working'
+        : 'ended';
     const [bar, act] = this.#part('.doing').children;
     this.#part('.doing').hidden = Boolean(found);
     [bar.hidden, bar.value] = [!underWay(job ?? {}), job?.progress ?? 0];
     act.textContent = underWay(job ?? {}) ? 'Pause' : 'Go on';
-    act.title = underWay(job ?? {}) ? 'It goes on from its last look at the validation episodes' : '';
+    act.title = underWay(job ?? {})
+      ? 'It goes on from its last look at the validation episodes'
+      : '';
     this.#decisions();
     const mapped = this.#catalog.tasks.find(({ name }) => name === run.task);
     this.#live.show(progress && curvesOf(progress, mapped), null);
-    this.#report.show(found?.change ?? null, null);
-    this.#moments(found?.moments ?? []);
+    this.#report.show(found?.comparison ?? null, null);
+    this.#moments(found?.events ?? []);
   }
 
   #decisions() {
-    const { child, place, found } = this.#run;
+    const { finetuned: child, saved_as: place, result: found } = this.#run;
     const host = this.#part('.decide');
     host.hidden = !found;
     if (!found) return;
     const acts = [
-      ['accept', 'Accept', 'What this server shows first from now on', place !== 'default'],
-      ['keep', 'Keep', 'On the shelf beside its parent', place !== 'kept'],
-      ['roll-back', 'Roll back', 'Off the shelf; the parent is as it was', place !== null],
+      [
+        'promote',
+        'Promote to default',
+        'What this server shows first from now on',
+        place !== 'default',
+      ],
+      ['save', 'Save', 'On the shelf beside its parent', place !== 'saved'],
+      ['discard', 'Discard', 'Off the shelf; the parent is as it was', place !== null],
     ];
     const line = document.createElement('span');
-    line.textContent = PLACES[place] ?? `${child}: after ${found.child.best_step} of ${found.child.steps} steps, ${fixed(found.child.seconds, 0)} s. The parent is untouched.`;
+    line.textContent =
+      PLACES[place] ??
+      `${child}: after ${found.finetuned.best_step} of ${found.finetuned.steps} steps, ${fixed(found.finetuned.seconds, 0)} s. The parent is untouched.`;
     host.replaceChildren(
       ...acts.map(([act, name, title, able]) => {
         const button = document.createElement('button');
-        Object.assign(button, { type: 'button', className: 'text', textContent: name, title, disabled: !able });
+        Object.assign(button, {
+          type: 'button',
+          className: 'text',
+          textContent: name,
+          title,
+          disabled: !able,
+        });
         button.addEventListener('click', () => this.#decide(act));
         return button;
       }),
@@ -274,11 +356,16 @@ export class Finetune {
   /** The shelf is another one then, so the page begins anew, at the child or at its parent. */
   async #decide(act, to = null) {
     try {
-      const { run, filter, child } = this.#run;
-      await api.decide(run, act);
+      const { run, filter, finetuned: child } = this.#run;
+      await api.decideFinetune(run, act);
       const { state } = this.#store;
-      const shown = act === 'accept' ? child : state.filter === child && act === 'roll-back' ? filter : state.filter;
-      location.assign(to ?? `/${address({ ...state, filter: shown })}`);
+      const shown =
+        act === 'promote'
+          ? child
+          : state.filter === child && act === 'discard'
+            ? filter
+            : state.filter;
+      location.assign(to ?? `/${permalink({ ...state, filter: shown })}`);
     } catch (error) {
       this.#part('.verdict').textContent = error.message;
     }
@@ -290,14 +377,20 @@ export class Finetune {
     host.querySelector('ol').replaceChildren(
       ...moments.map((m) => {
         const line = document.createElement('li');
-        const link = Object.assign(document.createElement('a'), { href: `/${m.link}`, textContent: `episode ${m.episode}, step ${m.step}` });
+        const link = Object.assign(document.createElement('a'), {
+          href: `/${m.link}`,
+          textContent: `episode ${m.episode}, step ${m.step}`,
+        });
         link.title = `Opens it on the child, with ${m.only.length ? `${m.only.join(' + ')} alone` : 'its parent'} beside it`;
         link.addEventListener('click', (event) => {
-          if (this.#run.place) return;
+          if (this.#run.saved_as) return;
           event.preventDefault();
-          this.#decide('keep', link.href); // a link opens what is on the shelf
+          this.#decide('save', link.href); // a link opens what is on the shelf
         });
-        line.append(link, ` ${m.slice}${m.contact ? ', in contact' : ''}: ${fixed(100 * m.before, 2)} → ${fixed(100 * m.after, 2)}`);
+        line.append(
+          link,
+          ` ${m.slice}${m.contact ? ', in contact' : ''}: ${fixed(100 * m.before, 2)} → ${fixed(100 * m.after, 2)}`,
+        );
         return line;
       }),
     );
@@ -305,31 +398,74 @@ export class Finetune {
 }
 
 /** The loss of each step, and each slice's error on the validation episodes, as plots. */
-function curvesOf({ losses, looks }, task) {
-  const places = looks.length ? Object.keys(looks[0].slices) : [];
-  const error = (name) => ({ name, layer: '', x: looks.map((l) => l.step), y: looks.map((l) => l.slices[name].rmse.position_cm) });
-  const plots = [{ title: 'Loss', x_label: 'step', y_label: '', kind: 'line', diagonal: false, lines: [{ name: '', layer: '', x: losses.map(([step]) => step), y: losses.map(([, loss]) => loss) }] }];
-  const of = spoken(task.map.x).replace(/(^| )x$/, '') || 'position';
-  plots.push({ title: 'Validation', x_label: 'step', y_label: `RMSE of the ${of} (cm)`, kind: 'line', diagonal: false, lines: places.map(error) });
-  return { curves: [], bands: {}, tables: [], pictures: [], plots: plots.filter(({ lines }) => lines.length && lines[0].x.length) };
+function curvesOf({ losses, validations }, task) {
+  const places = validations.length ? Object.keys(validations[0].slices) : [];
+  const error = (name) => ({
+    name,
+    layer: '',
+    x: validations.map((l) => l.step),
+    y: validations.map((l) => l.slices[name].rmse.position_cm),
+  });
+  const plots = [
+    {
+      title: 'Loss',
+      x_label: 'step',
+      y_label: '',
+      kind: 'line',
+      diagonal: false,
+      lines: [
+        { name: '', layer: '', x: losses.map(([step]) => step), y: losses.map(([, loss]) => loss) },
+      ],
+    },
+  ];
+  const of = displayName(task.map.x).replace(/(^| )x$/, '') || 'position';
+  plots.push({
+    title: 'Validation',
+    x_label: 'step',
+    y_label: `RMSE of the ${of} (cm)`,
+    kind: 'line',
+    diagonal: false,
+    lines: places.map(error),
+  });
+  return {
+    curves: [],
+    bands: {},
+    tables: [],
+    images: [],
+    plots: plots.filter(({ lines }) => lines.length && lines[0].x.length),
+  };
 }
 
-const said = (job) => (job.state === 'cancelled' ? 'Paused. It goes on from its last look at the validation episodes.' : told(job));
+const said = (job) =>
+  job.state === 'cancelled'
+    ? 'Paused. It goes on from its last look at the validation episodes.'
+    : told(job);
 
-const learned = ({ settings }) => settings.mix.map(({ slice }) => slice.name).join(' and ') || 'nominal data';
+const learned = ({ settings }) =>
+  settings.mix.map(({ slice }) => slice.name).join(' and ') || 'nominal data';
 
 /** A slice as the server takes it. */
 const plain = ({ name, faults, contact, only }) => ({ name, faults, contact, only });
 
 /** A slice's text, named after what it is. */
 function own(faults, contact, only) {
-  const name = [faults.replace(/[:=]/g, ' ') || 'whole', { yes: 'in contact', no: 'out of contact' }[contact], only && `${only} alone`].filter(Boolean).join(', ');
-  return [name, `faults=${faults}`, contact && `contact=${contact}`, only && `only=${only}`].filter(Boolean).join(':');
+  const name = [
+    faults.replace(/[:=]/g, ' ') || 'whole',
+    { yes: 'in contact', no: 'out of contact' }[contact],
+    only && `${only} alone`,
+  ]
+    .filter(Boolean)
+    .join(', ');
+  return [name, `faults=${faults}`, contact && `contact=${contact}`, only && `only=${only}`]
+    .filter(Boolean)
+    .join(':');
 }
 
 function number([name, text, step, title]) {
   const label = Object.assign(document.createElement('label'), { title, textContent: `${text} ` });
-  label.append(Object.assign(document.createElement('input'), { type: 'number', name, step, min: 0 }));
+  label.append(
+    Object.assign(document.createElement('input'), { type: 'number', name, step, min: 0 }),
+  );
   return label;
 }
 

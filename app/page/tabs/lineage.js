@@ -1,7 +1,7 @@
 /** Which filter was made from which: the children of the workspace under their ancestors, with what each gained and lost. */
 
 import * as api from '../data/api.js';
-import { address } from '../core/state.js';
+import { permalink } from '../core/state.js';
 import { fixed } from '../core/units.js';
 
 export class Descent {
@@ -19,18 +19,26 @@ export class Descent {
     const { task } = this.#store.state;
     const { members } = await api.lineage(task, signal);
     const byHash = new Map(members.map((one) => [one.hash, one]));
-    const children = (hash) => members.filter(({ parent }) => parent === hash);
-    const roots = members.filter((one) => !byHash.has(one.parent) && (one.parent || children(one.hash).length));
+    const children = (hash) => members.filter(({ base }) => base === hash);
+    const roots = members.filter(
+      (one) => !byHash.has(one.base) && (one.base || children(one.hash).length),
+    );
     this.#host.hidden = !roots.length;
     const list = document.createElement('ul');
     list.append(...roots.map((one) => this.#branch(one, null, children)));
-    this.#host.replaceChildren(Object.assign(document.createElement('h4'), { textContent: 'Who was made from whom' }), list);
+    this.#host.replaceChildren(
+      Object.assign(document.createElement('h4'), { textContent: 'Who was made from whom' }),
+      list,
+    );
   }
 
   #branch(one, parent, children) {
     const item = document.createElement('li');
     const line = document.createElement('div');
-    const name = Object.assign(document.createElement('b'), { textContent: one.shelf ?? `${one.name} ${one.hash.slice(0, 6)}`, title: one.hash });
+    const name = Object.assign(document.createElement('b'), {
+      textContent: one.catalog_name ?? `${one.name} ${one.hash.slice(0, 6)}`,
+      title: one.hash,
+    });
     line.append(name, ' ', ...told(one, parent), ...this.#links(one, parent));
     item.append(line);
     const below = children(one.hash);
@@ -46,12 +54,29 @@ export class Descent {
   #links(one, parent) {
     const { state } = this.#store;
     const own = { task: state.task, data: state.data };
-    const of = (text, patch, title) => link(text, address({ ...state, ...patch, run: patch.run ?? '' }), `${title}: ${one.shelf ?? one.hash.slice(0, 6)}`);
+    const of = (text, patch, title) =>
+      link(
+        text,
+        permalink({ ...state, ...patch, run: patch.run ?? '' }),
+        `${title}: ${one.catalog_name ?? one.hash.slice(0, 6)}`,
+      );
     const links = [];
-    if (one.shelf && one.shelf !== state.filter) links.push(of('open', { ...own, filter: one.shelf, against: '' }, 'Show its runs'));
-    if (one.shelf && parent?.shelf) links.push(of('compare', { filter: one.shelf, against: `filter=${parent.shelf}`, tab: 'compare' }, 'Beside its parent'));
+    if (one.catalog_name && one.catalog_name !== state.filter)
+      links.push(of('open', { ...own, filter: one.catalog_name, against: '' }, 'Show its runs'));
+    if (one.catalog_name && parent?.catalog_name)
+      links.push(
+        of(
+          'compare',
+          { filter: one.catalog_name, against: `filter=${parent.catalog_name}`, tab: 'compare' },
+          'Beside its parent',
+        ),
+      );
     if (one.run) links.push(of('report', { run: one.run }, 'What fine-tuning changed'));
-    const zip = link('export', `/api/lineage/${encodeURIComponent(state.task)}/${one.hash}.zip`, `With its ancestors, to hand on: ${one.shelf ?? one.hash.slice(0, 6)}`);
+    const zip = link(
+      'export',
+      `/api/lineage/${encodeURIComponent(state.task)}/${one.hash}.zip`,
+      `With its ancestors, to hand on: ${one.catalog_name ?? one.hash.slice(0, 6)}`,
+    );
     return [...links, zip];
   }
 }
@@ -60,10 +85,18 @@ export class Descent {
 function told(one, parent) {
   const number = ({ position_cm: cm } = {}) => fixed(cm, 2);
   const muted = (text) => Object.assign(document.createElement('span'), { textContent: text });
-  if (!one.parent) return one.rmse.position_cm === undefined ? [] : [muted(`${number(one.rmse)} cm`)];
-  const changes = Object.keys(one.after).map((slice) => `${slice} ${number(one.before[slice])} → ${number(one.after[slice])}`);
-  const what = [one.train.join(', '), one.learned.length ? `on ${one.learned.join(' and ')}` : ''].filter(Boolean).join(' ');
-  return [muted(`${what}${changes.length ? `: ${changes.join(', ')} cm` : ''}${parent ? '' : `; made from ${one.parent.slice(0, 6)}, which is not here`}`)];
+  if (!one.base) return one.rmse.position_cm === undefined ? [] : [muted(`${number(one.rmse)} cm`)];
+  const changes = Object.keys(one.after).map(
+    (slice) => `${slice} ${number(one.before[slice])} → ${number(one.after[slice])}`,
+  );
+  const what = [one.train.join(', '), one.learned.length ? `on ${one.learned.join(' and ')}` : '']
+    .filter(Boolean)
+    .join(' ');
+  return [
+    muted(
+      `${what}${changes.length ? `: ${changes.join(', ')} cm` : ''}${parent ? '' : `; made from ${one.base.slice(0, 6)}, which is not here`}`,
+    ),
+  ];
 }
 
 function link(text, href, title) {

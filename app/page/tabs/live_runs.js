@@ -1,17 +1,17 @@
 /** Live runs: which there are, and how the page fills while one of them goes on. */
 
 import * as api from '../data/api.js';
-import { told } from '../data/live_stream.js';
-import { spoken } from '../core/units.js';
+import { liveStatus } from '../data/live_stream.js';
+import { displayName } from '../core/units.js';
 
 const AGAIN = 2000; // ms until it is asked again which there are
 const SOONEST = 50; // ms from one question for more steps to the next
 const KEPT = 1000; // latencies
 
-/** @typedef {{name: string, data: string, task: string, filter: string, here: boolean, episode: number, steps: number, expected: number | null, state: string, told: string}} Run */
+/** @typedef {{name: string, data: string, task: string, filter: string, available: boolean, episode: number, steps: number, expected: number | null, state: string, message: string}} Run */
 
 /** Puts runs into the catalog, each as a data set of one episode, in place of those before. @param {import('../data/api.js').Catalog} catalog */
-export function shelve(catalog, { runs, tasks }) {
+export function addLiveRuns(catalog, { runs, tasks }) {
   for (const task of catalog.tasks) {
     task.data = task.data.filter(({ live }) => !live);
     task.filters = task.filters.filter(({ live }) => !live);
@@ -20,8 +20,14 @@ export function shelve(catalog, { runs, tasks }) {
     let task = catalog.tasks.find(({ name }) => name === run.task);
     if (!task) catalog.tasks.push((task = tasks.find(({ name }) => name === run.task)));
     const label = [run.episode, run.state === 'running' ? 'live' : 'live, ended'].join(' · ');
-    task.data.push({ name: run.data, first: run.episode, live: run, episodes: [{ index: run.episode, steps: run.steps, label }] });
-    if (!task.filters.some(({ name }) => name === run.filter)) task.filters.push({ name: run.filter, kind: run.kind, live: run.data });
+    task.data.push({
+      name: run.data,
+      first: run.episode,
+      live: run,
+      episodes: [{ index: run.episode, steps: run.steps, label }],
+    });
+    if (!task.filters.some(({ name }) => name === run.filter))
+      task.filters.push({ name: run.filter, kind: run.kind, live: run.data });
   }
 }
 
@@ -30,7 +36,20 @@ export function showing(catalog, { task: name, filter, data, episode, steps, sta
   const { map } = catalog.tasks.find((task) => task.name === name);
   const component = now.task === name ? now.component : map.x;
   const running = state === 'running';
-  return { task: name, filter, data, episode, faults: '', against: '', step: running ? Math.max(0, steps - 1) : 0, angle: null, component, window: '', playing: false, follow: running };
+  return {
+    task: name,
+    filter,
+    data,
+    episode,
+    faults: '',
+    against: '',
+    step: running ? Math.max(0, steps - 1) : 0,
+    angle: null,
+    component,
+    window: '',
+    playing: false,
+    follow: running,
+  };
 }
 
 export class Live {
@@ -46,15 +65,20 @@ export class Live {
 
   /**
    * @param {HTMLElement} root of the page @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
-   * @param {{grown: (trace: object, fresh: boolean) => void, ended: (trace: object) => void, listed: () => void, say: (line: string) => void}} handlers
+   * @param {{grown: (trace: import('../data/trace.js').Trace, fresh: boolean) => void, ended: (trace: import('../data/trace.js').Trace) => void, listed: () => void, say: (line: string) => void}} handlers
    *   are told that a trace has more steps (fresh: and columns), that its run has ended, that there are other runs, what is to be said
    * @param {{runs: Run[], tasks: object[]}} first
    */
   constructor(root, catalog, store, handlers, first) {
-    [this.#button, this.#list, this.#follow] = ['#live', '#live-runs', '#follow'].map((part) => root.querySelector(part));
+    [this.#button, this.#list, this.#follow] = ['#live', '#live-runs', '#follow'].map((part) =>
+      root.querySelector(part),
+    );
     [this.#catalog, this.#store, this.#handlers] = [catalog, store, handlers];
     this.#follow.addEventListener('click', () => this.newest());
-    this.#list.addEventListener('beforetoggle', ({ newState }) => newState === 'open' && this.#place());
+    this.#list.addEventListener(
+      'beforetoggle',
+      ({ newState }) => newState === 'open' && this.#place(),
+    );
     store.listen((state, changed) => this.#heed(state, changed));
     this.#take(first);
     setInterval(() => document.hidden || this.#look(), AGAIN);
@@ -72,7 +96,7 @@ export class Live {
     this.#trace = trace;
     this.#latencies = [];
     const { live } = trace ?? {};
-    this.#handlers.say(live?.told ?? this.#shown?.told ?? '');
+    this.#handlers.say(live?.message ?? this.#shown?.message ?? '');
     if (this.#running && this.#store.state.follow) this.#go();
     this.#tell();
     if (this.#running) this.#fill(trace);
@@ -98,7 +122,8 @@ export class Live {
   #heed({ data, step, playing, follow }, changed) {
     if (!this.#running || data !== this.#trace.selection.data || changed.has('data')) return;
     // Who moves the cursor away leaves the newest step, who moves it there comes back to it.
-    if (changed.has('step') && this.#store.origin !== 'live') this.#store.set({ follow: step >= this.#trace.steps - 1 });
+    if (changed.has('step') && this.#store.origin !== 'live')
+      this.#store.set({ follow: step >= this.#trace.steps - 1 });
     else if (changed.has('playing') && playing) this.#store.set({ follow: false });
     else if (changed.has('follow') && follow) this.#go();
     this.#tell();
@@ -114,7 +139,7 @@ export class Live {
       const asked = performance.now();
       const block = await trace.stream.next(trace.steps, trace.live.state);
       if (!block || this.#trace !== trace) break;
-      trace.live = { ...trace.live, ...told(block) };
+      trace.live = { ...trace.live, ...liveStatus(block) };
       if (block.steps) {
         const fresh = trace.grow(block);
         this.#handlers.grown(trace, fresh);
@@ -122,15 +147,27 @@ export class Live {
         this.#tell();
       }
       await drawn();
-      if (block.steps) this.#latencies = [...this.#latencies, { step: trace.steps - 1, ms: Date.now() - 1000 * block.written, at: Date.now() }].slice(-KEPT);
-      const behind = trace.steps < block.of;
-      if (!behind) await new Promise((resolve) => setTimeout(resolve, Math.max(0, asked + SOONEST - performance.now())));
+      if (block.steps)
+        this.#latencies = [
+          ...this.#latencies,
+          { step: trace.steps - 1, ms: Date.now() - 1000 * block.written, at: Date.now() },
+        ].slice(-KEPT);
+      const behind = trace.steps < block.total;
+      if (!behind)
+        await new Promise((resolve) =>
+          setTimeout(resolve, Math.max(0, asked + SOONEST - performance.now())),
+        );
     }
     trace.stream.close();
     if (this.#trace !== trace) return;
-    if (trace.stream.refused) trace.live = { ...trace.live, state: 'gone', told: `The live run has gone: ${trace.stream.refused}.` };
+    if (trace.stream.error)
+      trace.live = {
+        ...trace.live,
+        state: 'gone',
+        message: `The live run has gone: ${trace.stream.error}.`,
+      };
     this.#tell();
-    this.#handlers.say(trace.live.told);
+    this.#handlers.say(trace.live.message);
     this.#handlers.ended(trace);
     this.#look();
   }
@@ -154,7 +191,7 @@ export class Live {
     const others = identity(found.runs) !== identity(this.#runs);
     this.#runs = found.runs;
     if (others) {
-      shelve(this.#catalog, found);
+      addLiveRuns(this.#catalog, found);
       this.#handlers.listed();
     }
     const running = this.#runs.filter(({ state }) => state === 'running').length;
@@ -174,7 +211,10 @@ export class Live {
       row.dataset.state = run.state;
       row.firstChild.disabled = !run.data;
       row.firstChild.setAttribute('aria-current', String(run.data === this.#store.state.data));
-      [name.textContent, what.textContent] = [run.name, run.data ? `${run.filter} · ${spoken(run.task)} ${run.episode}` : ''];
+      [name.textContent, what.textContent] = [
+        run.name,
+        run.data ? `${run.filter} · ${displayName(run.task)} ${run.episode}` : '',
+      ];
       how.textContent = how.title = said(run);
       row.firstChild.onclick = () => this.#open(run);
     });
@@ -195,19 +235,23 @@ export class Live {
 
   #place() {
     const { left, bottom } = this.#button.getBoundingClientRect();
-    Object.assign(this.#list.style, { left: `${Math.max(8, Math.min(left, innerWidth - 388))}px`, top: `${bottom + 5}px` });
+    Object.assign(this.#list.style, {
+      left: `${Math.max(8, Math.min(left, innerWidth - 388))}px`,
+      top: `${bottom + 5}px`,
+    });
     this.#draw();
   }
 }
 
 /** What the pickers depend on. */
-const identity = (runs) => JSON.stringify(runs.map(({ name, state, started, filter }) => [name, state, started, filter]));
+const identity = (runs) =>
+  JSON.stringify(runs.map(({ name, state, started, filter }) => [name, state, started, filter]));
 
 /** How a run is, in a line. @param {Run} run */
-function said({ state, told: line, steps, expected, here }) {
+function said({ state, message: line, steps, expected, available }) {
   if (line) return line;
   const count = expected ? `${steps} of ${expected} steps` : `${steps} steps`;
-  const absent = here ? '' : ' · its checkpoint is not served here (--filter)';
+  const absent = available ? '' : ' · its checkpoint is not served here (--filter)';
   return `${state === 'running' ? 'goes on' : 'ended'}, ${count}${absent}`;
 }
 

@@ -15,11 +15,17 @@ export class ModuleTree {
     [this.#host, this.#changed] = [host, changed];
   }
 
-  /** @param {{name: string, kind: string, says: string, parameters: number, depth: number}[]} modules @param {string[]} parameters names of all */
+  /** @param {{name: string, kind: string, description: string, parameters: number, depth: number}[]} modules @param {string[]} parameters names of all */
   show(modules, parameters) {
     this.#all = parameters;
     const inside = (name) => parameters.filter((p) => p === name || p.startsWith(`${name}.`));
-    this.#rows = modules.map((module) => this.#row(module, inside(module.name), modules.some((m) => m.name.startsWith(`${module.name}.`))));
+    this.#rows = modules.map((module) =>
+      this.#row(
+        module,
+        inside(module.name),
+        modules.some((m) => m.name.startsWith(`${module.name}.`)),
+      ),
+    );
     this.#host.replaceChildren(...this.#rows.map(({ row }) => row));
     this.#draw();
   }
@@ -27,8 +33,11 @@ export class ModuleTree {
   /** Chooses these parameters and no others, and opens what is trained in part. @param {string[]} names */
   choose(names) {
     this.#trained = new Set(names);
-    const partly = ({ within }) => within.some((p) => this.#trained.has(p)) && !within.every((p) => this.#trained.has(p));
-    this.#closed = new Set(this.#rows.filter((row) => !partly(row)).map(({ module }) => module.name));
+    const partly = ({ within }) =>
+      within.some((p) => this.#trained.has(p)) && !within.every((p) => this.#trained.has(p));
+    this.#closed = new Set(
+      this.#rows.filter((row) => !partly(row)).map(({ module }) => module.name),
+    );
     this.#draw();
   }
 
@@ -36,26 +45,41 @@ export class ModuleTree {
   get trained() {
     const names = [];
     const told = (p) => names.some((name) => p === name || p.startsWith(`${name}.`));
-    for (const { module, within } of this.#rows) if (!told(module.name) && within.every((p) => this.#trained.has(p))) names.push(module.name);
+    for (const { module, within } of this.#rows)
+      if (!told(module.name) && within.every((p) => this.#trained.has(p))) names.push(module.name);
     return [...names, ...[...this.#trained].filter((p) => !told(p))];
   }
 
   /** How many of how many numbers are trained. @returns {[number, number]} */
   get count() {
-    const leaves = this.#rows.filter(({ module }) => !this.#rows.some((other) => other.module.name.startsWith(`${module.name}.`)));
-    const size = ({ module, within }) => (within.every((p) => this.#trained.has(p)) ? module.parameters : 0);
-    return [leaves.reduce((sum, row) => sum + size(row), 0), leaves.reduce((sum, { module }) => sum + module.parameters, 0)];
+    const leaves = this.#rows.filter(
+      ({ module }) => !this.#rows.some((other) => other.module.name.startsWith(`${module.name}.`)),
+    );
+    const size = ({ module, within }) =>
+      within.every((p) => this.#trained.has(p)) ? module.parameters : 0;
+    return [
+      leaves.reduce((sum, row) => sum + size(row), 0),
+      leaves.reduce((sum, { module }) => sum + module.parameters, 0),
+    ];
   }
 
   #row(module, within, deeper) {
     const row = document.createElement('li');
     row.style.setProperty('--depth', String(module.depth - 1));
-    row.innerHTML = `<button type="button" class="quiet twist"></button><label><input type="checkbox"> <b></b></label><span class="number"></span><span class="says"></span>`;
-    const [twist, label, size, says] = row.children;
+    row.innerHTML = `<button type="button" class="quiet twist"></button><label><input type="checkbox"> <b></b></label><span class="number"></span><span class="description"></span>`;
+    const [twist, label, size, description] = row.children;
     const box = label.firstElementChild;
     label.querySelector('b').textContent = module.name.split('.').at(-1);
-    [label.title, size.textContent] = [`${module.name} (${module.kind})`, module.parameters.toLocaleString('en')];
-    says.textContent = says.title = [history(module), module.says || module.kind].filter(Boolean).join(' · ');
+    [label.title, size.textContent] = [
+      `${module.name} (${module.kind})`,
+      module.parameters.toLocaleString('en'),
+    ];
+    description.textContent = description.title = [
+      history(module),
+      module.description || module.kind,
+    ]
+      .filter(Boolean)
+      .join(' · ');
     box.setAttribute('aria-label', `Train ${module.name}`);
     twist.style.visibility = deeper ? '' : 'hidden';
     twist.addEventListener('click', () => {
@@ -73,7 +97,10 @@ export class ModuleTree {
   #draw() {
     for (const { module, row, box, twist, within } of this.#rows) {
       const count = within.filter((p) => this.#trained.has(p)).length;
-      [box.checked, box.indeterminate] = [count === within.length, count > 0 && count < within.length];
+      [box.checked, box.indeterminate] = [
+        count === within.length,
+        count > 0 && count < within.length,
+      ];
       row.hidden = [...this.#closed].some((name) => module.name.startsWith(`${name}.`));
       const closed = this.#closed.has(module.name);
       twist.textContent = closed ? '▸' : '▾';
@@ -85,5 +112,7 @@ export class ModuleTree {
 
 /** What the fine-tuning that made the filter did to a module; nothing where there was none, or it was frozen. */
 function history({ gradient, change }) {
-  return gradient === undefined ? '' : `gradient ${significant(gradient)}, changed by ${significant(100 * change)} %`;
+  return gradient === undefined
+    ? ''
+    : `gradient ${significant(gradient)}, changed by ${significant(100 * change)} %`;
 }

@@ -5,7 +5,7 @@ import * as api from '../data/api.js';
 import { FileTable } from '../widgets/file_table.js';
 import { told, underWay } from '../widgets/jobs.js';
 import { say } from '../widgets/panel_state.js';
-import { bytes, sentence } from '../core/units.js';
+import { formatBytes, sentence } from '../core/units.js';
 
 const AGAIN = 4000; // ms until the list is asked for again: another browser may have changed it
 const SOON = 700; // while a file is being looked into
@@ -33,16 +33,45 @@ const BODY = `
   <div class="drop" hidden><p>Drop <b>.rrd</b> files to add them</p></div>
   <p class="note"></p>`;
 
-const words = (name, title, help, value = (file) => file[name] ?? null) => ({ name, title, help, value, shown: (file) => String(value(file) ?? '–') });
+const words = (name, title, help, value = (file) => file[name] ?? null) => ({
+  name,
+  title,
+  help,
+  value,
+  shown: (file) => String(value(file) ?? '–'),
+});
 const OF_A_RUN = [
   words('task', 'task', 'What it is of'),
   words('filter', 'filter', 'That made it'),
   { ...words('episode', 'ep.', 'Index of the episode'), number: true },
-  { ...words('faults', 'sensors', 'How they were broken', ({ task, faults }) => (task === null ? null : faults || 'as recorded')), hint: ({ faults }) => faults },
+  {
+    ...words('faults', 'sensors', 'How they were broken', ({ task, faults }) =>
+      task === null ? null : faults || 'as recorded',
+    ),
+    hint: ({ faults }) => faults,
+  },
 ];
-const size = { name: 'bytes', title: 'size', help: 'On the disk', value: (file) => file.bytes, shown: (file) => bytes(file.bytes), number: true };
-const when = (name) => ({ name: 'when', title: 'when', help: 'It was written', value: (file) => Date.parse(file[name]), shown: (file) => moment(new Date(file[name])), hint: (file) => new Date(file[name]).toLocaleString('en-GB'), number: true });
-const data = { ...words('data', 'data', 'Data set, as it is named here', (file) => file.run?.data ?? null), hint: (file) => file.data_hash && `Episode ${file.data_hash.slice(0, 12)}` };
+const size = {
+  name: 'bytes',
+  title: 'size',
+  help: 'On the disk',
+  value: (file) => file.bytes,
+  shown: (file) => formatBytes(file.bytes),
+  number: true,
+};
+const when = (name) => ({
+  name: 'when',
+  title: 'when',
+  help: 'It was written',
+  value: (file) => Date.parse(file[name]),
+  shown: (file) => moment(new Date(file[name])),
+  hint: (file) => new Date(file[name]).toLocaleString('en-GB'),
+  number: true,
+});
+const data = {
+  ...words('data', 'data', 'Data set, as it is named here', (file) => file.run?.data ?? null),
+  hint: (file) => file.data_hash && `Episode ${file.data_hash.slice(0, 12)}`,
+};
 
 export class Library {
   #host;
@@ -68,18 +97,39 @@ export class Library {
    * @param {import('./rerun.js').Rerun} rerun that shows recordings
    */
   constructor(host, catalog, store, jobs, rerun) {
-    [this.#host, this.#catalog, this.#store, this.#jobs, this.#rerun] = [host, catalog, store, jobs, rerun];
+    [this.#host, this.#catalog, this.#store, this.#jobs, this.#rerun] = [
+      host,
+      catalog,
+      store,
+      jobs,
+      rerun,
+    ];
     host.innerHTML = BODY;
-    const name = { name: 'name', title: 'name', help: 'Of the file', value: (file) => file.name, shown: (file) => this.#tags(file), hint: (file) => (file.reading ? '' : file.problem) };
-    this.#recordings = new FileTable(this.#part('.recordings'), [name, ...OF_A_RUN, data, size, when('modified')], {
-      acts: (file) => this.#acts(file),
-      sort: { name: 'when', down: true },
-      picks: { has: (file) => this.#chosen.has(file), toggle: (file) => this.#choose(file) },
-    });
-    this.#reports = new FileTable(this.#part('.reports table'), [{ ...name, shown: () => '', hint: ({ title }) => title }, ...OF_A_RUN, size, when('made')], {
-      acts: (file) => this.#actsOfReport(file),
-      sort: { name: 'when', down: true },
-    });
+    const name = {
+      name: 'name',
+      title: 'name',
+      help: 'Of the file',
+      value: (file) => file.name,
+      shown: (file) => this.#tags(file),
+      hint: (file) => (file.reading ? '' : file.problem),
+    };
+    this.#recordings = new FileTable(
+      this.#part('.recordings'),
+      [name, ...OF_A_RUN, data, size, when('modified')],
+      {
+        acts: (file) => this.#acts(file),
+        sort: { name: 'when', down: true },
+        picks: { has: (file) => this.#chosen.has(file), toggle: (file) => this.#choose(file) },
+      },
+    );
+    this.#reports = new FileTable(
+      this.#part('.reports table'),
+      [{ ...name, shown: () => '', hint: ({ title }) => title }, ...OF_A_RUN, size, when('made')],
+      {
+        acts: (file) => this.#actsOfReport(file),
+        sort: { name: 'when', down: true },
+      },
+    );
     this.#adding = new Adding(this.#part('.adding'), (added) => this.#added(added));
     jobs.listen((list) => this.#hear(list));
     this.#take();
@@ -108,7 +158,17 @@ export class Library {
       const [kept, made] = await Promise.all([api.recordings(), api.reports()]);
       const read = JSON.stringify([kept, made]);
       if (read !== this.#read) {
-        [this.#read, this.#kept] = [read, { ...kept, reports: made.reports, trash: [...kept.deleted.map((one) => ({ ...one, of: 'recordings' })), ...made.deleted.map((one) => ({ ...one, of: 'reports' }))] }];
+        [this.#read, this.#kept] = [
+          read,
+          {
+            ...kept,
+            reports: made.reports,
+            trash: [
+              ...kept.deleted.map((one) => ({ ...one, of: 'recordings' })),
+              ...made.deleted.map((one) => ({ ...one, of: 'reports' })),
+            ],
+          },
+        ];
         this.#draw();
       }
       say(this.#host, 'ready');
@@ -118,7 +178,11 @@ export class Library {
     }
     clearTimeout(this.#timer);
     const soon = this.#kept?.recordings.some(({ reading }) => reading);
-    if (this.#open) this.#timer = setTimeout(() => (document.hidden ? this.#later() : this.load()), soon ? SOON : AGAIN);
+    if (this.#open)
+      this.#timer = setTimeout(
+        () => (document.hidden ? this.#later() : this.load()),
+        soon ? SOON : AGAIN,
+      );
   }
 
   #later() {
@@ -145,9 +209,15 @@ export class Library {
     const many = `${kept.length} recording${kept.length === 1 ? '' : 's'}`;
     const what = found.length < kept.length ? `${found.length} of ${many}` : many;
     const disk = reports.reduce((sum, one) => sum + one.bytes, used);
-    this.#part('.told').textContent = `${what} · ${bytes(disk)} used, ${bytes(free)} free`;
-    const none = 'None yet. “Save .rrd” above writes one of the run that is shown; “Add .rrd…” takes one from elsewhere.';
-    this.#part('.rest').textContent = kept.length ? (found.length ? '' : 'No recording has all these words.') : none;
+    this.#part('.told').textContent =
+      `${what} · ${formatBytes(disk)} used, ${formatBytes(free)} free`;
+    const none =
+      'None yet. “Save .rrd” above writes one of the run that is shown; “Add .rrd…” takes one from elsewhere.';
+    this.#part('.rest').textContent = kept.length
+      ? found.length
+        ? ''
+        : 'No recording has all these words.'
+      : none;
     this.#drawAutomatic(recordings.filter((file) => file.automatic && this.#sought(file)));
     this.#drawTrash(trash);
     this.#drawChosen();
@@ -161,14 +231,19 @@ export class Library {
     const host = this.#part('.automatic');
     host.hidden = !files.length;
     const [text, button] = host.children;
-    const size = bytes(files.reduce((sum, one) => sum + one.bytes, 0));
+    const size = formatBytes(files.reduce((sum, one) => sum + one.bytes, 0));
     text.textContent = `${files.length} ${files.length === 1 ? 'was' : 'were'} written for the Rerun tab, ${size}; the oldest go when there are many.`;
     button.textContent = this.#automatic ? 'Hide' : 'Show';
   }
 
   #sought({ name, task, filter, tags = [], faults, application = '', run }) {
-    const text = [name, task, filter, ...tags, faults, application, run?.data].join(' ').toLowerCase();
-    return this.#part('[type=search]').value.toLowerCase().split(/\s+/).every((word) => text.includes(word));
+    const text = [name, task, filter, ...tags, faults, application, run?.data]
+      .join(' ')
+      .toLowerCase();
+    return this.#part('[type=search]')
+      .value.toLowerCase()
+      .split(/\s+/)
+      .every((word) => text.includes(word));
   }
 
   /** What stands behind a name: its tags; of a file that is no run of ours, what it is. */
@@ -180,7 +255,12 @@ export class Library {
     else if (file.problem) host.append(note(`of ${file.application}`));
     else if (file.automatic) host.append(note('for the Rerun tab'));
     for (const tag of file.tags) {
-      const button = Object.assign(document.createElement('button'), { type: 'button', className: 'tag', textContent: tag, title: `Search for ${tag}` });
+      const button = Object.assign(document.createElement('button'), {
+        type: 'button',
+        className: 'tag',
+        textContent: tag,
+        title: `Search for ${tag}`,
+      });
       button.dataset.part = `tag ${tag}`;
       button.addEventListener('click', () => this.#search(tag));
       host.append(button);
@@ -196,15 +276,33 @@ export class Library {
 
   /** @returns {import('../widgets/file_table.js').Act[]} */
   #acts(file) {
-    const unread = file.reading ? 'It is looked into just now' : file.application ? undefined : sentence(file.problem);
+    const unread = file.reading
+      ? 'It is looked into just now'
+      : file.application
+        ? undefined
+        : sentence(file.problem);
     return [
       { name: 'Open in Rerun', key: 'Enter', act: () => this.#show([file]), why: unread },
       { name: 'Open the run here', ...this.#run(file, unread) },
-      ...(file.automatic ? [{ name: 'Keep', act: () => this.#keep(file), why: this.#readOnly, hint: 'It was written for the Rerun tab, and goes when there are many.' }] : []),
+      ...(file.automatic
+        ? [
+            {
+              name: 'Keep',
+              act: () => this.#keep(file),
+              why: this.#readOnly,
+              hint: 'It was written for the Rerun tab, and goes when there are many.',
+            },
+          ]
+        : []),
       { name: 'Rename', key: 'F2', act: () => this.#rename(file), why: this.#readOnly },
       { name: 'Tags', act: () => this.#tag(file), why: this.#readOnly },
-      { name: `Download, ${bytes(file.bytes)}`, href: file.url, download: file.name },
-      { name: 'Delete', key: 'Delete', act: () => this.#delete(file, 'recordings'), why: this.#readOnly },
+      { name: `Download, ${formatBytes(file.bytes)}`, href: file.url, download: file.name },
+      {
+        name: 'Delete',
+        key: 'Delete',
+        act: () => this.#delete(file, 'recordings'),
+        why: this.#readOnly,
+      },
     ];
   }
 
@@ -212,14 +310,19 @@ export class Library {
   #run(file, unread) {
     if (file.run) return { act: () => this.#store.set({ ...this.#selection(file), tab: 'scene' }) };
     const known = this.#catalog.tasks.some(({ name }) => name === file.task);
-    if (unread || file.problem || !known) return { why: unread ?? sentence(file.problem || `This server has no task ${file.task}`) };
-    return { act: () => this.#readRun(file), why: this.#readOnly, hint: `As it was recorded. ${file.why_not}` };
+    if (unread || file.problem || !known)
+      return { why: unread ?? sentence(file.problem || `This server has no task ${file.task}`) };
+    return {
+      act: () => this.#readRun(file),
+      why: this.#readOnly,
+      hint: `As it was recorded. ${file.why_not}`,
+    };
   }
 
   /** Has a run read out of its file, and opens it when that is done. */
   #readRun(file) {
     return this.#try(async () => {
-      const { job } = await api.readRun(file);
+      const { job } = await api.importRun(file);
       if (job.state === 'done') location.assign(`/${job.link}`);
       this.#awaited = job.id;
       this.#say(`The run in ${file.name} is read; it opens in a moment.`);
@@ -229,7 +332,8 @@ export class Library {
 
   #hear(list) {
     const job = list.find(({ id }) => id === this.#awaited);
-    if (job?.state === 'done') location.assign(`/${job.link}`); // its episode is new to this page
+    if (job?.state === 'done')
+      location.assign(`/${job.link}`); // its episode is new to this page
     else if (job && !underWay(job)) [this.#awaited] = ['', this.#say(told(job), null, true)];
     if (this.#open) this.load();
   }
@@ -237,18 +341,32 @@ export class Library {
   #actsOfReport(file) {
     return [
       { name: 'Open', key: 'Enter', href: `${file.url}?shown=true`, window: true },
-      { name: 'Open its run here', act: () => this.#store.set({ ...this.#selection({ ...file, run: file }), tab: 'scene' }), why: this.#lacking(file) },
+      {
+        name: 'Open its run here',
+        act: () => this.#store.set({ ...this.#selection({ ...file, run: file }), tab: 'scene' }),
+        why: this.#lacking(file),
+      },
       { name: 'Download the page', href: file.url, download: `${file.name}.html` },
-      ...(file.pdf ? [{ name: 'Download the PDF', href: file.pdf, download: `${file.name}.pdf` }] : []),
-      { name: 'Delete', key: 'Delete', act: () => this.#delete(file, 'reports'), why: this.#readOnly },
+      ...(file.pdf
+        ? [{ name: 'Download the PDF', href: file.pdf, download: `${file.name}.pdf` }]
+        : []),
+      {
+        name: 'Delete',
+        key: 'Delete',
+        act: () => this.#delete(file, 'reports'),
+        why: this.#readOnly,
+      },
     ];
   }
 
   /** Why a report's run cannot be opened: a filter of this name may have gone since. */
   #lacking({ task, filter, episode }) {
     const found = this.#catalog.tasks.find(({ name }) => name === task);
-    if (!found?.filters.some(({ name }) => name === filter)) return `Filter ${filter} of ${task} is not one of this server’s.`;
-    return found.data.some((set) => set.episodes.some(({ index }) => index === episode)) ? undefined : `No data set here has an episode ${episode}.`;
+    if (!found?.filters.some(({ name }) => name === filter))
+      return `Filter ${filter} of ${task} is not one of this server’s.`;
+    return found.data.some((set) => set.episodes.some(({ index }) => index === episode))
+      ? undefined
+      : `No data set here has an episode ${episode}.`;
   }
 
   /** The state that shows a file's run. */
@@ -258,7 +376,18 @@ export class Library {
     const set = run.data ?? found.data[0].name;
     const same = state.task === task && state.data === set && state.episode === episode;
     const other = state.task === task ? {} : { component: found.map.x };
-    return { task, filter: run.filter, data: set, episode, faults, against: '', playing: false, angle: null, step: same ? state.step : 0, ...other };
+    return {
+      task,
+      filter: run.filter,
+      data: set,
+      episode,
+      faults,
+      against: '',
+      playing: false,
+      angle: null,
+      step: same ? state.step : 0,
+      ...other,
+    };
   }
 
   #show(files) {
@@ -273,7 +402,9 @@ export class Library {
 
   /** The files that are ticked, the first that was first. */
   get #two() {
-    return [...this.#chosen].map((name) => this.#kept.recordings.find((file) => file.name === name)).filter(Boolean);
+    return [...this.#chosen]
+      .map((name) => this.#kept.recordings.find((file) => file.name === name))
+      .filter(Boolean);
   }
 
   /** What two files that are ticked can be compared by. */
@@ -283,8 +414,14 @@ export class Library {
     host.hidden = !files.length;
     if (!files.length) return;
     const [text, both, compare, why] = host.children;
-    text.textContent = files.length === 1 ? 'One chosen: choose another to compare.' : `${files.length} chosen.`;
-    const unread = files.length !== 2 ? 'Choose two.' : files.some(({ application }) => !application) ? 'One of them cannot be read.' : '';
+    text.textContent =
+      files.length === 1 ? 'One chosen: choose another to compare.' : `${files.length} chosen.`;
+    const unread =
+      files.length !== 2
+        ? 'Choose two.'
+        : files.some(({ application }) => !application)
+          ? 'One of them cannot be read.'
+          : '';
     both.disabled = Boolean(unread);
     const cannot = unread || apart(...files);
     compare.disabled = Boolean(cannot);
@@ -297,19 +434,34 @@ export class Library {
   }
 
   #rename(file) {
-    this.#recordings.edit(file, `New name of ${file.name}`, file.name.replace(/\.rrd$/, ''), async (text) => {
-      const { name } = await api.changeRecording(file, { name: text });
-      if (this.#chosen.delete(file.name)) this.#chosen.add(name);
-      this.#point = name;
-      await this.load();
-    });
+    this.#recordings.edit(
+      file,
+      `New name of ${file.name}`,
+      file.name.replace(/\.rrd$/, ''),
+      async (text) => {
+        const { name } = await api.changeRecording(file, { name: text });
+        if (this.#chosen.delete(file.name)) this.#chosen.add(name);
+        this.#point = name;
+        await this.load();
+      },
+    );
   }
 
   #tag(file) {
-    this.#recordings.edit(file, `Tags of ${file.name}, divided by commas`, file.tags.join(', '), async (text) => {
-      await api.changeRecording(file, { tags: text.split(',').map((tag) => tag.trim()).filter(Boolean) });
-      await this.load();
-    });
+    this.#recordings.edit(
+      file,
+      `Tags of ${file.name}, divided by commas`,
+      file.tags.join(', '),
+      async (text) => {
+        await api.changeRecording(file, {
+          tags: text
+            .split(',')
+            .map((tag) => tag.trim())
+            .filter(Boolean),
+        });
+        await this.load();
+      },
+    );
   }
 
   #keep(file) {
@@ -322,15 +474,18 @@ export class Library {
 
   async #delete(file, of) {
     await this.#try(async () => {
-      const { deleted } = await api.discard(file);
-      return [`${file.name} is in the trash.`, () => this.#restore({ id: deleted, name: file.name, of })];
+      const { deleted } = await api.deleteFile(file);
+      return [
+        `${file.name} is in the trash.`,
+        () => this.#restore({ id: deleted, name: file.name, of }),
+      ];
     });
     this.#part('.said button').focus();
   }
 
   #restore({ id, name, of }) {
     return this.#try(async () => {
-      await api.restore(of, id);
+      await api.restoreFile(of, id);
       this.#point = of === 'recordings' ? name : '';
       return [`${name} is back.`];
     });
@@ -339,8 +494,11 @@ export class Library {
   async #empty() {
     this.#part('.sure').hidden = true;
     await this.#try(async () => {
-      const freed = (await Promise.all(['recordings', 'reports'].map(api.emptyTrash))).reduce((sum, one) => sum + one.freed, 0);
-      return [`The trash is empty: ${bytes(freed)} are free again.`];
+      const freed = (await Promise.all(['recordings', 'reports'].map(api.emptyTrash))).reduce(
+        (sum, one) => sum + one.freed,
+        0,
+      );
+      return [`The trash is empty: ${formatBytes(freed)} are free again.`];
     });
   }
 
@@ -363,16 +521,30 @@ export class Library {
   #drawTrash(trash) {
     const host = this.#part('.trash');
     host.hidden = !trash.length;
-    const all = bytes(trash.reduce((sum, one) => sum + one.bytes, 0));
+    const all = formatBytes(trash.reduce((sum, one) => sum + one.bytes, 0));
     host.querySelector('summary').textContent = `Deleted: ${trash.length}, ${all}`;
     const button = host.querySelector('.empty');
-    [button.textContent, button.disabled, button.title] = [`Empty the trash (${all})`, Boolean(this.#readOnly), this.#readOnly ?? ''];
+    [button.textContent, button.disabled, button.title] = [
+      `Empty the trash (${all})`,
+      Boolean(this.#readOnly),
+      this.#readOnly ?? '',
+    ];
     host.querySelector('ul').replaceChildren(
       ...trash.map((one) => {
         const line = document.createElement('li');
-        const back = Object.assign(document.createElement('button'), { type: 'button', className: 'text quiet', textContent: 'Restore', ariaLabel: `Restore ${one.name}`, disabled: Boolean(this.#readOnly) });
+        const back = Object.assign(document.createElement('button'), {
+          type: 'button',
+          className: 'text quiet',
+          textContent: 'Restore',
+          ariaLabel: `Restore ${one.name}`,
+          disabled: Boolean(this.#readOnly),
+        });
         back.addEventListener('click', () => this.#restore(one));
-        line.append(back, one.name, note(`${bytes(one.bytes)}, deleted ${moment(new Date(1000 * one.deleted))}`));
+        line.append(
+          back,
+          one.name,
+          note(`${formatBytes(one.bytes)}, deleted ${moment(new Date(1000 * one.deleted))}`),
+        );
         return line;
       }),
     );
@@ -401,7 +573,10 @@ export class Library {
     const press = (selector, act) => this.#part(selector).addEventListener('click', act);
     const picker = this.#part('[type=file]');
     const field = this.#part('[type=search]');
-    [this.#part('.add').disabled, this.#part('.add').title] = [Boolean(this.#readOnly), this.#readOnly ?? this.#part('.add').title];
+    [this.#part('.add').disabled, this.#part('.add').title] = [
+      Boolean(this.#readOnly),
+      this.#readOnly ?? this.#part('.add').title,
+    ];
     press('.add', () => picker.click());
     press('.both', () => this.#show(this.#two));
     press('.compare', () => this.#compare());
@@ -414,7 +589,10 @@ export class Library {
     press('.said .quiet', () => this.#say(''));
     picker.addEventListener('change', () => (this.#add(picker.files), (picker.value = '')));
     field.addEventListener('input', () => this.#kept && this.#draw());
-    field.addEventListener('keydown', (event) => event.key === 'Escape' && this.#search(field.value.trim()));
+    field.addEventListener(
+      'keydown',
+      (event) => event.key === 'Escape' && this.#search(field.value.trim()),
+    );
   }
 
   /** Files that are dragged here. A drag enters and leaves every element on its way. */
@@ -427,10 +605,22 @@ export class Library {
       event.preventDefault();
       act(event);
     };
-    this.#host.addEventListener('dragenter', ours(() => show(1)));
-    this.#host.addEventListener('dragover', ours(() => {}));
-    this.#host.addEventListener('dragleave', ours(() => show(-1)));
-    this.#host.addEventListener('drop', ours((event) => (show(-inside), this.#add(event.dataTransfer.files))));
+    this.#host.addEventListener(
+      'dragenter',
+      ours(() => show(1)),
+    );
+    this.#host.addEventListener(
+      'dragover',
+      ours(() => {}),
+    );
+    this.#host.addEventListener(
+      'dragleave',
+      ours(() => show(-1)),
+    );
+    this.#host.addEventListener(
+      'drop',
+      ours((event) => (show(-inside), this.#add(event.dataTransfer.files))),
+    );
   }
 }
 
@@ -439,7 +629,8 @@ function apart(one, other) {
   const without = [one, other].find(({ run }) => !run);
   if (one.task !== other.task) return 'They are of different tasks.';
   if (without) return `${without.name}: ${without.why_not}`;
-  if (one.episode !== other.episode || one.run.data !== other.run.data) return 'They are of different episodes: Rerun shows both.';
+  if (one.episode !== other.episode || one.run.data !== other.run.data)
+    return 'They are of different episodes: Rerun shows both.';
   return against(one, other) ? '' : 'They are of the same run.';
 }
 

@@ -1,7 +1,7 @@
 /** Rerun's viewer in the page, loaded when its tab is first opened; its time and the page's step follow each other. It shows
  *  the page's run, or files in its place, which keep their own time. */
 
-import { recorded } from '../data/api.js';
+import { recordingRequest } from '../data/api.js';
 import { say } from '../widgets/panel_state.js';
 import { written } from '../widgets/save_button.js';
 
@@ -30,7 +30,8 @@ export class Rerun {
   constructor(host, jobs, moved) {
     [this.#host, this.#jobs, this.#moved] = [host, jobs, moved];
     [this.#bar.className, this.#bar.hidden] = ['files', true];
-    this.#bar.innerHTML = '<span></span><button type="button" class="text">Back to the run</button>';
+    this.#bar.innerHTML =
+      '<span></span><button type="button" class="text">Back to the run</button>';
     this.#bar.querySelector('button').addEventListener('click', () => this.files(null));
     host.append(this.#bar);
   }
@@ -45,7 +46,9 @@ export class Rerun {
   files(files) {
     this.#files = files;
     this.#bar.hidden = !files;
-    this.#bar.firstElementChild.textContent = files ? files.map(({ name }) => name).join(' and ') : '';
+    this.#bar.firstElementChild.textContent = files
+      ? files.map(({ name }) => name).join(' and ')
+      : '';
     if (this.#open && (files || this.#trace)) this.#load();
   }
 
@@ -76,14 +79,22 @@ export class Rerun {
     this.#settled = null;
     try {
       say(this.#host, 'loading', files ? 'Starting Rerun …' : 'Writing the recording …');
-      const [recordings] = await Promise.all([files ?? Promise.all([trace.stream ? this.#growing(trace) : this.#record(trace)]), this.#start()]);
+      const [recordings] = await Promise.all([
+        files ?? Promise.all([trace.stream ? this.#growing(trace) : this.#record(trace)]),
+        this.#start(),
+      ]);
       if (this.#shown !== shown) return;
       say(this.#host, 'loading', 'Opening the recording …');
-      const { store_ids: kept } = await this.#viewer.open(recordings.map(({ url }) => new URL(url, location.href).href));
+      const { store_ids: kept } = await this.#viewer.open(
+        recordings.map(({ url }) => new URL(url, location.href).href),
+      );
       const others = this.#opened.filter((id) => !kept.includes(id));
       this.#opened = [...others, ...kept];
       if (this.#shown !== shown) return;
-      this.#viewer.override_panel_state('blueprint', recordings.length > 1 ? 'expanded' : undefined);
+      this.#viewer.override_panel_state(
+        'blueprint',
+        recordings.length > 1 ? 'expanded' : undefined,
+      );
       say(this.#host, 'ready');
       // What follows takes a drawing or more for each answer: the recording can be looked at meanwhile.
       if (!files) await this.#settle(shown);
@@ -99,8 +110,9 @@ export class Rerun {
   }
 
   #record(trace) {
-    return written(recorded(trace, true), this.#jobs, ({ progress, message }) => {
-      if (this.#shown === trace) say(this.#host, 'loading', `Writing the recording: ${message || 'starting'} …`, progress);
+    return written(recordingRequest(trace, true), this.#jobs, ({ progress, message }) => {
+      if (this.#shown === trace)
+        say(this.#host, 'loading', `Writing the recording: ${message || 'starting'} …`, progress);
     });
   }
 
@@ -152,7 +164,13 @@ export class Rerun {
 
   /** Whether the viewer's time and ours are the same. */
   get #follows() {
-    return this.#viewer !== null && !this.#files && this.#open && this.#settled === this.#trace && this.#host.dataset.state === 'ready';
+    return (
+      this.#viewer !== null &&
+      !this.#files &&
+      this.#open &&
+      this.#settled === this.#trace &&
+      this.#host.dataset.state === 'ready'
+    );
   }
 
   /** Moves the viewer's time, one request at a time: the newest wins. */
@@ -164,9 +182,14 @@ export class Rerun {
       const started = performance.now();
       [this.#echo, this.#pending] = [this.#pending, null];
       try {
-        await this.#viewer.set_time({ timeline: 'step', sequence: this.#echo, play_state: 'paused' });
+        await this.#viewer.set_time({
+          timeline: 'step',
+          sequence: this.#echo,
+          play_state: 'paused',
+        });
         // It tells nothing back if it was there already. Its frames are ours: how long they take does not matter.
-        for (let i = 0; i < ECHO_FRAMES && this.#echo !== null && this.#pending === null; i++) await frame();
+        for (let i = 0; i < ECHO_FRAMES && this.#echo !== null && this.#pending === null; i++)
+          await frame();
       } catch (error) {
         console.warn('Rerun did not take the time:', error);
       }

@@ -1,57 +1,80 @@
-/** One track of the time line: a uPlot chart without cursor, legend or axis of its own, with shaded stretches. */
+/** A chart of the timeline: a uPlot chart without its own cursor, legend and step axis, with shaded intervals. */
 
-import { colour, em, line, translucent } from '../core/palette.js';
+import { context2d } from '../core/dom.js';
+import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
 
 /**
  * @typedef {object} Series
- * @property {string} name truth, fused, a modality @property {ArrayLike<number>} values
- * @property {ArrayLike<number>} [sigma] draws a band of two of them on either side
- * @property {boolean} [other] of the trace that is drawn over the first
+ * @property {string} name truth, fused or a modality
+ * @property {Float32Array} values
+ * @property {Float32Array} [sigma] draws a band of ±2 sigma
+ * @property {boolean} [comparison] whether it belongs to the comparison run
+ *
  * @typedef {object} Track
- * @property {string} title @property {string} unit @property {string} [help] what it is @property {Series[]} series
- * @property {[number, number]} [limits] of the y axis; fitted to what is in view otherwise
- * @property {boolean} [fromZero] @property {boolean} [log] whether the y axis is logarithmic
- * @property {[number, number]} [bounds] between which values should be
- * @property {number} [digits] of the values in the legend; three that are significant otherwise
- * @property {string} [note] said in place of a plot
- * @typedef {{contact: [number, number][], black: [number, number][], edit?: [number, number][]}} Shading stretches of steps
+ * @property {string} title
+ * @property {string} unit
+ * @property {string} [help]
+ * @property {Series[]} series
+ * @property {[number, number]} [limits] of the y axis; by default it fits the visible values
+ * @property {boolean} [fromZero] whether the y axis starts at 0
+ * @property {boolean} [log] whether the y axis is logarithmic; needs `bounds`
+ * @property {[number, number]} [bounds] interval that is expected to contain the values
+ * @property {number} [digits] of the values in the legend; three significant ones by default
+ * @property {string} [note] text in place of a chart
+ *
+ * @typedef {[first: number, last: number]} Interval of steps
+ * @typedef {{contact: Interval[], blackout: Interval[], edits: Interval[]}} Shading
+ *
+ * @typedef {object} Frame
+ * @property {number} width px
+ * @property {number} height px
+ * @property {() => Interval} window visible steps
+ * @property {number} steps
+ * @property {boolean} withAxis whether the step axis has labels
+ * @property {string} stepLabel
+ * @property {boolean} compared whether a comparison run is displayed
+ *
+ * @typedef {{stroke: string, grid: uPlot.Axis.Grid, ticks: uPlot.Axis.Ticks, font: string}} AxisStyle
  */
 
-/** px beside and below a track's plot. */
-export const GUTTER = { left: em(46), right: em(12), axis: em(33) };
-const BLACK_STRIP = em(8); // px
-const LOWEST = 0.1; // of the lower bound: a logarithmic axis goes no further down
-export const FONT = `${em(10)}px system-ui, sans-serif`;
-/** An axis's name. */
-export const LABEL = { labelSize: em(14), labelGap: 0, labelFont: FONT };
+/** px beside and below the plot. */
+export const GUTTER = { left: scaled(46), right: scaled(12), axis: scaled(33) };
+export const FONT = `${scaled(10)}px system-ui, sans-serif`;
+/** Style of axis labels. */
+export const LABEL = { labelSize: scaled(14), labelGap: 0, labelFont: FONT };
+const BLACKOUT_HEIGHT = scaled(8); // px
+const LOG_MARGIN = 0.1; // share of the lower bound at which a logarithmic axis starts at the latest
+const STEP_INCREMENTS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
+const INTEGER_TOLERANCE = 1e-9;
 
-/** How a line is drawn. Where two traces are compared, the first's lines are whole and the other's dashed. */
-export function style({ name, other = false }, compared) {
-  const own = line(name);
-  if (!compared) return own;
-  return other ? { ...own, dash: [5, 4], width: Math.min(own.width, 1.75) } : { ...own, dash: [] };
+/**
+ * Returns the style of a line. In a comparison the lines of the comparison run are dashed and all others solid.
+ * @param {Pick<Series, 'name' | 'comparison'>} series
+ * @param {boolean} compared
+ */
+export function seriesStyle({ name, comparison = false }, compared) {
+  const style = lineStyle(name);
+  if (!compared) return style;
+  return comparison
+    ? { ...style, dash: [5, 4], width: Math.min(style.width, 1.75) }
+    : { ...style, dash: [] };
 }
 
 /**
- * @param {HTMLElement} parent @param {Track} track @param {Shading} shading
- * @param {object} frame
- * @param {number} frame.width @param {number} frame.height px @param {() => [number, number]} frame.window steps in view
- * @param {number} frame.steps @param {boolean} frame.withAxis @param {string} frame.stepName
- * @param {boolean} frame.compared whether another trace is drawn over the first
+ * @param {HTMLElement} parent
+ * @param {Track} track
+ * @param {Shading} shading
+ * @param {Frame} frame
  * @returns {uPlot}
  */
 export function chart(parent, track, shading, frame) {
-  const ink = { stroke: colour('muted'), grid: { stroke: colour('grid'), width: 1, show: !track.note }, ticks: { stroke: colour('grid'), size: 4, width: 1 }, font: FONT };
-  const series = [{}];
-  const bands = [];
-  for (const { name, sigma } of track.series) {
-    if (!sigma) continue;
-    const edge = { points: { show: false }, width: 0, stroke: 'transparent' };
-    series.push({ ...edge }, { ...edge });
-    bands.push({ series: [series.length - 2, series.length - 1], fill: translucent(line(name).stroke, name === 'fused' ? 0.2 : 0.08) });
-  }
-  for (const one of track.series) series.push({ ...style(one, frame.compared), points: { show: false } });
-  if (!track.series.length) series[1] = {}; // an axis needs a line
+  const axisStyle = {
+    stroke: colour('muted'),
+    grid: { stroke: colour('grid'), width: 1, show: !track.note },
+    ticks: { stroke: colour('grid'), size: 4, width: 1 },
+    font: FONT,
+  };
+  const { bounds } = track;
   return new uPlot(
     {
       width: frame.width,
@@ -59,105 +82,208 @@ export function chart(parent, track, shading, frame) {
       padding: [4, GUTTER.right, frame.withAxis ? 0 : 4, 0],
       cursor: { show: false },
       legend: { show: false },
-      select: { show: false },
+      select: { show: false, left: 0, top: 0, width: 0, height: 0 },
       scales: {
         x: { time: false, range: () => frame.window() },
-        y: { distr: track.log ? 3 : 1, range: () => track.limits ?? (track.note ? [0, 1] : fitted(track, frame.window())) },
+        y: { distr: track.log ? 3 : 1, range: () => valueRange(track, frame.window()) },
       },
       axes: [
-        stepAxis(ink, frame),
-        { ...ink, size: GUTTER.left, gap: 3, space: em(20), ...heights(track, ink) },
+        stepAxis(axisStyle, frame),
+        {
+          ...axisStyle,
+          size: GUTTER.left,
+          gap: 3,
+          space: scaled(20),
+          ...valueAxis(track, axisStyle),
+        },
       ],
-      series,
-      bands,
-      hooks: { drawClear: [(plot) => shade(plot, shading)], drawAxes: [(plot) => track.bounds && between(plot, track.bounds)] },
+      ...lines(track, frame.compared),
+      hooks: {
+        drawClear: [(plot) => shadeIntervals(plot, shading)],
+        drawAxes: [(plot) => void (bounds && shadeBounds(plot, bounds))],
+      },
     },
-    plotted(track, frame.steps),
+    chartData(track, frame.steps),
     parent,
   );
 }
 
-/** What uPlot draws of a track: the steps, the edges of each band, the lines. @param {Track} track */
-export function plotted({ series }, steps) {
-  const edges = series.filter(({ sigma }) => sigma).flatMap(({ values, sigma }) => [2, -2].map((by) => values.map((v, t) => v + by * sigma[t])));
-  const lines = series.map(({ values }) => values);
-  return [Float64Array.from({ length: steps }, (_, t) => t), ...edges, ...(lines.length ? lines : [new Array(steps).fill(null)])];
+/**
+ * Returns uPlot's series and bands for a track, in the order of `chartData`.
+ * @param {Track} track
+ * @param {boolean} compared
+ * @returns {{series: uPlot.Series[], bands: uPlot.Band[]}}
+ */
+function lines(track, compared) {
+  /** @type {uPlot.Series[]} */
+  const series = [{}];
+  /** @type {uPlot.Band[]} */
+  const bands = [];
+  for (const { name, sigma } of track.series) {
+    if (!sigma) continue;
+    const edge = { points: { show: false }, width: 0, stroke: 'transparent' };
+    series.push({ ...edge }, { ...edge });
+    const fill = translucent(lineStyle(name).stroke, name === 'fused' ? 0.2 : 0.08);
+    bands.push({ series: [series.length - 2, series.length - 1], fill });
+  }
+  for (const item of track.series)
+    series.push({ ...seriesStyle(item, compared), points: { show: false } });
+  if (!track.series.length) series.push({}); // uPlot draws an axis only for a line
+  return { series, bands };
 }
 
-/** The y axis of a logarithmic chart has powers of ten alone, that of none names nothing. */
-function heights({ log, note }, { grid, ticks }) {
+/**
+ * Returns uPlot's data for a track: the steps, the edges of the bands and the lines.
+ * @param {Track} track
+ * @param {number} steps
+ * @returns {uPlot.AlignedData}
+ */
+export function chartData({ series }, steps) {
+  const edges = series.flatMap(({ values, sigma }) =>
+    sigma ? [2, -2].map((factor) => values.map((v, t) => v + factor * sigma[t])) : [],
+  );
+  const values = series.map((item) => item.values);
+  return [
+    Float64Array.from({ length: steps }, (_, t) => t),
+    ...edges,
+    ...(values.length ? values : [new Array(steps).fill(null)]),
+  ];
+}
+
+/**
+ * Returns the options of the y axis: only powers of ten on a logarithmic one, no labels without a chart.
+ * @param {Track} track
+ * @param {AxisStyle} style
+ * @returns {uPlot.Axis}
+ */
+function valueAxis({ log, note }, { grid, ticks }) {
   if (note) return { values: (_, splits) => splits.map(() => '') };
   if (!log) return {};
-  const filter = (_, splits) => splits.map((v) => (Math.abs(Math.log10(v) - Math.round(Math.log10(v))) < 1e-9 ? v : null));
-  return { filter, grid: { ...grid, filter }, ticks: { ...ticks, filter }, values: (_, splits) => splits.map((v) => (v ? String(Number(v.toPrecision(1))) : '')) };
-}
-
-/** Only the lowest track names the steps; the others have the same grid. (uPlot draws no axis after one not shown.) */
-function stepAxis(ink, { withAxis, stepName }) {
-  const axis = { ...ink, gap: 2, space: em(60), incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] };
-  if (!withAxis) return { ...axis, size: 0, ticks: { show: false }, values: (_, splits) => splits.map(() => '') };
-  return { ...axis, size: GUTTER.axis - LABEL.labelSize, label: stepName, ...LABEL };
-}
-
-/** Fits what matters: the truth and the fused belief wholly, a modality that runs away only as far as most of it. */
-function fitted(track, [from, to]) {
-  let [low, high] = [Infinity, -Infinity];
-  const take = (value) => {
-    if (!Number.isFinite(value)) return;
-    low = Math.min(low, value);
-    high = Math.max(high, value);
+  /** @type {uPlot.Axis.Filter} */
+  const filter = (_, splits) =>
+    splits.map((v) => {
+      const exponent = Math.log10(v);
+      return Math.abs(exponent - Math.round(exponent)) < INTEGER_TOLERANCE ? v : null;
+    });
+  return {
+    filter,
+    grid: { ...grid, filter },
+    ticks: { ...ticks, filter },
+    values: (_, splits) => splits.map((v) => (v ? String(Number(v.toPrecision(1))) : '')),
   };
+}
+
+/**
+ * Returns the step axis. Only the lowest chart labels it; the others have the same grid. (uPlot draws no axis after a hidden one.)
+ * @param {AxisStyle} style
+ * @param {Frame} frame
+ * @returns {uPlot.Axis}
+ */
+function stepAxis(style, { withAxis, stepLabel }) {
+  const axis = { ...style, gap: 2, space: scaled(60), incrs: STEP_INCREMENTS };
+  if (!withAxis)
+    return {
+      ...axis,
+      size: 0,
+      ticks: { show: false },
+      values: (_, splits) => splits.map(() => ''),
+    };
+  return { ...axis, size: GUTTER.axis - LABEL.labelSize, label: stepLabel, ...LABEL };
+}
+
+/**
+ * Returns the range of the y axis. It fits the visible truth and fused estimate, and most values of the modalities.
+ * @param {Track} track
+ * @param {Interval} window
+ * @returns {Interval}
+ */
+export function valueRange(track, [from, to]) {
+  if (track.limits) return track.limits;
+  if (track.note) return [0, 1];
   const [first, last] = [Math.max(0, Math.floor(from)), Math.ceil(to)];
-  for (const { name, values, sigma } of track.series) {
-    const part = Array.from(values.slice(first, last + 1));
-    if (name === 'truth' || name === 'fused') {
-      part.forEach((v, t) => (sigma ? [v - 2 * sigma[first + t], v + 2 * sigma[first + t]] : [v]).forEach(take));
-    } else {
-      part.sort((a, b) => a - b);
-      take(part[Math.floor(0.02 * (part.length - 1))]);
-      take(part[Math.ceil(0.98 * (part.length - 1))]);
-    }
+  const extremes = track.series
+    .flatMap((series) => extremesOf(series, first, last))
+    .filter(Number.isFinite);
+  let [low, high] = [Math.min(...extremes), Math.max(...extremes)];
+  if (track.log && track.bounds) {
+    const [least, most] = track.bounds;
+    return [
+      Math.min(Math.max(low, LOG_MARGIN * least), 0.5 * least),
+      Math.max(1.3 * high, 2 * most),
+    ];
   }
-  if (track.log) return [Math.min(Math.max(low, LOWEST * track.bounds[0]), 0.5 * track.bounds[0]), Math.max(1.3 * high, 2 * track.bounds[1])];
   if (track.fromZero) low = 0;
   if (!(high > low)) [low, high] = Number.isFinite(low) ? [low - 1, low + 1] : [0, 1];
   const margin = 0.06 * (high - low);
   return [track.fromZero ? 0 : low - margin, high + margin];
 }
 
-/** Contact behind everything, as the paper draws it; edited steps; black pictures hatched along the top edge. @param {uPlot} plot @param {Shading} shading */
-export function shade(plot, { contact, black, edit = [] }) {
+/**
+ * Returns values that the y axis must include.
+ * @param {Series} series
+ * @param {number} first
+ * @param {number} last
+ */
+function extremesOf({ name, values, sigma }, first, last) {
+  const visible = Array.from(values.subarray(first, last + 1));
+  if (name === 'truth' || name === 'fused') {
+    const bands = visible.flatMap((v, t) =>
+      sigma ? [v - 2 * sigma[first + t], v + 2 * sigma[first + t]] : [v],
+    );
+    const finite = bands.filter(Number.isFinite);
+    return [
+      finite.reduce((a, b) => Math.min(a, b), Infinity),
+      finite.reduce((a, b) => Math.max(a, b), -Infinity),
+    ];
+  }
+  visible.sort((a, b) => a - b);
+  const end = visible.length - 1;
+  return [visible[Math.floor(0.02 * end)], visible[Math.ceil(0.98 * end)]];
+}
+
+/**
+ * Shades contact and interventions, and hatches blackouts along the top edge.
+ * @param {uPlot} plot
+ * @param {Shading} shading
+ */
+export function shadeIntervals(plot, { contact, blackout, edits }) {
   const { ctx, bbox } = plot;
-  const across = ([first, last]) => {
-    const left = Math.max(bbox.left, plot.valToPos(first - 0.5, 'x', true));
-    return [left, Math.min(bbox.left + bbox.width, plot.valToPos(last + 0.5, 'x', true)) - left];
+  /** @param {Interval[]} intervals @param {string | CanvasPattern | null} fill @param {number} [height] */
+  const shade = (intervals, fill, height = bbox.height) => {
+    ctx.fillStyle = fill ?? 'transparent';
+    for (const [first, last] of intervals) {
+      const left = Math.max(bbox.left, plot.valToPos(first - 0.5, 'x', true));
+      const right = Math.min(bbox.left + bbox.width, plot.valToPos(last + 0.5, 'x', true));
+      if (right > left) ctx.fillRect(left, bbox.top, Math.max(right - left, 1), height);
+    }
   };
   ctx.save();
-  ctx.fillStyle = colour('contact-band');
-  for (const [left, width] of contact.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, width, bbox.height);
-  ctx.fillStyle = translucent(colour('accent'), 0.12);
-  for (const [left, width] of edit.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, width, bbox.height);
-  ctx.fillStyle = hatch(ctx);
-  for (const [left, width] of black.map(across)) if (width > 0) ctx.fillRect(left, bbox.top, Math.max(width, 1), BLACK_STRIP * devicePixelRatio);
+  shade(contact, colour('contact-band'));
+  shade(edits, translucent(colour('accent'), 0.12));
+  shade(blackout, hatching(ctx), BLACKOUT_HEIGHT * devicePixelRatio);
   ctx.restore();
 }
 
-/** Where values should lie. @param {uPlot} plot @param {[number, number]} bounds */
-export function between(plot, bounds) {
+/**
+ * Shades the interval that is expected to contain the values.
+ * @param {uPlot} plot
+ * @param {[number, number]} bounds
+ */
+export function shadeBounds(plot, bounds) {
   const { ctx, bbox } = plot;
   ctx.save();
   ctx.beginPath();
   ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
   ctx.clip();
-  const [high, low] = bounds.map((v) => plot.valToPos(v, 'y', true)).sort((a, b) => a - b);
+  const [top, bottom] = bounds.map((v) => plot.valToPos(v, 'y', true)).sort((a, b) => a - b);
   ctx.globalAlpha = 0.1;
   ctx.fillStyle = colour('truth');
-  ctx.fillRect(bbox.left, high, bbox.width, low - high);
+  ctx.fillRect(bbox.left, top, bbox.width, bottom - top);
   ctx.globalAlpha = 1;
   ctx.strokeStyle = colour('muted');
   ctx.lineWidth = devicePixelRatio;
   ctx.setLineDash([4 * devicePixelRatio, 3 * devicePixelRatio]);
-  for (const y of [high, low]) {
+  for (const y of [top, bottom]) {
     ctx.beginPath();
     ctx.moveTo(bbox.left, y);
     ctx.lineTo(bbox.left + bbox.width, y);
@@ -166,16 +292,18 @@ export function between(plot, bounds) {
   ctx.restore();
 }
 
-function hatch(ctx) {
-  const tile = new OffscreenCanvas(8, 8);
-  const pen = tile.getContext('2d');
-  pen.strokeStyle = colour('black-band');
-  pen.lineWidth = 1.5;
-  pen.beginPath();
+/** @param {CanvasRenderingContext2D} context */
+function hatching(context) {
+  const tile = document.createElement('canvas');
+  [tile.width, tile.height] = [8, 8];
+  const tileContext = context2d(tile);
+  tileContext.strokeStyle = colour('blackout-band');
+  tileContext.lineWidth = 1.5;
+  tileContext.beginPath();
   for (const shift of [-8, 0, 8]) {
-    pen.moveTo(shift, 8);
-    pen.lineTo(shift + 8, 0);
+    tileContext.moveTo(shift, 8);
+    tileContext.lineTo(shift + 8, 0);
   }
-  pen.stroke();
-  return ctx.createPattern(tile, 'repeat');
+  tileContext.stroke();
+  return context.createPattern(tile, 'repeat');
 }

@@ -1,9 +1,13 @@
-/** Which charts the time line has for a trace and a state. */
+/** The charts of the timeline for a trace and a state. */
 
-import { fixed, spoken } from '../core/units.js';
+/** @import { State } from '../core/state.js' */
+/** @import { Series as Values, Trace } from '../data/trace.js' */
+/** @import { Series, Track } from './chart.js' */
 
-/** What the lowest chart can be about, by the name in an address. */
-export const KINDS = {
+import { displayName, fixed } from '../core/units.js';
+
+/** Options for the lowest chart, and their labels. */
+export const TRACKS = {
   error: 'error',
   signed: 'signed error',
   nees: 'NEES',
@@ -11,139 +15,270 @@ export const KINDS = {
   particles: 'particles',
 };
 
+/** @type {Record<string, (trace: Trace, component: number) => Track>} */
+const LOWEST_TRACKS = {
+  error: errorTrack,
+  signed: signedErrorTrack,
+  nees: neesTrack,
+  innovation: innovationTrack,
+  particles: particleTrack,
+};
+const NO_TRUTH = 'None: the true state of this run is unknown.';
+
 /**
- * @param {import('../data/trace.js').Trace} trace @param {import('../core/state.js').State} state
- * @param {import('../data/trace.js').Trace | null} other of the same episode, drawn over it
- * @returns {import('./chart.js').Track[]}
+ * @param {Trace} trace
+ * @param {Pick<State, 'component' | 'weights' | 'track'>} state
+ * @param {Trace | null} [comparison] drawn over the trace
+ * @returns {Track[]}
  */
-export function tracks(trace, state, other = null) {
+export function tracks(trace, state, comparison = null) {
   const component = trace.components.findIndex((c) => c.name === state.component);
-  const makers = [(of) => weights(of, state.weights, component), (of) => estimates(of, component), (of) => LOWEST[state.track](of, component)];
-  return makers.map((make) => (other ? over(make(trace), make(other)) : make(trace)));
+  /** @type {((trace: Trace) => Track)[]} */
+  const builders = [
+    (run) => weightTrack(run, state.weights, component),
+    (run) => estimateTrack(run, component),
+    (run) => LOWEST_TRACKS[state.track](run, component),
+  ];
+  return builders.map((build) =>
+    comparison ? overlay(build(trace), build(comparison)) : build(trace),
+  );
 }
 
-/** The track of the other trace over that of the first: its lines alone. */
-function over(track, other) {
+/**
+ * Adds the lines of the comparison run to a track.
+ * @param {Track} track
+ * @param {Track} other
+ * @returns {Track}
+ */
+function overlay(track, other) {
   if (other.note) return track;
-  const lines = other.series.filter((s) => s.name !== 'truth').map(({ name, values }) => ({ name, values, other: true }));
+  const lines = other.series
+    .filter(({ name }) => name !== 'truth')
+    .map(({ name, values }) => ({ name, values, comparison: true }));
   if (track.note) return { ...other, series: lines };
-  const limits = track.limits && other.limits && [Math.min(track.limits[0], other.limits[0]), Math.max(track.limits[1], other.limits[1])];
-  const both = { ...track, limits, series: [...track.series, ...lines] };
-  // One filter has weights of a network, the other only shares.
-  return kindOf(track) === kindOf(other) ? both : { ...both, title: `${kindOf(track)} / ${kindOf(other).toLowerCase()}`, help: `${track.title}; dashed: ${other.title}` };
+  /** @type {[number, number] | undefined} */
+  const limits = track.limits &&
+    other.limits && [
+      Math.min(track.limits[0], other.limits[0]),
+      Math.max(track.limits[1], other.limits[1]),
+    ];
+  const merged = { ...track, limits, series: [...track.series, ...lines] };
+  // One filter may have fusion weights and the other one only effective weights.
+  const [kind, otherKind] = [kindOf(track), kindOf(other)];
+  if (kind === otherKind) return merged;
+  return {
+    ...merged,
+    title: `${kind} / ${otherKind.toLowerCase()}`,
+    help: `${track.title}; dashed: ${other.title}`,
+  };
 }
 
+/** @param {Track} track */
 const kindOf = ({ title }) => title.split(',')[0];
 
-/** @returns {import('./chart.js').Track} or, where nothing is weighed, a line that says so. */
-function weights(trace, chosen, component) {
-  const both = trace.has('weights') && trace.has('acting');
-  const kind = both ? chosen : trace.has('weights') ? 'raw' : 'acting';
-  const series = known(trace.modalities, (name) => trace.weight(kind, name, component));
-  if (!series.length) return none('Weights', unweighed(trace));
-  const what = trace.weightWidth > 1 ? `, ${spoken(trace.components[component].name)}` : '';
-  const title = kind === 'raw' ? `Weight β${what}` : `Acting share${what}`;
-  const most = Math.max(1, ...series.map((s) => s.values.reduce((a, b) => Math.max(a, b), 0)));
-  return { title, unit: '', series, limits: [-0.04 * most, 1.06 * most], digits: 2 };
+/**
+ * @param {Trace} trace
+ * @param {string} selected `raw` or `effective`
+ * @param {number} component
+ * @returns {Track}
+ */
+function weightTrack(trace, selected, component) {
+  const both = trace.has('weights') && trace.has('effective_weights');
+  const kind = both ? selected : trace.has('weights') ? 'raw' : 'effective';
+  const series = availableSeries(trace.modalities, (name) => trace.weight(kind, name, component));
+  if (!series.length) return emptyTrack('Weights', missingWeights(trace));
+  const scope = trace.weightWidth > 1 ? `, ${displayName(trace.components[component].name)}` : '';
+  const title = kind === 'raw' ? `Weight β${scope}` : `Effective weight${scope}`;
+  const max = Math.max(1, ...series.map(({ values }) => maximum(values)));
+  return { title, unit: '', series, limits: [-0.04 * max, 1.06 * max], digits: 2 };
 }
 
-function unweighed({ modalities: [model], fuses, header }) {
-  if (fuses) return 'None: this filter does not say how it weighs its modalities.';
-  if (model) return `None: ${model.replaceAll('+', ' and ')} ${model.includes('+') ? 'go into one measurement model, which' : 'alone'} decides.`;
-  if (header.kind === 'foreign') return 'None: this filter does not say which of its senses it follows.';
-  return 'None: the network takes all senses in at once and does not say which it follows.';
+/** @param {Trace} trace */
+function missingWeights({ modalities: [model], fuses, header }) {
+  if (fuses) return 'None: this filter does not report its fusion weights.';
+  if (model)
+    return model.includes('+')
+      ? `None: a single measurement model uses ${model.replaceAll('+', ' and ')}.`
+      : `None: ${model} is the only modality.`;
+  if (header.kind === 'external') return 'None: this filter does not report its modalities.';
+  return 'None: the network combines all modalities without explicit weights.';
 }
 
-function estimates(trace, component) {
+/**
+ * @param {Trace} trace
+ * @param {number} component
+ * @returns {Track}
+ */
+function estimateTrack(trace, component) {
   const { name } = trace.components[component];
-  const sources = known(trace.sources, (source) => trace.mean(source, component), (source) => trace.sigma(source, component));
+  const estimates = availableSeries(
+    trace.sources,
+    (source) => trace.mean(source, component),
+    (source) => trace.sigma(source, component),
+  );
   const truth = { name: 'truth', values: trace.truth(component) };
-  return { title: capital(spoken(name)), unit: trace.shown(component).unit, series: [truth, ...sources], digits: 1 };
+  return {
+    title: capitalised(displayName(name)),
+    unit: trace.unitOf(component).unit,
+    series: [truth, ...estimates],
+    digits: 1,
+  };
 }
 
-const LOWEST = { error, signed, nees, innovation, particles };
-
-function error(trace, component) {
-  const angle = trace.angles.includes(component);
-  if (!trace.truth(component).some(Number.isFinite)) return none('Error', UNKNOWN);
+/**
+ * @param {Trace} trace
+ * @param {number} component
+ * @returns {Track}
+ */
+function errorTrack(trace, component) {
+  if (!trace.truth(component).some(Number.isFinite)) return emptyTrack('Error', NO_TRUTH);
+  const isAngle = trace.angles.includes(component);
+  const name = capitalised(displayName(trace.components[component].name));
   return {
-    title: angle ? `${capital(spoken(trace.components[component].name))} error` : 'Position error',
-    unit: angle ? '°' : 'cm',
-    series: known(trace.sources, (source) => trace.error(source, angle ? component : 'position')),
+    title: isAngle ? `${name} error` : 'Position error',
+    unit: isAngle ? '°' : 'cm',
+    series: availableSeries(trace.sources, (source) =>
+      trace.error(source, isAngle ? component : 'position'),
+    ),
     fromZero: true,
     digits: 1,
   };
 }
 
-/** What estimates are off by, with the band of what they claim: where it leaves zero out, the filter is surprised. */
-function signed(trace, component) {
-  if (!trace.truth(component).some(Number.isFinite)) return none('Signed error', UNKNOWN);
-  const sources = known(trace.sources, (source) => trace.offset(source, component), (source) => trace.sigma(source, component));
+/**
+ * @param {Trace} trace
+ * @param {number} component
+ * @returns {Track}
+ */
+function signedErrorTrack(trace, component) {
+  if (!trace.truth(component).some(Number.isFinite)) return emptyTrack('Signed error', NO_TRUTH);
+  const estimates = availableSeries(
+    trace.sources,
+    (source) => trace.offset(source, component),
+    (source) => trace.sigma(source, component),
+  );
   const truth = { name: 'truth', values: new Float32Array(trace.steps) };
-  return { title: 'Signed error', unit: trace.shown(component).unit, help: 'Estimate less truth, with what it claims', series: [truth, ...sources], digits: 1 };
+  return {
+    title: 'Signed error',
+    unit: trace.unitOf(component).unit,
+    help: 'Estimate minus truth, with the predicted standard deviation. The filter is overconfident where the ±2σ band excludes zero.',
+    series: [truth, ...estimates],
+    digits: 1,
+  };
 }
 
-function nees(trace) {
-  const series = known(trace.sources, (source) => trace.nees(source));
-  if (!series.length) return none('NEES', trace.has('nees') ? UNKNOWN : 'None: this filter does not say how sure it is.');
+/**
+ * @param {Trace} trace
+ * @returns {Track}
+ */
+function neesTrack(trace) {
+  const series = availableSeries(trace.sources, (source) => trace.nees(source));
   const bounds = trace.header.nees_bounds;
+  if (!series.length || !bounds) {
+    const reason = 'None: this filter has no covariance.';
+    return emptyTrack('NEES', trace.has('nees') ? NO_TRUTH : reason);
+  }
   const [low, high] = [fixed(bounds[0], 2), fixed(bounds[1], 1)];
   return {
     title: 'NEES/n',
     unit: `${low}–${high}`,
-    help: `Squared error over the claimed covariance, by component: 1 on average. 95 % of a consistent filter's steps are between ${low} and ${high}; more is over-confident.`,
+    help: `Normalised estimation error squared per component: 1 on average. For a consistent filter 95 % of the steps are between ${low} and ${high}; higher values mean overconfidence.`,
     series,
     bounds,
     log: true,
   };
 }
 
-function innovation(trace, component) {
-  const series = known(trace.modalities, (name) => trace.innovation(name, component), (name) => trace.innovationSigma(name, component));
-  if (!series.length) return none('Innovation', uninnovative(trace.header.kind));
-  const help = 'What each modality measured less what was predicted. 95 % are within the band where both claim what is so.';
-  return { title: 'Innovation', unit: trace.shown(component).unit, help, series, digits: 1 };
+/**
+ * @param {Trace} trace
+ * @param {number} component
+ * @returns {Track}
+ */
+function innovationTrack(trace, component) {
+  const series = availableSeries(
+    trace.modalities,
+    (name) => trace.innovation(name, component),
+    (name) => trace.innovationSigma(name, component),
+  );
+  if (!series.length) return emptyTrack('Innovation', missingInnovation(trace.header.kind));
+  return {
+    title: 'Innovation',
+    unit: trace.unitOf(component).unit,
+    help: 'Measurement minus prediction of each modality. For a consistent filter 95 % are within the band.',
+    series,
+    digits: 1,
+  };
 }
 
-function uninnovative(kind) {
-  if (kind === 'pf') return 'None: a particle filter asks how likely each particle is, and measures no state to compare with.';
-  if (kind === 'lstm') return 'None: the network compares no measurement with a prediction.';
-  return 'None: this filter does not say what it measured and what it expected.';
+/** @param {string} kind of the filter */
+function missingInnovation(kind) {
+  if (kind === 'pf')
+    return 'None: a particle filter weights its particles and does not measure the state.';
+  if (kind === 'lstm') return 'None: the network has no separate prediction and measurement.';
+  return 'None: this filter does not report its predictions and measurements.';
 }
 
-function particles(trace) {
-  const values = trace.particles;
-  if (!values) return none('Particles', unparticular(trace.header.kind));
-  const most = trace.header.settings?.particles ?? values.reduce((a, b) => Math.max(a, b), 0);
+/**
+ * @param {Trace} trace
+ * @returns {Track}
+ */
+function particleTrack(trace) {
+  const values = trace.effectiveSampleSize;
+  if (!values) return emptyTrack('Particles', missingParticles(trace.header.kind));
+  const count = trace.header.settings?.particles ?? maximum(values);
   return {
     title: 'Particles',
-    unit: `of ${most}`,
-    help: 'Effective sample size: how many particles still carry weight',
+    unit: `of ${count}`,
+    help: 'Effective sample size of the particles',
     series: [{ name: 'fused', values }],
-    limits: [0, 1.04 * most],
+    limits: [0, 1.04 * count],
     digits: 0,
   };
 }
 
-function unparticular(kind) {
+/** @param {string} kind of the filter */
+function missingParticles(kind) {
   if (kind === 'lstm') return 'None: an LSTM has no particles.';
-  return kind === 'foreign' ? 'None: this filter shows no particles.' : 'None: a Kalman filter has a Gaussian and no particles.';
+  if (kind === 'external') return 'None: this filter reports no particles.';
+  return 'None: a Kalman filter has a Gaussian belief and no particles.';
 }
 
-const UNKNOWN = 'None: the true state of this run is not known.';
-const none = (title, note) => ({ title, unit: '', series: [], note });
+/**
+ * @param {string} title
+ * @param {string} note
+ * @returns {Track}
+ */
+const emptyTrack = (title, note) => ({ title, unit: '', series: [], note });
 
-/** A line for each name whose values are known. @returns {import('./chart.js').Series[]} */
-function known(names, valuesOf, sigmaOf = () => undefined) {
-  const lines = names.map((name) => ({ name, values: valuesOf(name), sigma: sigmaOf(name) }));
-  return lines.filter(({ values }) => values?.some(Number.isFinite));
+/**
+ * Returns a series for each name that has values.
+ * @param {string[]} names
+ * @param {(name: string) => Values | undefined} valuesOf
+ * @param {(name: string) => Values | undefined} [sigmaOf]
+ * @returns {Series[]}
+ */
+function availableSeries(names, valuesOf, sigmaOf = () => undefined) {
+  return names.flatMap((name) => {
+    const values = valuesOf(name);
+    return values?.some(Number.isFinite) ? [{ name, values, sigma: sigmaOf(name) }] : [];
+  });
 }
 
-/** (T,) The error that the largest is sought in. */
-export function shownError(trace, state) {
+/** @param {Values} values */
+const maximum = (values) => values.reduce((a, b) => Math.max(a, b), 0);
+
+/**
+ * Returns the error of the fused estimate in the selected component, or of the position.
+ * @param {Trace} trace
+ * @param {Pick<State, 'component'>} state
+ */
+export function selectedError(trace, state) {
   const component = trace.components.findIndex((c) => c.name === state.component);
   return trace.error('fused', trace.angles.includes(component) ? component : 'position');
 }
 
-/** A symbol as x stays small. */
-const capital = (text) => (text.length > 1 ? text[0].toUpperCase() + text.slice(1) : text);
+/**
+ * Capitalises a name, but not a symbol such as x.
+ * @param {string} text
+ */
+const capitalised = (text) => (text.length > 1 ? text[0].toUpperCase() + text.slice(1) : text);

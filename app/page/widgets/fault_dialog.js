@@ -62,7 +62,11 @@ export function faultPicker(select, sheet, { none, chosen, choose, check }) {
     const own = faults && !ready.some((r) => r.faults === faults) ? [{ name: faults, faults }] : [];
     const all = [{ name: none, faults: '' }, ...ready, ...own, { name: 'other …', faults: OTHER }];
     select.replaceChildren(...all.map((r) => new Option(r.name, r.faults)));
-    [select.value, select.disabled, select.title] = [faults, false, `How the sensors are broken${faults && `: ${faults}`}`];
+    [select.value, select.disabled, select.title] = [
+      faults,
+      false,
+      `How the sensors are broken${faults && `: ${faults}`}`,
+    ];
   };
   const take = (faults) => (choose(faults), show());
   select.addEventListener('change', () => {
@@ -78,14 +82,23 @@ function row({ fault, meaning, parameters }, text) {
   const own = parameters.slice(0, -2); // all have the last two, from and to
   const line = document.createElement('tr');
   const button = document.createElement('button');
-  [button.type, button.className, button.textContent, button.title] = ['button', 'text quiet', fault, 'Add it'];
+  [button.type, button.className, button.textContent, button.title] = [
+    'button',
+    'text quiet',
+    fault,
+    'Add it',
+  ];
   button.addEventListener('click', () => {
     const first = parameters[0].default ?? '';
     text.value = [text.value.trim(), `${fault}=${first}`].filter(Boolean).join(',');
     text.dispatchEvent(new Event('input'));
     text.focus();
   });
-  const cells = [button, own.map((p) => (p.default === null ? p.name : `${p.name}=${p.default}`)).join(' '), meaning];
+  const cells = [
+    button,
+    own.map((p) => (p.default === null ? p.name : `${p.name}=${p.default}`)).join(' '),
+    meaning,
+  ];
   for (const cell of cells) line.insertCell().append(cell);
   line.cells[1].title = own.map((p) => `${p.name}: ${p.meaning} (${p.unit})`).join('\n');
   return line;

@@ -32,7 +32,13 @@ export class FileTable {
    *   the first of a file's acts is what a click on its name does; `picks` gives each row a box to tick
    */
   constructor(table, columns, { acts, sort, picks = null }) {
-    [this.#table, this.#columns, this.#acts, this.#sort, this.#picks] = [table, columns, acts, sort, picks];
+    [this.#table, this.#columns, this.#acts, this.#sort, this.#picks] = [
+      table,
+      columns,
+      acts,
+      sort,
+      picks,
+    ];
     this.#menu.setAttribute('role', 'menu');
     table.parentElement.append(this.#menu);
     this.#menu.addEventListener('keydown', (event) => this.#roam(event));
@@ -58,7 +64,8 @@ export class FileTable {
     const cell = this.#rows.get(file.name)?.querySelector('.name');
     if (!cell) return;
     const form = document.createElement('form');
-    form.innerHTML = '<input type="text" autocomplete="off" spellcheck="false"><p class="wrong" role="alert"></p>';
+    form.innerHTML =
+      '<input type="text" autocomplete="off" spellcheck="false"><p class="wrong" role="alert"></p>';
     const [input, wrong] = form.children;
     [input.value, input.ariaLabel] = [text, label];
     this.#editing = true;
@@ -95,16 +102,21 @@ export class FileTable {
   get #ordered() {
     const { value } = this.#columns.find(({ name }) => name === this.#sort.name);
     const sign = this.#sort.down ? -1 : 1;
-    const order = (a, b) => (typeof a === 'string' ? a.localeCompare(b, 'en', { numeric: true }) : a - b);
+    const order = (a, b) =>
+      typeof a === 'string' ? a.localeCompare(b, 'en', { numeric: true }) : a - b;
     return [...this.#files].sort((a, b) => {
       const [one, other] = [value(a), value(b)];
-      return one === null || other === null ? Number(one === null) - Number(other === null) : sign * order(one, other);
+      return one === null || other === null
+        ? Number(one === null) - Number(other === null)
+        : sign * order(one, other);
     });
   }
 
   #draw() {
     const { activeElement: active } = document;
-    const [focused, part] = this.#table.contains(active) ? [active.closest('tr')?.dataset.name, active.dataset.part] : [];
+    const [focused, part] = this.#table.contains(active)
+      ? [active.closest('tr')?.dataset.name, active.dataset.part]
+      : [];
     const top = document.createElement('tr');
     if (this.#picks) top.append(unseen('Chosen', 'pick'));
     top.append(...this.#columns.map((column) => this.#heading(column)), unseen('Menu', 'menus'));
@@ -119,10 +131,18 @@ export class FileTable {
   }
 
   #heading({ name, title, help, number }) {
-    const cell = Object.assign(document.createElement('th'), { scope: 'col', className: `${number ? 'number ' : ''}of-${name}` });
+    const cell = Object.assign(document.createElement('th'), {
+      scope: 'col',
+      className: `${number ? 'number ' : ''}of-${name}`,
+    });
     const sorted = this.#sort.name === name;
     cell.ariaSort = sorted ? (this.#sort.down ? 'descending' : 'ascending') : 'none';
-    const button = part('button', `sort ${name}`, { type: 'button', className: 'quiet sort', title: `${help}. Sort by it`, textContent: title });
+    const button = part('button', `sort ${name}`, {
+      type: 'button',
+      className: 'quiet sort',
+      title: `${help}. Sort by it`,
+      textContent: title,
+    });
     button.addEventListener('click', () => {
       this.#sort = { name, down: sorted ? !this.#sort.down : Boolean(number) };
       this.#draw();
@@ -137,7 +157,11 @@ export class FileTable {
     row.classList.toggle('here', file.name === this.#here);
     const acts = this.#acts(file);
     if (this.#picks) {
-      const pick = part('input', 'pick', { type: 'checkbox', checked: this.#picks.has(file.name), ariaLabel: `Choose ${file.name}` });
+      const pick = part('input', 'pick', {
+        type: 'checkbox',
+        checked: this.#picks.has(file.name),
+        ariaLabel: `Choose ${file.name}`,
+      });
       pick.addEventListener('change', () => this.#picks.toggle(file.name));
       row.insertCell().append(pick);
       row.cells[0].className = 'pick';
@@ -150,7 +174,13 @@ export class FileTable {
       if (!c) place.append(this.#opener(file, acts[0]));
       place.append(shown(file));
     }
-    const more = part('button', 'more', { type: 'button', className: 'quiet more', textContent: '⋯', ariaHasPopup: 'menu', title: 'What can be done with it' });
+    const more = part('button', 'more', {
+      type: 'button',
+      className: 'quiet more',
+      textContent: '⋯',
+      ariaHasPopup: 'menu',
+      title: 'What can be done with it',
+    });
     more.setAttribute('aria-label', `Menu of ${file.name}`);
     more.addEventListener('click', () => this.#unfold(more, acts));
     row.insertCell().append(more);
@@ -159,7 +189,11 @@ export class FileTable {
   }
 
   #opener(file, { name, why }) {
-    const button = part('button', 'open', { type: 'button', className: 'title', textContent: file.name });
+    const button = part('button', 'open', {
+      type: 'button',
+      className: 'title',
+      textContent: file.name,
+    });
     button.title = why ?? `${name}: ${file.name}`;
     button.setAttribute('aria-disabled', String(Boolean(why)));
     button.addEventListener('click', () => this.#do(file, ({ name: other }) => other === name));
@@ -192,13 +226,24 @@ export class FileTable {
   }
 
   #item(act) {
-    const item = act.href && !act.why ? link(act) : Object.assign(document.createElement('button'), { type: 'button' });
+    const item =
+      act.href && !act.why
+        ? link(act)
+        : Object.assign(document.createElement('button'), { type: 'button' });
     item.setAttribute('role', 'menuitem');
     item.setAttribute('aria-disabled', String(Boolean(act.why)));
     item.tabIndex = -1;
     item.append(Object.assign(document.createElement('span'), { textContent: act.name }));
-    if (act.key) item.append(Object.assign(document.createElement('kbd'), { textContent: { Delete: 'del' }[act.key] ?? act.key }));
-    if (act.why ?? act.hint) item.append(Object.assign(document.createElement('small'), { textContent: act.why ?? act.hint }));
+    if (act.key)
+      item.append(
+        Object.assign(document.createElement('kbd'), {
+          textContent: { Delete: 'del' }[act.key] ?? act.key,
+        }),
+      );
+    if (act.why ?? act.hint)
+      item.append(
+        Object.assign(document.createElement('small'), { textContent: act.why ?? act.hint }),
+      );
     item.addEventListener('click', () => {
       if (act.why) return;
       this.#menu.hidePopover();
@@ -222,12 +267,21 @@ export class FileTable {
 /** The heading of a column whose cells say by themselves what they are. */
 function unseen(text, className) {
   const cell = Object.assign(document.createElement('th'), { scope: 'col', className });
-  cell.append(Object.assign(document.createElement('span'), { className: 'visually-hidden', textContent: text }));
+  cell.append(
+    Object.assign(document.createElement('span'), {
+      className: 'visually-hidden',
+      textContent: text,
+    }),
+  );
   return cell;
 }
 
 function link({ href, download, window }) {
-  return Object.assign(document.createElement('a'), { href, ...(download !== undefined && { download }), ...(window && { target: '_blank', rel: 'noopener' }) });
+  return Object.assign(document.createElement('a'), {
+    href,
+    ...(download !== undefined && { download }),
+    ...(window && { target: '_blank', rel: 'noopener' }),
+  });
 }
 
 /** An element that is found again when its row is made anew. */

@@ -4,7 +4,14 @@ import * as api from '../data/api.js';
 import { percent, sentence } from '../core/units.js';
 
 const AGAIN = 500; // ms until the server is asked again, while something is under way
-const STATES = { waiting: 'waits', running: 'runs', done: 'done', failed: 'failed', cancelled: 'cancelled', interrupted: 'interrupted' };
+const STATES = {
+  waiting: 'waits',
+  running: 'runs',
+  done: 'done',
+  failed: 'failed',
+  cancelled: 'cancelled',
+  interrupted: 'interrupted',
+};
 
 /** @param {api.Job} job */
 export const underWay = (job) => job.state === 'waiting' || job.state === 'running';
@@ -57,7 +64,11 @@ export class Jobs {
     this.#drawer.hidden = !opens;
     this.#button.setAttribute('aria-expanded', String(opens));
     if (opens) this.#drawer.querySelector('.bar button').focus();
-    else if (this.#drawer.contains(document.activeElement) || document.activeElement === document.body) this.#button.focus();
+    else if (
+      this.#drawer.contains(document.activeElement) ||
+      document.activeElement === document.body
+    )
+      this.#button.focus();
     this.refresh();
   }
 
@@ -72,7 +83,7 @@ export class Jobs {
 
   /** Cancels one that is under way, forgets one that has ended. */
   async cancel(id) {
-    await api.cancel(id).catch(() => {}); // one that is gone already
+    await api.cancelJob(id).catch(() => {}); // one that is gone already
     await this.refresh();
   }
 
@@ -116,7 +127,13 @@ export class Jobs {
     row.dataset.state = job.state;
     const [title, button, progress, state] = row.children;
     if (job.link && job.state === 'done') {
-      if (!title.firstElementChild) title.replaceChildren(Object.assign(document.createElement('a'), { href: `/${job.link}`, textContent: job.title }));
+      if (!title.firstElementChild)
+        title.replaceChildren(
+          Object.assign(document.createElement('a'), {
+            href: `/${job.link}`,
+            textContent: job.title,
+          }),
+        );
     } else title.textContent = job.title;
     button.textContent = underWay(job) ? 'Cancel' : 'Forget';
     button.setAttribute('aria-label', `${button.textContent}: ${job.title}`);
@@ -137,7 +154,8 @@ export class Jobs {
 /** A job's state in a line. @param {api.Job} job */
 export function told(job) {
   if (job.state === 'running') return `${percent(job.progress)}, ${job.message || 'starting'}`;
-  if (job.error && job.error !== job.state) return sentence(job.state === 'failed' ? job.error : `${STATES[job.state]}: ${job.error}`);
+  if (job.error && job.error !== job.state)
+    return sentence(job.state === 'failed' ? job.error : `${STATES[job.state]}: ${job.error}`);
   if (job.state === 'done') return `Done in ${Math.max(1, Math.round(job.ended - job.started))} s.`;
   return sentence(STATES[job.state]);
 }

@@ -1,6 +1,6 @@
 /** What is shown: task, filter, episode, speed; and the small choices above the time line. */
 
-import { check } from '../data/api.js';
+import { checkSelection } from '../data/api.js';
 import { showing } from '../tabs/live_runs.js';
 import { faultPicker } from './fault_dialog.js';
 import { SPEEDS } from '../core/state.js';
@@ -19,35 +19,69 @@ export function pickers(catalog, store, sheet) {
   /** The filters of this task that a data set can be shown with: one known by its live run alone, with no other. */
   const usable = (set) => current().filters.filter(({ live }) => !live || live === set);
   // Who chooses what this run is compared with sees the two change places.
-  const swapped = (key, value) => (store.state.against === `${key}=${value}` ? { against: `${key}=${store.state[key]}` } : {});
+  const swapped = (key, value) =>
+    store.state.against === `${key}=${value}` ? { against: `${key}=${store.state[key]}` } : {};
   const showFaults = faultPicker(document.getElementById('faults'), sheet, {
     none: 'as recorded',
     chosen: () => store.state.faults,
     choose: (faults) => store.set({ faults, ...swapped('faults', faults) }),
-    check: (faults) => check({ ...store.state, faults, against: '' }),
+    check: (faults) => checkSelection({ ...store.state, faults, against: '' }),
   });
-  fill(speed, SPEEDS.map((s) => [s, `${s}×`]));
+  fill(
+    speed,
+    SPEEDS.map((s) => [s, `${s}×`]),
+  );
   const refill = () => {
     fill(task, names(catalog.tasks));
     fill(filter, names(usable(store.state.data)));
     fill(data, names(current().data));
-    fill(episode, (named(current().data, store.state.data)?.episodes ?? []).map((e) => [e.index, described(e)]));
+    fill(
+      episode,
+      (named(current().data, store.state.data)?.episodes ?? []).map((e) => [e.index, described(e)]),
+    );
     // A choice of one is none.
     for (const select of [task, data]) select.parentElement.hidden = select.length < 2;
   };
   task.addEventListener('change', () => {
-    const { name, filters, data: [{ name: data, first }], fault_presets, map } = named(catalog.tasks, task.value);
+    const {
+      name,
+      filters,
+      data: [{ name: data, first }],
+      fault_presets,
+      map,
+    } = named(catalog.tasks, task.value);
     const filter = (named(filters, store.state.filter) ?? filters[0]).name;
-    const faults = fault_presets.some((r) => r.faults === store.state.faults) ? store.state.faults : '';
-    store.set({ task: name, filter, data, episode: first, faults, against: '', step: 0, angle: null, component: map.x, playing: false });
+    const faults = fault_presets.some((r) => r.faults === store.state.faults)
+      ? store.state.faults
+      : '';
+    store.set({
+      task: name,
+      filter,
+      data,
+      episode: first,
+      faults,
+      against: '',
+      step: 0,
+      angle: null,
+      component: map.x,
+      playing: false,
+    });
   });
   data.addEventListener('change', () => {
     const { live, first } = named(current().data, data.value);
     const { name } = named(usable(data.value), filter.value) ?? current().filters[0];
-    store.set(live ? showing(catalog, live, store.state) : { data: data.value, filter: name, episode: first, step: 0, playing: false });
+    store.set(
+      live
+        ? showing(catalog, live, store.state)
+        : { data: data.value, filter: name, episode: first, step: 0, playing: false },
+    );
   });
-  filter.addEventListener('change', () => store.set({ filter: filter.value, ...swapped('filter', filter.value) }));
-  episode.addEventListener('change', () => store.set({ episode: Number(episode.value), step: 0, playing: false }));
+  filter.addEventListener('change', () =>
+    store.set({ filter: filter.value, ...swapped('filter', filter.value) }),
+  );
+  episode.addEventListener('change', () =>
+    store.set({ episode: Number(episode.value), step: 0, playing: false }),
+  );
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
   const show = (state, changed = new Set(['task'])) => {
     if (changed.has('task') || changed.has('data')) refill();
@@ -60,7 +94,12 @@ export function pickers(catalog, store, sheet) {
 }
 
 function described({ index, policy, split, steps, contact_fraction, label }) {
-  return label ?? [index, policy, split, `${steps} steps`, `contact ${percent(contact_fraction)}`].filter((part) => part !== '').join(' · ');
+  return (
+    label ??
+    [index, policy, split, `${steps} steps`, `contact ${percent(contact_fraction)}`]
+      .filter((part) => part !== '')
+      .join(' · ')
+  );
 }
 
 function fill(select, options) {
@@ -88,7 +127,11 @@ const choosing = new WeakMap(); // host -> what is to be done with a choice
 
 function option(host, value, text) {
   const label = document.createElement('label');
-  const input = Object.assign(document.createElement('input'), { type: 'radio', name: host.id, value });
+  const input = Object.assign(document.createElement('input'), {
+    type: 'radio',
+    name: host.id,
+    value,
+  });
   input.addEventListener('change', () => choosing.get(host)(value));
   label.append(input, text);
   return label;

@@ -19,14 +19,18 @@ const BODY = `
   </form>`;
 
 export class ReportSheet {
-  #sheet = Object.assign(document.createElement('div'), { id: 'report-sheet', popover: 'auto', innerHTML: BODY });
+  #sheet = Object.assign(document.createElement('div'), {
+    id: 'report-sheet',
+    popover: 'auto',
+    innerHTML: BODY,
+  });
   #form;
   #make;
   #trace = null;
 
   /**
    * @param {HTMLButtonElement} button that opens it @param {() => {step: number, pinned: {maps: {step: number}, selection: object} | null}} now the moments to offer
-   * @param {(trace: import('../data/trace.js').Trace, wanted: object) => Promise<void>} make has it made; rejects with what is wrong
+   * @param {(trace: import('../data/trace.js').Trace, wanted: import('../data/api.js').ReportOptions) => Promise<void>} make has it made; rejects with what is wrong
    */
   constructor(button, now, make) {
     this.#make = make;
@@ -39,12 +43,18 @@ export class ReportSheet {
     const { steps, which } = this.#form.elements;
     steps.addEventListener('input', () => (which.value = steps.value.trim() ? 'these' : 'worst'));
     // Who chose with the mouse makes it with Enter, too.
-    this.#form.addEventListener('change', ({ target }) => target.matches(':focus-visible') || this.#form.querySelector('.make').focus());
+    this.#form.addEventListener(
+      'change',
+      ({ target }) => target.matches(':focus-visible') || this.#form.querySelector('.make').focus(),
+    );
     this.#form.addEventListener('submit', (event) => (event.preventDefault(), this.#submit()));
     this.#sheet.addEventListener('beforetoggle', ({ newState }) => {
       if (newState !== 'open') return;
       const { bottom, right } = button.getBoundingClientRect();
-      [this.#sheet.style.top, this.#sheet.style.right] = [`${bottom + 5}px`, `${Math.max(6, innerWidth - right - 60)}px`];
+      [this.#sheet.style.top, this.#sheet.style.right] = [
+        `${bottom + 5}px`,
+        `${Math.max(6, innerWidth - right - 60)}px`,
+      ];
       this.#say('');
       this.#offer(now());
     });
@@ -60,12 +70,25 @@ export class ReportSheet {
 
   /** Buttons that put this moment, or the pinned one, among the steps. */
   #offer({ step, pinned }) {
-    const same = pinned && Object.entries(this.#trace?.selection ?? {}).every(([key, value]) => pinned.selection[key] === value);
-    const offered = [[`this one, ${step}`, step], ...(same && pinned.maps.step !== step ? [[`the pinned one, ${pinned.maps.step}`, pinned.maps.step]] : [])];
+    const same =
+      pinned &&
+      Object.entries(this.#trace?.selection ?? {}).every(
+        ([key, value]) => pinned.selection[key] === value,
+      );
+    const offered = [
+      [`this one, ${step}`, step],
+      ...(same && pinned.maps.step !== step
+        ? [[`the pinned one, ${pinned.maps.step}`, pinned.maps.step]]
+        : []),
+    ];
     this.#form.querySelector('.offered').replaceChildren(
       'Add ',
       ...offered.map(([textContent, one]) => {
-        const button = Object.assign(document.createElement('button'), { type: 'button', className: 'text quiet', textContent });
+        const button = Object.assign(document.createElement('button'), {
+          type: 'button',
+          className: 'text quiet',
+          textContent,
+        });
         button.addEventListener('click', () => this.#add(one));
         return button;
       }),
@@ -85,10 +108,17 @@ export class ReportSheet {
     const last = (this.#trace?.steps ?? 0) - 1;
     const wrong = asked.find((step) => !WHOLE.test(step) || Number(step) > last);
     if (!this.#trace) return this.#say('The run is not there yet.');
-    if (wrong !== undefined) return this.#say(`${wrong} is no step of this run: it has steps 0 to ${last}.`);
-    if (which.value === 'these' && !asked.length) return this.#say('Give one step or more, such as 12, 40.');
+    if (wrong !== undefined)
+      return this.#say(`${wrong} is no step of this run: it has steps 0 to ${last}.`);
+    if (which.value === 'these' && !asked.length)
+      return this.#say('Give one step or more, such as 12, 40.');
     try {
-      await this.#make(this.#trace, { moments: asked.map(Number), every: every.checked, pdf: pdf.checked, title: title.value.trim() });
+      await this.#make(this.#trace, {
+        events: asked.map(Number),
+        slow: every.checked,
+        pdf: pdf.checked,
+        title: title.value.trim(),
+      });
       this.#sheet.hidePopover();
     } catch (error) {
       this.#say(error.message);

@@ -5,7 +5,9 @@ export function walk(body) {
   body.addEventListener('keydown', (event) => {
     const rows = [...body.rows];
     const place = rows.findIndex((row) => row.contains(document.activeElement));
-    const to = { ArrowDown: place + 1, ArrowUp: place - 1, Home: 0, End: rows.length - 1 }[event.key];
+    const to = { ArrowDown: place + 1, ArrowUp: place - 1, Home: 0, End: rows.length - 1 }[
+      event.key
+    ];
     if (to === undefined || place < 0) return;
     event.preventDefault();
     event.stopPropagation();
@@ -15,7 +17,8 @@ export function walk(body) {
 
 /** Makes a row the one where the tab key stops, and brings it into sight. @param {HTMLTableRowElement} row @param {boolean} focus */
 export function stopAt(row, focus) {
-  for (const button of row.parentElement.querySelectorAll('button, input')) button.tabIndex = row.contains(button) ? 0 : -1;
+  for (const button of row.parentElement.querySelectorAll('button, input'))
+    button.tabIndex = row.contains(button) ? 0 : -1;
   if (focus) row.querySelector('button').focus({ preventScroll: true });
   const box = row.closest('.scroll');
   const [seen, at] = [box.getBoundingClientRect(), row.getBoundingClientRect()];

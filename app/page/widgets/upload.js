@@ -1,6 +1,6 @@
 /** Files that are being added: sent one after the other, each with how far it is, a way to stop it, and what went wrong. */
 
-import { bytes, percent, sentence } from '../core/units.js';
+import { formatBytes, percent, sentence } from '../core/units.js';
 
 export class Adding {
   #host;
@@ -19,10 +19,11 @@ export class Adding {
 
   async #one(file, free, largest, before) {
     const line = document.createElement('li');
-    line.innerHTML = '<span></span><progress max="1" value="0"></progress><button type="button" class="text quiet">Cancel</button>';
+    line.innerHTML =
+      '<span></span><progress max="1" value="0"></progress><button type="button" class="text quiet">Cancel</button>';
     const [text, bar, button] = line.children;
     bar.ariaLabel = `Progress of ${file.name}`;
-    text.textContent = `${file.name}, ${bytes(file.size)}: waits`;
+    text.textContent = `${file.name}, ${formatBytes(file.size)}: waits`;
     this.#host.append(line);
     const request = new XMLHttpRequest();
     let stopped = false;
@@ -30,7 +31,10 @@ export class Adding {
     await before;
     if (stopped) return;
     try {
-      if (file.size > largest) throw new Error(`it has ${bytes(file.size)}, and no more than ${bytes(largest)} are taken here`);
+      if (file.size > largest)
+        throw new Error(
+          `it has ${formatBytes(file.size)}, and no more than ${formatBytes(largest)} are taken here`,
+        );
       const added = await send(request, file, free(file.name), (share) => {
         bar.value = share;
         text.textContent = `${file.name}: ${share < 1 ? percent(share) : 'is looked into'}`;
@@ -51,7 +55,9 @@ function send(request, file, name, progress) {
   return new Promise((resolve, reject) => {
     request.open('PUT', `/api/recordings/${encodeURIComponent(name)}`);
     request.responseType = 'json';
-    request.upload.addEventListener('progress', ({ loaded, total }) => progress(total ? loaded / total : 1));
+    request.upload.addEventListener('progress', ({ loaded, total }) =>
+      progress(total ? loaded / total : 1),
+    );
     request.addEventListener('load', () => {
       if (request.status === 201) resolve(request.response);
       else reject(new Error(request.response?.error ?? `the server answered ${request.status}`));

@@ -1,4 +1,4 @@
-"""The other run over HTTP: another filter, other faults, an edit over some steps."""
+"""Comparison runs over HTTP: another filter, other faults, or an intervention."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.runs.trace_store import Selection, Settings
+from beliefscope.app.runs.selection import Selection
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.app.views.scene import Scene
 from beliefscope.app.views.scene_belief import OUTLINES
@@ -27,13 +28,13 @@ EKF = f"door/crossmodal-ekf/{EPISODE}"
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     app = create_app(Settings(tmp_path_factory.mktemp("workspace"), particles=30), warm=False)
     with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
         yield client
 
 
-def answered(client: TestClient, address: str, **query: Any) -> Any:
+def poll(client: TestClient, address: str, **query: Any) -> Any:
     end = time.monotonic() + 60.0
     while (answer := client.get(address, params=query)).status_code == 202:
         assert 0.0 <= answer.json()["progress"] <= 1.0
@@ -41,46 +42,46 @@ def answered(client: TestClient, address: str, **query: Any) -> Any:
     return answer
 
 
-def compared(client: TestClient, against: str, of: str = EKF, **query: Any) -> dict[str, Any]:
-    answer = answered(client, f"/api/compare/{of}", against=against, **query)
+def compare(client: TestClient, against: str, run: str = EKF, **query: Any) -> dict[str, Any]:
+    answer = poll(client, f"/api/compare/{run}", against=against, **query)
     assert answer.status_code == 200, answer.text
     return answer.json()
 
 
-def estimate(client: TestClient, of: str = EKF, **query: Any) -> np.ndarray[Any, Any]:
+def estimate(client: TestClient, run: str = EKF, **query: Any) -> np.ndarray[Any, Any]:
     """(T, n)"""
-    header = answered(client, f"/api/trace/{of}", **query).json()
+    header = poll(client, f"/api/trace/{run}", **query).json()
     column = next(c for c in header["columns"] if c["name"] == "estimate_mean")
-    data = client.get(f"/api/trace/{of}/columns", params=query).content
+    data = client.get(f"/api/trace/{run}/columns", params=query).content
     count = int(np.prod(column["shape"]))
     return np.frombuffer(data, "<f4", count, column["offset"]).reshape(column["shape"])
 
 
 @pytest.mark.parametrize("filter_", ["crossmodal-ekf", "crossmodal-pf"])
-def test_an_edit_changes_nothing_before_it(shown: TestClient, filter_: str) -> None:
-    of = f"door/{filter_}/{EPISODE}"
-    original, edited = estimate(shown, of), estimate(shown, of, against=EDIT)
+def test_intervention_does_not_affect_earlier_steps(server: TestClient, filter_: str) -> None:
+    run = f"door/{filter_}/{EPISODE}"
+    original, edited = estimate(server, run), estimate(server, run, against=EDIT)
     assert np.array_equal(original[:40], edited[:40])
     assert (original[40:60] != edited[40:60]).any(axis=1).all()
-    found = compared(shown, EDIT, of)
-    assert found["names"] == ["original", "edited"]
-    distance = np.array(next(c["values"] for c in found["curves"] if c["name"] == "fused"))
+    result = compare(server, EDIT, run)
+    assert result["names"] == ["original", "edited"]
+    distance = np.array(next(c["values"] for c in result["curves"] if c["name"] == "fused"))
     assert not distance[:40].any()
     assert distance[40:60].all()
-    assert [t for t, edit in enumerate(found["bands"]["edit"]) if edit] == list(range(40, 60))
-    assert "haptics" in found["verdict"]
+    assert [t for t, edit in enumerate(result["bands"]["edit"]) if edit] == list(range(40, 60))
+    assert "haptics" in result["verdict"]
 
 
-def test_an_edit_is_the_faults_over_its_span(shown: TestClient) -> None:
-    whole = estimate(shown, faults="blackout:from=40:to=60")
-    assert np.array_equal(estimate(shown, against=EDIT), whole)
+def test_intervention_equals_faults_over_its_span(server: TestClient) -> None:
+    expected = estimate(server, faults="blackout:from=40:to=60")
+    assert np.array_equal(estimate(server, against=EDIT), expected)
 
 
-def test_weights_by_hand(shown: TestClient) -> None:
+def test_manual_weights(server: TestClient) -> None:
     against = "from=40&to=60&weights=haptics=0.75"
-    header = answered(shown, f"/api/trace/{EKF}", against=against).json()
+    header = poll(server, f"/api/trace/{EKF}", against=against).json()
     column = next(c for c in header["columns"] if c["name"] == "weights")
-    data = shown.get(f"/api/trace/{EKF}/columns", params={"against": against}).content
+    data = server.get(f"/api/trace/{EKF}/columns", params={"against": against}).content
     weights = np.frombuffer(data, "<f4", int(np.prod(column["shape"])), column["offset"]).reshape(column["shape"])
     np.testing.assert_allclose(weights[40:60, header["modalities"].index("haptics")], 0.75, atol=1e-6)
 
@@ -98,14 +99,14 @@ def test_weights_by_hand(shown: TestClient) -> None:
         ),
     ],
 )
-def test_another_filter_or_other_faults(
-    shown: TestClient, against: str, query: dict[str, str], names: list[str]
+def test_compare_with_another_filter_or_other_faults(
+    server: TestClient, against: str, query: dict[str, str], names: list[str]
 ) -> None:
-    found = compared(shown, against, **query)
-    assert found["names"] == names
-    (table,) = found["tables"]
+    result = compare(server, against, **query)
+    assert result["names"] == names
+    (table,) = result["tables"]
     assert table["columns"][2:4] == names
-    other = answered(shown, f"/api/trace/{EKF}", against=against, **query).json()
+    other = poll(server, f"/api/trace/{EKF}", against=against, **query).json()
     assert [other["filter"], other["faults"] or "as recorded"] == [
         "crossmodal-pf" if "filter=" in against else "crossmodal-ekf",
         "blackout=0.5" if against == "faults=blackout=0.5" else "as recorded",
@@ -113,12 +114,12 @@ def test_another_filter_or_other_faults(
 
 
 @pytest.mark.parametrize(
-    ("against", "said"),
+    ("against", "message"),
     [
-        ("filter=crossmodal-ekf", "is the run that is shown"),
+        ("filter=crossmodal-ekf", "describes the selected run"),
         ("filter=kalman", "'kalman'"),
         ("faults=lightning", "lightning"),
-        ("speed=3", "part of the other run"),
+        ("speed=3", "the comparison run"),
         ("from=40&to=60", "nothing is edited"),
         ("from=40&faults=blackout", "'to' of the edit"),
         ("from=60&to=40&faults=blackout", "has no steps"),
@@ -129,18 +130,18 @@ def test_another_filter_or_other_faults(
         ("from=40&to=60&faults=blackout:from=2", "span of its own"),
     ],
 )
-def test_what_cannot_be_compared_is_said(shown: TestClient, against: str, said: str) -> None:
+def test_invalid_comparison_is_reported(server: TestClient, against: str, message: str) -> None:
     for route in ("trace", "compare"):
-        answer = answered(shown, f"/api/{route}/{EKF}", against=against)
+        answer = poll(server, f"/api/{route}/{EKF}", against=against)
         assert answer.status_code == 400
-        assert said in answer.json()["error"]
+        assert message in answer.json()["error"]
 
 
-def test_a_selection_knows_its_other_run() -> None:
+def test_selection_of_comparison_run() -> None:
     selection = Selection("door", "crossmodal-ekf", EPISODE)
-    edited = selection.against("from=40&to=60&faults=blackout&weights=image=0.5")
+    edited = selection.comparison("from=40&to=60&faults=blackout&weights=image=0.5")
     assert edited == replace(selection, edit=Edit(40, 60, Faults.parse("blackout"), {"image": 0.5}))
-    assert len({selection, edited, selection.against("from=40&to=60&faults=blackout&weights=image=0.6")}) == 3
+    assert len({selection, edited, selection.comparison("from=40&to=60&faults=blackout&weights=image=0.6")}) == 3
 
 
 @pytest.mark.parametrize("shape", OUTLINES)
@@ -156,33 +157,33 @@ def test_dashes_lie_on_their_edges_and_cover_about_half(shape: str) -> None:
     assert np.linalg.norm(away - on * along, axis=-1).min(axis=1).max() < 1e-6
 
 
-def test_the_scene_shows_the_other_run_where_it_is(shown: TestClient) -> None:
-    library = shown.app.state.library  # type: ignore[attr-defined]
+def test_scene_shows_comparison_run(server: TestClient) -> None:
+    store = server.app.state.store  # type: ignore[attr-defined]
     selection = Selection("door", "crossmodal-ekf", EPISODE)
-    traced, its = library.traced(selection), library.traced(selection.against("filter=crossmodal-pf"))
-    other = its.trace
-    assert library.there(selection.against("filter=crossmodal-pf")) is its
-    assert library.there(selection.against("from=1&to=3&weights=image=0.123")) is None
+    run, other_run = store.request(selection), store.request(selection.comparison("filter=crossmodal-pf"))
+    other = other_run.trace
+    assert store.cached(selection.comparison("filter=crossmodal-pf")) is other_run
+    assert store.cached(selection.comparison("from=1&to=3&weights=image=0.123")) is None
     scene = Scene(lambda step: None, dark=False)
     try:
-        scene.show(traced, 45, other)
+        scene.show(run, 45, other)
         nodes = scene.viser.server.scene._handle_from_node_name
         there = {name: nodes[name] for name in ("/other/pole", "/other/ghost")}
-        ghost = traced.checkpoint.task.ghost
+        ghost = run.checkpoint.task.outline
         assert ghost is not None
         placed = ghost(other.estimate_mean)
         np.testing.assert_allclose(there["/other/ghost"].position, placed.position[45], atol=1e-6)
         np.testing.assert_allclose(there["/other/pole"].position[:2], placed.anchor[45, :2], atol=1e-6)
-        scene.show(traced, 46)
+        scene.show(run, 46)
         assert not any(name.startswith("/other") for name in nodes)
     finally:
         scene.close()
 
 
-def test_maps_of_the_other_run_come_before_this_ones(shown: TestClient) -> None:
+def test_maps_of_comparison_run_are_sent_first(server: TestClient) -> None:
     against = "filter=crossmodal-pf"
-    compared(shown, against)
-    view = shown.post("/api/views").json()
+    compare(server, against)
+    view = server.post("/api/views").json()
     cursor = {
         "type": "cursor",
         "task": "door",
@@ -191,18 +192,18 @@ def test_maps_of_the_other_run_come_before_this_ones(shown: TestClient) -> None:
         "step": 45,
         "angle": None,
     }
-    with shown.websocket_connect(f"ws://localhost:8000{view['socket']}") as socket:
+    with server.websocket_connect(f"ws://localhost:8000{view['socket']}") as socket:
         for serial, extra in enumerate(({}, {"against": against}, {"against": against, "beside": True})):
             socket.send_json({**cursor, "serial": serial, "size": 41, "scene": False, **extra})
-            of = [header(socket.receive_bytes()) for _ in range(1 + len(extra) // 2)]
-            assert [one["other"] for one in of] == [True, False][-len(of) :]
-            assert {one["serial"] for one in of} == {serial}
-        alone = {**cursor, "filter": "crossmodal-pf", "serial": 9, "size": 41, "scene": False}
-        socket.send_json(alone)
-        assert header(socket.receive_bytes())["peak"] == of[0]["peak"] != of[1]["peak"]
+            headers = [header(socket.receive_bytes()) for _ in range(1 + len(extra) // 2)]
+            assert [h["other"] for h in headers] == [True, False][-len(headers) :]
+            assert {h["serial"] for h in headers} == {serial}
+        other = {**cursor, "filter": "crossmodal-pf", "serial": 9, "size": 41, "scene": False}
+        socket.send_json(other)
+        assert header(socket.receive_bytes())["peak"] == headers[0]["peak"] != headers[1]["peak"]
 
 
 def header(message: bytes) -> dict[str, Any]:
     size = int.from_bytes(message[:4], "little")
-    found: dict[str, Any] = json.loads(message[4 : 4 + size])
-    return found
+    values: dict[str, Any] = json.loads(message[4 : 4 + size])
+    return values

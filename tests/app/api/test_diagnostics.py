@@ -1,4 +1,4 @@
-"""Diagnostics over HTTP, with filters and episodes that ship."""
+"""Diagnostics over HTTP, with built-in filters and episodes."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.api import diagnostics
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.protocol.diagnostic_options import describe_entry
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnostics.base import VIEWS, Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.views import VIEWS
 from beliefscope.inspect.trace import trace
 
 ORIGIN = "http://localhost:8000"
-PATIENCE = 90.0  # s: a job imports PyTorch first
+TIMEOUT = 90.0  # s, including the import of PyTorch by a job
 EPISODE = 9
 
 
-@pytest.fixture
-def shown(tmp_path: Path) -> Iterator[TestClient]:
-    app = create_app(Settings(tmp_path / "workspace", particles=30), warm=False)
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    app = create_app(Settings(tmp_path_factory.mktemp("workspace"), particles=30), warm=False)
     with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
         yield client
 
@@ -38,13 +40,13 @@ def url(name: str, filter_: str = "crossmodal-ekf") -> str:
     return f"/api/diagnostics/{name}/door/{filter_}/{EPISODE}"
 
 
-def answered(client: TestClient, address: str, **query: Any) -> Any:
-    """The answer once the trace, and the job where there is one, is there."""
-    end = time.monotonic() + PATIENCE
+def poll(client: TestClient, address: str, **query: Any) -> Any:
+    """The response once the trace and the job, if any, are finished."""
+    end = time.monotonic() + TIMEOUT
     while (answer := client.get(address, params=query)).status_code == 202:
-        said = answer.json()
-        assert 0.0 <= said.get("progress", 0.0) <= 1.0
-        if "job" in said and (said["job"] is None or said["job"]["state"] not in ("waiting", "running")):
+        state = answer.json()
+        assert 0.0 <= state.get("progress", 0.0) <= 1.0
+        if "job" in state and (state["job"] is None or state["job"]["state"] not in ("waiting", "running")):
             break
         assert time.monotonic() < end
         time.sleep(0.02)
@@ -60,8 +62,8 @@ class Length(Diagnostic):
         return f"{self.steps} steps"
 
 
-def test_the_list_says_what_each_answers(shown: TestClient) -> None:
-    listed = shown.get("/api/diagnostics").json()
+def test_list_of_diagnostics(server: TestClient) -> None:
+    listed = server.get("/api/diagnostics").json()
     assert [entry["name"] for entry in listed] == list(DIAGNOSTICS)
     for entry in listed:
         assert entry["question"].endswith("?")
@@ -74,112 +76,112 @@ def test_the_list_says_what_each_answers(shown: TestClient) -> None:
     )["options"]
 
 
-def test_of_a_trace_the_list_says_what_does_not_apply(shown: TestClient) -> None:
-    refused = {
+def test_list_for_a_trace_gives_reasons(server: TestClient) -> None:
+    reasons = {
         filter_: {
             entry["name"]: entry["why_not"]
-            for entry in answered(shown, f"/api/diagnostics/door/{filter_}/{EPISODE}").json()
+            for entry in poll(server, f"/api/diagnostics/door/{filter_}/{EPISODE}").json()
         }
         for filter_ in ("crossmodal-ekf", "crossmodal-pf")
     }
-    assert refused["crossmodal-ekf"]["particles"] == "crossmodal-ekf has no particles"
-    assert refused["crossmodal-pf"]["particles"] is None
-    assert refused["crossmodal-ekf"]["consistency"] is None
+    assert reasons["crossmodal-ekf"]["particles"] == "crossmodal-ekf has no particles"
+    assert reasons["crossmodal-pf"]["particles"] is None
+    assert reasons["crossmodal-ekf"]["consistency"] is None
 
 
-def test_a_fast_one_is_what_the_function_gives(shown: TestClient) -> None:
-    answer = answered(shown, url("consistency"))
+def test_fast_diagnostic_equals_function_result(server: TestClient) -> None:
+    answer = poll(server, url("consistency"))
     assert answer.status_code == 200, answer.text
-    got = answer.json()
+    result = answer.json()
     checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
-        made = trace(checkpoint, data[EPISODE], EPISODE)
-    wanted = DIAGNOSTICS["consistency"]([made], checkpoint).views()
-    assert got.pop("trajectories") == 1
-    assert set(got) == {"verdict", *VIEWS}
-    assert got == wanted
+        run = trace(checkpoint, data[EPISODE], EPISODE)
+    expected = DIAGNOSTICS["consistency"]([run], checkpoint).views()
+    assert result.pop("trajectories") == 1
+    assert set(result) == {"verdict", *VIEWS}
+    assert result == expected
 
 
-def test_it_is_computed_once_for_a_trace_and_its_options(shown: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[int, float]] = []
+def test_results_are_cached_by_trace_and_options(server: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[int, float]] = []
 
     def run(traces: Any, every: int = 1, share: float | None = None) -> Length:
-        asked.append((every, share or 0.0))
+        calls.append((every, share or 0.0))
         return Length(len(range(0, len(traces[0]), every)))
 
     entry = Entry("length", "Length", "How long is it?", run, options={"every": "steps", "share": "0 to 1"})
     monkeypatch.setitem(DIAGNOSTICS, "length", entry)
-    first = answered(shown, url("length"))
+    first = poll(server, url("length"))
     assert first.json()["verdict"] == "100 steps"
-    assert answered(shown, url("length"), every="2", share="0.5").json()["verdict"] == "50 steps"
-    assert answered(shown, url("length"), every="").content == first.content
-    assert answered(shown, url("length"), faults="blackout=0.5").json()["verdict"] == "100 steps"
-    assert asked == [(1, 0.0), (2, 0.5), (1, 0.0)]
+    assert poll(server, url("length"), every="2", share="0.5").json()["verdict"] == "50 steps"
+    assert poll(server, url("length"), every="").content == first.content
+    assert poll(server, url("length"), faults="blackout=0.5").json()["verdict"] == "100 steps"
+    assert calls == [(1, 0.0), (2, 0.5), (1, 0.0)]
     monkeypatch.setattr(diagnostics, "RESULTS_IN_MEMORY", 1)
-    answered(shown, url("length"), every="4")
-    answered(shown, url("length"))
-    assert len(asked) == 5
-    assert diagnostics.described(entry)["options"] == [
+    poll(server, url("length"), every="4")
+    poll(server, url("length"))
+    assert len(calls) == 5
+    assert describe_entry(entry)["options"] == [
         {"name": "every", "meaning": "steps", "default": "1"},
         {"name": "share", "meaning": "0 to 1", "default": ""},
     ]
 
 
-def test_what_cannot_be_had_says_why(shown: TestClient) -> None:
-    answered(shown, url("consistency"))
+def test_errors_name_the_reason(server: TestClient) -> None:
+    poll(server, url("consistency"))
     for method in ("GET", "POST"):
-        refused = shown.request(method, url("particles"))
-        assert (refused.status_code, refused.json()) == (409, {"error": "crossmodal-ekf has no particles"})
-        unknown = shown.request(method, url("tea-leaves"))
+        inapplicable = server.request(method, url("particles"))
+        assert (inapplicable.status_code, inapplicable.json()) == (409, {"error": "crossmodal-ekf has no particles"})
+        unknown = server.request(method, url("tea-leaves"))
         assert unknown.status_code == 404
         assert f"'tea-leaves' does not exist. Available: {', '.join(DIAGNOSTICS)}." in unknown.json()["error"]
-        bad = shown.request(method, url("maps"), params={"size": "large"})
+        bad = server.request(method, url("maps"), params={"size": "large"})
         assert bad.status_code == 400
         assert bad.json()["error"] == (
-            "maps's 'size' is 'large': Input should be a valid integer, unable to parse string as an integer. "
-            "It is cells along a side, 41 by default."
+            "option 'size' of maps (cells along a side, 41 by default) is 'large': "
+            "Input should be a valid integer, unable to parse string as an integer."
         )
-        unheard = shown.request(method, url("maps"), params={"colour": "red"})
-        assert (unheard.status_code, "Available: size" in unheard.text) == (400, True)
-        some = shown.request(method, url("maps"), params={"episodes": "some"})
-        assert (some.status_code, "held-out" in some.text) == (422, True)
-    assert shown.get("/api/diagnostics/consistency/door/nope/0").status_code == 400
+        unknown_option = server.request(method, url("maps"), params={"colour": "red"})
+        assert (unknown_option.status_code, "Available: size" in unknown_option.text) == (400, True)
+        invalid = server.request(method, url("maps"), params={"episodes": "some"})
+        assert (invalid.status_code, "held-out" in invalid.text) == (422, True)
+    assert server.get("/api/diagnostics/consistency/door/nope/0").status_code == 400
 
 
-def test_a_slow_one_is_a_job_that_is_asked_for(shown: TestClient) -> None:
+def test_slow_diagnostic_is_a_job(server: TestClient) -> None:
     quick = {"size": "5"}
-    assert answered(shown, url("maps"), **quick).json() == {"job": None}
-    asked = shown.post(url("maps"), params=quick)
-    job = asked.json()["job"]
-    assert (asked.status_code, job["state"]) == (202, "running")
+    assert poll(server, url("maps"), **quick).json() == {"job": None}
+    response = server.post(url("maps"), params=quick)
+    job = response.json()["job"]
+    assert (response.status_code, job["state"]) == (202, "running")
     assert job["title"] == f"Likelihood maps of crossmodal-ekf, door episode {EPISODE}"
-    opens = {
+    query = {
         "task": "door",
         "filter": "crossmodal-ekf",
         "tab": "diagnostics",
         "diagnostic": "maps",
         "options": "size=5",
     }
-    assert opens.items() <= dict(parse_qsl(job["link"].removeprefix("?"))).items()
-    assert shown.post(url("maps"), params=quick).json()["job"]["id"] == job["id"]
-    answer = answered(shown, url("maps"), **quick)
+    assert query.items() <= dict(parse_qsl(job["link"].removeprefix("?"))).items()
+    assert server.post(url("maps"), params=quick).json()["job"]["id"] == job["id"]
+    answer = poll(server, url("maps"), **quick)
     assert answer.status_code == 200, answer.text
     checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
     with open_dataset(sample_path("door")) as data:
-        made = trace(checkpoint, data[EPISODE], EPISODE)
-    assert answer.json()["verdict"] == DIAGNOSTICS["maps"]([made], checkpoint, size=5).verdict
-    assert shown.get(f"/api/jobs/{job['id']}/result").json() == answer.json()
-    assert shown.get(f"/api/jobs/{job['id']}").json()["state"] == "done"
-    assert answered(shown, url("maps")).json() == {"job": None}  # with other options it is another one
+        run = trace(checkpoint, data[EPISODE], EPISODE)
+    assert answer.json()["verdict"] == DIAGNOSTICS["maps"]([run], checkpoint, size=5).verdict
+    assert server.get(f"/api/jobs/{job['id']}/result").json() == answer.json()
+    assert server.get(f"/api/jobs/{job['id']}").json()["state"] == "done"
+    assert poll(server, url("maps")).json() == {"job": None}  # other options are another result
 
 
 @pytest.mark.long
-def test_over_all_held_out_episodes_it_has_bounds(shown: TestClient) -> None:
-    answered(shown, url("consistency"))
-    assert shown.get(url("consistency"), params={"episodes": "held-out"}).json() == {"job": None}
-    job = shown.post(url("consistency"), params={"episodes": "held-out"}).json()["job"]
+def test_held_out_episodes(server: TestClient) -> None:
+    poll(server, url("consistency"))
+    assert server.get(url("consistency"), params={"episodes": "held-out"}).json() == {"job": None}
+    job = server.post(url("consistency"), params={"episodes": "held-out"}).json()["job"]
     assert job["title"].endswith("door all 14 held-out episodes")
-    answer = answered(shown, url("consistency"), episodes="held-out")
+    answer = poll(server, url("consistency"), episodes="held-out")
     assert answer.status_code == 200, answer.text
     assert answer.json()["trajectories"] == 14
     (table, *_) = answer.json()["tables"]
@@ -187,16 +189,16 @@ def test_over_all_held_out_episodes_it_has_bounds(shown: TestClient) -> None:
     assert max(row[trajectories] for row in table["rows"]) == 14
 
 
-def test_a_failed_one_says_why(shown: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Refused only where it runs: the process has the catalog as it ships.
+def test_failed_job_reports_reason(server: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The job's process has the unmodified catalog and refuses.
     monkeypatch.setitem(DIAGNOSTICS, "particles", replace(DIAGNOSTICS["particles"], why_not=lambda *_: None, slow=True))
-    answered(shown, url("particles"))
-    shown.post(url("particles"))
-    job = answered(shown, url("particles")).json()["job"]
+    poll(server, url("particles"))
+    server.post(url("particles"))
+    job = poll(server, url("particles")).json()["job"]
     assert (job["state"], job["error"]) == ("failed", "crossmodal-ekf has no particles")
 
 
-def test_settings_travel_as_json(tmp_path: Path, root: Path) -> None:
+def test_settings_json_round_trip(tmp_path: Path, root: Path) -> None:
     settings = Settings(
         tmp_path,
         data={"mine": tmp_path / "door.h5"},
@@ -205,15 +207,15 @@ def test_settings_travel_as_json(tmp_path: Path, root: Path) -> None:
         seed=3,
         tasks=("push",),
     )
-    assert Settings.of_json(settings.to_json()) == settings
+    assert Settings.from_json(settings.to_json()) == settings
     with pytest.raises(BadInput, match="task 'nope'"):
-        Settings.of_json(settings.to_json() | {"tasks": ["nope"]})
+        Settings.from_json(settings.to_json() | {"tasks": ["nope"]})
     source = f"{root / 'examples' / '04_own_filter.py'}:build"
-    foreign = diagnostics.Settings.of_json(
+    external = Settings.from_json(
         settings.to_json() | {"checkpoints": {"own": {"source": source, "task": "door"}}}
     )
-    again = Settings.of_json(foreign.to_json())
-    assert again.checkpoints["own"].hash == foreign.checkpoints["own"].hash  # type: ignore[union-attr]
+    again = Settings.from_json(external.to_json())
+    assert again.checkpoints["own"].hash == external.checkpoints["own"].hash  # type: ignore[union-attr]
 
 
 @pytest.fixture

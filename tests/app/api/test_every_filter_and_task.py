@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.server.main import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.push import PUSH
@@ -38,7 +38,7 @@ def serve(tmp_path: Path, open_client: Callable[..., TestClient]) -> Iterator[Se
         episode = replace(episode, task=task.name, observations=seen)
         write_dataset(tmp_path / "one.h5", task, [episode])
         filter_ = build(architecture(task.name, name))
-        filter_.statistics.fit(Steps.of(task, [episode]))
+        filter_.statistics.fit(Steps.from_episodes(task, [episode]))
         save_checkpoint(filter_, name, {}, tmp_path / name)
         data, checkpoints = {"one": tmp_path / "one.h5"}, {"own": tmp_path / name}
         opened.append(open_client(Settings(tmp_path / "workspace", data, checkpoints, particles=30)))
@@ -77,11 +77,11 @@ def look(client: TestClient, task: Task) -> list[str] | None:
 @pytest.mark.parametrize(
     ("name", "layers", "has", "has_not"),
     [
-        ("feature-ekf", ["image+haptics", "fused"], "estimate_sigma", "weights acting effective_sample_size"),
-        ("image-pf", ["image", "fused"], "estimate_sigma effective_sample_size", "weights acting"),
-        ("unimodal-ekf", ["image", "haptics", "fused"], "acting", "weights"),
-        ("crossmodal-ukf", ["image", "haptics", "fused"], "acting weights modality_sigma", "effective_sample_size"),
-        ("lstm", None, "estimate_mean", "estimate_sigma modality_mean modality_sigma weights acting"),
+        ("feature-ekf", ["image+haptics", "fused"], "estimate_sigma", "weights effective_weights effective_sample_size"),
+        ("image-pf", ["image", "fused"], "estimate_sigma effective_sample_size", "weights effective_weights"),
+        ("unimodal-ekf", ["image", "haptics", "fused"], "effective_weights", "weights"),
+        ("crossmodal-ukf", ["image", "haptics", "fused"], "effective_weights weights modality_sigma", "effective_sample_size"),
+        ("lstm", None, "estimate_mean", "estimate_sigma modality_mean modality_sigma weights effective_weights"),
     ],
 )
 def test_a_filter_shows_what_it_has(serve: Serve, name: str, layers: list[str] | None, has: str, has_not: str) -> None:
@@ -97,7 +97,7 @@ def test_a_filter_shows_what_it_has(serve: Serve, name: str, layers: list[str] |
     assert answer.status_code == 201, answer.text
 
 
-PLAIN = replace(PUSH, name="plain", replay=None, ghost=None)
+PLAIN = replace(PUSH, name="plain", replay=None, outline=None)
 
 
 def test_a_task_without_a_replay_has_a_scene(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:

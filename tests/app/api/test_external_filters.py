@@ -15,8 +15,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.cli.main import main
-from beliefscope.app.server.main import Settings
-from beliefscope.filters.external.load import load_foreign
+from beliefscope.app.runs.settings import Settings
+from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.trace import load_trace
 from beliefscope.recordings.read import read_recording
 
@@ -59,7 +59,7 @@ def test_trace_and_recording_are_of_one_run(tmp_path: Path) -> None:
     result("record", "door", "--filter", SPEC, "--maps", 50, "-o", tmp_path / "own.rrd")
     traced, recorded = load_trace(tmp_path / "own.trace"), read_recording(tmp_path / "own.rrd")
     assert traced.checkpoint_hash == recorded.checkpoint_hash == made["checkpoint_hash"]
-    assert (traced.kind, traced.modalities) == (recorded.kind, recorded.modalities) == ("foreign", ())
+    assert (traced.kind, traced.modalities) == (recorded.kind, recorded.modalities) == ("external", ())
     for name in ("estimate_mean", "estimate_covariance", "modality_mean"):
         np.testing.assert_array_equal(getattr(recorded, name), getattr(traced, name))
 
@@ -89,21 +89,21 @@ def test_a_server_must_know_the_task(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def client(given: Settings, tmp_path: Path, open_client: Callable[..., TestClient]) -> TestClient:
-    own = load_foreign(SPEC)
-    return open_client(Settings(tmp_path / "workspace", given.data, {own.name: own}))
+def client(base_settings: Settings, tmp_path: Path, open_client: Callable[..., TestClient]) -> TestClient:
+    own = load_external(SPEC)
+    return open_client(Settings(tmp_path / "workspace", base_settings.data, {own.name: own}))
 
 
 def test_the_page_has_what_it_says(client: TestClient) -> None:
     with client:
         listed = client.get("/api/catalog").json()["tasks"][0]["filters"][0]
-        assert (listed["name"], listed["kind"]) == ("04_own_filter-build", "foreign")
+        assert (listed["name"], listed["kind"]) == ("04_own_filter-build", "external")
         while (answer := client.get("/api/trace/door/04_own_filter-build/0")).status_code == 202:
             pass
         found = answer.json()
         columns = {column["name"] for column in found["columns"]}
         assert {"estimate_mean", "estimate_sigma"} <= columns
-        assert not {"modality_mean", "modality_sigma", "weights", "acting", "effective_sample_size"} & columns
+        assert not {"modality_mean", "modality_sigma", "weights", "effective_weights", "effective_sample_size"} & columns
         assert found["no_maps"] is None
 
 

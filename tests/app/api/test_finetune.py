@@ -1,4 +1,4 @@
-"""Fine-tuning over HTTP: a run is a job, its child is held against the parent, and what becomes of it is remembered."""
+"""Fine-tuning over HTTP: options, runs, results, and saving the fine-tuned filter."""
 
 from __future__ import annotations
 
@@ -12,107 +12,110 @@ from urllib.parse import parse_qsl
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.api.finetune import Diary
-from beliefscope.app.server.main import Settings
+from beliefscope.app.jobs.finetune import ProgressLog
+from beliefscope.app.workspace.finetune_runs import FineTuneRuns
+from beliefscope.app.runs.settings import Settings
 from beliefscope.filters.checkpoint import load_checkpoint
 
-PATIENCE = 120.0  # s: a job imports PyTorch first
+TIMEOUT = 120.0  # s, including the import of PyTorch by a job
 URL = "/api/finetune/door/crossmodal-ekf"
 SMALL = {"train": ["haptics-only"], "steps": 4, "check": 2, "length": 8, "windows": 2}
-BLACK = {"slice": {"name": "black", "faults": [{"fault": "blackout", "probability": 1.0}]}, "share": 1.0}
+BLACKOUT = {"slice": {"name": "blackout", "faults": [{"fault": "blackout", "probability": 1.0}]}, "share": 1.0}
 
 
-def finished(client: TestClient, run: str) -> Any:
-    """The run, once its job has ended."""
-    end = time.monotonic() + PATIENCE
-    while (shown := client.get(f"/api/tuned/{run}").json())["job"]["state"] in ("waiting", "running"):
+def wait_for(client: TestClient, run: str) -> Any:
+    """The run when its job has ended."""
+    end = time.monotonic() + TIMEOUT
+    while (details := client.get(f"/api/tuned/{run}").json())["job"]["state"] in ("waiting", "running"):
         assert time.monotonic() < end
         time.sleep(0.05)
-    return shown
+    return details
 
 
 def filters(client: TestClient) -> list[str]:
     tasks = client.get("/api/catalog").json()["tasks"]
-    return [one["name"] for one in next(task for task in tasks if task["name"] == "door")["filters"]]
+    return [f["name"] for f in next(task for task in tasks if task["name"] == "door")["filters"]]
 
 
-def test_what_can_be_trained_is_a_tree_with_presets_and_slices(client: TestClient) -> None:
+def test_options(client: TestClient) -> None:
     offer = client.get(URL).json()
     assert offer["why_not"] is None
-    names = [one["name"] for one in offer["modules"]]
+    names = [m["name"] for m in offer["modules"]]
     assert {"dynamics", "virtual_sensors.haptics.state", "weight_model"} <= set(names)
-    presets = {one["name"]: one["trains"] for one in offer["presets"]}
+    presets = {p["name"]: p["trains"] for p in offer["presets"]}
     assert {"haptics-only", "image-only", "weights-only", "noise-only", "dynamics-only", "heads-only", "all"} <= set(
         presets
     )
     assert "virtual_sensors.haptics.state.weight" in presets["haptics-only"]
     assert not any(name.startswith("virtual_sensors.image") for name in presets["haptics-only"])
-    assert "haptics alone" in [one["name"] for one in offer["slices"]]
+    assert "haptics only" in [m["name"] for m in offer["slices"]]
     assert offer["runs"] == []
 
 
 @pytest.mark.long
-def test_a_child_is_made_held_against_its_parent_and_placed(
+def test_run_is_compared_with_its_base_and_saved(
     settings: Settings, open_client: Callable[..., TestClient]
 ) -> None:
-    parent = load_checkpoint(settings.checkpoints["crossmodal-ekf"])  # type: ignore[arg-type]
+    base = load_checkpoint(settings.checkpoints["crossmodal-ekf"])  # type: ignore[arg-type]
     with open_client(settings) as client:
         before = filters(client)
-        asked = client.post(URL, json=SMALL | {"mix": [BLACK]})
-        assert asked.status_code == 202, asked.text
-        run = asked.json()["run"]
-        assert client.post(f"/api/tuned/{run}/accept").status_code == 409
-        shown = finished(client, run)
-        assert shown["job"]["state"] == "done", shown["job"]
-        assert [step for step, _ in shown["progress"]["losses"]][-1] == 4
-        assert set(shown["progress"]["looks"][0]["slices"]) == {"nominal", "black"}
-        found, name = shown["found"], shown["child"]
-        assert found["child"]["name"] == name
-        assert "virtual_sensors.image" in found["frozen"]
-        assert "black" in {
-            row[0] for t in found["change"]["tables"] if t["title"].startswith("Errors") for row in t["rows"]
+        response = client.post(URL, json=SMALL | {"mix": [BLACKOUT]})
+        assert response.status_code == 202, response.text
+        run = response.json()["run"]
+        assert client.post(f"/api/tuned/{run}/promote").status_code == 409
+        details = wait_for(client, run)
+        assert details["job"]["state"] == "done", details["job"]
+        assert [step for step, _ in details["progress"]["losses"]][-1] == 4
+        assert set(details["progress"]["validations"][0]["slices"]) == {"clean", "blackout"}
+        result, name = details["result"], details["finetuned"]
+        assert result["finetuned"]["name"] == name
+        assert "virtual_sensors.image" in result["frozen"]
+        assert "blackout" in {
+            row[0] for t in result["comparison"]["tables"] if t["title"].startswith("Errors") for row in t["rows"]
         }
-        for moment in found["moments"]:
-            link = dict(parse_qsl(moment["link"][1:]))
-            alone = f"from=0&to={moment['last'] + 1}&weights={moment['only'][0]}%3D1" if moment["only"] else None
-            assert (link["filter"], link["against"]) == (name, alone or "filter=crossmodal-ekf")
-        path = settings.workspace / "finetune" / run / "child.safetensors"
-        assert load_checkpoint(path).record["parent"]["hash"] == parent.hash
+        for event in result["events"]:
+            link = dict(parse_qsl(event["link"][1:]))
+            weights = f"from=0&to={event['last'] + 1}&weights={event['only'][0]}%3D1" if event["only"] else None
+            assert (link["filter"], link["against"]) == (name, weights or "filter=crossmodal-ekf")
+        path = settings.workspace / "finetune" / run / "finetuned.safetensors"
+        assert load_checkpoint(path).record["base"]["hash"] == base.hash
         assert list((path.parent / "log").iterdir())
-        assert client.post(URL, json=SMALL | {"mix": [BLACK]}).json()["job"]["id"] == shown["job"]["id"]
+        assert client.post(URL, json=SMALL | {"mix": [BLACKOUT]}).json()["job"]["id"] == details["job"]["id"]
 
         assert filters(client) == before
-        assert client.post(f"/api/tuned/{run}/keep").json()["place"] == "kept"
+        assert client.post(f"/api/tuned/{run}/save").json()["saved_as"] == "saved"
         assert filters(client)[: len(settings.checkpoints) + 1] == [*settings.checkpoints, name]
-        assert client.post(f"/api/tuned/{run}/accept").json()["place"] == "default"
+        assert client.post(f"/api/tuned/{run}/promote").json()["saved_as"] == "default"
         assert filters(client)[0] == name
         assert client.get(f"/api/finetune/door/{name}").json()["runs"][0]["run"] == run
     with open_client(settings) as client:
-        assert filters(client)[0] == name, "another server on the same workspace shows it too"
-        assert client.post(f"/api/tuned/{run}/roll-back").json()["place"] is None
+        assert filters(client)[0] == name, "saved for later servers, too"
+        assert client.post(f"/api/tuned/{run}/discard").json()["saved_as"] is None
         assert filters(client) == before
         assert path.is_file()
         client.delete(f"/api/jobs/{shown['job']['id']}")
         again = client.get(f"/api/tuned/{run}").json()
-        assert (again["job"], again["found"]) == (None, found), "a child outlasts its job"
-    assert load_checkpoint(settings.checkpoints["crossmodal-ekf"]).hash == parent.hash  # type: ignore[arg-type]
+        assert (again["job"], again["result"]) == (None, result), "the result outlasts its job"
+    assert load_checkpoint(settings.checkpoints["crossmodal-ekf"]).hash == base.hash  # type: ignore[arg-type]
 
 
-def test_a_run_that_was_stopped_keeps_the_losses_of_its_steps(tmp_path: Path) -> None:
-    before = Diary(tmp_path, 9)
+def test_interrupted_run_keeps_its_losses(tmp_path: Path) -> None:
+    runs = FineTuneRuns(tmp_path)
+    runs.folder("run").mkdir(parents=True)
+    before = ProgressLog(runs, "run", 9)
     for step in range(1, 6):
-        before.step(step, 1.0 / step)
+        before.add_step(step, 1.0 / step)
     before.write()
-    after = Diary(tmp_path, 9)
-    after.resume(4)  # its last look; the fifth step is done anew
-    after.step(5, 0.25)
+    after = ProgressLog(runs, "run", 9)
+    after.resume(4)  # the last validation; the fifth step is repeated
+    after.add_step(5, 0.25)
     after.write()
-    losses = json.loads((tmp_path / "progress.json").read_text())["losses"]
+    losses = json.loads((runs.folder("run") / "progress.json").read_text())["losses"]
     assert losses == [[1, 1.0], [2, 0.5], [3, pytest.approx(1 / 3)], [4, 0.25], [5, 0.25]]
 
 
 @pytest.mark.parametrize(
-    ("body", "told"),
+    ("body", "message"),
     [
         ({"steps": 0}, "steps of a fine-tuning is 0"),
         ({"train": ["haptic-only"]}, "Did you mean haptics-only"),
@@ -120,13 +123,13 @@ def test_a_run_that_was_stopped_keeps_the_losses_of_its_steps(tmp_path: Path) ->
         ({"mix": [{"slice": {"name": "a", "only": ["touch"]}, "share": 1.0}]}, "Available: image, haptics"),
     ],
 )
-def test_what_cannot_be_is_said_before_a_job_is_made(client: TestClient, body: dict[str, Any], told: str) -> None:
+def test_invalid_settings_create_no_job(client: TestClient, body: dict[str, Any], message: str) -> None:
     answer = client.post(URL, json=body)
     assert answer.status_code == 400
-    assert told in answer.json()["error"]
+    assert message in answer.json()["error"]
     assert client.get("/api/jobs").json() == []
 
 
-def test_a_run_that_is_not_there_is_404(client: TestClient) -> None:
+def test_unknown_run_is_404(client: TestClient) -> None:
     assert client.get("/api/tuned/0123").status_code == 404
-    assert client.post("/api/tuned/0123/keep").status_code == 404
+    assert client.post("/api/tuned/0123/save").status_code == 404

@@ -16,14 +16,15 @@ import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 
 from beliefscope.app.api.live import PATIENCE
-from beliefscope.app.protocol.messages import columns, pictures
-from beliefscope.app.runs.trace_store import Selection, Settings
+from beliefscope.app.protocol.trace_format import camera_images, columns
+from beliefscope.app.runs.selection import Selection
+from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.failures.moments import failures_of
+from beliefscope.inspect.failures.events import failures_of
 from beliefscope.inspect.failures.step_scores import Survey
-from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_of
-from beliefscope.inspect.traces.live_file import GrowingReader, GrowingWriter
+from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_from_arrays
+from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter
 from beliefscope.recordings.read import read_recording
 
 STEPS = 24
@@ -32,7 +33,7 @@ SHOWN = "/api/trace/door/{}/9?data=live:run"
 
 def cut(whole: Trace, first: int, last: int) -> Trace:
     static = ("start_mean", "start_covariance")
-    return trace_of(header_of(whole), {n: a if n in static else a[first:last] for n, a in arrays_of(whole).items()})
+    return trace_from_arrays(header_of(whole), {n: a if n in static else a[first:last] for n, a in arrays_of(whole).items()})
 
 
 @pytest.fixture(scope="module", params=["crossmodal-ekf", "crossmodal-pf"])
@@ -59,8 +60,8 @@ def folder(settings: Any) -> Path:
 
 
 @pytest.fixture
-def writer(folder: Path, whole: Trace) -> Iterator[GrowingWriter]:
-    made = GrowingWriter(folder / "run.live", whole, expected=STEPS)
+def writer(folder: Path, whole: Trace) -> Iterator[LiveFileWriter]:
+    made = LiveFileWriter(folder / "run.live", whole, expected=STEPS)
     yield made
     made.close()
 
@@ -83,7 +84,7 @@ def values(head: dict[str, Any], buffer: bytes) -> dict[str, np.ndarray[Any, Any
 
 def expected(whole: Trace) -> dict[str, np.ndarray[Any, Any]]:
     said, buffer = columns(whole)
-    shown = pictures(whole)
+    shown = camera_images(whole)
     assert shown is not None
     return values({"columns": said, "pictures": shown.nbytes, "steps": len(whole)}, buffer + shown.tobytes())
 
@@ -94,14 +95,14 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> None:
         np.testing.assert_allclose(one[name], other[name], rtol=1e-5, atol=1e-7, err_msg=name)
 
 
-def test_pages_of_different_speeds_both_get_everything(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
+def test_pages_of_different_speeds_both_get_everything(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     """One asks after each step that is written, the other once in a while: its blocks are larger, nothing is lost."""
     got: dict[str, list[Any]] = {"fast": [], "slow": []}
     with client.websocket_connect("/api/live/run") as fast, client.websocket_connect("/api/live/run") as slow:
         for step in range(STEPS):
             writer.append(cut(whole, step, step + 1))
             head, buffer = ask(fast, step)
-            assert (head["first"], head["steps"], head["of"], head["state"]) == (step, 1, step + 1, "running")
+            assert (head["first"], head["steps"], head["total"], head["state"]) == (step, 1, step + 1, "running")
             got["fast"].append(values(head, buffer))
             if step % 8 == 7:
                 head, buffer = ask(slow, step - 7)
@@ -109,7 +110,7 @@ def test_pages_of_different_speeds_both_get_everything(client: TestClient, write
                 got["slow"].append(values(head, buffer))
         writer.finish()
         head, _ = ask(fast, STEPS)
-        assert (head["steps"], head["state"], head["told"]) == (0, "ended", "")
+        assert (head["steps"], head["state"], head["message"]) == (0, "ended", "")
     for blocks in got.values():
         same({name: np.concatenate([b[name] for b in blocks]) for name in blocks[0]}, expected(whole))
 
@@ -120,7 +121,7 @@ def test_a_page_that_does_not_ask_costs_nothing(address: str, settings: Any, who
 
     folder = settings.workspace / "live"
     folder.mkdir(parents=True)
-    writer = GrowingWriter(folder / "run.live", whole)
+    writer = LiveFileWriter(folder / "run.live", whole)
     with connect(f"ws://{address}/api/live/run", origin=f"http://{address}", max_size=None) as socket:  # type: ignore[arg-type]
         for _ in range(20):
             writer.append(whole)
@@ -134,7 +135,7 @@ def test_a_page_that_does_not_ask_costs_nothing(address: str, settings: Any, who
     writer.close()
 
 
-def test_one_message_is_bounded(client: TestClient, writer: GrowingWriter, whole: Trace, monkeypatch: Any) -> None:
+def test_one_message_is_bounded(client: TestClient, writer: LiveFileWriter, whole: Trace, monkeypatch: Any) -> None:
     """However long the run: the page asks again for the rest."""
     writer.append(whole)
     monkeypatch.setattr("beliefscope.app.api.live.BLOCK", 5 * writer_row(writer))
@@ -148,13 +149,13 @@ def test_one_message_is_bounded(client: TestClient, writer: GrowingWriter, whole
     same({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, expected(whole))
 
 
-def writer_row(writer: GrowingWriter) -> int:
-    reader = GrowingReader(writer.path)
+def writer_row(writer: LiveFileWriter) -> int:
+    reader = LiveFileReader(writer.path)
     reader.close()
     return reader.bytes_per_step
 
 
-def test_a_page_waits_until_a_step_comes(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
+def test_a_page_waits_until_a_step_comes(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     writer.append(cut(whole, 0, 1))
     with client.websocket_connect("/api/live/run") as socket:
         late = threading.Timer(0.3, writer.append, [cut(whole, 1, 2)])
@@ -168,7 +169,7 @@ def test_a_page_waits_until_a_step_comes(client: TestClient, writer: GrowingWrit
         assert time.monotonic() - started >= PATIENCE - 0.1
 
 
-def test_a_growing_run_is_shown_as_far_as_it_is(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
+def test_a_growing_run_is_shown_as_far_as_it_is(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     url = SHOWN.format(whole.filter)
     assert client.get(url).status_code == 202  # there is no step yet
     writer.append(cut(whole, 0, 10))
@@ -188,28 +189,28 @@ def test_a_growing_run_is_shown_as_far_as_it_is(client: TestClient, writer: Grow
     )
 
 
-def test_maps_of_a_growing_run_are_those_of_the_whole(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
+def test_maps_of_a_growing_run_are_those_of_the_whole(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     """Made of one step alone, as the newest must be; the same once it has ended."""
     writer.append(cut(whole, 0, 12))
-    library = client.app.state.library  # type: ignore[attr-defined]
+    store = client.app.state.store  # type: ignore[attr-defined]
     asked = Selection("door", whole.filter, 9, data="live:run")
-    growing = library.traced(asked)
-    assert growing.grows
+    growing = store.request(asked)
+    assert growing.growing
     maps = [growing.map(step, None, 41) for step in (0, 11)]
     writer.append(cut(whole, 12, STEPS))
     writer.finish()
-    ended = library.traced(asked)
-    assert not ended.grows
+    ended = store.request(asked)
+    assert not ended.growing
     for one in maps:
         np.testing.assert_allclose(
             one.log_likelihood, ended.map(one.step, None, 41).log_likelihood, rtol=1e-4, atol=1e-3
         )
 
 
-def test_the_list_tells_how_each_run_is(client: TestClient, writer: GrowingWriter, whole: Trace, folder: Path) -> None:
+def test_the_list_tells_how_each_run_is(client: TestClient, writer: LiveFileWriter, whole: Trace, folder: Path) -> None:
     """One goes on, one was killed at its step 4, one is no run at all; none keeps the others from being listed."""
     writer.append(cut(whole, 0, 3))
-    dead = GrowingWriter(folder / "dead.live", whole)
+    dead = LiveFileWriter(folder / "dead.live", whole)
     dead.append(cut(whole, 0, 5))
     dead.close()
     (folder / "torn.live").write_bytes(b"BsL\nnot a run")
@@ -221,9 +222,9 @@ def test_the_list_tells_how_each_run_is(client: TestClient, writer: GrowingWrite
         ("dead", "died"),
         ("torn", "damaged"),
     ]
-    assert (listed[0]["filter"], listed[0]["steps"], listed[0]["here"]) == (whole.filter, 3, True)
-    assert listed[1]["told"] == "Live run 'dead' ended without closing at step 4: its process is gone."
-    assert "torn.live" in listed[2]["told"]
+    assert (listed[0]["filter"], listed[0]["steps"], listed[0]["available"]) == (whole.filter, 3, True)
+    assert listed[1]["message"] == "Live run 'dead' stopped at step 4: its process has exited without closing the file."
+    assert "torn.live" in listed[2]["message"]
     assert client.get(SHOWN.format(whole.filter).replace("run", "dead")).json()["steps"] == 5
 
 
@@ -232,10 +233,10 @@ def test_a_filter_that_is_not_here_is_shown_without_its_networks(
 ) -> None:
     """Another hash: its Gaussians are drawn; a particle filter's networks cannot be asked."""
     other = replace(whole, checkpoint_hash="f" * 64)
-    writer = GrowingWriter(folder / "run.live", other)
+    writer = LiveFileWriter(folder / "run.live", other)
     writer.append(other)
     run = client.get("/api/live").json()["runs"][0]
-    assert (run["filter"], run["here"]) == (f"{whole.filter} (live)", False)
+    assert (run["filter"], run["available"]) == (f"{whole.filter} (live)", False)
     header = client.get(SHOWN.format(run["filter"])).json()
     assert (header["no_maps"] is None) == (whole.kind == "ekf")
     writer.finish()
@@ -246,7 +247,7 @@ def test_a_filter_that_is_not_here_is_shown_without_its_networks(
 def test_a_run_whose_truth_is_not_known(client: TestClient, folder: Path, whole: Trace) -> None:
     """Numbers of the truth are NaN and maps lie around the estimate; nothing fails."""
     blind = replace(whole, episode=replace(whole.episode, states=np.full_like(whole.episode.states, np.nan)))
-    writer = GrowingWriter(folder / "run.live", blind)
+    writer = LiveFileWriter(folder / "run.live", blind)
     writer.append(blind)
     with client.websocket_connect("/api/live/run") as socket:
         found = values(*ask(socket, 0))
@@ -270,7 +271,7 @@ def test_a_run_whose_truth_is_not_known(client: TestClient, folder: Path, whole:
     assert [score["total"] for score in found["scores"] if score["name"] == "error"] == [0]
 
 
-def test_what_cannot_be_asked_of_a_live_run(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
+def test_what_cannot_be_asked_of_a_live_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     writer.append(cut(whole, 0, 6))
     for url, said in {
         "/api/trace/door/image-ekf/9?data=live:run": "live run 'run' goes on",
@@ -286,7 +287,7 @@ def test_what_cannot_be_asked_of_a_live_run(client: TestClient, writer: GrowingW
         assert socket.receive()["code"] == 4000
 
 
-def test_another_filter_runs_over_a_run_that_has_ended(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
+def test_another_filter_runs_over_a_run_that_has_ended(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     writer.append(whole)
     writer.finish()
     url = "/api/trace/door/image-ekf/9?data=live:run"
@@ -297,19 +298,19 @@ def test_another_filter_runs_over_a_run_that_has_ended(client: TestClient, write
 
 
 def test_failures_of_a_run_that_has_ended_are_those_of_its_episode(
-    client: TestClient, writer: GrowingWriter, whole: Trace
+    client: TestClient, writer: LiveFileWriter, whole: Trace
 ) -> None:
     writer.append(whole)
     writer.finish()
     found = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
     assert (found["data"], found["steps"], found["faults"]) == ("live:run", STEPS, "")
     by_error = next(score for score in found["scores"] if score["name"] == "error")
-    expected = failures_of(Survey.of([whole]), "error").moments
-    assert [(m["step"], m["value"]) for m in by_error["moments"]] == [(m.step, m.score) for m in expected]
-    assert {m["episode"] for m in by_error["moments"]} == {9}
-    assert "data=live%3Arun" in by_error["moments"][0]["link"]
+    expected = failures_of(Survey.from_traces([whole]), "error").events
+    assert [(m["step"], m["value"]) for m in by_error["events"]] == [(m.step, m.score) for m in expected]
+    assert {m["episode"] for m in by_error["events"]} == {9}
+    assert "data=live%3Arun" in by_error["events"][0]["link"]
     asked = client.post(f"/api/failures/door/{whole.filter}?data=live:run")
-    assert "one episode, not a set of them" in asked.json()["error"]
+    assert "a single episode, not a data set" in asked.json()["error"]
 
 
 def until(client: TestClient, url: str) -> dict[str, Any]:
@@ -322,7 +323,7 @@ def until(client: TestClient, url: str) -> dict[str, Any]:
 
 
 def test_recorded_compared_and_diagnosed_as_any_run(
-    client: TestClient, writer: GrowingWriter, whole: Trace, settings: Any
+    client: TestClient, writer: LiveFileWriter, whole: Trace, settings: Any
 ) -> None:
     """A recording is of what there is by then; what needs the whole episode comes with its end."""
     asked = {"task": "door", "filter": whole.filter, "episode": 9, "data": "live:run", "maps": 4}
@@ -343,7 +344,7 @@ def test_recorded_compared_and_diagnosed_as_any_run(
     assert until(client, f"/api/diagnostics/{name}/{path}?data=live:run")["trajectories"] == 1
 
 
-def test_its_recording_is_sent_as_it_grows(client: TestClient, writer: GrowingWriter, whole: Trace) -> None:
+def test_its_recording_is_sent_as_it_grows(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     """Whole, though it grows while it is read; until the run has ended, not until the file has."""
     writer.append(cut(whole, 0, 1))
     recording = writer.path.with_suffix(".rrd")

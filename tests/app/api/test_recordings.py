@@ -1,4 +1,4 @@
-"""The library of recordings over HTTP: written, added, named, tagged, deleted and had back."""
+"""The store of recordings over HTTP: written, added, named, tagged, deleted and had back."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import rerun as rr
 from starlette.testclient import TestClient
 
 from beliefscope.app.api import recordings
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace import trash
-from beliefscope.app.workspace.recording_probe import About, Reader
+from beliefscope.app.workspace.recording_probe import RecordingInfo, RecordingProbe
 from beliefscope.app.workspace.recordings import checked
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
@@ -34,11 +34,11 @@ PATIENCE = 60.0  # s: a file is read by a process that imports Rerun first
 
 
 @pytest.fixture(scope="session")
-def own(given: Settings, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def own(base_settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A recording of the first filter's run over the second given episode, made elsewhere."""
-    checkpoint = load_checkpoint(Path(str(given.checkpoints["crossmodal-ekf"])))
-    with open_dataset(given.data["mine"], DOOR) as data:
-        run = trace(checkpoint, data[1], episode_index=1, seed=0, particles=given.particles)
+    checkpoint = load_checkpoint(Path(str(base_settings.checkpoints["crossmodal-ekf"])))
+    with open_dataset(base_settings.data["mine"], DOOR) as data:
+        run = trace(checkpoint, data[1], episode_index=1, seed=0, particles=base_settings.particles)
     return write_recording(run, tmp_path_factory.mktemp("own") / "run.rrd").read_bytes()
 
 
@@ -66,13 +66,13 @@ def folder(settings: Settings) -> Path:
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are read by the same function in this process, which has imported Rerun already."""
 
-    def read(self: Reader, path: Path) -> About:
+    def read(self: RecordingProbe, path: Path) -> RecordingInfo:
         try:
-            return About.of(describe(path), path)
+            return RecordingInfo.from_json(describe(path), path)
         except BadInput as error:
-            return About.of({"error": str(error)}, path)
+            return RecordingInfo.from_json({"error": str(error)}, path)
 
-    monkeypatch.setattr(Reader, "__call__", read)
+    monkeypatch.setattr(RecordingProbe, "__call__", read)
 
 
 HERE = pytest.mark.usefixtures("here")
@@ -89,7 +89,7 @@ def listed(client: TestClient) -> dict[str, dict[str, Any]]:
         time.sleep(0.05)
 
 
-def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str, settings: Settings) -> None:
+def test_a_recording_is_written_listed_and_read(client: TestClient, trace_url: str, settings: Settings) -> None:
     wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "faults": ""}
     answer = client.post("/api/recordings", json=wanted)
     assert answer.status_code == 201, answer.text
@@ -103,8 +103,8 @@ def test_a_recording_is_written_listed_and_read(client: TestClient, traced: str,
     part = client.get(made["url"], headers={"Range": "bytes=4-11"})
     assert (part.status_code, part.content) == (206, content[4:12])
     run = read_recording(settings.workspace / "recordings" / made["name"])
-    (offset,) = (c["offset"] for c in client.get(traced).json()["columns"] if c["name"] == "estimate_mean")
-    shown = np.frombuffer(client.get(f"{traced}/columns").content, "<f4", run.estimate_mean.size, offset)
+    (offset,) = (c["offset"] for c in client.get(trace_url).json()["columns"] if c["name"] == "estimate_mean")
+    shown = np.frombuffer(client.get(f"{trace_url}/columns").content, "<f4", run.estimate_mean.size, offset)
     np.testing.assert_array_equal(run.estimate_mean.ravel(), shown)
 
 
@@ -114,7 +114,7 @@ def test_nothing_of_it_is_left_when_the_server_has_ended(settings: Settings, ope
     assert not [one for one in threading.enumerate() if "recordings" in one.name]
 
 
-def test_a_recording_that_is_there_is_not_written_again(client: TestClient, traced: str, settings: Settings) -> None:
+def test_a_recording_that_is_there_is_not_written_again(client: TestClient, trace_url: str, settings: Settings) -> None:
     wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
     first = client.post("/api/recordings", json=wanted).json()
     path = settings.workspace / "recordings" / first["name"]
@@ -250,10 +250,10 @@ def test_a_file_made_to_do_harm_ends_its_reader_only(
     monkeypatch.setattr("sys.executable", "/bin/false")
     (folder / "bad.rrd").write_bytes(own)
     (found,) = listed(client).values()
-    assert "Reading it failed" in found["problem"]
+    assert "Reading the file failed" in found["problem"]
     answer = client.put(f"{URL}/x.rrd", content=own)
     assert answer.status_code == 400
-    assert "Reading it failed" in answer.json()["error"]
+    assert "Reading the file failed" in answer.json()["error"]
 
 
 @HERE
@@ -266,7 +266,7 @@ def test_names_and_tags_change_and_outlive_the_server(
         answer = client.patch(f"{URL}/a.rrd", json={"tags": ["paper", "Fig  3", "PAPER"]})
         assert answer.json()["tags"] == ["paper", "Fig 3"]
         taken = client.patch(f"{URL}/a.rrd", json={"name": "b"})
-        assert (taken.status_code, "'b.rrd' is there already" in taken.json()["error"]) == (409, True)
+        assert (taken.status_code, "'b.rrd' already exists" in taken.json()["error"]) == (409, True)
         assert client.put(f"{URL}/b.rrd", content=own).status_code == 409
         renamed = client.patch(f"{URL}/a.rrd", json={"name": "Tür (neu)"}).json()
         assert (renamed["name"], renamed["tags"]) == ("Tür (neu).rrd", ["paper", "Fig 3"])
@@ -342,7 +342,7 @@ def test_a_list_is_told_again_only_when_it_has_changed(client: TestClient, own: 
         client.delete(f"{URL}/a.rrd"),
     ):
         assert answer.status_code == 404
-        assert "is not there, or no longer" in answer.json()["error"]
+        assert "does not exist" in answer.json()["error"]
 
 
 @HERE
@@ -382,7 +382,7 @@ def test_links_and_files_under_way_are_no_recordings(
 
 @HERE
 def test_a_renamed_recording_is_not_written_again_and_a_namesake_is_not_taken_for_it(
-    client: TestClient, traced: str, own: bytes, folder: Path
+    client: TestClient, trace_url: str, own: bytes, folder: Path
 ) -> None:
     wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
     made = client.post(URL, json=wanted).json()
@@ -394,4 +394,4 @@ def test_a_renamed_recording_is_not_written_again_and_a_namesake_is_not_taken_fo
     other = client.post(URL, json=wanted)
     assert (other.status_code, other.json()["name"]) == (201, made["name"].replace(".rrd", "-2.rrd"))
     assert read_recording(folder / other.json()["name"]).filter == "crossmodal-pf"
-    assert json.loads((folder / ".about" / f"{other.json()['name']}.json").read_text())["made_as"] == made["name"]
+    assert json.loads((folder / ".about" / f"{other.json()['name']}.json").read_text())["original_name"] == made["name"]

@@ -11,7 +11,7 @@ from urllib.parse import parse_qs
 import numpy as np
 from starlette.testclient import TestClient
 
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint

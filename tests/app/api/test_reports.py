@@ -1,4 +1,4 @@
-"""Reports over HTTP: asked for, made by a job, and downloaded."""
+"""Reports over HTTP."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from typing import Any
 from httpx import Response
 from starlette.testclient import TestClient
 
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 
 ORIGIN = "http://localhost:8000"
-PATIENCE = 120.0  # s: a job imports PyTorch first
-WANTED = {"moments": [7, 40], "title": "Two moments"}
+TIMEOUT = 120.0  # s, including the import of PyTorch by a job
+OPTIONS = {"events": [7, 40], "title": "Two events"}
 
 
-def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
+def test_report_is_written_downloaded_deleted_and_restored(tmp_path: Path) -> None:
     app = create_app(Settings(tmp_path / "workspace"), warm=False)
     with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
 
-        def ask(**wanted: Any) -> Response:
+        def request_report(**options: Any) -> Response:
             params = {"data": "sample", "faults": "blackout=0.4"}
-            return client.post("/api/reports/door/crossmodal-ekf/9", params=params, json=WANTED | wanted)
+            return client.post("/api/reports/door/crossmodal-ekf/9", params=params, json=OPTIONS | options)
 
-        for wrong, status, said in (
-            ({"moments": [100]}, 400, "moment 100 does not exist: the run has steps 0 to 99"),
-            ({"moments": [-1]}, 422, "moments"),
-            ({"moments": list(range(30))}, 422, "at most 20"),
+        for options, status, message in (
+            ({"events": [100]}, 400, "event step 100 does not exist: the run has steps 0 to 99"),
+            ({"events": [-1]}, 422, "events"),
+            ({"events": list(range(30))}, 422, "at most 20"),
             ({"sections": ["all"]}, 422, "sections"),
         ):
-            answer = ask(**wrong)
-            assert (answer.status_code, said in answer.json()["error"]) == (status, True), answer.text
-        asked = ask()
-        assert asked.status_code == 202
-        job = asked.json()["job"]
+            answer = request_report(**options)
+            assert (answer.status_code, message in answer.json()["error"]) == (status, True), answer.text
+        response = request_report()
+        assert response.status_code == 202
+        job = response.json()["job"]
         assert client.get(f"/{job['link']}").status_code == 404
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while (job := client.get(f"/api/jobs/{job['id']}").json())["state"] in ("waiting", "running"):
             assert time.monotonic() < end
             time.sleep(0.1)
@@ -48,16 +48,16 @@ def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
         assert f"{ORIGIN}/?task=door&amp;filter=crossmodal-ekf&amp;data=sample&amp;episode=9&amp;step=" in page.text
         assert "faults=blackout%3D0.4" in page.text
         assert [f"episode=9&amp;step={step}" in page.text for step in (7, 40, 41)] == [True, True, False]
-        assert "--moment=7 --moment=40 --title &#x27;Two moments&#x27; -o report" in page.text
-        assert ask().json()["job"]["state"] == "done", "what is there is not made again"
+        assert "--event=7 --event=40 --title &#x27;Two events&#x27; -o report" in page.text
+        assert request_report().json()["job"]["state"] == "done", "an existing report is not written again"
         (listed,) = client.get("/api/reports").json()["reports"]
-        assert (f"/{job['link']}", "Two moments", None) == (listed["url"], listed["title"], listed["pdf"])
+        assert (f"/{job['link']}", "Two events", None) == (listed["url"], listed["title"], listed["pdf"])
         assert client.get(listed["url"].replace(".html", ".pdf")).status_code == 404
-        said = tuple(listed[key] for key in ("task", "filter", "episode", "faults"))
-        assert said == ("door", "crossmodal-ekf", 9, "blackout=0.4")
-        shown = client.get(listed["url"], params={"shown": "true"})
-        assert shown.headers["content-disposition"].startswith("inline")
-        assert shown.headers["content-security-policy"].startswith("sandbox")
+        run = tuple(listed[key] for key in ("task", "filter", "episode", "faults"))
+        assert run == ("door", "crossmodal-ekf", 9, "blackout=0.4")
+        inline = client.get(listed["url"], params={"shown": "true"})
+        assert inline.headers["content-disposition"].startswith("inline")
+        assert inline.headers["content-security-policy"].startswith("sandbox")
         id = client.delete(listed["url"]).json()["deleted"]
         assert client.get("/api/reports").json()["reports"] == []
         assert client.get(listed["url"]).status_code == 404
@@ -66,6 +66,6 @@ def test_a_report_is_made_and_downloaded(tmp_path: Path) -> None:
         assert client.get("/api/reports").json() == {"reports": [listed], "deleted": []}
         client.delete(listed["url"])
         assert client.delete("/api/reports/deleted").json() == {"freed": listed["bytes"]}
-        assert ask().json()["job"]["state"] in ("waiting", "running"), "what was deleted is made again"
+        assert request_report().json()["job"]["state"] in ("waiting", "running"), "a deleted report is written again"
         assert client.get("/api/reports/door-nosuch-episode9-00000000.html").status_code == 404
         assert client.post("/api/reports/door/nosuch/9").status_code in (400, 404)

@@ -1,4 +1,4 @@
-"""A study over HTTP: the one that ships, one that was given, and which of their checkpoints can be looked at."""
+"""Studies over HTTP: results, checkpoints, and training of unfinished cells."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.api.studies import FILE, SHIPPED, Study, studies_of
-from beliefscope.app.cli.commands.study import matrix, write
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.api.studies import all_studies
+from beliefscope.app.workspace.studies import FILE, SHIPPED, Study
+from beliefscope.app.cli.commands.study import _cells
+from beliefscope.recordings.study_figures import write_study
+from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
@@ -24,26 +26,26 @@ from beliefscope.filters.training.study import run_cell
 FILTER = "crossmodal-ekf"
 
 
-def results(hash_: str, **more: Any) -> dict[str, Any]:
-    """A study of one filter and two seeds, of which the second has no checkpoint yet."""
+def results(hash_: str, **fields: Any) -> dict[str, Any]:
+    """A study of one filter and two seeds; the second has no checkpoint."""
     row = {
         "task": "door",
         "filter": FILTER,
         "blackout": 0.4,
         "seeds": 1,
-        "asked": 2,
+        "requested": 2,
         "failed": 0,
         "mean": {"position_cm": 0.5, "nees": None},
         "spread": {"position_cm": None},
-        "each": {"0": {"position_cm": 0.5}},
+        "by_seed": {"0": {"position_cm": 0.5}},
     }
-    told = {"preset": "smoke", "tasks": {"door": {"data": "door.h5"}}, "seeds": 2, "rows": [row]}
-    return told | {"checkpoints": {f"door/{FILTER}/seed0": hash_}} | more
+    study = {"preset": "smoke", "tasks": {"door": {"data": "door.h5"}}, "seeds": 2, "rows": [row]}
+    return study | {"checkpoints": {f"door/{FILTER}/seed0": hash_}} | fields
 
 
 @pytest.fixture
 def folder(settings: Settings, tmp_path: Path) -> Path:
-    """Of a study whose checkpoint is not on the shelf: another one has that filter's name there."""
+    """Folder of a study whose checkpoint is not in the catalog; another one there has the same name."""
     cell = tmp_path / "mine" / "cells" / "door" / FILTER / "seed0.safetensors"
     cell.parent.mkdir(parents=True)
     shutil.copy(PRETRAINED / f"door-{FILTER}.safetensors", cell)
@@ -51,130 +53,130 @@ def folder(settings: Settings, tmp_path: Path) -> Path:
     return tmp_path / "mine"
 
 
-def named(client: TestClient, name: str) -> dict[str, Any]:
-    (study,) = (one for one in client.get("/api/studies").json()["studies"] if one["name"] == name)
+def find_study(client: TestClient, name: str) -> dict[str, Any]:
+    (study,) = (s for s in client.get("/api/studies").json()["studies"] if s["name"] == name)
     return study
 
 
-def test_the_study_that_ships_is_whole_and_says_which_weights_are_here(
+def test_built_in_study(
     settings: Settings, open_client: Callable[..., TestClient]
 ) -> None:
     with open_client(replace(settings, checkpoints={}, data={})) as client:
-        study = named(client, SHIPPED)
+        study = find_study(client, SHIPPED)
     assert [task["name"] for task in study["tasks"]] == ["door", "push"]
     for task in study["tasks"]:
-        shelf = {one["name"]: [seed["shelf"] for seed in one["trained"]] for one in task["filters"]}
-        assert len(shelf) == 12
-        for name, seeds in shelf.items():
-            ships = (PRETRAINED / f"{task['name']}-{name}.safetensors").is_file()
-            assert seeds == [name if ships else None, None, None]
+        names = {f["name"]: [seed["catalog_name"] for seed in f["trained"]] for f in task["filters"]}
+        assert len(names) == 12
+        for name, seeds in names.items():
+            built_in = (PRETRAINED / f"{task['name']}-{name}.safetensors").is_file()
+            assert seeds == [name if built_in else None, None, None]
         for row in task["rows"]:
             for key, mean in row["mean"].items():
-                each = [numbers[key] for numbers in row["each"].values()]
+                values = [numbers[key] for numbers in row["by_seed"].values()]
                 if mean is not None and row["blackout"] is not None:
-                    assert mean == pytest.approx(sum(each) / 3)
-                    assert min(each) <= mean <= max(each)
+                    assert mean == pytest.approx(sum(values) / 3)
+                    assert min(values) <= mean <= max(values)
 
 
-def test_a_checkpoint_of_a_study_is_put_on_the_shelf_once(
+def test_checkpoint_is_added_to_the_catalog_once(
     settings: Settings, folder: Path, open_client: Callable[..., TestClient]
 ) -> None:
     with open_client(replace(settings, studies={"mine": folder})) as client:
-        (task,) = named(client, "mine")["tasks"]
-        assert task["filters"] == [{"name": FILTER, "trained": [{"seed": 0, "shelf": None, "file": True}]}]
+        (task,) = find_study(client, "mine")["tasks"]
+        assert task["filters"] == [{"name": FILTER, "trained": [{"seed": 0, "catalog_name": None, "file": True}]}]
         url = f"/api/studies/mine/door/{FILTER}/0"
         opened = client.post(url).json()
         assert opened == {"filter": f"mine-{FILTER}-seed0"} == client.post(url).json()
-        (door,) = (one for one in client.get("/api/catalog").json()["tasks"] if one["name"] == "door")
-        assert [one["name"] for one in door["filters"]].count(opened["filter"]) == 1
-        (task,) = named(client, "mine")["tasks"]
-        assert task["filters"][0]["trained"][0]["shelf"] == opened["filter"]
+        (door,) = (t for t in client.get("/api/catalog").json()["tasks"] if t["name"] == "door")
+        assert [f["name"] for f in door["filters"]].count(opened["filter"]) == 1
+        (task,) = find_study(client, "mine")["tasks"]
+        assert task["filters"][0]["trained"][0]["catalog_name"] == opened["filter"]
         assert client.post(f"/api/studies/mine/door/{FILTER}/1").status_code == 404
         assert client.post(f"/api/studies/none/door/{FILTER}/0").status_code == 404
 
 
-def test_a_checkpoint_that_is_not_the_measured_one_is_refused(
+def test_checkpoint_with_another_hash_is_refused(
     settings: Settings, folder: Path, open_client: Callable[..., TestClient]
 ) -> None:
     (folder / FILE).write_text(json.dumps(results("0" * 64)))
     with open_client(replace(settings, studies={"mine": folder})) as client:
         answer = client.post(f"/api/studies/mine/door/{FILTER}/0")
     assert answer.status_code == 400
-    assert "is not the checkpoint that study 'mine' measured" in answer.json()["error"]
+    assert "is not the checkpoint that study 'mine' evaluated" in answer.json()["error"]
 
 
-def test_studies_of_the_workspace_come_after_those_given_and_before_the_one_that_ships(
+def test_order_of_studies(
     settings: Settings, folder: Path, open_client: Callable[..., TestClient]
 ) -> None:
     workspace = settings.workspace
     shutil.copytree(folder, workspace / "later")
     (workspace / "broken").mkdir()
     (workspace / "broken" / FILE).write_text("{}")
-    names = [one.name for one in studies_of({"mine": folder, "again": workspace / "later"}, workspace)]
-    assert names == ["mine", "again", "broken", SHIPPED], "one that was given is not found once more"
+    names = [study.name for study in all_studies({"mine": folder, "again": workspace / "later"}, workspace)]
+    assert names == ["mine", "again", "broken", SHIPPED], "studies are listed once"
     with open_client(replace(settings, studies={"mine": folder})) as client:
         answer = client.get("/api/studies").json()
-    assert [one["name"] for one in answer["studies"]] == ["mine", "later", SHIPPED]
+    assert [s["name"] for s in answer["studies"]] == ["mine", "later", SHIPPED]
     (problem,) = answer["problems"]
-    assert "broken/study.json' does not hold a study's results: preset" in problem
+    assert "broken/study.json' does not contain the results of a study: preset" in problem
 
 
 @pytest.mark.parametrize(
     "text", ["[]", "{", '"\\udcff"', json.dumps(results("", seeds=0)), json.dumps(results("")).replace("0.5", "NaN")]
 )
-def test_what_is_no_study_is_said_in_a_line(tmp_path: Path, text: str) -> None:
+def test_invalid_results_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / FILE).write_text(text)
-    with pytest.raises(BadInput, match="does not hold a study's results"):
-        Study("mine", tmp_path, checkpoints=True).read()
+    with pytest.raises(BadInput, match="does not contain the results of a study"):
+        Study("mine", tmp_path, has_checkpoints=True).read()
 
 
-def test_the_cells_that_are_left_are_trained_by_a_job(
+def test_job_trains_unfinished_cells(
     settings: Settings, tmp_path: Path, open_client: Callable[..., TestClient]
 ) -> None:
     folder = tmp_path / "mine"
     folder.mkdir()
-    cells = matrix("smoke", ["door"], ["haptics-ekf"], 2, [f"door={settings.data['mine']}"], False)
-    write(folder, cells, "smoke")  # none of them is trained
-    run_cell(cells[0], folder)  # by another process, after which the table was not written
+    cells = _cells("smoke", ["door"], ["haptics-ekf"], 2, [f"door={settings.data['mine']}"], False)
+    write_study(folder, cells, "smoke")
+    run_cell(cells[0], folder)  # without updating the table
     with open_client(replace(settings, studies={"mine": folder})) as client:
-        study = named(client, "mine")
-        assert (study["left"], study["cells"], study["job"], study["why_not"]) == (2, 2, None, "")
+        study = find_study(client, "mine")
+        assert (study["unfinished"], study["cells"], study["job"], study["why_not"]) == (2, 2, None, "")
         job = client.post("/api/studies/mine/cells").json()["job"]
-        assert named(client, "mine")["job"] == job["id"]
-        until = time.monotonic() + 400.0  # jobs run at a low priority
+        assert find_study(client, "mine")["job"] == job["id"]
+        deadline = time.monotonic() + 400.0  # jobs have a low priority
         while not (job := client.get(f"/api/jobs/{job['id']}").json())["ended"]:
-            assert time.monotonic() < until
+            assert time.monotonic() < deadline
             time.sleep(0.05)
         assert (job["state"], job["error"]) == ("done", "")
         assert client.get(f"/api/jobs/{job['id']}/result").json() == {"finished": [str(cells[1])]}
         assert all(cell.finished(folder) for cell in cells)
-        study = named(client, "mine")
-        assert (study["left"], [row["seeds"] for row in study["tasks"][0]["rows"]]) == (0, [2, 2, 2, 0])
+        study = find_study(client, "mine")
+        assert (study["unfinished"], [row["seeds"] for row in study["tasks"][0]["rows"]]) == (0, [2, 2, 2, 0])
         again = client.post("/api/studies/mine/cells")
         assert (again.status_code, again.json()["error"]) == (400, "all cells of study 'mine' are finished")
         cells[1].path(folder).unlink()
-        write(folder, cells, "smoke")
+        write_study(folder, cells, "smoke")
         assert client.post("/api/studies/mine/cells").json()["job"]["state"] in ("waiting", "running")
 
 
-def test_cells_that_cannot_be_trained_here_say_why(
+def test_reason_why_cells_cannot_be_trained(
     settings: Settings, folder: Path, open_client: Callable[..., TestClient]
 ) -> None:
-    def why(**more: Any) -> str:
-        left = {"cells": {f"door/{FILTER}/seed1": "missing"}} | more
-        (folder / FILE).write_text(json.dumps(results("", **left)))
-        shown = named(client, "mine")
+    def reason(**fields: Any) -> str:
+        fields = {"cells": {f"door/{FILTER}/seed1": "missing"}} | fields
+        (folder / FILE).write_text(json.dumps(results("", **fields)))
+        study = find_study(client, "mine")
         answer = client.post("/api/studies/mine/cells")
-        assert (answer.status_code, answer.json()["error"]) == (400, shown["why_not"])
-        return str(shown["why_not"])
+        assert (answer.status_code, answer.json()["error"]) == (400, study["why_not"])
+        return str(study["why_not"])
 
     with open_client(replace(settings, studies={"mine": folder})) as client:
-        assert why() == "no data set of this server is door.h5 (), on which door is trained: serve it with --data"
-        assert why(preset="huge").startswith("preset 'huge' does not exist")
+        assert reason() == "this server does not have door.h5 (), the training data of door: serve it with --data"
+        assert reason(preset="huge").startswith("preset 'huge' does not exist")
         hash_ = open_dataset(settings.data["mine"]).hash
-        known = {"tasks": {"door": {"data": "door.h5", "data_hash": hash_}}}
-        assert why(**known, cells={"push/lstm/seed0": "missing"}) == "study 'mine' does not say what push is trained on"
+        tasks = {"tasks": {"door": {"data": "door.h5", "data_hash": hash_}}}
+        assert reason(**tasks, cells={"push/lstm/seed0": "missing"}) == "study 'mine' does not name the training data of push"
         assert client.post("/api/studies/shipped/cells").status_code == 400
         assert client.post("/api/studies/none/cells").status_code == 404
         (folder / FILE).write_text(json.dumps(results("", cells={"../../door/seed0": "missing"})))
-        assert "does not hold a study's results: cells" in client.get("/api/studies").json()["problems"][0]
+        assert "does not contain the results of a study: cells" in client.get("/api/studies").json()["problems"][0]

@@ -13,7 +13,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope import __version__
-from beliefscope.app.server.main import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.trace import load_trace
 
@@ -44,17 +44,17 @@ def test_the_catalog_says_what_there_is(client: TestClient, steps: int) -> None:
     assert sample["episodes"][sample["first"]]["split"] == "test"
 
 
-def test_a_trace_comes_as_its_own_numbers(client: TestClient, traced: str, settings: Settings, steps: int) -> None:
-    header = client.get(traced).json()
+def test_a_trace_comes_as_its_own_numbers(client: TestClient, trace_url: str, settings: Settings, steps: int) -> None:
+    header = client.get(trace_url).json()
     (file,) = (settings.workspace / "traces").iterdir()
     trace = load_trace(file)
     assert header["steps"] == len(trace) == steps
     assert header["checkpoint_hash"] == trace.checkpoint_hash
     assert header["modalities"] == ["image", "haptics"]
-    got = columns(client, traced)
+    got = columns(client, trace_url)
     np.testing.assert_array_equal(got["truth"], trace.episode.states)
     np.testing.assert_array_equal(got["estimate_mean"], trace.estimate_mean)
-    np.testing.assert_array_equal(got["acting"], trace.acting)
+    np.testing.assert_array_equal(got["effective_weights"], trace.effective_weights)
     np.testing.assert_array_equal(got["contact"], trace.episode.contact)
     np.testing.assert_array_equal(got["force"], trace.episode.observations["force"])
     np.testing.assert_allclose(got["estimate_sigma"][:, 0] ** 2, trace.estimate_covariance[:, 0, 0], rtol=1e-5)
@@ -62,7 +62,7 @@ def test_a_trace_comes_as_its_own_numbers(client: TestClient, traced: str, setti
     np.testing.assert_allclose(
         got["effective_sample_size"], 1.0 / np.square(np.exp(trace.log_weights)).sum(axis=1), rtol=1e-4
     )
-    pictures = np.frombuffer(client.get(f"{traced}/images").content, np.uint8).reshape(steps, 32, 32)
+    pictures = np.frombuffer(client.get(f"{trace_url}/images").content, np.uint8).reshape(steps, 32, 32)
     np.testing.assert_array_equal(pictures, trace.episode.observations["image"])
 
 
@@ -74,44 +74,44 @@ def test_a_filter_without_particles_has_no_sample_size(client: TestClient) -> No
 
 
 def test_a_trace_outlives_the_server(
-    client: TestClient, traced: str, settings: Settings, open_client: OpenClient
+    client: TestClient, trace_url: str, settings: Settings, open_client: OpenClient
 ) -> None:
     (file,) = (settings.workspace / "traces").iterdir()
     written = file.stat().st_mtime_ns
     with open_client(settings) as again:
-        while again.get(traced).status_code == 202:
+        while again.get(trace_url).status_code == 202:
             pass
-        assert columns(again, traced).keys() == columns(client, traced).keys()
+        assert columns(again, trace_url).keys() == columns(client, trace_url).keys()
     assert file.stat().st_mtime_ns == written
 
 
-def test_a_damaged_trace_file_is_computed_again(traced: str, settings: Settings, open_client: OpenClient) -> None:
+def test_a_damaged_trace_file_is_computed_again(trace_url: str, settings: Settings, open_client: OpenClient) -> None:
     (file,) = (settings.workspace / "traces").iterdir()
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
     with open_client(settings) as again:
-        while (answer := again.get(traced)).status_code == 202:
+        while (answer := again.get(trace_url)).status_code == 202:
             pass
         assert answer.status_code == 200
     assert len(file.read_bytes()) == len(whole)
 
 
-def test_the_catalog_has_faults_that_can_be_asked_for(client: TestClient, traced: str) -> None:
+def test_the_catalog_has_faults_that_can_be_asked_for(client: TestClient, trace_url: str) -> None:
     tasks = {t["name"]: t for t in client.get("/api/catalog").json()["tasks"]}
     fault_sets = {r["name"]: r["faults"] for r in tasks["door"]["fault_presets"]}
-    assert fault_sets["40 % black pictures"] == "blackout=0.4"
-    assert {"force axis stuck", "effector off by 2 cm", "haptics dropped"} <= fault_sets.keys()
-    whole = client.get(f"{traced}/images").content
+    assert fault_sets["40 % image blackout"] == "blackout=0.4"
+    assert {"force axis stuck", "end-effector offset 2 cm", "haptics dropped"} <= fault_sets.keys()
+    whole = client.get(f"{trace_url}/images").content
     for faults in ("blackout=0.8", '[{"fault": "image_frozen", "from": 20}]'):
         query = {"faults": faults}
-        while (answer := client.get(traced, params=query)).status_code == 202:
+        while (answer := client.get(trace_url, params=query)).status_code == 202:
             pass
         assert answer.json()["faults"] == str(Faults.parse(faults))
-        broken = client.get(f"{traced}/images", params=query).content
+        broken = client.get(f"{trace_url}/images", params=query).content
         assert len(broken) == len(whole)
         assert broken != whole
-    assert client.get(traced).json()["faults"] == ""
-    assert client.get(f"{traced}/images").content == whole
+    assert client.get(trace_url).json()["faults"] == ""
+    assert client.get(f"{trace_url}/images").content == whole
 
 
 @pytest.mark.parametrize(
@@ -124,9 +124,9 @@ def test_the_catalog_has_faults_that_can_be_asked_for(client: TestClient, traced
         ("secret.json", "fault 'secret.json' does not exist"),
     ],
 )
-def test_a_bad_faults_is_one_readable_line(client: TestClient, traced: str, faults: str, said: str) -> None:
+def test_a_bad_faults_is_one_readable_line(client: TestClient, trace_url: str, faults: str, said: str) -> None:
     body = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "faults": faults}
-    answers = [client.get(traced + part, params={"faults": faults}) for part in ("", "/columns", "/images")]
+    answers = [client.get(trace_url + part, params={"faults": faults}) for part in ("", "/columns", "/images")]
     for answer in (*answers, client.post("/api/recordings", json=body)):
         assert answer.status_code == 400
         assert said in answer.json()["error"]
@@ -158,19 +158,19 @@ def test_what_is_not_there_is_said_in_json(client: TestClient, path: str) -> Non
     assert answer.json()["error"]
 
 
-def test_a_trace_is_fetched_once(client: TestClient, traced: str) -> None:
-    first = client.get(f"{traced}/columns")
-    again = client.get(f"{traced}/columns", headers={"If-None-Match": first.headers["etag"]})
+def test_a_trace_is_fetched_once(client: TestClient, trace_url: str) -> None:
+    first = client.get(f"{trace_url}/columns")
+    again = client.get(f"{trace_url}/columns", headers={"If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_data_sets_are_told_apart(client: TestClient, traced: str) -> None:
-    mine = columns(client, traced)["truth"]
+def test_data_sets_are_told_apart(client: TestClient, trace_url: str) -> None:
+    mine = columns(client, trace_url)["truth"]
     url = "/api/trace/door/crossmodal-pf/1?data="
     while (answer := client.get(f"{url}sample")).status_code == 202:
         pass
-    assert answer.json()["data_hash"] != client.get(traced).json()["data_hash"]
-    assert client.get(f"{url}mine").json()["data_hash"] == client.get(traced).json()["data_hash"]
+    assert answer.json()["data_hash"] != client.get(trace_url).json()["data_hash"]
+    assert client.get(f"{url}mine").json()["data_hash"] == client.get(trace_url).json()["data_hash"]
     assert answer.json()["steps"] != len(mine)
     answer = client.get(f"{url}yours")
     assert answer.status_code == 400

@@ -90,7 +90,7 @@ def test_a_damaged_weight_is_named(tmp_path: Path, place: Place, monkeypatch: py
     assert "door-crossmodal-ekf.safetensors, door-image-ekf.safetensors not as shipped" in found.says
 
 
-@pytest.mark.parametrize("gone", ["maps/maps.js", "styles/maps.css", "index.html"])
+@pytest.mark.parametrize("gone", ["maps/map_panel.js", "styles/maps.css", "index.html"])
 def test_a_page_that_lacks_a_file_is_seen(
     gone: str, tmp_path: Path, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:

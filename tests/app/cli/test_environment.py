@@ -13,7 +13,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.catalog import short_names
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import sample_path
 

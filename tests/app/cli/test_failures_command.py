@@ -10,8 +10,8 @@ from urllib.parse import parse_qs
 import pytest
 
 from beliefscope.app.cli.main import main
-from beliefscope.app.protocol.permalinks import moment_link
-from beliefscope.app.server.main import Settings
+from beliefscope.app.protocol.permalinks import permalink
+from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.simulation.door import DOOR
 
 Run = Callable[..., tuple[int, str, str]]
@@ -29,27 +29,27 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.fixture
-def line(given: Settings) -> list[object]:
+def line(base_settings: Settings) -> list[object]:
     """The command over the small data set."""
-    checkpoint, data = given.checkpoints["crossmodal-pf"], given.data["mine"]
+    checkpoint, data = base_settings.checkpoints["crossmodal-pf"], base_settings.data["mine"]
     return ["failures", "door", "--filter", checkpoint, "--data", data, "--particles", 30]
 
 
-def test_a_document_with_links(run: Run, line: list[object], given: Settings) -> None:
-    folder = given.checkpoints["crossmodal-pf"].parent.name
+def test_a_document_with_links(run: Run, line: list[object], base_settings: Settings) -> None:
+    folder = base_settings.checkpoints["crossmodal-pf"].parent.name
     code, out, _ = run(*line, "--all", "--by", "angle", "--faults", "blackout=0.4", "--top", 2, "--json", "-")
     assert code == 0
     document = json.loads(out)
     assert document["episodes"] == 2
-    assert 1 <= len(document["moments"]) <= 2
-    moment = document["moments"][0]
-    asked = {key: value for key, (value,) in parse_qs(moment["link"].removeprefix("?")).items()}
+    assert 1 <= len(document["events"]) <= 2
+    event = document["events"][0]
+    asked = {key: value for key, (value,) in parse_qs(event["link"].removeprefix("?")).items()}
     assert asked == {
         "task": "door",
         "filter": f"{folder}-crossmodal-pf",  # the bare name is that of the filter that ships
         "data": "door",
-        "episode": str(moment["episode"]),
-        "step": str(moment["step"]),
+        "episode": str(event["episode"]),
+        "step": str(event["step"]),
         "component": "angle",
         "weights": "raw",
         "track": "error",
@@ -70,17 +70,17 @@ def test_tables_and_whole_links(run: Run, line: list[object]) -> None:
 
 
 def test_only_one_group(run: Run, line: list[object]) -> None:
-    every = json.loads(run(*line, "--all", "--by", "ess", "--json", "-")[1])["moments"]
-    name = every[-1]["group"]
-    kept = json.loads(run(*line, "--all", "--by", "ess", "--group", name, "--json", "-")[1])["moments"]
-    assert kept == [moment for moment in every if moment["group"] == name]
+    every = json.loads(run(*line, "--all", "--by", "ess", "--json", "-")[1])["events"]
+    name = every[-1]["phase"]
+    kept = json.loads(run(*line, "--all", "--by", "ess", "--phase", name, "--json", "-")[1])["events"]
+    assert kept == [event for event in every if event["phase"] == name]
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--by", "eror"], "score of task 'door' 'eror' does not exist. Available: error, angle, nees, ess"),
-        (["--group", "contact"], "group 'contact' does not exist. Available: contact made"),
+        (["--phase", "contact"], "phase 'contact' does not exist. Available: contact made"),
         (["--top", "0"], "'0' is not a whole number of at least 1"),
     ],
 )
@@ -91,8 +91,8 @@ def test_what_is_wrong_is_said(run: Run, line: list[object], options: list[str],
 
 
 def test_a_link_keeps_any_name() -> None:
-    link = moment_link(DOOR, "my filter*~", "a&b=ü", 3, 4, "blackout=1:from=2,delay=image:steps=3", "regret")
+    link = permalink(DOOR, "my filter*~", "a&b=ü", 3, 4, "blackout=1:from=2,delay=image:steps=3", "regret")
     asked = {key: value for key, (value,) in parse_qs(link.removeprefix("?")).items()}
     assert (asked["filter"], asked["data"]) == ("my filter*~", "a&b=ü")
     assert asked["faults"] == "blackout=1:from=2,delay=image:steps=3"
-    assert asked["weights"] == "acting"
+    assert asked["weights"] == "effective"

@@ -24,8 +24,9 @@ from starlette.types import Receive, Scope, Send
 from beliefscope.app.cli.commands.serve import _opening
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.server import timeouts
-from beliefscope.app.server.main import Settings, create_app
-from beliefscope.app.server.timeouts import PatientProtocol
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.server.main import create_app
+from beliefscope.app.server.timeouts import HTTPProtocol
 
 PATIENCE = 60.0  # s
 
@@ -120,8 +121,8 @@ async def _says_yes(scope: Scope, receive: Receive, send: Send) -> None:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
     """Address of a server that waits half a second for the head of a request."""
-    monkeypatch.setattr(timeouts, "HEAD_PATIENCE", 0.5)
-    config = uvicorn.Config(_says_yes, port=0, log_level="error", http=PatientProtocol, lifespan="off")
+    monkeypatch.setattr(timeouts, "HEAD_TIMEOUT", 0.5)
+    config = uvicorn.Config(_says_yes, port=0, log_level="error", http=HTTPProtocol, lifespan="off")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
     thread.start()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beliefscope.app.protocol.messages import columns, header
+from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build

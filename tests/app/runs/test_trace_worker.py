@@ -1,85 +1,103 @@
-"""Filters run in a process of their own: a real one, killed, refused, and closed in the midst of a run."""
+"""Filters run in a worker process: identical traces, crashes, errors, shutdown, imports."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from beliefscope.app.runs.trace_store import Library, Selection, Settings
-from beliefscope.app.runs.trace_worker import Tracer
+from beliefscope.app.runs.filter_runner import RunRequest
+from beliefscope.app.runs.selection import Selection
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.trace_worker import TraceWorker
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.trace import arrays_of, header_of
 
-EPISODE = Selection("door", "crossmodal-pf", 1, data="mine")
-PATIENCE = 60.0  # s
+SELECTION = Selection("door", "crossmodal-pf", 1, data="mine")
+OTHER = Selection("door", "crossmodal-ekf", 0, data="mine")
+TIMEOUT = 60.0  # s
 
 
 @pytest.fixture
-def tracer() -> Iterator[Tracer]:
-    tracer = Tracer()
-    yield tracer
-    tracer.close()
+def worker() -> Iterator[TraceWorker]:
+    worker = TraceWorker()
+    worker.start()  # or the first run would be computed in this process
+    yield worker
+    worker.close()
 
 
 @pytest.fixture
-def library(settings: Settings, tracer: Tracer) -> Iterator[Library]:
-    library = Library(settings, tracer)
-    yield library
-    library.close()
+def store(settings: Settings, worker: TraceWorker) -> Iterator[TraceStore]:
+    store = TraceStore(settings, worker)
+    yield store
+    store.close()
 
 
-def pid(tracer: Tracer) -> int:
-    assert tracer._process is not None
-    return tracer._process.pid
+def pid(worker: TraceWorker) -> int:
+    assert worker._process is not None
+    return worker._process.pid
 
 
-def test_traces_are_those_of_this_process_and_a_killed_one_is_replaced(
-    library: Library, tracer: Tracer, settings: Settings
+def request(store: TraceStore, selection: Selection) -> RunRequest:
+    return store._run_request(selection, store.checkpoint(selection.task, selection.filter))
+
+
+def test_traces_are_identical_and_a_killed_worker_is_replaced(
+    store: TraceStore, worker: TraceWorker, settings: Settings
 ) -> None:
-    inside = Library(settings)
-    edited = EPISODE.against("from=5&to=10&faults=blackout")
-    for selection in (EPISODE, edited):
-        # By itself first: it reads the file that the other one writes.
-        ours = inside.traced(selection).trace
-        for file in (settings.workspace / "traces").iterdir():
-            file.unlink()
-        theirs = library.traced(selection).done.result(PATIENCE)
-        assert header_of(theirs) == header_of(ours)
-        for name, array in arrays_of(ours).items():
-            np.testing.assert_array_equal(arrays_of(theirs)[name], array, err_msg=name)
-    inside.close()
-    # The edit's file is gone: it is soon made again.
-    assert len(list((settings.workspace / "traces").iterdir())) == 1
+    local = TraceStore(replace(settings, workspace=settings.workspace / "local"))
+    for selection in (SELECTION, SELECTION.comparison("from=5&to=10&faults=blackout")):
+        expected = local.request(selection).trace
+        result = store.request(selection).result(TIMEOUT)
+        assert header_of(result) == header_of(expected)
+        for name, array in arrays_of(expected).items():
+            np.testing.assert_array_equal(arrays_of(result)[name], array, err_msg=name)
+    local.close()
+    assert len(list((settings.workspace / "traces").iterdir())) == 1, "traces of interventions are not kept"
 
-    first = pid(tracer)
-    os.kill(first, signal.SIGSTOP)  # in the midst of the next one
-    traced = library.traced(Selection("door", "crossmodal-ekf", 0, data="mine"))
+    first = pid(worker)
+    os.kill(first, signal.SIGSTOP)  # during the next run
+    run = store.request(OTHER)
     os.kill(first, signal.SIGKILL)
     with pytest.raises(RuntimeError, match=r"its process was ended by signal 9 \(SIGKILL\)"):
-        traced.done.result(PATIENCE)
-    assert len(library.traced(Selection("door", "crossmodal-ekf", 0, data="mine")).done.result(PATIENCE)) == 40
-    assert pid(tracer) != first
+        run.result(TIMEOUT)
+    assert len(store.request(OTHER).result(TIMEOUT)) == 40
+    assert pid(worker) != first
 
 
-def test_what_is_wrong_with_a_run_is_said_and_closing_ends_it(library: Library, tracer: Tracer) -> None:
-    order = (library.settings.to_json(), EPISODE.to_json() | {"filter": "none"}, library.settings.workspace / "x.trace")
-    with pytest.raises(BadInput, match=r"filter 'none' does not exist. Available: crossmodal-ekf"):
-        tracer.run(*order, lambda _: None)
-    os.kill(pid(tracer), signal.SIGSTOP)
-    traced = library.traced(EPISODE)
-    closing = threading.Thread(target=library.close)
+def test_errors_are_reported_and_close_ends_a_run(store: TraceStore, worker: TraceWorker) -> None:
+    invalid = request(store, SELECTION)
+    with pytest.raises(BadInput, match="'missing' does not exist"):
+        worker.run(replace(invalid, checkpoint="missing"), lambda _: None)
+    with pytest.raises(RuntimeError, match="RuntimeError: manual_seed"):
+        worker.run(replace(invalid, seed="text"), lambda _: None)  # type: ignore[arg-type]
+    os.kill(pid(worker), signal.SIGSTOP)
+    run = store.request(SELECTION)
+    closing = threading.Thread(target=store.close)
     closing.start()
-    closing.join(PATIENCE)
+    closing.join(TIMEOUT)
     assert not closing.is_alive()
-    with pytest.raises(RuntimeError, match=r"signal 9|the server is stopping"):  # begun before or after it was closed
-        traced.done.result(PATIENCE)
+    with pytest.raises(RuntimeError, match=r"signal 9|the server is stopping"):  # started before or after the close
+        run.result(TIMEOUT)
 
 
-def test_selections_travel() -> None:
-    for selection in (EPISODE, EPISODE.against("from=5&to=10&faults=blackout&weights=image=0.5")):
-        assert Selection.of_json(selection.to_json()) == selection
+def test_requests_survive_json(store: TraceStore) -> None:
+    for selection in (SELECTION, SELECTION.comparison("from=5&to=10&faults=blackout&weights=image=0.5")):
+        assert Selection.from_json(selection.to_json()) == selection
+        original = replace(request(store, selection), user_tasks=())
+        assert RunRequest.from_json(original.to_json() | {"user_tasks": ()}) == original
+
+
+def test_the_worker_imports_no_web_or_viewer_packages() -> None:
+    code = "import sys, beliefscope.app.runs.trace_worker; print([m for m in sys.argv[1:] if m in sys.modules])"
+    packages = ["fastapi", "starlette", "uvicorn", "viser", "rerun", "matplotlib", "beliefscope.app.runs.trace_store"]
+    output = subprocess.run([sys.executable, "-c", code, *packages], capture_output=True, text=True, check=True).stdout
+    assert output == "[]\n"

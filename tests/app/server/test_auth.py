@@ -13,8 +13,9 @@ from fastapi import FastAPI
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from beliefscope.app.server import logs
-from beliefscope.app.server.auth import PERIOD, SHORTEST, TRIES, VARIABLE, Access, SignIn, TooMany, names_of, token_for
-from beliefscope.app.server.main import Settings, create_app, serve
+from beliefscope.app.server.auth import PERIOD, MIN_LENGTH, MAX_ATTEMPTS, VARIABLE, Access, SignIn, TooManyAttempts, host_names, token_for
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.server.main import create_app, serve
 from beliefscope.datasets.errors import BadInput
 
 TOKEN = "k7-Zq0_long-enough-to-be-one"
@@ -120,7 +121,7 @@ def test_with_a_token_the_machine_is_known_by_its_addresses(client: TestClient) 
 
 def test_who_guesses_has_to_wait(client: TestClient) -> None:
     signed_in(client)
-    for _ in range(TRIES):
+    for _ in range(MAX_ATTEMPTS):
         assert client.get("/api/jobs", headers={"Authorization": "Bearer wrong"}).status_code == 401
     answer = client.get("/api/jobs", headers=BEARER)
     assert answer.status_code == 429
@@ -131,9 +132,9 @@ def test_who_guesses_has_to_wait(client: TestClient) -> None:
 def test_waiting_is_by_address_and_ends() -> None:
     now = [0.0]
     sign_in = SignIn(TOKEN, clock=lambda: now[0])
-    for _ in range(TRIES):
+    for _ in range(MAX_ATTEMPTS):
         assert not sign_in.accepts("wrong", "10.0.0.7")
-    with pytest.raises(TooMany):
+    with pytest.raises(TooManyAttempts):
         sign_in.accepts(TOKEN, "10.0.0.7")
     assert sign_in.accepts(TOKEN, "10.0.0.8")
     now[0] = PERIOD + 1.0
@@ -150,9 +151,9 @@ def test_addresses_are_not_remembered_without_end() -> None:
 def test_nobody_locks_out_who_shares_an_address() -> None:
     own = token_for("0.0.0.0", False, {})
     sign_in = SignIn(own)
-    for _ in range(TRIES):
+    for _ in range(MAX_ATTEMPTS):
         assert not sign_in.accepts("wrong", "10.0.0.7")
-    with pytest.raises(TooMany):
+    with pytest.raises(TooManyAttempts):
         sign_in.accepts("wrong", "10.0.0.7")
     assert sign_in.accepts(own, "10.0.0.7")
     assert not sign_in.accepts(own.swapcase(), "10.0.0.8")
@@ -174,7 +175,7 @@ def test_on_the_loopback_there_is_one_where_it_is_asked_for() -> None:
         assert token_for(host, False, {VARIABLE: TOKEN}) == TOKEN
 
 
-@pytest.mark.parametrize("token", ["short", "x" * (SHORTEST - 1), "with spaces in between", "über-lange-geheime-worte"])
+@pytest.mark.parametrize("token", ["short", "x" * (MIN_LENGTH - 1), "with spaces in between", "über-lange-geheime-worte"])
 def test_a_token_that_could_be_guessed_is_none(token: str) -> None:
     with pytest.raises(BadInput, match=VARIABLE) as error:
         token_for("127.0.0.1", False, {VARIABLE: token})
@@ -182,15 +183,15 @@ def test_a_token_that_could_be_guessed_is_none(token: str) -> None:
 
 
 def test_the_printed_name_can_be_opened() -> None:
-    assert names_of("lab") == ("lab",)
-    assert names_of("0.0.0.0")[0] != "0.0.0.0"
+    assert host_names("lab") == ("lab",)
+    assert host_names("0.0.0.0")[0] != "0.0.0.0"
 
 
 @pytest.mark.parametrize("form", logs.FORMATS)
 @pytest.mark.usefixtures("restored")
 def test_the_log_never_holds_it(client: TestClient, form: str) -> None:
     stream = io.StringIO()
-    logs.begin("debug", form, TOKEN, stream)
+    logs.configure("debug", form, TOKEN, stream)
     client.get("/", params={"token": "a-wrong-one-of-mine"})
     client.get(f"/api/{TOKEN}", headers={"Host": f"{TOKEN}.example"})
     signed_in(client).get("/api/jobs")

@@ -22,14 +22,15 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from beliefscope.app.api import recordings
-from beliefscope.app.runs import selection as selection_module
-from beliefscope.app.runs import trace_store as library_module
-from beliefscope.app.runs.selection import Traced
-from beliefscope.app.runs.trace_store import TRACES_IN_MEMORY, Library, Selection
-from beliefscope.app.server.main import Settings
-from beliefscope.app.views.scheduler import Desk, Turns
-from beliefscope.app.views.view import AHEAD, Views
-from beliefscope.app.workspace.recording_probe import About, Reader
+from beliefscope.app.runs import trace_store, traced_run
+from beliefscope.app.runs.traced_run import TracedRun
+from beliefscope.app.runs.selection import Selection
+from beliefscope.app.runs.trace_store import TRACES_IN_MEMORY, TraceStore
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
+from beliefscope.app.views.registry import Views
+from beliefscope.app.views.view import PREFETCH_STEPS
+from beliefscope.app.workspace.recording_probe import RecordingInfo, RecordingProbe
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 
@@ -37,10 +38,10 @@ PATIENCE = 30.0  # s
 
 
 @pytest.fixture
-def library(settings: Settings) -> Iterator[Library]:
-    library = Library(settings)
-    yield library
-    library.close()
+def store(settings: Settings) -> Iterator[TraceStore]:
+    store = TraceStore(settings)
+    yield store
+    store.close()
 
 
 def broken(number: int, filter_: str = "crossmodal-ekf") -> Selection:
@@ -48,10 +49,10 @@ def broken(number: int, filter_: str = "crossmodal-ekf") -> Selection:
     return Selection("door", filter_, 1, Faults.parse(f"blackout=0.{number:02d}"))
 
 
-def opened(library: Library, count: int) -> list[weakref.ref[Traced]]:
+def opened(store: TraceStore, count: int) -> list[weakref.ref[TracedRun]]:
     found = []
     for number in range(1, count + 1):
-        traced = library.traced(broken(number))
+        traced = store.request(broken(number))
         traced.result(PATIENCE)
         found.append(weakref.ref(traced))
     return found
@@ -62,46 +63,46 @@ def living(refs: list[weakref.ref[Any]]) -> int:
     return sum(ref() is not None for ref in refs)
 
 
-def test_memory_holds_the_newest_traces_not_all_that_were_opened(library: Library) -> None:
-    refs = opened(library, TRACES_IN_MEMORY + 4)
+def test_memory_holds_the_newest_traces_not_all_that_were_opened(store: TraceStore) -> None:
+    refs = opened(store, TRACES_IN_MEMORY + 4)
     # The thread that traced the last one may not have let go of it yet.
     assert TRACES_IN_MEMORY <= living(refs) <= TRACES_IN_MEMORY + 1
     assert refs[-1]() is not None
     assert refs[0]() is None
 
 
-def test_large_traces_count_by_their_bytes(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(library_module, "BYTES_IN_MEMORY", 1)
-    assert living(opened(library, 4)) <= 2
-    assert library.there(broken(4)) is not None
+def test_large_traces_count_by_their_bytes(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trace_store, "BYTES_IN_MEMORY", 1)
+    assert living(opened(store, 4)) <= 2
+    assert store.cached(broken(4)) is not None
 
 
-def test_a_trace_that_somebody_shows_stays_and_is_the_others_too(library: Library) -> None:
-    shown = library.traced(broken(90))
+def test_a_trace_that_somebody_shows_stays_and_is_the_others_too(store: TraceStore) -> None:
+    shown = store.request(broken(90))
     shown.result(PATIENCE)
-    opened(library, TRACES_IN_MEMORY + 1)
-    assert library.traced(broken(90)) is shown
+    opened(store, TRACES_IN_MEMORY + 1)
+    assert store.request(broken(90)) is shown
 
 
-def test_names_of_what_was_opened_are_forgotten(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(library_module, "KEYS_KEPT", 3)
-    keys = [library.key(broken(number)) for number in range(1, 8)]
-    assert len(library._keys) == 3
-    assert [library.key(broken(number)) for number in range(1, 8)] == keys
+def test_names_of_what_was_opened_are_forgotten(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trace_store, "MAX_KEYS", 3)
+    keys = [store.key(broken(number)) for number in range(1, 8)]
+    assert len(store._keys) == 3
+    assert [store.key(broken(number)) for number in range(1, 8)] == keys
 
 
 def test_so_many_runs_wait_and_no_more(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(library_module, "RUNS_WAITING", 3)
-    served: Library = client.app.state.library  # type: ignore[attr-defined]
+    monkeypatch.setattr(trace_store, "MAX_WAITING", 3)
+    served: TraceStore = client.app.state.store  # type: ignore[attr-defined]
     go_on = threading.Event()
-    served._tracing.submit(go_on.wait, PATIENCE)
+    served._executor.submit(go_on.wait, PATIENCE)
     asked = [client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": f"blackout=0.{i}"}) for i in range(1, 6)]
     assert [answer.status_code for answer in asked] == [202, 202, 202, 429, 429]
-    assert "3 runs of filters wait already" in asked[-1].json()["error"]
+    assert "3 filter runs are waiting already" in asked[-1].json()["error"]
     assert client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": "blackout=0.3"}).status_code == 202
     assert client.get("/api/trace/door/crossmodal-ekf/1/columns", params={"faults": "blackout=0.3"}).status_code == 202
     go_on.set()
-    served.traced(broken(30)).result(PATIENCE)
+    served.request(broken(30)).result(PATIENCE)
     assert client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": "blackout=0.5"}).status_code in (200, 202)
 
 
@@ -110,11 +111,11 @@ def test_recordings_that_are_read_for_long_hold_up_nobody_else(
 ) -> None:
     go_on = threading.Event()
 
-    def slow(_: Reader, path: Path) -> About:
+    def slow(_: RecordingProbe, path: Path) -> RecordingInfo:
         go_on.wait(PATIENCE)
-        return About(problem="read at last")
+        return RecordingInfo(problem="read at last")
 
-    monkeypatch.setattr(Reader, "__call__", slow)
+    monkeypatch.setattr(RecordingProbe, "__call__", slow)
     headers = {"Origin": f"http://{address}"}
 
     def put(number: int) -> int:
@@ -145,22 +146,22 @@ def test_what_others_add_meanwhile_leaves_no_room(client: TestClient, monkeypatc
     free = iter([recordings.SPARED + 10**9, *[recordings.SPARED - 1] * 10])
     monkeypatch.setattr(recordings, "disk", lambda _: next(free))
     monkeypatch.setattr(recordings, "LOOK", 1000)
-    folder = client.app.state.library.settings.workspace / "recordings"  # type: ignore[attr-defined]
+    folder = client.app.state.store.settings.workspace / "recordings"  # type: ignore[attr-defined]
     answer = client.put("/api/recordings/x.rrd", content=(b"RRF2" + bytes(596) for _ in range(10)))
     assert answer.status_code == 413
     assert not list(folder.iterdir())
 
 
-def test_maps_are_made_once_for_all_who_look(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
-    traced = library.traced(broken(1, "crossmodal-pf"))
+def test_maps_are_made_once_for_all_who_look(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    traced = store.request(broken(1, "crossmodal-pf"))
     traced.result(PATIENCE)
-    one = traced.wired(3, None, 41)
-    assert traced.wired(3, None, 41) is one
-    assert traced.wired(3, 0.1, 41) is not one
+    one = traced.encoded_maps(3, None, 41)
+    assert traced.encoded_maps(3, None, 41) is one
+    assert traced.encoded_maps(3, 0.1, 41) is not one
     assert one.message(5)[4:].startswith(b'{"type": "maps", "serial": 5, "other": false, "step": 3')
-    monkeypatch.setattr(selection_module, "MAPS_IN_MEMORY", 3 * one.nbytes)
+    monkeypatch.setattr(traced_run, "MAP_CACHE_BYTES", 3 * one.nbytes)
     for step in range(10):
-        traced.wired(step, None, 41)
+        traced.encoded_maps(step, None, 41)
     assert len(traced._kept) == 3
     assert traced._kept_bytes == sum(kept.nbytes for kept in traced._kept.values())
 
@@ -168,14 +169,14 @@ def test_maps_are_made_once_for_all_who_look(library: Library, monkeypatch: pyte
 def test_while_a_hand_rests_the_maps_about_it_are_made(client: TestClient) -> None:
     view = client.post("/api/views").json()
     chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1}
-    served: Library = client.app.state.library  # type: ignore[attr-defined]
+    served: TraceStore = client.app.state.store  # type: ignore[attr-defined]
     with client.websocket_connect(view["socket"]) as socket:
         socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **chosen})
         assert len(socket.receive_bytes()) > 0
-        traced = served.traced(Selection("door", "crossmodal-ekf", 1))
-        assert traced.unmade(3, 0.1, 4) == [3, 2, 4, 1]
+        traced = served.request(Selection("door", "crossmodal-ekf", 1))
+        assert traced.missing_maps(3, 0.1, 4) == [3, 2, 4, 1]
         until = time.monotonic() + PATIENCE
-        while traced.unmade(3, None, AHEAD):
+        while traced.missing_maps(3, None, PREFETCH_STEPS):
             assert time.monotonic() < until
             time.sleep(0.01)
 
@@ -205,36 +206,36 @@ def test_a_closed_view_leaves_nothing_behind(open_client: Callable[..., TestClie
 
 def test_one_page_too_many_is_told_how_many_there_may_be(settings: Settings) -> None:
     async def scenario() -> str:
-        views = Views(Library(settings), limit=1)
+        views = Views(TraceStore(settings), limit=1)
         (await views.open(False)).idle_since = None  # its page is there
         with pytest.raises(BadInput) as told:
             await views.open(False)
         await views.close()
         return str(told.value)
 
-    assert asyncio.run(scenario()).startswith("As many pages are open already as this server shows at a time, 1;")
+    assert asyncio.run(scenario()).startswith("The maximum number of pages is open, 1.")
 
 
 def test_the_desk_takes_what_is_due_first_and_never_two_that_need_the_same() -> None:
     async def scenario() -> tuple[list[str], int]:
-        desk, go_on = Desk(threads=1), threading.Event()
+        desk, go_on = DeadlineExecutor(threads=1), threading.Event()
         order: list[str] = []
-        first = asyncio.ensure_future(desk.do(lambda: go_on.wait(PATIENCE), 0.0))
+        first = asyncio.ensure_future(desk.run(lambda: go_on.wait(PATIENCE), 0.0))
         await asyncio.sleep(0)  # it is taken up, and the others queue
         others = [
-            asyncio.ensure_future(desk.do(lambda name=name: order.append(name), within))  # type: ignore[misc]
+            asyncio.ensure_future(desk.run(lambda name=name: order.append(name), within))  # type: ignore[misc]
             for name, within in (("fine", 3.0), ("scene", 2.0), ("coarse", 1.0), ("late scene", 2.5))
         ]
         await asyncio.sleep(0)
         others[3].cancel()  # whose page has gone meanwhile
         await asyncio.sleep(0.01)
-        assert 0.01 <= desk.late() < PATIENCE, "of the first, which was due at once"
+        assert 0.01 <= desk.overdue() < PATIENCE, "of the first, which was due at once"
         go_on.set()
         await asyncio.gather(first, *others[:3])
-        assert desk.late() == 0.0
+        assert desk.overdue() == 0.0
         desk.close()
 
-        desk, inside, most = Desk(threads=4), [0], [0]
+        desk, inside, most = DeadlineExecutor(threads=4), [0], [0]
 
         def alone() -> None:
             inside[0] += 1
@@ -242,7 +243,7 @@ def test_the_desk_takes_what_is_due_first_and_never_two_that_need_the_same() -> 
             threading.Event().wait(0.002)
             inside[0] -= 1
 
-        await asyncio.gather(*(desk.do(alone, 0.0, frozenset({"engine"})) for _ in range(20)))
+        await asyncio.gather(*(desk.run(alone, 0.0, frozenset({"engine"})) for _ in range(20)))
         desk.close()
         return order, most[0]
 
@@ -251,7 +252,7 @@ def test_the_desk_takes_what_is_due_first_and_never_two_that_need_the_same() -> 
 
 def test_one_after_the_other_has_its_turn_and_a_rest_follows_each_even_a_failed_one() -> None:
     async def scenario() -> list[tuple[str, float]]:
-        turns, told = Turns(rest=2.0), []
+        turns, told = FairLock(pause=2.0), []
 
         async def one(name: str) -> None:
             async with turns:
@@ -274,13 +275,13 @@ def test_one_after_the_other_has_its_turn_and_a_rest_follows_each_even_a_failed_
 
 def test_the_desk_gives_back_errors_and_refuses_when_it_is_closed() -> None:
     async def scenario() -> None:
-        desk = Desk(threads=1)
+        desk = DeadlineExecutor(threads=1)
         with pytest.raises(ZeroDivisionError):
-            await desk.do(lambda: 1 / 0, 0.0)
-        assert await desk.do(lambda: 3, 0.0) == 3
+            await desk.run(lambda: 1 / 0, 0.0)
+        assert await desk.run(lambda: 3, 0.0) == 3
         desk.close()
         with pytest.raises(RuntimeError, match="stopping"):
-            await desk.do(lambda: 3, 0.0)
+            await desk.run(lambda: 3, 0.0)
 
     asyncio.run(scenario())
 
@@ -289,13 +290,13 @@ def test_a_browser_that_never_reads_costs_no_more_than_what_is_on_its_way(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[int] = []
-    real = Traced.wired
+    real = TracedRun.encoded_maps
 
-    def counted(self: Traced, step: int, angle: float | None, size: int) -> Any:
+    def counted(self: TracedRun, step: int, angle: float | None, size: int) -> Any:
         made.append(step)
         return real(self, step, angle, size)
 
-    monkeypatch.setattr(Traced, "wired", counted)
+    monkeypatch.setattr(TracedRun, "encoded_maps", counted)
     origin = Origin(f"http://{address}")
 
     def view() -> str:

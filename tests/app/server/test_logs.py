@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.server import logs
-from beliefscope.app.server.logs import REFUSED, Enough
+from beliefscope.app.server.logs import MAX_REFUSALS, RefusalLimit
 
 log = logging.getLogger("beliefscope.app")
 
@@ -25,7 +25,7 @@ def written(request: pytest.FixtureRequest) -> Iterator[io.StringIO]:
     names = ("beliefscope", "uvicorn.error")
     before = [(logger.handlers, logger.level) for logger in map(logging.getLogger, names)]
     stream = io.StringIO()
-    logs.begin("info", request.param, stream=stream)
+    logs.configure("info", request.param, stream=stream)
     yield stream
     for name, (handlers, level) in zip(names, before, strict=True):
         logging.getLogger(name).handlers = handlers
@@ -83,18 +83,18 @@ def test_what_is_refused_is_told_with_its_reason(written: io.StringIO, client: T
 
 def test_refusals_do_not_fill_the_log() -> None:
     now = [0.0]
-    enough = Enough(clock=lambda: now[0])
+    enough = RefusalLimit(clock=lambda: now[0])
 
     def record(text: str) -> logging.LogRecord:
         return logging.LogRecord("beliefscope.app", logging.WARNING, "", 0, text, None, None)
 
     lines = ("refused: no", "Invalid HTTP request received.")  # the second is uvicorn's
-    assert sum(enough.filter(record(lines[i % 2])) for i in range(10 * REFUSED)) == REFUSED
+    assert sum(enough.filter(record(lines[i % 2])) for i in range(10 * MAX_REFUSALS)) == MAX_REFUSALS
     assert enough.filter(record("job ended"))
     now[0] = 61.0
     after = record("refused: no")
     assert enough.filter(after)
-    assert after.event["left_out_before"] == 9 * REFUSED  # type: ignore[attr-defined]
+    assert after.event["left_out_before"] == 9 * MAX_REFUSALS  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("written", ["json"], indirect=True)

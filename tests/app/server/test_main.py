@@ -18,7 +18,7 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 
 from beliefscope.app.server.auth import Access
-from beliefscope.app.server.main import PAGE, Settings, _bound, serve
+from beliefscope.app.server.main import PAGE, Settings, _listen, serve
 from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.vendor_files import RerunViewer, installed, without_names
 from beliefscope.datasets.errors import BadInput
@@ -133,7 +133,7 @@ def test_a_busy_port_is_one_clear_line(settings: Settings) -> None:
 
 def test_small_messages_are_not_held_back() -> None:
     # What asyncio looks at before it switches off Nagle's algorithm: without it, a frame waits 40 ms for its scene.
-    with _bound("127.0.0.1", 0) as listener:
+    with _listen("127.0.0.1", 0) as listener:
         assert listener.proto == socket.IPPROTO_TCP
 
 

@@ -15,7 +15,8 @@ from starlette.websockets import WebSocketDisconnect
 
 from beliefscope.app.server import security
 from beliefscope.app.server.auth import Access
-from beliefscope.app.server.main import Settings, create_app
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.server.main import create_app
 from beliefscope.app.server.security import MAX_BODY, Guard
 
 JSON = {"content-type": "application/json"}

@@ -28,9 +28,9 @@ from websockets.sync.client import connect
 
 from beliefscope.app.jobs import queue as jobs_module
 from beliefscope.app.jobs.queue import Job, Jobs
-from beliefscope.app.runs.trace_store import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
-from beliefscope.app.views.view import Views
+from beliefscope.app.views.registry import Views
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
@@ -149,12 +149,12 @@ def apart(*works: Callable[[], object], user: int | None = None) -> list[str]:
     return lines
 
 
-def test_a_server_with_a_full_disk_says_so_and_goes_on(client: TestClient, traced: str, settings: Settings) -> None:
+def test_a_server_with_a_full_disk_says_so_and_goes_on(client: TestClient, trace_url: str, settings: Settings) -> None:
     with room_for(100):
         refused = client.post("/api/failures/door/crossmodal-pf")
         assert refused.status_code == 400
         assert "cannot write" in refused.json()["error"]
-        assert client.get(traced).status_code == 200
+        assert client.get(trace_url).status_code == 200
         assert client.get("/api/catalog").status_code == 200
     assert client.post("/api/failures/door/crossmodal-pf").status_code == 202
     (job,) = client.get("/api/jobs").json()
@@ -204,17 +204,17 @@ def test_a_folder_that_cannot_be_written_is_one_line(run: Trace) -> None:
         assert not list(Path(place).iterdir())
 
 
-def test_files_deleted_under_a_server(client: TestClient, traced: str, settings: Settings, tmp_path: Path) -> None:
+def test_files_deleted_under_a_server(client: TestClient, trace_url: str, settings: Settings, tmp_path: Path) -> None:
     asked = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
     said = client.post("/api/recordings", json=asked)
     assert said.status_code == 201, said.text
     made = said.json()
     shutil.rmtree(settings.workspace)
-    assert client.get(traced).status_code == 200
+    assert client.get(trace_url).status_code == 200
     gone = client.get(made["url"])
     assert gone.status_code == 404
     assert made["name"] in gone.json()["error"]
-    assert answer(client, traced.replace("/1", "/0")).status_code == 200, "the workspace is made again"
+    assert answer(client, trace_url.replace("/1", "/0")).status_code == 200, "the workspace is made again"
 
 
 def test_given_files_that_are_gone_are_named_and_the_rest_is_shown(
@@ -329,7 +329,7 @@ def test_a_browser_that_vanishes_leaves_nothing_open(settings: Settings, address
 @pytest.mark.anyio
 async def test_a_view_whose_page_has_gone_is_closed_after_a_while(settings: Settings) -> None:
     application = create_app(settings, warm=False)
-    views = Views(application.state.library, patience=0.0)
+    views = Views(application.state.store, timeout=0.0)
     view = await views.open(dark=False)
     assert len(views) == 1
     await views._close_idle(keep=0, idle_for=0.0)

@@ -13,7 +13,7 @@ import uvicorn
 from starlette.types import Receive, Scope, Send
 
 from beliefscope.app.server import main, timeouts
-from beliefscope.app.server.timeouts import PARTS, PatientProtocol, PatientSocket
+from beliefscope.app.server.timeouts import MAX_FRAMES, HTTPProtocol, WebSocketProtocol
 
 SECONDS = 20.0
 UPGRADE = (
@@ -39,9 +39,9 @@ async def _listens(scope: Scope, receive: Receive, send: Send) -> None:
 @pytest.fixture
 def running(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
     """Listens as ``serve`` does, with few buffers, and gives up half a second after nothing is taken any more."""
-    monkeypatch.setattr(main, "READ_PATIENCE", 500)
-    config = uvicorn.Config(_listens, log_level="critical", http=PatientProtocol, ws=PatientSocket, lifespan="off")
-    with main._bound("127.0.0.1", 0) as listener:
+    monkeypatch.setattr(main, "UNREAD_TIMEOUT", 500)
+    config = uvicorn.Config(_listens, log_level="critical", http=HTTPProtocol, ws=WebSocketProtocol, lifespan="off")
+    with main._listen("127.0.0.1", 0) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 14)
         running = uvicorn.Server(config)
         thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
@@ -94,7 +94,7 @@ def test_what_is_no_websocket_is_closed(running: uvicorn.Server, head: str) -> N
 def test_there_are_so_many_connections_sockets_among_them(
     running: uvicorn.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(timeouts, "CONNECTIONS", 2)
+    monkeypatch.setattr(timeouts, "MAX_CONNECTIONS", 2)
     first, second = called(running, SOCKET), called(running, SOCKET)
     assert first.recv(12) == second.recv(12) == b"HTTP/1.1 101"
     with called(running, "") as third:
@@ -124,10 +124,10 @@ def test_a_message_has_so_many_parts_at_most(running: uvicorn.Server) -> None:
         while not caller.recv(4096).endswith(b"\r\n\r\n"):
             pass
         caller.sendall(
-            frame(TEXT, b"a") + frame(PART) * (PARTS - 2) + frame(PART | LAST) + frame(PING | LAST, b"still")
+            frame(TEXT, b"a") + frame(PART) * (MAX_FRAMES - 2) + frame(PART | LAST) + frame(PING | LAST, b"still")
         )
         assert caller.recv(100).endswith(b"still")
-        caller.sendall(frame(TEXT, b"a") + frame(PART) * 2 * PARTS)
+        caller.sendall(frame(TEXT, b"a") + frame(PART) * 2 * MAX_FRAMES)
         said = caller.recv(100)
         assert (said[0], said[2:4]) == (0x88, (1009).to_bytes(2))
 

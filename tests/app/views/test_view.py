@@ -1,4 +1,4 @@
-"""The view's socket: maps for cursors, the newest wins, the scene answers back, and nothing said can break it."""
+"""Socket of a view: maps and scene updates for cursors, skipped cursors, the scene's slider, invalid messages."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 
-from beliefscope.app.protocol.map_format import LOG_RANGE, quantised
-from beliefscope.app.runs.trace_store import Traced
-from beliefscope.app.server.main import Settings
+from beliefscope.app.protocol.map_format import LOG_RANGE, quantise
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.maps.statistics import measure_maps
@@ -23,8 +23,8 @@ from beliefscope.inspect.trace import load_trace
 
 
 def cursor(serial: int = 1, **changes: Any) -> dict[str, Any]:
-    whole = {"type": "cursor", "serial": serial, "task": "door", "filter": "crossmodal-pf", "episode": 1, "step": 7}
-    return whole | {"angle": None, "size": 41} | changes
+    message = {"type": "cursor", "serial": serial, "task": "door", "filter": "crossmodal-pf", "episode": 1, "step": 7}
+    return message | {"angle": None, "size": 41} | changes
 
 
 def maps(socket: WebSocketTestSession) -> tuple[dict[str, Any], np.ndarray[Any, Any]]:
@@ -44,7 +44,7 @@ def read(data: bytes) -> tuple[dict[str, Any], np.ndarray[Any, Any]]:
 
 
 @pytest.fixture
-def socket(client: TestClient, traced: str) -> Any:
+def socket(client: TestClient, trace_url: str) -> Any:
     view = client.post("/api/views").json()
     with client.websocket_connect(view["socket"]) as socket:
         yield socket
@@ -60,15 +60,15 @@ def test_a_cursor_is_answered_with_maps_then_the_scene(
     trace = load_trace(next((settings.workspace / "traces").iterdir()))
     expected = MapEngine(load_checkpoint(settings.checkpoints["crossmodal-pf"]), trace).map(7, angle=0.4, size=size)
     log_max, log_range = (np.array(header[key])[:, None, None] for key in ("log_max", "log_range"))
-    told = log_max + log_range * (layers / 65535.0 - 1.0)
-    # Half a step of 64 nats in 65535 at most; all layers of this filter lie within 64 nats.
+    decoded = log_max + log_range * (layers / 65535.0 - 1.0)
+    # The quantization error is at most half of 64 nats / 65535; all layers of this filter lie within 64 nats.
     assert log_range.max() < LOG_RANGE
-    np.testing.assert_allclose(told, expected.log_likelihood, rtol=0, atol=0.5 * LOG_RANGE / 65535 + 1e-6)
+    np.testing.assert_allclose(decoded, expected.log_likelihood, rtol=0, atol=0.5 * LOG_RANGE / 65535 + 1e-6)
     assert (layers.max(axis=(1, 2)) == 65535).all()
     particles, weights = np.split(header["cloud"], [2 * header["particles"]])
     np.testing.assert_array_equal(particles.reshape(-1, 2), trace.particles[7, :, :2])
     weights = weights.reshape(3, -1)
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-5)  # 300 numbers of float32
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-5)  # sums of float32
     np.testing.assert_allclose(weights, np.exp(particle_log_weights(trace)[7]), rtol=1e-4, atol=1e-7)
     measured = measure_maps([expected], trace)
     for name, value in header["numbers"].items():
@@ -81,9 +81,9 @@ def test_a_cursor_is_answered_with_maps_then_the_scene(
     np.testing.assert_allclose(header["effector"], trace.episode.observations["effector_position"][7, :2], rtol=1e-6)
 
 
-def test_what_lies_deeper_than_can_be_told_is_told_as_if_it_lay_so_deep() -> None:
+def test_values_below_the_range_are_clipped() -> None:
     log = np.array([[[0.0, -63.0], [-64.0, -2000.0]], [[5.0, 5.0], [5.0, 5.0]]], dtype=np.float32)
-    cells, log_max, log_range = quantised(log)
+    cells, log_max, log_range = quantise(log)
     assert log_max.tolist() == [0.0, 5.0]
     assert log_range[0] == LOG_RANGE
     assert cells[0, 1].tolist() == [0, 0]
@@ -91,35 +91,35 @@ def test_what_lies_deeper_than_can_be_told_is_told_as_if_it_lay_so_deep() -> Non
     assert (cells[1] == 65535).all()  # a flat layer
 
 
-def test_a_faults_changes_what_the_maps_show(socket: WebSocketTestSession) -> None:
-    shown = []
+def test_faults_change_the_maps(socket: WebSocketTestSession) -> None:
+    layers = []
     for serial, faults in enumerate(("", "blackout", "")):
         socket.send_json(cursor(serial=serial, faults=faults))
-        shown.append(maps(socket)[1])
+        layers.append(maps(socket)[1])
         assert socket.receive_json()["type"] == "drawn"
-    assert np.array_equal(shown[0], shown[2])
-    assert not np.array_equal(shown[0][0], shown[1][0])
+    assert np.array_equal(layers[0], layers[2])
+    assert not np.array_equal(layers[0][0], layers[1][0])
 
 
-def test_the_newest_cursor_wins(
+def test_outdated_cursors_are_skipped(
     socket: WebSocketTestSession, monkeypatch: pytest.MonkeyPatch, client: TestClient
 ) -> None:
-    busy, go_on = threading.Event(), threading.Event()
-    real = Traced.map
+    busy, resume = threading.Event(), threading.Event()
+    original = TracedRun.map
 
-    def slow(self: Traced, step: int, angle: float | None, size: int) -> Any:
+    def slow(self: TracedRun, step: int, angle: float | None, size: int) -> Any:
         busy.set()
-        assert go_on.wait(10.0)
-        return real(self, step, angle, size)
+        assert resume.wait(10.0)
+        return original(self, step, angle, size)
 
-    monkeypatch.setattr(Traced, "map", slow)
+    monkeypatch.setattr(TracedRun, "map", slow)
     socket.send_json(cursor(serial=1, step=1))
     assert busy.wait(10.0)
     for serial in range(2, 9):
         socket.send_json(cursor(serial=serial, step=serial))
-    socket.send_text("understood in order, so by now all of the above are")
+    socket.send_text("not JSON")  # messages are processed in order
     assert socket.receive_json()["type"] == "error"
-    go_on.set()
+    resume.set()
     answered, drawn = [], []
     while 8 not in answered or 8 not in drawn:
         message = socket.receive()
@@ -128,45 +128,43 @@ def test_the_newest_cursor_wins(
         else:
             drawn.append(json.loads(message["text"])["serial"])
     assert answered == [1, 8]
-    assert drawn in ([8], [1, 8])  # the first may be overtaken on its way to the scene
+    assert drawn in ([8], [1, 8])  # the first may be replaced while it waits for the scene
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "error"),
     [
         ("not json", "Not JSON"),
         ("[1]", "JSON object"),
-        ("{}", "Message type None does not exist. Available: cursor, look, stand, theme."),
+        ("{}", "Unable to extract tag using discriminator 'type'."),
         (json.dumps(cursor(task="nothing")), "task 'nothing' does not exist"),
         (json.dumps(cursor(filter="nothing")), "filter 'nothing' does not exist"),
-        (json.dumps(cursor(filter=3)), "cursor needs 'filter', a name; got 3."),
+        (json.dumps(cursor(filter=3)), "cursor.filter: Input should be a valid string."),
         (json.dumps(cursor(episode=9)), "episode 9 does not exist"),
         (json.dumps(cursor(step=40)), "step 40 does not exist. Available: 0 to 39."),
-        (json.dumps(cursor(step=-1)), "cursor needs 'step', an integer from 0; got -1."),
-        (json.dumps(cursor(step=1.5)), "cursor needs 'step', an integer from 0; got 1.5."),
-        (json.dumps(cursor(step=True)), "cursor needs 'step', an integer from 0; got True."),
-        (json.dumps(cursor(faults=0.4)), "cursor's 'faults' is text; got 0.4."),
+        (json.dumps(cursor(step=-1)), "cursor.step: Input should be greater than or equal to 0."),
+        (json.dumps(cursor(step=1.5)), "cursor.step: Input should be a valid integer."),
+        (json.dumps(cursor(step=True)), "cursor.step: Input should be a valid integer."),
+        (json.dumps(cursor(faults=0.4)), "cursor.faults: Input should be an instance of Faults."),
         (json.dumps(cursor(faults="blakout")), "fault 'blakout' does not exist. Available: blackout,"),
         (json.dumps(cursor(faults="delay=touch")), "modality of task 'door' 'touch' does not exist."),
-        (json.dumps(cursor(size=10**6)), "cursor's 'size' is 41 or 135; got 1000000."),
-        (json.dumps(cursor(angle="wide")), "cursor's 'angle' is a number of radians or null; got 'wide'."),
-        (json.dumps(cursor(angle=float("nan"))), "Not JSON: NaN is no number of JSON."),
+        (json.dumps(cursor(size=10**6)), "cursor.size: Input should be 41 or 135."),
+        (json.dumps(cursor(angle="wide")), "cursor.angle: Input should be a valid number."),
+        (json.dumps(cursor(angle=float("nan"))), "Not JSON: NaN is not a JSON number."),
     ],
 )
-def test_what_cannot_be_answered_is_said_and_the_socket_stays(
-    socket: WebSocketTestSession, text: str, said: str
-) -> None:
+def test_invalid_messages_are_answered_with_an_error(socket: WebSocketTestSession, text: str, error: str) -> None:
     socket.send_text(text)
     answer = socket.receive_json()
     assert answer["type"] == "error"
-    assert said in answer["error"]
+    assert error in answer["error"]
     socket.send_json(cursor(serial=2))
     assert maps(socket)[0]["serial"] == 2
 
 
-def test_a_failure_of_ours_is_said_too(socket: WebSocketTestSession, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as broken:
-        broken.setattr(Traced, "map", lambda *_: 1 / 0)
+def test_internal_errors_are_reported(socket: WebSocketTestSession, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(TracedRun, "map", lambda *_: 1 / 0)
         socket.send_json(cursor(serial=4))
         answer = socket.receive_json()
     assert answer == {"type": "error", "serial": 4, "error": "The server failed: division by zero"}
@@ -174,7 +172,7 @@ def test_a_failure_of_ours_is_said_too(socket: WebSocketTestSession, monkeypatch
     assert maps(socket)[0]["serial"] == 5
 
 
-def test_the_scene_moves_the_cursor_without_an_echo(client: TestClient, traced: str) -> None:
+def test_the_slider_moves_the_cursor(client: TestClient, trace_url: str) -> None:
     views = client.app.state.views  # type: ignore[attr-defined]
     view = client.post("/api/views", json={"dark": True}).json()
     with client.websocket_connect(view["socket"]) as socket:
@@ -182,26 +180,26 @@ def test_the_scene_moves_the_cursor_without_an_echo(client: TestClient, traced: 
         maps(socket)
         assert socket.receive_json()["type"] == "drawn"
         scene = views[view["view"]].scene
-        assert scene._slider.value == 7  # moved by us: nothing is told
-        scene._on_slider(SimpleNamespace(client_id=0, target=SimpleNamespace(value=12)))
+        assert scene._slider.value == 7  # moved by the server, so no message follows
+        scene._slider_updated(SimpleNamespace(client_id=0, target=SimpleNamespace(value=12)))
         assert socket.receive_json() == {"type": "cursor", "step": 12, "origin": "scene"}
-        scene._on_slider(SimpleNamespace(client_id=0, target=SimpleNamespace(value=13)))
+        scene._slider_updated(SimpleNamespace(client_id=0, target=SimpleNamespace(value=13)))
         assert socket.receive_json()["step"] == 13
-        # The page follows with a step that the hand has left already: the slider stays under the hand.
+        # A delayed cursor of the page does not move the slider back.
         socket.send_json(cursor(serial=2, step=12))
         maps(socket)
         assert socket.receive_json()["type"] == "drawn"
         assert scene._slider.value == 7
 
 
-def test_a_view_that_is_not_open_says_so(client: TestClient) -> None:
+def test_unknown_views_are_rejected(client: TestClient) -> None:
     for path in ("/api/views/none", "/scene/none"):
         with client.websocket_connect(path) as socket, pytest.raises(WebSocketDisconnect) as closed:
             socket.receive_text()
         assert closed.value.code == 4004
 
 
-def test_a_second_page_takes_a_view_over(client: TestClient, traced: str) -> None:
+def test_a_second_page_replaces_the_first(client: TestClient, trace_url: str) -> None:
     address = client.post("/api/views").json()["socket"]
     with client.websocket_connect(address) as first, client.websocket_connect(address) as second:
         with pytest.raises(WebSocketDisconnect) as closed:

@@ -1,4 +1,4 @@
-"""A workspace into which others have put what no server of ours leaves there: pipes, odd names, wrong records."""
+"""A workspace with unexpected content: pipes, unusual names, invalid records."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from starlette.testclient import TestClient
 
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.server.main import Settings
+from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace.json_files import content
 
-PATIENCE = 60.0  # s
+TIMEOUT = 60.0  # s
 REPORT = "door-crossmodal-ekf-episode{}-0123abcd"
 RECORDS = (
     "kept.json",
@@ -37,7 +37,7 @@ Opens = Callable[..., TestClient]
 
 @pytest.fixture
 def workspace(settings: Settings) -> Path:
-    """With a recording that Rerun cannot read, as there are some, and a folder for each record."""
+    """A workspace with an unreadable recording and a folder for each record."""
     for name in (*RECORDS, *FILES):
         (settings.workspace / name).parent.mkdir(parents=True, exist_ok=True)
     (settings.workspace / "recordings" / "a.rrd").write_bytes(b"RRF2 of no run")
@@ -46,38 +46,38 @@ def workspace(settings: Settings) -> Path:
 
 @pytest.fixture
 def pipes(workspace: Path) -> Iterator[list[Path]]:
-    """In place of files."""
-    made = [workspace / name for name in (*RECORDS, *FILES)]
-    for path in made:
+    """Named pipes in place of files."""
+    paths = [workspace / name for name in (*RECORDS, *FILES)]
+    for path in paths:
         os.mkfifo(path)
-    yield made
-    for path in made:  # whoever waits there all the same goes on
+    yield paths
+    for path in paths:  # unblocks any reader
         os.close(os.open(path, os.O_RDWR | os.O_NONBLOCK))
 
 
-def told(open_client: Opens, settings: Settings, *paths: str) -> dict[str, Any]:
-    """What a new server answers, each 200."""
+def get_all(open_client: Opens, settings: Settings, *paths: str) -> dict[str, Any]:
+    """JSON responses of a new server, with status 200."""
     with open_client(settings) as client:
-        answers = {path: client.get(f"/api/{path}") for path in paths}
-    assert {path: answer.status_code for path, answer in answers.items()} == dict.fromkeys(paths, 200)
-    return {path: answer.json() for path, answer in answers.items()}
+        responses = {path: client.get(f"/api/{path}") for path in paths}
+    assert {path: response.status_code for path, response in responses.items()} == dict.fromkeys(paths, 200)
+    return {path: response.json() for path, response in responses.items()}
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
-def test_nobody_waits_at_a_pipe(pipes: list[Path], settings: Settings, open_client: Opens) -> None:
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="requires named pipes")
+def test_pipes_do_not_block_the_server(pipes: list[Path], settings: Settings, open_client: Opens) -> None:
     with ThreadPoolExecutor(1) as thread:
-        asked = thread.submit(told, open_client, settings, *LISTS)
+        responses = thread.submit(get_all, open_client, settings, *LISTS)
         try:
-            found = asked.result(PATIENCE)
+            lists = responses.result(TIMEOUT)
         finally:
             for path in pipes:
                 os.close(os.open(path, os.O_RDWR | os.O_NONBLOCK))
-    assert [one["name"] for one in found["recordings"]["recordings"]] == ["a.rrd"]
-    assert found["reports"]["reports"] == found["jobs"] == []
-    assert [one["name"] for one in found["studies"]["studies"]] == ["shipped"]
+    assert [file["name"] for file in lists["recordings"]["recordings"]] == ["a.rrd"]
+    assert lists["reports"]["reports"] == lists["jobs"] == []
+    assert [study["name"] for study in lists["studies"]["studies"]] == ["shipped"]
 
 
-def test_a_record_is_a_plain_file_of_a_size_that_can_be(workspace: Path) -> None:
+def test_records_are_regular_files_of_limited_size(workspace: Path) -> None:
     (workspace / "endless").symlink_to("/dev/zero")
     with (workspace / "large").open("wb") as file:
         file.truncate(1 << 40)
@@ -87,103 +87,99 @@ def test_a_record_is_a_plain_file_of_a_size_that_can_be(workspace: Path) -> None
     assert content(workspace / "recordings" / "a.rrd") == b"RRF2 of no run"
 
 
-WRONG: tuple[Any, ...] = ([], "[" * 100_000, "\ud800")
+INVALID: tuple[Any, ...] = ([], "[" * 100_000, "\ud800")
 
 
-@pytest.mark.parametrize("wrong", WRONG, ids=["a list", "deep", "half a letter"])
-def test_a_record_that_makes_no_sense_is_none(
-    workspace: Path, settings: Settings, open_client: Opens, wrong: Any
-) -> None:
+@pytest.mark.parametrize("invalid", INVALID, ids=["list", "nested", "surrogate"])
+def test_invalid_records_are_ignored(workspace: Path, settings: Settings, open_client: Opens, invalid: Any) -> None:
     status = (workspace / "recordings" / "a.rrd").stat()
-    about = dict.fromkeys(("application", "title", "entities", "rows", "task", "filter", "faults", "problem"), wrong)
-    run = [{"episode": wrong, "faults": wrong}]
+    about = dict.fromkeys(("application", "title", "entities", "rows", "task", "filter", "faults", "problem"), invalid)
+    run = [{"episode": invalid, "faults": invalid}]
     records = {
         "recordings/.about/a.rrd.json": {"bytes": status.st_size, "modified": status.st_mtime_ns, "about": about},
         f"reports/{REPORT.format(0)}/manifest.json": {
-            **{"title": wrong, "made": wrong, "task": "door", "filter": wrong},
+            **{"title": invalid, "made": invalid, "task": "door", "filter": invalid},
             **{"traces": run, "files": {}},
         },
-        f"reports/{REPORT.format(1)}/manifest.json": wrong,
-        "study/study.json": wrong,
-        "kept.json": wrong,
+        f"reports/{REPORT.format(1)}/manifest.json": invalid,
+        "study/study.json": invalid,
+        "kept.json": invalid,
     }
-    for name, said in records.items():
+    for name, record in records.items():
         path = workspace / name
         path.parent.mkdir(exist_ok=True)
-        path.write_text(said if isinstance(said, str) and said.isascii() else json.dumps(said))
+        path.write_text(record if isinstance(record, str) and record.isascii() else json.dumps(record))
     good = workspace / "reports" / REPORT.format(2)
     good.mkdir()
     traces = [{"episode": 2, "faults": []}]
-    fine = {"title": "fine", "made": "2026", "task": "door", "filter": "x", "traces": traces, "files": {}}
-    (good / "manifest.json").write_text(json.dumps(fine))
-    found = told(open_client, settings, *LISTS)
-    assert [one["title"] for one in found["reports"]["reports"]] == ["fine"]
-    assert [one["name"] for one in found["recordings"]["recordings"]] == ["a.rrd"]
+    valid = {"title": "valid", "made": "2026", "task": "door", "filter": "x", "traces": traces, "files": {}}
+    (good / "manifest.json").write_text(json.dumps(valid))
+    lists = get_all(open_client, settings, *LISTS)
+    assert [report["title"] for report in lists["reports"]["reports"]] == ["valid"]
+    assert [file["name"] for file in lists["recordings"]["recordings"]] == ["a.rrd"]
 
 
-def test_a_file_of_any_name_that_can_be_read_is_looked_after(
-    workspace: Path, settings: Settings, open_client: Opens
-) -> None:
+def test_files_with_unusual_names_can_be_managed(workspace: Path, settings: Settings, open_client: Opens) -> None:
     names = ("a:b", " a", "a ", "e\u0301", "<img src=x onerror=alert(1)>", "x" * 246)
     for name in names:
         (workspace / "recordings" / f"{name}.rrd").write_bytes(name.encode())
     with open_client(settings) as client:
-        found = {one["name"]: one["url"] for one in client.get("/api/recordings").json()["recordings"]}
-        assert found.keys() == {f"{name}.rrd" for name in (*names, "a")}
+        urls = {file["name"]: file["url"] for file in client.get("/api/recordings").json()["recordings"]}
+        assert urls.keys() == {f"{name}.rrd" for name in (*names, "a")}
         for name in names:
-            url = found[f"{name}.rrd"]
+            url = urls[f"{name}.rrd"]
             assert client.get(url).content == name.encode()
             assert client.patch(url, json={"tags": ["odd"]}).json()["tags"] == ["odd"]
             assert client.patch(url, json={"name": "plain"}).json()["tags"] == ["odd"]
             assert client.delete("/api/recordings/plain.rrd").status_code == 200
 
 
-def test_a_recording_that_nobody_may_read_is_said(workspace: Path, settings: Settings, open_client: Opens) -> None:
+def test_unreadable_recordings_are_reported(workspace: Path, settings: Settings, open_client: Opens) -> None:
     (workspace / "recordings" / "a.rrd").chmod(0)
     if os.access(workspace / "recordings" / "a.rrd", os.R_OK):
-        pytest.skip("this user may read everything")
+        pytest.skip("this user may read all files")
     with open_client(settings) as client:
-        answer = client.get("/api/recordings/a.rrd")
-    assert (answer.status_code, "Permission denied" in answer.json()["error"]) == (400, True)
+        response = client.get("/api/recordings/a.rrd")
+    assert (response.status_code, "Permission denied" in response.json()["error"]) == (400, True)
 
 
-def test_a_file_of_another_name_is_none(workspace: Path, settings: Settings, open_client: Opens) -> None:
+def test_files_with_unprintable_names_are_ignored(workspace: Path, settings: Settings, open_client: Opens) -> None:
     names = (b"a\nb", b"a\xffb", "a\u2028b".encode(), "a\u202eb".encode(), b"x" * 250)
     for name in names:
-        with suppress(OSError):  # a disk that takes no such name
+        with suppress(OSError):  # the file system rejects the name
             (workspace / "recordings" / os.fsdecode(name + b".rrd")).write_bytes(b"RRF2 more")
     with open_client(settings) as client:
-        assert [one["name"] for one in client.get("/api/recordings").json()["recordings"]] == ["a.rrd"]
+        assert [file["name"] for file in client.get("/api/recordings").json()["recordings"]] == ["a.rrd"]
         for name in names:
             assert client.get(f"/api/recordings/{quote(name)}.rrd").status_code == 404
 
 
-def test_a_file_in_place_of_a_folder_is_said(settings: Settings, open_client: Opens) -> None:
+def test_files_in_place_of_folders_are_reported(settings: Settings, open_client: Opens) -> None:
     run = {"task": "door", "filter": "crossmodal-ekf", "episode": 1}
     with open_client(settings) as client:
         for folder in ("recordings", "reports", "live", "jobs", "finetune", "traces"):
             (settings.workspace / folder).write_text("")
-        asked = [client.get(f"/api/{path}") for path in LISTS]
-        asked += [
+        responses = [client.get(f"/api/{path}") for path in LISTS]
+        responses += [
             client.post("/api/recordings", json=run),
             client.post("/api/reports/door/crossmodal-ekf/1"),
             client.post("/api/finetune/door/crossmodal-ekf", json={}),
             client.get("/api/trace/door/crossmodal-ekf/1"),
         ]
-    assert {answer.status_code for answer in asked} <= {200, 201, 202, 400, 404}, [answer.text for answer in asked]
-    assert any("recordings' cannot be used: Not a directory." in answer.text for answer in asked)
+    assert {response.status_code for response in responses} <= {200, 201, 202, 400, 404}
+    assert any("recordings' cannot be used: Not a directory." in response.text for response in responses)
 
 
 @pytest.mark.parametrize("name", ["../../x", "x/../../../y", "a" * 300, "a\nb", "\u202e<script>", "..", "/etc/x"])
-def test_files_of_a_run_are_named_by_letters_whatever_its_filter_is_called(name: str) -> None:
-    stem = Selection("door", name, 3).stem
+def test_file_names_contain_only_safe_characters(name: str) -> None:
+    stem = Selection("door", name, 3).file_stem
     assert stem.startswith("door-")
     assert stem.endswith("-episode3")
     assert len(stem) <= 170
     assert not set(stem) & set("/\\\0\n<>")
 
 
-def test_a_result_that_leads_elsewhere_is_none(tmp_path: Path) -> None:
+def test_links_to_results_are_not_followed(tmp_path: Path) -> None:
     (tmp_path / "jobs" / "0123").mkdir(parents=True)
     (tmp_path / "secret").write_text("{}")
     (tmp_path / "jobs" / "0123" / "result.json").symlink_to(tmp_path / "secret")

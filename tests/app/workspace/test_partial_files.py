@@ -1,4 +1,4 @@
-"""Files that were being written when their writer was killed: known by their names, and swept when they are old."""
+"""Partial files of interrupted writes: their names, and the deletion of old ones."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.runs.trace_store import Settings
-from beliefscope.app.workspace.partial_files import ABANDONED, FOLDERS, sweep
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.workspace.partial_files import FOLDERS, MAX_AGE, delete_abandoned_parts
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.simulation.door import DOOR
@@ -28,15 +28,15 @@ def aged(path: Path, seconds: float) -> Path:
     return path
 
 
-def test_a_server_sweeps_what_is_old_and_ours_and_nothing_else(
+def test_a_server_deletes_only_old_partial_files(
     settings: Settings, open_client: Callable[..., TestClient], tmp_path: Path
 ) -> None:
     workspace, outside = settings.workspace, tmp_path / "outside"
-    old, young = 2 * ABANDONED, ABANDONED / 2
-    gone = [aged(workspace / name / "deep" / ".run.trace.1.part", old) for name in FOLDERS]
-    gone += [aged(workspace / "recordings" / ".a.rrd.2.part", old), aged(workspace / ".children.json.3.part", old)]
-    stay = [
-        aged(workspace / "traces" / ".run.trace.4.part", young),  # somebody may be writing
+    old, young = 2 * MAX_AGE, MAX_AGE / 2
+    deleted = [aged(workspace / name / "deep" / ".run.trace.1.part", old) for name in FOLDERS]
+    deleted += [aged(workspace / "recordings" / ".a.rrd.2.part", old), aged(workspace / ".kept.json.3.part", old)]
+    others = [
+        aged(workspace / "traces" / ".run.trace.4.part", young),  # may still be written
         aged(workspace / "recordings" / "named.part", old),
         aged(workspace / "recordings" / ".hidden", old),
         aged(workspace / "theirs" / ".download.part", old),
@@ -44,22 +44,23 @@ def test_a_server_sweeps_what_is_old_and_ours_and_nothing_else(
     ]
     (workspace / "traces" / "link").symlink_to(outside)
     with open_client(settings):
-        assert not [path for path in gone if path.exists()]
-    assert all(path.exists() for path in stay)
-    sweep(workspace / "nowhere")
+        assert not [path for path in deleted if path.exists()]
+    assert all(path.exists() for path in others)
+    delete_abandoned_parts(workspace / "nowhere")
 
 
-def test_every_file_under_way_has_such_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As seen in the moment before it gets its own."""
-    seen: list[str] = []
+def test_writers_use_partial_file_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sources: list[str] = []
     replace = os.replace
-    monkeypatch.setattr(os, "replace", lambda source, target: seen.append(Path(source).name) or replace(source, target))
+    monkeypatch.setattr(
+        os, "replace", lambda source, target: sources.append(Path(source).name) or replace(source, target)
+    )
     with open_dataset(sample_path("door")) as data:
         episode: Episode = data[9]
     write_dataset(tmp_path / "a.h5", DOOR, [episode])
     write_atomically(tmp_path / "b.json", b"{}")
     write_recording(trace(load_checkpoint(shipped("door", "haptics-ekf")), episode), tmp_path / "c.rrd")
-    assert len(seen) == 3
-    for name, whole in zip(seen, ("a.h5", "b.json", "c.rrd"), strict=True):
-        assert name.startswith(f".{whole}.")
+    assert len(sources) == 3
+    for name, target in zip(sources, ("a.h5", "b.json", "c.rrd"), strict=True):
+        assert name.startswith(f".{target}.")
         assert name.endswith(".part")

@@ -1,4 +1,4 @@
-"""Names that come in requests and reach the disk: none leads out of the workspace, neither by itself nor by a link."""
+"""File names in requests: none leads out of the workspace, neither directly nor through a link."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from starlette.testclient import TestClient
 from starlette.types import Message
 
 from beliefscope.app.jobs.queue import Job
-from beliefscope.app.server.main import Settings
-from beliefscope.app.server.security import kept_file
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.workspace.paths import file_within
 
-SECRET = "what lies outside"
-EVIL = (
+SECRET = "outside the workspace"
+UNSAFE_NAMES = (
     "..",
     ".",
     "../secret",
@@ -49,7 +49,7 @@ EVIL = (
 
 @pytest.fixture
 def outside(settings: Settings) -> Path:
-    """The folder around the workspace, with files that nobody may have or touch."""
+    """The folder around the workspace, with files that must not be read or changed."""
     folder = settings.workspace.parent
     for name in ("secret", "secret.rrd", "secret.html", "report.html", "result.json", "run.json", "job.json"):
         (folder / name).write_text(SECRET)
@@ -57,19 +57,21 @@ def outside(settings: Settings) -> Path:
     return folder
 
 
-def asked(app: FastAPI, outside: Path) -> Iterator[tuple[str, str]]:
-    """Method and path of every route that takes a name, each evil one in each place, what is there in the others."""
-    there = {"task": "door", "filter": "crossmodal-ekf", "episode": "1", "act": "keep"}
+def requests(app: FastAPI, outside: Path) -> Iterator[tuple[str, str]]:
+    """Method and path of every route with a name: each unsafe name in each parameter, valid values in the others."""
+    valid = {"task": "door", "filter": "crossmodal-ekf", "episode": "1", "act": "keep"}
     for path, methods in app.openapi()["paths"].items():
         for name in re.findall(r"\{(\w+)\}", path):
-            for evil in EVIL:
-                names = defaultdict(lambda: "x", there | {name: evil.format(outside=quote(str(outside)[1:], safe=""))})
+            for unsafe in UNSAFE_NAMES:
+                names = defaultdict(
+                    lambda: "x", valid | {name: unsafe.format(outside=quote(str(outside)[1:], safe=""))}
+                )
                 yield from ((method.upper(), path.format_map(names)) for method in methods)
 
 
-def ask(client: TestClient, method: str, path: str, body: bytes) -> tuple[int, bytes]:
-    """Status and body. Straight to the application: every HTTP client would put such a path right."""
-    sent: list[Message] = []
+def send(client: TestClient, method: str, path: str, body: bytes) -> tuple[int, bytes]:
+    """Status and body. Calls the application directly, because HTTP clients normalize paths."""
+    messages: list[Message] = []
     headers = {"host": "localhost:8000", "origin": "http://localhost:8000", "content-type": "application/json"}
     scope = {
         "type": "http",
@@ -83,48 +85,48 @@ def ask(client: TestClient, method: str, path: str, body: bytes) -> tuple[int, b
     }
 
     async def call() -> None:
-        gone = asyncio.Event()
+        disconnected = asyncio.Event()
         parts = iter([{"type": "http.request", "body": body}])
 
         async def receive() -> Message:
             for part in parts:
                 return part
-            await gone.wait()
+            await disconnected.wait()
             return {"type": "http.disconnect"}
 
-        async def send(message: Message) -> None:
-            sent.append(message)
+        async def collect(message: Message) -> None:
+            messages.append(message)
 
-        await client.app(scope, receive, send)
+        await client.app(scope, receive, collect)
 
     assert client.portal is not None
     client.portal.call(call)
-    return sent[0]["status"], b"".join(part.get("body", b"") for part in sent[1:])
+    return messages[0]["status"], b"".join(part.get("body", b"") for part in messages[1:])
 
 
-def test_no_name_leads_out_of_the_workspace(client: TestClient, outside: Path) -> None:
+def test_path_parameters_stay_in_the_workspace(client: TestClient, outside: Path) -> None:
     before = {path: path.read_bytes() for path in outside.iterdir() if path.is_file()}
     count = 0
-    for method, path in asked(client.app, outside):  # type: ignore[arg-type]
-        status, told = ask(client, method, path, b"{}")
+    for method, path in requests(client.app, outside):  # type: ignore[arg-type]
+        status, body = send(client, method, path, b"{}")
         assert 400 <= status < 500, (method, path)
-        assert SECRET.encode() not in told
+        assert SECRET.encode() not in body
         count += 1
-    assert count > 20 * len(EVIL)
+    assert count > 20 * len(UNSAFE_NAMES)
     assert {path: path.read_bytes() for path in outside.iterdir() if path.is_file()} == before
 
 
 @pytest.mark.parametrize("path", ["/static/{}", "/vendor/uplot/{}", "/{}"])
-def test_nor_out_of_the_page(client: TestClient, outside: Path, path: str) -> None:
-    for evil in (*EVIL, "../server.py", "..%2fserver.py", "%2e%2e/server.py", "../../app/server/main.py"):
-        status, told = ask(client, "GET", path.format(evil.format(outside=quote(str(outside)[1:], safe=""))), b"")
-        assert status == 404 or (status, path) == (200, "/{}"), evil
-        assert b"create_app" not in told
-        assert SECRET.encode() not in told
+def test_static_files_stay_in_the_page_folder(client: TestClient, outside: Path, path: str) -> None:
+    for unsafe in (*UNSAFE_NAMES, "../server.py", "..%2fserver.py", "%2e%2e/server.py", "../../app/server/main.py"):
+        status, body = send(client, "GET", path.format(unsafe.format(outside=quote(str(outside)[1:], safe=""))), b"")
+        assert status == 404 or (status, path) == (200, "/{}"), unsafe
+        assert b"create_app" not in body
+        assert SECRET.encode() not in body
 
 
 @pytest.mark.parametrize("key", ["faults", "data", "task", "filter"])
-def test_nor_does_one_in_a_query_or_a_body(client: TestClient, outside: Path, key: str) -> None:
+def test_queries_and_bodies_stay_in_the_workspace(client: TestClient, outside: Path, key: str) -> None:
     run = {"task": "door", "filter": "crossmodal-ekf", "episode": 1}
     for name in (str(outside / "secret"), "../secret", f"{outside / 'secret.py'}:TASK", "../secret.py:TASK"):
         answers = [client.post("/api/recordings", json=run | {key: name})]
@@ -136,7 +138,7 @@ def test_nor_does_one_in_a_query_or_a_body(client: TestClient, outside: Path, ke
     assert not (outside / "ran").exists()
 
 
-def test_a_link_out_of_the_workspace_is_not_followed(
+def test_links_out_of_the_workspace_are_not_followed(
     settings: Settings, outside: Path, open_client: Callable[..., TestClient]
 ) -> None:
     workspace, name = settings.workspace, "door-crossmodal-ekf-episode1-0123abcd"
@@ -169,7 +171,7 @@ def test_a_link_out_of_the_workspace_is_not_followed(
     assert (outside / "result.json").read_text() == SECRET
 
 
-def test_a_kept_file_lies_in_its_folder(tmp_path: Path) -> None:
+def test_file_within_rejects_paths_outside_the_folder(tmp_path: Path) -> None:
     inside, outside = tmp_path / "inside", tmp_path / "secret"
     (inside / "deep").mkdir(parents=True)
     for path in (inside / "file", inside / "deep" / "file", outside):
@@ -178,8 +180,8 @@ def test_a_kept_file_lies_in_its_folder(tmp_path: Path) -> None:
     (inside / "in").symlink_to("file")
     (inside / "circle").symlink_to("circle")
     for name in ("file", "deep/file", "in", "deep/../file"):
-        assert kept_file(inside, name) is not None
+        assert file_within(inside, name) is not None
     for name in ("", "deep", "missing", "out", "circle", "../secret", str(outside), "file\0", "x" * 5000):
-        assert kept_file(inside, name) is None
+        assert file_within(inside, name) is None
     (tmp_path / "moved").symlink_to(inside)
-    assert kept_file(tmp_path / "moved", "file") == inside / "file", "the folder itself may lie elsewhere"
+    assert file_within(tmp_path / "moved", "file") == inside / "file", "the folder itself may be a link"

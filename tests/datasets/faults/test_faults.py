@@ -1,4 +1,4 @@
-"""Every fault keeps its law, breaks what it should and nothing else, and travels as text and as JSON."""
+"""Sensor faults: effects, unaffected data, and conversion to text and JSON."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ import beliefscope
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.faults import FAULTS, Fault, parameters
-from beliefscope.datasets.faults.injection import FAULT_PRESETS, WHOLE, Faults, broken_copies, described
+from beliefscope.datasets.faults.injection import FAULT_PRESETS, NO_FAULTS, Faults, fault_catalog, faulty_copies
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.simulate import hand_controls
 from beliefscope.datasets.store import open_dataset, sample_path
 
 Array = np.ndarray[Any, Any]
 SPAN = ":from=20:to=60"
-BREAKS = {
+AFFECTED = {
     "blackout": {"image"},
     "force_bias=5": {"force"},
     "force_drift=1": {"force"},
     "effector_offset=0.02": {"effector_position"},
     "contact_flipped": {"contact"},
-    "contact_late": {"contact"},
+    "contact_delayed": {"contact"},
     "delay=haptics": {"effector_position", "force", "torque", "contact"},
     "delay=image": {"image"},
     "drop=haptics": {"effector_position", "force", "torque", "contact"},
@@ -37,18 +37,18 @@ BREAKS = {
     "force_saturation": {"force"},
     "force_stuck": {"force"},
 } | {name: {"image"} for name in FAULTS if name.startswith("image_")}
-"""Fault -> observations it breaks."""
+"""Fault -> observations it changes."""
 
 
 @pytest.fixture(scope="module")
 def episode() -> Episode:
-    """A push: it makes and breaks contact."""
+    """A push, with steps in contact and in free motion."""
     with open_dataset(sample_path("door")) as data:
         index = next(s.index for s in data.summaries if s.policy == "push" and 0.2 < s.contact_fraction < 0.8)
         return data[index]
 
 
-def broken(text: str, episode: Episode, seed: int = 0) -> Episode:
+def inject(text: str, episode: Episode, seed: int = 0) -> Episode:
     return Faults.parse(text).apply(episode, seed)
 
 
@@ -56,21 +56,21 @@ def force(episode: Episode) -> Array:
     return episode.observations["force"].astype(np.float64)
 
 
-def pictures(episode: Episode) -> Array:
+def images(episode: Episode) -> Array:
     return episode.observations["image"].astype(np.float64)
 
 
-def test_every_fault_is_looked_at() -> None:
-    assert {text.split("=")[0] for text in BREAKS} == set(FAULTS)
+def test_all_faults_are_covered() -> None:
+    assert {text.split("=")[0] for text in AFFECTED} == set(FAULTS)
 
 
-@pytest.mark.parametrize("text", BREAKS)
-def test_a_fault_breaks_its_sensors_in_its_span_and_nothing_else(text: str, episode: Episode) -> None:
+@pytest.mark.parametrize("text", AFFECTED)
+def test_fault_changes_only_its_sensors_within_its_span(text: str, episode: Episode) -> None:
     before = episode.digest()
-    after = broken(text + SPAN, episode)
-    assert episode.digest() == before, "changed in place"
+    after = inject(text + SPAN, episode)
+    assert episode.digest() == before, "modified in place"
     changed = {k for k, v in episode.observations.items() if not np.array_equal(v, after.observations[k])}
-    assert changed == BREAKS[text]
+    assert changed == AFFECTED[text]
     for key, values in episode.observations.items():
         assert after.observations[key].dtype == values.dtype
         assert after.observations[key].shape == values.shape
@@ -81,132 +81,135 @@ def test_a_fault_breaks_its_sensors_in_its_span_and_nothing_else(text: str, epis
             assert getattr(after, field.name) is getattr(episode, field.name)
 
 
-@pytest.mark.parametrize("text", [*BREAKS, "drop=haptics:probability=0.1:steps=4", "blackout=0.4"])
-def test_the_same_seed_gives_the_same_bits(text: str, episode: Episode) -> None:
-    assert broken(text, episode, 3).digest() == broken(text, episode, 3).digest()
+@pytest.mark.parametrize("text", [*AFFECTED, "drop=haptics:probability=0.1:steps=4", "blackout=0.4"])
+def test_faults_are_deterministic(text: str, episode: Episode) -> None:
+    assert inject(text, episode, 3).digest() == inject(text, episode, 3).digest()
 
 
 @pytest.mark.parametrize(
-    "text", ["blackout=0.5", "image_noise", "image_patch", "force_noise", "contact_flipped=0.5", "drop:probability=0.1"]
+    "text",
+    ["blackout=0.5", "image_noise", "image_occluded", "force_noise", "contact_flipped=0.5", "drop:probability=0.1"],
 )
-def test_draws_differ_by_seed_episode_and_place(text: str, episode: Episode) -> None:
-    key = Faults.parse(text).faults[0].keys(DOOR)[0]
-    first = broken(text, episode, 0).observations[key]
-    assert not np.array_equal(first, broken(text, episode, 1).observations[key])
-    other = broken(text, replace(episode, seed=episode.seed + 1)).observations[key]
+def test_randomness_depends_on_seed_episode_and_position(text: str, episode: Episode) -> None:
+    key = Faults.parse(text).sequence[0].keys(DOOR)[0]
+    first = inject(text, episode, 0).observations[key]
+    assert not np.array_equal(first, inject(text, episode, 1).observations[key])
+    other = inject(text, replace(episode, seed=episode.seed + 1)).observations[key]
     assert not np.array_equal(first, other)
-    assert not np.array_equal(first, broken(f"effector_offset=1,{text}", episode).observations[key])
+    assert not np.array_equal(first, inject(f"effector_offset=1,{text}", episode).observations[key])
 
 
-def test_controls_follow_what_is_reported(episode: Episode) -> None:
+def test_controls_follow_the_readings(episode: Episode) -> None:
     assert np.array_equal(
         hand_controls(episode.observations["effector_position"], episode.observations["contact"]), episode.controls
     )
-    off = broken("effector_offset:x=0.02,contact_flipped", episode)
-    np.testing.assert_allclose(off.controls[:, 0] - episode.controls[:, 0], 0.02, atol=1e-6)
-    np.testing.assert_allclose(off.controls[:, 3:6], episode.controls[:, 3:6], atol=1e-6)
-    assert np.array_equal(off.controls[:, 6], 1 - episode.controls[:, 6])
-    jump = broken("effector_offset:x=0.02:from=20", episode)
+    offset = inject("effector_offset:x=0.02,contact_flipped", episode)
+    np.testing.assert_allclose(offset.controls[:, 0] - episode.controls[:, 0], 0.02, atol=1e-6)
+    np.testing.assert_allclose(offset.controls[:, 3:6], episode.controls[:, 3:6], atol=1e-6)
+    assert np.array_equal(offset.controls[:, 6], 1 - episode.controls[:, 6])
+    jump = inject("effector_offset:x=0.02:from=20", episode)
     assert jump.controls[20, 3] - episode.controls[20, 3] == pytest.approx(0.02, abs=1e-6)
-    others = replace(episode, controls=episode.controls + 1)
-    assert broken("effector_offset=1", others).controls is others.controls
+    external = replace(episode, controls=episode.controls + 1)
+    assert inject("effector_offset=1", external).controls is external.controls
 
 
-def test_a_share_of_the_pictures_is_black_and_the_others_untouched(episode: Episode) -> None:
-    long = replace(episode, observations={"image": np.full((20_000, 32, 32), 7, np.uint8)})
-    for share in (0.0, 0.4, 0.8, 1.0):
-        dark = broken(f"blackout={share}", long).observations["image"]
-        black = ~dark.any(axis=(1, 2))
-        assert abs(black.mean() - share) < 4 * np.sqrt(share * (1 - share) / 20_000) + 1e-12
-        assert (dark[~black] == 7).all()
-    # Each step on its own: two in a row are as rare as chance has it.
-    black = ~broken("blackout=0.4", long).observations["image"].any(axis=(1, 2))
+def test_blackout_probability(episode: Episode) -> None:
+    long = replace(episode, observations={"image": np.full((20_000, 4, 4), 7, np.uint8)})
+    for p in (0.0, 0.4, 0.8, 1.0):
+        observed = inject(f"blackout={p}", long).observations["image"]
+        black = ~observed.any(axis=(1, 2))
+        assert abs(black.mean() - p) < 4 * np.sqrt(p * (1 - p) / 20_000) + 1e-12
+        assert (observed[~black] == 7).all()
+    # Steps are independent: the probability of two in a row is 0.4 ** 2.
+    black = ~inject("blackout=0.4", long).observations["image"].any(axis=(1, 2))
     assert abs((black[1:] & black[:-1]).mean() - 0.16) < 0.015
 
 
-def test_pictures(episode: Episode) -> None:
-    seen = pictures(episode)
-    assert (pictures(broken("image_frozen=30", episode))[30:] == seen[30]).all()
-    assert np.array_equal(pictures(broken("image_darker=0.4", episode)), np.rint(0.4 * seen))
-    assert pictures(broken("image_darker=100", episode)).max() == 255
+def test_image_faults(episode: Episode) -> None:
+    clean = images(episode)
+    assert (images(inject("image_frozen=30", episode))[30:] == clean[30]).all()
+    assert np.array_equal(images(inject("image_underexposed=0.4", episode)), np.rint(0.4 * clean))
+    assert images(inject("image_underexposed=100", episode)).max() == 255
     gray = replace(episode, observations={"image": np.full((400, 32, 32), 128, np.uint8)})
-    noise = pictures(broken("image_noise=20", gray)) - 128
+    noise = images(inject("image_noise=20", gray)) - 128
     assert abs(noise.mean()) < 0.2
     assert noise.std() == pytest.approx(20, rel=0.01)
-    hidden = broken("image_patch=10:x=3:y=20:gray=9", episode).observations["image"]
-    assert (hidden[:, 20:30, 3:13] == 9).all()
+    occluded = inject("image_occluded=10:x=3:y=20:gray=9", episode).observations["image"]
+    assert (occluded[:, 20:30, 3:13] == 9).all()
     outside = np.ones((32, 32), bool)
     outside[20:30, 3:13] = False
-    assert np.array_equal(hidden[:, outside], seen[:, outside])
+    assert np.array_equal(occluded[:, outside], clean[:, outside])
 
 
-def test_a_patch_without_a_place_stays_where_the_seed_puts_it(episode: Episode) -> None:
+def test_position_of_an_occlusion_is_random_but_constant(episode: Episode) -> None:
     white = replace(episode, observations={"image": np.full((5, 32, 32), 255, np.uint8)})
-    places = set()
+    positions = set()
     for seed in range(40):
-        dark = broken("image_patch=12", white, seed).observations["image"] == 0
-        assert (dark == dark[0]).all()
-        assert dark[0].sum() == 144
-        places.add(tuple(np.argwhere(dark[0])[0]))
-    assert len(places) > 20
+        occluded = inject("image_occluded=12", white, seed).observations["image"] == 0
+        assert (occluded == occluded[0]).all()
+        assert occluded[0].sum() == 144
+        positions.add(tuple(np.argwhere(occluded[0])[0]))
+    assert len(positions) > 20
 
 
-def test_forces(episode: Episode) -> None:
-    felt = force(episode)
-    np.testing.assert_allclose(force(broken("force_bias:x=5:z=-2", episode)) - felt, [[5, 0, -2]] * 100, atol=1e-5)
-    drift = force(broken("force_drift:x=0.5:y=-1:from=20", episode)) - felt
+def test_force_faults(episode: Episode) -> None:
+    clean = force(episode)
+    np.testing.assert_allclose(force(inject("force_bias:x=5:z=-2", episode)) - clean, [[5, 0, -2]] * 100, atol=1e-5)
+    drift = force(inject("force_drift:x=0.5:y=-1:from=20", episode)) - clean
     np.testing.assert_allclose(drift[20:, 0], 0.5 * 0.1 * np.arange(80), atol=1e-5)
     np.testing.assert_allclose(drift[:, 1], -2 * drift[:, 0], atol=1e-5)
-    limited = broken("force_saturation=5", episode)
-    assert np.abs(felt).max() > 5
+    limited = inject("force_saturation=5", episode)
+    assert np.abs(clean).max() > 5
     assert np.abs(force(limited)).max() == 5
-    assert broken("force_saturation=5", limited).digest() == limited.digest()
-    inside = np.abs(felt) <= 5
-    assert np.array_equal(force(limited)[inside], felt[inside])
-    stuck = force(broken("force_stuck=y:from=20", episode))
-    assert (stuck[20:, 1] == felt[20, 1]).all()
-    assert np.array_equal(stuck[:, [0, 2]], felt[:, [0, 2]])
-    noise = [force(broken("force_noise=3", episode, seed)) - felt for seed in range(30)]
+    assert inject("force_saturation=5", limited).digest() == limited.digest()
+    inside = np.abs(clean) <= 5
+    assert np.array_equal(force(limited)[inside], clean[inside])
+    stuck = force(inject("force_stuck=y:from=20", episode))
+    assert (stuck[20:, 1] == clean[20, 1]).all()
+    assert np.array_equal(stuck[:, [0, 2]], clean[:, [0, 2]])
+    noise = [force(inject("force_noise=3", episode, seed)) - clean for seed in range(30)]
     assert np.std(noise) == pytest.approx(3, rel=0.05)
     assert abs(np.mean(noise)) < 0.15
 
 
-def test_what_is_late_is_shifted(episode: Episode) -> None:
-    late = broken("delay=haptics:steps=3", episode)
+def test_delays_shift_readings(episode: Episode) -> None:
+    delayed = inject("delay=haptics:steps=3", episode)
     for key in ("force", "torque", "effector_position", "contact"):
-        assert np.array_equal(late.observations[key][3:], episode.observations[key][:-3])
-        assert (late.observations[key][:3] == episode.observations[key][0]).all()
-    twice = broken("delay=image:steps=2,delay=image:steps=3", episode)
-    assert np.array_equal(twice.observations["image"], broken("delay=image:steps=5", episode).observations["image"])
-    flag = broken("contact_late=4", episode).observations["contact"]
+        assert np.array_equal(delayed.observations[key][3:], episode.observations[key][:-3])
+        assert (delayed.observations[key][:3] == episode.observations[key][0]).all()
+    twice = inject("delay=image:steps=2,delay=image:steps=3", episode)
+    assert np.array_equal(twice.observations["image"], inject("delay=image:steps=5", episode).observations["image"])
+    flag = inject("contact_delayed=4", episode).observations["contact"]
     assert np.array_equal(flag[4:], episode.observations["contact"][:-4])
-    assert np.array_equal(late.controls[3:], episode.controls[:-3])
+    assert np.array_equal(delayed.controls[3:], episode.controls[:-3])
 
 
-def test_contact_flipped_twice_is_as_it_was(episode: Episode) -> None:
-    flipped = broken("contact_flipped", episode)
+def test_flipping_contact_twice_restores_it(episode: Episode) -> None:
+    flipped = inject("contact_flipped", episode)
     assert np.array_equal(flipped.observations["contact"], 1 - episode.observations["contact"])
-    assert broken("contact_flipped", flipped).digest() == episode.digest()
-    share = (broken("contact_flipped=0.3", episode).observations["contact"] != episode.observations["contact"]).mean()
-    assert 0.1 < share < 0.5
+    assert inject("contact_flipped", flipped).digest() == episode.digest()
+    fraction = (
+        inject("contact_flipped=0.3", episode).observations["contact"] != episode.observations["contact"]
+    ).mean()
+    assert 0.1 < fraction < 0.5
 
 
-def test_what_is_dropped_stays_or_is_black(episode: Episode) -> None:
-    gone = broken("drop=haptics:from=20:to=40", episode).observations
+def test_dropped_images_are_black_and_other_readings_constant(episode: Episode) -> None:
+    dropped = inject("drop=haptics:from=20:to=40", episode).observations
     for key in ("force", "torque", "effector_position", "contact"):
-        assert (gone[key][20:40] == episode.observations[key][19]).all()
-    assert not broken("drop=image:from=20:to=40", episode).observations["image"][20:40].any()
-    assert (broken("drop=haptics", episode).observations["force"] == episode.observations["force"][0]).all()
+        assert (dropped[key][20:40] == episode.observations[key][19]).all()
+    assert not inject("drop=image:from=20:to=40", episode).observations["image"][20:40].any()
+    assert (inject("drop=haptics", episode).observations["force"] == episode.observations["force"][0]).all()
 
 
-def test_gaps_have_their_length_and_take_all_sensors_of_the_modality(episode: Episode) -> None:
+def test_dropouts_have_the_given_length_and_affect_all_sensors(episode: Episode) -> None:
     count = 4000
     ramp = np.arange(count, dtype=np.float32)[:, None]
     keys = DOOR.modalities["haptics"]
     long = replace(episode, observations=dict.fromkeys(keys, ramp))
-    gone = broken("drop=haptics:probability=0.02:steps=5", long).observations
-    assert all(np.array_equal(gone[key], gone[keys[0]]) for key in keys)
-    lost = (gone[keys[0]] != ramp)[:, 0]
+    dropped = inject("drop=haptics:probability=0.02:steps=5", long).observations
+    assert all(np.array_equal(dropped[key], dropped[keys[0]]) for key in keys)
+    lost = (dropped[keys[0]] != ramp)[:, 0]
     assert lost.mean() == pytest.approx(1 - 0.98**5, rel=0.25)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], lost, [0]])))
     lengths = edges[1::2] - edges[::2]
@@ -214,82 +217,95 @@ def test_gaps_have_their_length_and_take_all_sensors_of_the_modality(episode: Ep
     assert np.bincount(lengths).argmax() == 5
 
 
-def test_a_fault_that_begins_after_the_end_changes_nothing(episode: Episode) -> None:
-    for text in BREAKS:
-        assert broken(f"{text}:from=5000", episode).digest() == episode.digest()
+def test_fault_after_the_end_changes_nothing(episode: Episode) -> None:
+    for text in AFFECTED:
+        assert inject(f"{text}:from=5000", episode).digest() == episode.digest()
 
 
-def test_faults_act_in_their_order(episode: Episode) -> None:
-    there = broken("force_bias:x=100,force_saturation=5", episode)
-    back = broken("force_saturation=5,force_bias:x=100", episode)
-    assert force(there).max() == 5
-    assert force(back).max() > 95
+def test_faults_are_applied_in_order(episode: Episode) -> None:
+    saturated = inject("force_bias:x=100,force_saturation=5", episode)
+    biased = inject("force_saturation=5,force_bias:x=100", episode)
+    assert force(saturated).max() == 5
+    assert force(biased).max() > 95
     both = Faults.parse("force_bias:x=100") + Faults.parse("force_saturation=5")
     assert both == Faults.parse("force_bias:x=100,force_saturation=5")
-    assert both.apply(episode).digest() == there.digest()
+    assert both.apply(episode).digest() == saturated.digest()
 
 
-def test_no_fault_is_no_copy(episode: Episode) -> None:
-    assert not WHOLE
-    assert WHOLE.apply(episode) is episode
-    assert Faults.parse("") == Faults.parse(" ") == Faults.parse("[]") == Faults.parse("{}") == Faults.of([]) == WHOLE
+def test_no_faults_return_the_same_episode(episode: Episode) -> None:
+    assert not NO_FAULTS
+    assert NO_FAULTS.apply(episode) is episode
+    assert (
+        Faults.parse("")
+        == Faults.parse(" ")
+        == Faults.parse("[]")
+        == Faults.parse("{}")
+        == Faults.from_json([])
+        == NO_FAULTS
+    )
 
 
-def test_copies_of_training_episodes(episode: Episode) -> None:
+def test_only_training_episodes_are_copied(episode: Episode) -> None:
     some = [replace(episode, split=split) for split in ("train", "val", "test", "train")]
-    copies = broken_copies(Faults.parse("force_bias:x=5"), some, 0)
+    copies = faulty_copies(Faults.parse("force_bias:x=5"), some, 0)
     assert [copy.split for copy in copies] == ["train", "train"]
     assert all(force(copy)[:, 0].mean() > force(episode)[:, 0].mean() + 4 for copy in copies)
 
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=list(FAULTS))
-def test_a_fault_prints_and_travels(fault: type[Fault]) -> None:
-    odd = {float: 0.37, int: 3}
-    given = {one.name: odd.get(one.metadata["kind"], one.default) for one in parameters(fault).values()} | {
-        "from_": 2,
-        "to": 9,
-    }
-    for faults in (Faults((fault(),)), Faults((fault(**given), fault()))):
+def test_fault_round_trips_as_text_and_json(fault: type[Fault]) -> None:
+    unusual = {float: 0.37, int: 3}
+    values = {p.name: unusual.get(p.metadata["kind"], p.default) for p in parameters(fault).values()}
+    values |= {"from_": 2, "to": 9}
+    for faults in (Faults((fault(),)), Faults((fault(**values), fault()))):
         assert Faults.parse(str(faults)) == faults
-        assert Faults.of(json.loads(json.dumps(faults.to_json()))) == faults
+        assert Faults.from_json(json.loads(json.dumps(faults.to_json()))) == faults
         assert Faults.parse(json.dumps(faults.to_json())) == faults
         assert {faults: 1}[Faults.parse(str(faults))] == 1
-    assert Faults((fault(**given),)).to_json()[0].items() >= {"fault": fault.name, "from": 2, "to": 9}.items()
+    assert Faults((fault(**values),)).to_json()[0].items() >= {"fault": fault.name, "from": 2, "to": 9}.items()
 
 
 def test_short_forms() -> None:
-    asked = Faults((FAULTS["blackout"](probability=0.4),))
+    faults = Faults((FAULTS["blackout"](probability=0.4),))
     for text in ('{"blackout": 0.4}', '[{"fault": "blackout", "probability": 0.4}]', "blackout:probability=0.4"):
-        assert Faults.parse(text) == asked
-    assert Faults.parse(" blackout=0.4 , force_bias:x=5 ") == asked + Faults.of({"fault": "force_bias", "x": 5})
-    assert str(asked) == "blackout=0.4"
+        assert Faults.parse(text) == faults
+    assert Faults.parse(" blackout=0.4 , force_bias:x=5 ") == faults + Faults.from_json({"fault": "force_bias", "x": 5})
+    assert str(faults) == "blackout=0.4"
     assert str(Faults.parse("force_bias=0:y=2:from=20:to=60")) == "force_bias:y=2:from=20:to=60"
     assert str(Faults.parse("delay:steps=3,blackout=1,image_frozen=7")) == "delay=image:steps=3,blackout,image_frozen=7"
-    assert asked.to_json() == [{"fault": "blackout", "probability": 0.4}]
+    assert faults.to_json() == [{"fault": "blackout", "probability": 0.4}]
 
 
-def test_ready_faults_are_of_the_door_and_each_does_something(episode: Episode) -> None:
+def test_fault_names_of_earlier_versions_are_read() -> None:
+    old = Faults.from_json(
+        [{"fault": "image_darker", "factor": 0.5}, {"fault": "image_patch"}, {"fault": "contact_late"}]
+    )
+    assert str(old) == "image_underexposed=0.5,image_occluded,contact_delayed"
+    assert Faults.parse("image_darker=0.5,image_patch,contact_late") == old
+
+
+def test_presets_fit_the_door_and_change_the_episode(episode: Episode) -> None:
     for text in FAULT_PRESETS.values():
         faults = Faults.parse(text)
         faults.check(DOOR)
         assert faults.apply(episode).digest() != episode.digest()
 
 
-def test_every_parameter_is_described() -> None:
-    for fault in described():
+def test_catalog_describes_all_parameters() -> None:
+    for fault in fault_catalog():
         assert fault["meaning"].endswith(".")
         assert all(p["unit"] and p["meaning"] for p in fault["parameters"])
-    assert json.dumps(described())
+    assert json.dumps(fault_catalog())
 
 
 def test_every_fault_is_documented() -> None:
     page = (Path(beliefscope.__file__).resolve().parents[2] / "docs" / "data.md").read_text()
-    rows = dict(re.findall(r"^\| `(\w+)` \| (.*\.) \|$", page.split("## Broken sensors")[1], re.MULTILINE))
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*\.) \|$", page.split("## Sensor faults")[1], re.MULTILINE))
     assert list(rows) == list(FAULTS)
-    for fault in described():
-        own = [p["name"] for p in fault["parameters"][:-2]]
-        shown = rows[fault["fault"]].split("`")[1].split() if own else []
-        assert [one.split("=")[0] for one in shown] == own
+    for fault in fault_catalog():
+        names = [p["name"] for p in fault["parameters"][:-2]]
+        documented = rows[fault["fault"]].split("`")[1].split() if names else []
+        assert [text.split("=")[0] for text in documented] == names
         assert rows[fault["fault"]].endswith(f"| {fault['meaning']}")
 
 
@@ -317,27 +333,27 @@ BAD = {
     '{"blackout": true}': r"blackout's 'probability' is True, not a number",
     '{"delay": ""}': r"delay's 'modality' is '', not a name",
     '{"delay": "a,b"}': r"delay's 'modality' is 'a,b', not a name",
-    '{"force_bias": 1' + "0" * 500 + "}": r"faults is not JSON: a number of 501 digits is beyond all floats",
+    '{"force_bias": 1' + "0" * 500 + "}": r"faults is not JSON: a number of 501 digits is beyond the range of floats",
     "force_bias=1" + "0" * 500: r"force_bias's 'x' is 10+, not a number",
     "delay=\ud800:steps=1": r"delay's 'modality' is '\\ud800', not a name",
 }
 
 
 @pytest.mark.parametrize("text", BAD, ids=lambda text: text[:40])
-def test_a_bad_faults_is_one_line_that_names_what_exists(text: str) -> None:
-    with pytest.raises(BadInput, match=BAD[text]) as caught:
+def test_invalid_faults_are_rejected_in_one_line(text: str) -> None:
+    with pytest.raises(BadInput, match=BAD[text]) as error:
         Faults.parse(text)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
-def test_a_fault_of_what_a_task_has_not(episode: Episode) -> None:
+def test_faults_of_missing_sensors_are_rejected(episode: Episode) -> None:
     with pytest.raises(BadInput, match=r"modality of task 'door' 'touch' does not exist\. Available: image, haptics\."):
         Faults.parse("delay=touch").check(DOOR)
-    blind = replace(DOOR, observations={"force": (3,)})
+    no_image = replace(DOOR, observations={"force": (3,)})
     with pytest.raises(BadInput, match=r"sensor of task 'door' 'image' does not exist\. Available: force\."):
-        Faults.parse("force_bias,blackout").check(blind)
+        Faults.parse("force_bias,blackout").check(no_image)
     flat = replace(episode, observations=dict(episode.observations) | {"force": np.zeros((100, 2), np.float32)})
-    with pytest.raises(BadInput, match=r"force_bias:z=1 is of an axis that the sensor has not\. Available: x, y\."):
-        broken("force_bias:z=1", flat)
+    with pytest.raises(BadInput, match=r"z=1 uses an axis that the sensor does not have\. Available: x, y\."):
+        inject("force_bias:z=1", flat)
     with pytest.raises(BadInput, match=r"axis of the force 'z' does not exist\. Available: x, y\."):
-        broken("force_stuck=z", flat)
+        inject("force_stuck=z", flat)

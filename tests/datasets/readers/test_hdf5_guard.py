@@ -1,4 +1,4 @@
-"""What libhdf5 does not take well: files that lead it round in circles, and a disk that is full."""
+"""libhdf5 failures: files that make it loop forever, and full disks."""
 
 from __future__ import annotations
 
@@ -14,55 +14,51 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.io.atomic_write import unwritable
+from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.readers import hdf5_guard
-from beliefscope.datasets.readers.hdf5_guard import SHIPPED, look_over, open_hdf5
+from beliefscope.datasets.readers.hdf5_guard import SAMPLES, open_hdf5, probe
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 
 @pytest.fixture
-def whole(tmp_path: Path) -> Path:
-    """A set of one episode."""
+def valid(tmp_path: Path) -> Path:
+    """A dataset of one episode."""
     with open_dataset(sample_path("door")) as data:
         write_dataset(tmp_path / "door.h5", DOOR, [data[0]])
     return tmp_path / "door.h5"
 
 
 def endless(path: Path) -> Path:
-    """A copy whose first string says that it is 2^64 - 16 bytes long, so that the next one in its heap is itself."""
+    """A copy whose first string has a size of 2^64 - 16 bytes, so that the next string in the heap is itself."""
     data = bytearray(path.read_bytes())
     heap = data.index(b"GCOL")
     data[heap + 24 : heap + 32] = struct.pack("<Q", 2**64 - 16)
-    other = path.with_name("endless.h5")
-    other.write_bytes(data)
-    return other
+    copy = path.with_name("endless.h5")
+    copy.write_bytes(data)
+    return copy
 
 
-def test_a_file_that_libhdf5_never_comes_back_from_is_refused_in_time(
-    whole: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_endless_file_is_rejected_in_time(valid: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hdf5_guard, "SECONDS", 0.5)
-    path, began = endless(whole), time.process_time()
-    for skip_bad in (False, True):  # the second time it is known
+    path, start = endless(valid), time.process_time()
+    for skip_bad in (False, True):  # the second result is cached
         with pytest.raises(BadInput, match=r"endless\.h5 cannot be read as HDF5 within 1 s: it is damaged"):
             open_dataset(path, skip_bad=skip_bad)
-    assert time.process_time() - began < 5, "this process does not look itself"
-    with open_dataset(whole) as data:
+    assert time.process_time() - start < 5, "only the subprocess reads the file"
+    with open_dataset(valid) as data:
         assert len(data[0])
 
 
-def test_one_bad_file_among_many_is_found_and_the_others_are_read(
-    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_endless_file_among_others(tmp_path: Path, valid: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hdf5_guard, "SECONDS", 0.5)
     paths = [tmp_path / f"{name}.h5" for name in "abcd"]
-    for number, path in enumerate(paths):  # files of their own, which this process has not written as a set
-        path.write_bytes(whole.read_bytes())
+    for number, path in enumerate(paths):  # distinct files that were not written by write_dataset
+        path.write_bytes(valid.read_bytes())
         with h5py.File(path, "r+") as file:
             file.attrs["number"] = number
-    endless(whole).rename(paths[1])
-    look_over(paths)
+    endless(valid).rename(paths[1])
+    probe(paths)
     for number in (0, 2, 3):
         with open_hdf5(paths[number]) as file:
             assert file.attrs["number"] == number
@@ -70,20 +66,18 @@ def test_one_bad_file_among_many_is_found_and_the_others_are_read(
         open_hdf5(paths[1])
 
 
-def test_a_process_is_started_for_new_files_of_others_only(
-    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_new_external_files_are_probed(tmp_path: Path, valid: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[object] = []
     run = subprocess.run
     monkeypatch.setattr(hdf5_guard.subprocess, "run", lambda *a, **b: started.append(a) or run(*a, **b))
     (tmp_path / "text.h5").write_text("no HDF5")
-    look_over([*SHIPPED.glob("*.h5"), whole, tmp_path / "text.h5", tmp_path / "gone.h5", tmp_path])
-    assert not started, "what ships, what was just written, and what is no HDF5"
-    with h5py.File(whole, "r+") as file:
+    probe([*SAMPLES.glob("*.h5"), valid, tmp_path / "text.h5", tmp_path / "gone.h5", tmp_path])
+    assert not started, "samples, files of this process and other formats"
+    with h5py.File(valid, "r+") as file:
         file.attrs["more"] = np.zeros(3)
     for _ in range(2):
-        look_over([whole])
-    assert len(started) == 1, "once for as long as it stays the same"
+        probe([valid])
+    assert len(started) == 1, "once until the file changes"
 
 
 FULL = """
@@ -92,35 +86,36 @@ from pathlib import Path
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, write_dataset
-path, room = Path(sys.argv[1]), int(sys.argv[2])
+path = Path(sys.argv[1])
 with open_dataset(path) as data:
     episode = data[0]
-resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
-try:
-    write_dataset(path, DOOR, [episode] * 3)
-except BadInput as error:
-    print(error)
+for limit in sys.argv[2:]:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), resource.RLIM_INFINITY))
+    try:
+        write_dataset(path, DOOR, [episode] * 3)
+    except BadInput as error:
+        print(error)
 resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 write_dataset(path.with_name("later.h5"), DOOR, [episode] * 3)
 """
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-def test_where_there_is_no_room_the_process_says_so_and_lives(whole: Path, share: float) -> None:
-    """Wherever it runs out: at the first byte, among the episodes, or as the file is closed."""
-    before, folder = whole.read_bytes(), whole.parent
-    with open_dataset(whole) as data:
+def test_full_disk_is_reported_without_a_crash(valid: Path) -> None:
+    """The disk is full at the first byte, between episodes, or when the file is closed."""
+    before, folder = valid.read_bytes(), valid.parent
+    with open_dataset(valid) as data:
         write_dataset(folder / "later.h5", DOOR, [data[0]] * 3)
-    room = int(share * (folder / "later.h5").stat().st_size)
-    ran = subprocess.run([sys.executable, "-c", FULL, whole, str(room)], capture_output=True, text=True, check=False)
-    assert (ran.returncode, ran.stdout, ran.stderr) == (0, f"cannot write {str(whole)!r}: File too large\n", "")
-    assert whole.read_bytes() == before
-    assert sorted(path.name for path in folder.iterdir()) == ["door.h5", "later.h5"], "nothing half-written is left"
+    limits = [str(int(fraction * (folder / "later.h5").stat().st_size)) for fraction in (0.0, 0.5, 0.99)]
+    process = subprocess.run([sys.executable, "-c", FULL, valid, *limits], capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stderr) == (0, "")
+    assert process.stdout == 3 * f"cannot write {str(valid)!r}: File too large\n"
+    assert valid.read_bytes() == before
+    assert sorted(path.name for path in folder.iterdir()) == ["door.h5", "later.h5"], "no partial file remains"
     with open_dataset(folder / "later.h5") as data:
         assert len(data) == 3
 
 
-def test_what_is_free_is_told_where_the_disk_is_full(tmp_path: Path) -> None:
-    said = str(unwritable(tmp_path / "x.h5", OSError(errno.ENOSPC, "No space left on device")))
-    assert said.startswith(f"cannot write '{tmp_path / 'x.h5'}': No space left on device, ")
-    assert said.endswith(" MB are free there")
+def test_error_of_a_full_disk_states_the_free_space(tmp_path: Path) -> None:
+    message = str(write_error(tmp_path / "x.h5", OSError(errno.ENOSPC, "No space left on device")))
+    assert message.startswith(f"cannot write '{tmp_path / 'x.h5'}': No space left on device, ")
+    assert message.endswith(" MB are free there")

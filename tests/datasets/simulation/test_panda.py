@@ -1,4 +1,4 @@
-"""The arm against Franka's own numbers, and the hand against mechanics."""
+"""Panda model: published parameters, wrist sensor and impedance controller."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import pytest
 from numpy.typing import NDArray
 
 from beliefscope.datasets.simulation.controller import HandController
-from beliefscope.datasets.simulation.door import HINGE_CENTRE, IMPEDANCE, DoorPhysics, door_model
+from beliefscope.datasets.simulation.door import IMPEDANCE, door_model
+from beliefscope.datasets.simulation.door_physics import HINGE_CENTRE, DoorPhysics
 from beliefscope.datasets.simulation.panda import ARM_JOINTS, GRIP_OFFSET
 from beliefscope.datasets.simulation.sensors import HandSensors
 
-FREE = np.array([0.45, 0.1, 0.6])  # away from everything
+FREE = np.array([0.45, 0.1, 0.6])  # far from all objects
 
 
 @pytest.fixture
@@ -31,7 +32,7 @@ def hold(model: mujoco.MjModel, data: mujoco.MjData, at: NDArray[np.float64], se
     return controller
 
 
-def test_published_joint_angles_put_the_hand_where_franka_puts_it(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
+def test_forward_kinematics_match_published_values(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
     model, data = scene
     data.qpos[:7] = (-1.609, -0.615, 1.696, -1.627, 1.782, 3.228, -0.498)
     mujoco.mj_kinematics(model, data)
@@ -40,7 +41,7 @@ def test_published_joint_angles_put_the_hand_where_franka_puts_it(scene: tuple[m
     assert along @ (1, 0, 0) > 0.99, "the hand points along +x"
 
 
-def test_joints_keep_frankas_limits_and_efforts(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
+def test_joint_limits_efforts_and_mass(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
     model, _ = scene
     assert [model.joint(name).range[1] for name in ARM_JOINTS] == pytest.approx(
         [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973]
@@ -51,7 +52,7 @@ def test_joints_keep_frankas_limits_and_efforts(scene: tuple[mujoco.MjModel, muj
 
 @pytest.mark.parametrize("yaw", [0.0, 0.35, 0.7])
 @pytest.mark.parametrize("position", [(0.725, 0.14, 0.62), (0.39, -0.365, 0.55), (0.5, -0.45, 0.69)])
-def test_place_reaches_the_whole_arc_of_the_bar(
+def test_place_reaches_the_arc_of_the_bar(
     scene: tuple[mujoco.MjModel, mujoco.MjData], position: tuple[float, float, float], yaw: float
 ) -> None:
     model, data = scene
@@ -64,7 +65,7 @@ def test_place_reaches_the_whole_arc_of_the_bar(
     assert np.linalg.norm(controller.position - data.body("hand").xpos) == pytest.approx(GRIP_OFFSET)
 
 
-def test_a_hand_at_rest_feels_nothing(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
+def test_wrench_is_zero_at_rest(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
     model, data = scene
     hold(model, data, FREE)
     np.testing.assert_allclose(HandSensors(model, data).wrench(), 0, atol=0.02)
@@ -72,13 +73,13 @@ def test_a_hand_at_rest_feels_nothing(scene: tuple[mujoco.MjModel, mujoco.MjData
 
 
 @pytest.mark.parametrize("force", [(20.0, 0.0, 0.0), (0.0, -15.0, 0.0), (0.0, 0.0, 10.0)])
-def test_the_wrist_feels_a_force_on_the_hand_with_its_sign(
+def test_wrench_of_an_external_force(
     scene: tuple[mujoco.MjModel, mujoco.MjData], force: tuple[float, float, float]
 ) -> None:
     model, data = scene
     controller = hold(model, data, FREE, 0.2)
     hand, wrist = model.body("hand").id, model.site("wrist").id
-    data.xfrc_applied[hand, :3] = force  # acts at the hand's centre of mass
+    data.xfrc_applied[hand, :3] = force  # applied at the hand's centre of mass
     for _ in range(30):
         controller.command(FREE, 0.0)
         mujoco.mj_step(model, data, 25)
@@ -88,7 +89,7 @@ def test_the_wrist_feels_a_force_on_the_hand_with_its_sign(
     np.testing.assert_allclose(wrench[3:], np.cross(lever, force), atol=0.02)
 
 
-def test_the_hand_yields_like_the_spring_it_is_told_to_be(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
+def test_hand_has_the_requested_stiffness(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
     model, data = scene
     controller = hold(model, data, FREE)
     start = controller.position
@@ -96,11 +97,11 @@ def test_the_hand_yields_like_the_spring_it_is_told_to_be(scene: tuple[mujoco.Mj
     for _ in range(50):
         controller.command(FREE, 0.0)
         mujoco.mj_step(model, data, 25)
-    # A force at the wrist also tilts the hand a little, hence the tolerance.
+    # The tolerance covers the tilt of the hand.
     assert controller.position[0] - start[0] == pytest.approx(20.0 / IMPEDANCE.stiffness[0], rel=0.25)
 
 
-def test_the_set_point_never_leads_by_more_than_allowed(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
+def test_lead_of_the_set_point_is_limited(scene: tuple[mujoco.MjModel, mujoco.MjData]) -> None:
     model, data = scene
     controller = hold(model, data, FREE, 0.1)
     set_point = controller.command(FREE + 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""Filters from outside, named by file or module: what cannot be one is said in a line, and nothing stays of it."""
+"""External filters loaded by file or module name: errors, hashes and adapters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.external.adapter import Adapter
-from beliefscope.filters.external.load import Foreign, load_foreign
+from beliefscope.filters.external.load import ExternalFilter, load_external
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +27,11 @@ FILE = """
 import torch
 from torch import nn
 class Filter(nn.Module):
-    said = {said}
+    value = {value}
     def initialize_beliefs(self, mean, covariance): self.at = 0
     def forward(self, observations, controls):
         self.at += 1
-        return self.said if self.at == 4 else torch.zeros(len(controls), 3)
+        return self.value if self.at == 4 else torch.zeros(len(controls), 3)
 build = Filter
 NUMBER = 3
 def number(): return 3
@@ -44,14 +44,14 @@ def other():
 
 
 @pytest.mark.parametrize(
-    ("name", "said", "message"),
+    ("name", "value", "message"),
     [
         ("missing.py:build", "", r"^missing\.py does not exist\.$"),
         ("no.such.module:build", "", r"^module 'no\.such\.module' cannot be imported: ModuleNotFoundError"),
-        ("own.py:biuld", "", r"^own\.py holds no 'biuld'\. To be called in it: Filter, build, number, fails, other\.$"),
-        ("own.py:NUMBER", "", r"^own\.py holds 'NUMBER', which cannot be called\. To be called"),
-        ("own.py:number", "", r"^own\.py:number gives a int, expected a torch\.nn\.Module, or an Adapter of one$"),
-        ("own.py:fails", "", r"^own\.py:fails fails when it is called: KeyError: 'weights\.pt'$"),
+        ("own.py:biuld", "", r"^own\.py has no 'biuld'\. Available: Filter, build, number, fails, other\.$"),
+        ("own.py:NUMBER", "", r"^own\.py has 'NUMBER', which is not callable\. Available"),
+        ("own.py:number", "", r"^own\.py:number returns a int, expected a torch\.nn\.Module, or an Adapter of one$"),
+        ("own.py:fails", "", r"^own\.py:fails fails when called: KeyError: 'weights\.pt'$"),
         ("own.py:other", "", r"^filter 'own\.py:other' is for task 'push', not for 'door'$"),
         ("own.py:build", "1 / 0", r"^own\.py cannot be run: ZeroDivisionError"),
         (
@@ -62,37 +62,37 @@ def other():
         (
             "own.py:build",
             "torch.zeros(1, 2)",
-            r"build at step 3 gives estimate_mean of shape \(1, 2\), expected \(1, 3\)$",
+            r"build at step 3 returns estimate_mean of shape \(1, 2\), expected \(1, 3\)$",
         ),
         (
             "own.py:build",
             "torch.full((1, 3), float('nan'))",
-            r"build at step 3 gives estimate_mean with a number that is",
+            r"build at step 3 returns estimate_mean with a number that is",
         ),
     ],
 )
-def test_files_that_are_no_filters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episode: Episode, name: str, said: str, message: str
+def test_invalid_filter_sources_are_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episode: Episode, name: str, value: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "own.py").write_text(FILE.format(said=said or "None"))
+    (tmp_path / "own.py").write_text(FILE.format(value=value or "None"))
     path = list(sys.path)
     with pytest.raises(BadInput, match=message):
-        load_foreign(name, "door").run([episode])
+        load_external(name, "door").run([episode])
     assert sys.path == path
 
 
-def test_the_hash_is_of_weights_and_code(tmp_path: Path) -> None:
-    (tmp_path / "beside.py").write_text("from torch import nn\nclass One(nn.Linear):\n    task = 'door'\n")
-    code = "import torch\nfrom beside import One\ndef build():\n    torch.manual_seed({})\n    return One(2, 2)\n"
+def test_hash_depends_on_weights_code_and_adapter(tmp_path: Path) -> None:
+    (tmp_path / "helper.py").write_text("from torch import nn\nclass One(nn.Linear):\n    task = 'door'\n")
+    code = "import torch\nfrom helper import One\ndef build():\n    torch.manual_seed({})\n    return One(2, 2)\n"
     hashes = []
     for seed in (0, 0, 1):
         (tmp_path / "own.py").write_text(code.format(seed))
-        hashes.append(load_foreign(f"{tmp_path}/own.py:build").hash)
-    sys.modules.pop("beside")
+        hashes.append(load_external(f"{tmp_path}/own.py:build").hash)
+    sys.modules.pop("helper")
     assert hashes[0] == hashes[1] != hashes[2]
     one, other = Adapter(nn.Linear(2, 2), std=(1, 1, 1)), Adapter(nn.Linear(2, 2), std=(1, 1, 2))
-    assert Foreign(one, DOOR, "a").hash != Foreign(other, DOOR, "a").hash
+    assert ExternalFilter(one, DOOR, "a").hash != ExternalFilter(other, DOOR, "a").hash
 
 
 @pytest.mark.parametrize(
@@ -104,6 +104,6 @@ def test_the_hash_is_of_weights_and_code(tmp_path: Path) -> None:
         ({"std": (1.0, 0.0, 1.0)}, r"Adapter's std is \(1.0, 0.0, 1.0\), expected numbers above 0"),
     ],
 )
-def test_adapters_that_do_not_fit(adapter: dict[str, Any], message: str) -> None:
+def test_adapters_that_do_not_fit_the_task_are_rejected(adapter: dict[str, Any], message: str) -> None:
     with pytest.raises(BadInput, match=message):
-        Foreign(Adapter(nn.Linear(2, 2), **adapter), DOOR, "mine")
+        ExternalFilter(Adapter(nn.Linear(2, 2), **adapter), DOOR, "mine")

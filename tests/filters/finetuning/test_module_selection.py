@@ -1,4 +1,4 @@
-"""Names, patterns and presets of modules: what is chosen, what stays frozen, and what a wrong pattern is told."""
+"""Module names, patterns and presets: selected and frozen parameters, and errors."""
 
 from __future__ import annotations
 
@@ -12,15 +12,23 @@ from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.catalog import architecture, build, filters_of
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.finetuning.module_selection import chosen, digest, freeze, moved, presets, tensors_of, tree
+from beliefscope.filters.finetuning.module_selection import (
+    digest,
+    freeze,
+    module_change,
+    module_tree,
+    named_tensors,
+    presets,
+    select_parameters,
+)
 
 
 def door(name: str = "crossmodal-ekf") -> Filter:
     return build(architecture("door", name))
 
 
-class Stranger(nn.Module):
-    """Somebody else's network: with running statistics, dropout and a layer that is used twice."""
+class ExternalModule(nn.Module):
+    """An external network with running statistics, dropout and a shared layer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -35,97 +43,105 @@ class Stranger(nn.Module):
 
 
 @pytest.mark.parametrize("name", filters_of(find_task("door")))
-def test_the_tree_holds_everything_once(name: str) -> None:
+def test_module_tree_contains_every_parameter_once(name: str) -> None:
     filter_ = door(name)
-    nodes = {node.name: node for node in tree(filter_)}
+    nodes = {node.name: node for node in module_tree(filter_)}
     total = sum(p.numel() for p in filter_.parameters())
     assert nodes[""].parameters == total
     top = [node for node in nodes.values() if node.depth == 1]
     assert sum(node.parameters for node in top) == total
     assert nodes[""].buffers == sum(b.numel() for b in filter_.buffers()) == nodes["statistics"].buffers
     assert set(dict(filter_.named_modules())) <= set(nodes)
-    known = presets(filter_)
-    assert len(list(chosen(filter_, ["all"]))) == len(list(filter_.parameters()))
-    assert ("weights-only" in known) == name.startswith("crossmodal")
-    assert all(set(chosen(filter_, [preset])) for preset in known)
+    available = presets(filter_)
+    assert len(list(select_parameters(filter_, ["all"]))) == len(list(filter_.parameters()))
+    assert ("weights-only" in available) == name.startswith("crossmodal")
+    assert all(set(select_parameters(filter_, [preset])) for preset in available)
 
 
-def test_presets_hold_what_they_say() -> None:
+def test_presets_select_their_modules() -> None:
     filter_ = door()
 
     def heads(preset: str, depth: int = 2) -> set[str]:
-        return {".".join(name.split(".")[:depth]) for name in chosen(filter_, [preset])}
+        return {".".join(name.split(".")[:depth]) for name in select_parameters(filter_, [preset])}
 
     assert heads("haptics-only") == {"virtual_sensors.haptics"}
     assert heads("image-only") == {"virtual_sensors.image"}
     assert heads("weights-only", 1) == {"weight_model"}
-    assert not [name for name in chosen(filter_, ["weights-only"]) if ".image" in name]
+    assert not [name for name in select_parameters(filter_, ["weights-only"]) if ".image" in name]
     assert heads("noise-only", 1) == {"dynamics", "virtual_sensors"}
-    assert all("log_noise" in name for name in chosen(filter_, ["noise-only"]))
+    assert all("log_noise" in name for name in select_parameters(filter_, ["noise-only"]))
     assert heads("dynamics-only", 1) == {"dynamics"}
-    assert not set(chosen(filter_, ["haptics-only"])) & set(chosen(filter_, ["weights-only"]))
+    assert not set(select_parameters(filter_, ["haptics-only"])) & set(select_parameters(filter_, ["weights-only"]))
 
 
-def test_patterns_reach_any_depth_and_frozen_wins() -> None:
+def test_patterns_match_at_any_depth_and_freeze_takes_precedence() -> None:
     filter_ = door()
-    every = set(chosen(filter_))
-    image = set(chosen(filter_, ["virtual_sensors.image.*"]))
-    assert image == set(chosen(filter_, ["virtual_sensors.image"])) == {n for n in every if "sensors.image." in n}
-    assert set(chosen(filter_, freeze=["virtual_sensors.image"])) == every - image
-    assert set(chosen(filter_, ["weight_model.trunk.0.bias"])) == {"weight_model.trunk.0.bias"}
-    both = chosen(filter_, ["haptics-only", "weights-only"], ["*.log_noise"])
+    every = set(select_parameters(filter_))
+    image = set(select_parameters(filter_, ["virtual_sensors.image.*"]))
+    assert (
+        image
+        == set(select_parameters(filter_, ["virtual_sensors.image"]))
+        == {n for n in every if "sensors.image." in n}
+    )
+    assert set(select_parameters(filter_, freeze=["virtual_sensors.image"])) == every - image
+    assert set(select_parameters(filter_, ["weight_model.trunk.0.bias"])) == {"weight_model.trunk.0.bias"}
+    both = select_parameters(filter_, ["haptics-only", "weights-only"], ["*.log_noise"])
     assert set(both) == {
-        n for n in [*chosen(filter_, ["haptics-only"]), *chosen(filter_, ["weights-only"])] if "log_noise" not in n
+        n
+        for n in [*select_parameters(filter_, ["haptics-only"]), *select_parameters(filter_, ["weights-only"])]
+        if "log_noise" not in n
     }
-    states = {node.name: node.state for node in tree(filter_, both)}
+    states = {node.name: node.state for node in module_tree(filter_, both)}
     assert states["weight_model.trunk"] == states["virtual_sensors.haptics.trunk"] == "trained"
-    assert states["virtual_sensors"] == states[""] == states["virtual_sensors.haptics"] == "in part"
+    assert states["virtual_sensors"] == states[""] == states["virtual_sensors.haptics"] == "partly trained"
     assert states["dynamics"] == states["virtual_sensors.image"] == "frozen"
     assert states["statistics"] == "-"
 
 
-def test_what_matches_nothing_is_told_what_there_is() -> None:
+def test_patterns_without_match_are_rejected_with_suggestions() -> None:
     filter_ = door()
     with pytest.raises(BadInput, match=r"'weigth_model' matches no part.*Did you mean weight_model.*Available: .*all;"):
-        chosen(filter_, freeze=["weigth_model"])
+        select_parameters(filter_, freeze=["weigth_model"])
     with pytest.raises(BadInput, match=r"'touch-only' matches no part .*haptics-only"):
-        chosen(filter_, ["touch-only"])
+        select_parameters(filter_, ["touch-only"])
     with pytest.raises(BadInput, match=r"--train dynamics-only --freeze dynamics leaves nothing to train"):
-        chosen(filter_, ["dynamics-only"], ["dynamics"])
+        select_parameters(filter_, ["dynamics-only"], ["dynamics"])
 
 
-def test_strangers_keep_their_frozen_statistics() -> None:
-    """A step in the mode that ``freeze`` leaves moves what trains, and no frozen parameter or buffer by a bit."""
+def test_frozen_parameters_and_buffers_do_not_change() -> None:
     torch.manual_seed(0)
-    module = Stranger()
-    for train, moving in (
+    module = ExternalModule()
+    for train, expected in (
         (["head"], {"head.weight", "head.bias", "again.weight", "again.bias"}),
         (["body.0"], {"body.0.weight", "body.0.bias"}),
         (["body.1.weight"], {"body.1.weight", "body.1.running_mean", "body.1.running_var"}),
     ):
         copied = copy.deepcopy(module)
-        trained = chosen(copied, train)
+        trained = select_parameters(copied, train)
         frozen = freeze(copied, trained)
-        before = {name: tensor.clone() for name, tensor in tensors_of(copied).items()}
-        proof = digest(copied, frozen)
+        before = {name: tensor.clone() for name, tensor in named_tensors(copied).items()}
+        before_digest = digest(copied, frozen)
         optimiser = torch.optim.SGD(trained.values(), lr=0.1)
         copied(3.0 + torch.randn(8, 4)).square().sum().backward()
         optimiser.step()
-        changed = {name for name, tensor in tensors_of(copied).items() if not torch.equal(tensor, before[name])}
-        assert changed - {"body.1.num_batches_tracked"} == moving, train
-        assert digest(copied, frozen) == proof
+        changed = {name for name, tensor in named_tensors(copied).items() if not torch.equal(tensor, before[name])}
+        assert changed - {"body.1.num_batches_tracked"} == expected, train
+        assert digest(copied, frozen) == before_digest
         assert not changed & set(frozen)
-    # A tensor with two names is frozen by either.
-    assert set(chosen(module, freeze=["again"])) == {"body.0.weight", "body.0.bias", "body.1.weight", "body.1.bias"} | {
-        "scale"
-    }
+    # A tensor with two names can be frozen by either.
+    assert set(select_parameters(module, freeze=["again"])) == {
+        "body.0.weight",
+        "body.0.bias",
+        "body.1.weight",
+        "body.1.bias",
+    } | {"scale"}
     assert presets(module) == {"all": ("*",)}
-    assert next(node for node in tree(module)).says.startswith("Somebody else's network")
+    assert next(node for node in module_tree(module)).description.startswith("An external network")
 
 
-def test_a_digest_sees_every_bit() -> None:
-    module = Stranger()
-    names = list(tensors_of(module))
+def test_digest_depends_on_every_bit() -> None:
+    module = ExternalModule()
+    names = list(named_tensors(module))
     before = digest(module, names)
     assert digest(module, reversed(names)) == before
     with torch.no_grad():
@@ -135,8 +151,8 @@ def test_a_digest_sees_every_bit() -> None:
     assert digest(module, [name for name in names if not name.startswith(("head", "again"))]) != before
 
 
-def test_what_a_training_did_adds_up() -> None:
-    ran = {"a.x": [3.0, 1.0, 3.0], "a.y": [4.0, 0.0, 4.0], "b": [1.0, 2.0, 4.0]}
-    assert moved("a", ran) == {"gradient": 5.0, "change": 0.2}
-    assert moved("b", ran) == {"gradient": 1.0, "change": 0.5}
-    assert moved("ab", ran) == {"gradient": 0.0, "change": 0.0}
+def test_module_change_combines_parameters() -> None:
+    changes = {"a.x": [3.0, 1.0, 3.0], "a.y": [4.0, 0.0, 4.0], "b": [1.0, 2.0, 4.0]}
+    assert module_change("a", changes) == {"gradient": 5.0, "change": 0.2}
+    assert module_change("b", changes) == {"gradient": 1.0, "change": 0.5}
+    assert module_change("ab", changes) == {"gradient": 0.0, "change": 0.0}

@@ -1,4 +1,4 @@
-"""A training and a fine-tuning that are told to end (SIGTERM) go on, when run again, to the bits of unbroken ones."""
+"""A training and a fine-tuning interrupted by SIGTERM resume to identical weights."""
 
 from __future__ import annotations
 
@@ -21,16 +21,18 @@ from valid_files import episodes
 from beliefscope.filters.catalog import architecture
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.finetuning.finetune import FineTune, finetune
-from beliefscope.filters.training.train import PLANS, train
+from beliefscope.filters.finetuning.finetune import finetune
+from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.training.plan import PLANS
+from beliefscope.filters.training.train import train
 
 MAKE = """
 import sys, torch
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 torch.set_num_threads(1)
-import test_terminated
-getattr(test_terminated, sys.argv[2])(Path(sys.argv[3]))
+import test_sigterm_resume
+getattr(test_sigterm_resume, sys.argv[2])(Path(sys.argv[3]))
 """
 
 
@@ -43,20 +45,22 @@ def one_thread() -> Iterator[None]:
 
 
 def trained(partial: Path | None) -> Filter:
-    plan, some = replace(PLANS["smoke"], dynamics=10, models=12, alone=3), episodes(steps=20)
-    return train(architecture("door", "haptics-ekf"), some, data_hash="0", plan=plan, partial=partial).filter
+    plan = replace(PLANS["smoke"], dynamics=10, models=12, single=3)
+    return train(
+        architecture("door", "haptics-ekf"), episodes(steps=20), data_hash="0", plan=plan, partial=partial
+    ).filter
 
 
 def tuned(partial: Path | None) -> Filter:
-    asked = FineTune(train=("haptics-only",), length=8, windows=4, steps=6, check=1, patience=6, particles=8)
-    parent = load_checkpoint(shipped("door", "crossmodal-pf"))
-    found = finetune(parent, episodes(steps=20), data_hash="0", settings=asked, partial=partial)
-    assert found is not None
-    return found.filter
+    settings = FineTune(train=("haptics-only",), length=8, windows=4, steps=6, check=1, patience=6, particles=8)
+    base = load_checkpoint(shipped("door", "crossmodal-pf"))
+    result = finetune(base, episodes(steps=20), data_hash="0", settings=settings, partial=partial)
+    assert result is not None
+    return result.filter
 
 
 @pytest.mark.parametrize("make", [pytest.param(trained, marks=pytest.mark.long), tuned])
-def test_what_was_told_to_end_goes_on_to_the_same_bits(make: Callable[[Path | None], Filter], tmp_path: Path) -> None:
+def test_sigterm_resumes_to_identical_weights(make: Callable[[Path | None], Filter], tmp_path: Path) -> None:
     partial = tmp_path / "x.partial"
     command = [sys.executable, "-c", MAKE, str(Path(__file__).parent), make.__name__, str(partial)]
     with subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}) as process:
@@ -64,9 +68,9 @@ def test_what_was_told_to_end_goes_on_to_the_same_bits(make: Callable[[Path | No
         while not partial.exists() and process.poll() is None and time.monotonic() < end:
             time.sleep(0.005)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == -signal.SIGTERM, "it ends at once, and before it is done"
-    assert partial.exists(), "with something to go on from"
-    resumed, whole = make(partial).state_dict(), make(None).state_dict()
-    for name, value in whole.items():
+        assert process.wait(60) == -signal.SIGTERM, "terminates before it is finished"
+    assert partial.exists(), "state to resume from"
+    resumed, uninterrupted = make(partial).state_dict(), make(None).state_dict()
+    for name, value in uninterrupted.items():
         assert torch.equal(value, resumed[name]), name
     assert not partial.exists()

@@ -1,4 +1,4 @@
-"""Slices: what they select, who speaks in them, and their texts."""
+"""Slices: their steps, modalities, and text and JSON forms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.filters.finetuning.slices import NOMINAL, Slice, slices_of
+from beliefscope.filters.finetuning.slices import CLEAN, Slice, standard_slices
 from beliefscope.filters.rollout import rollout, start_at_truth
 
 TEXTS = {
@@ -30,22 +30,22 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_a_slice_is_read_from_its_text_and_printed_and_travels_as_json(text: str) -> None:
+def test_slices_survive_text_and_json(text: str) -> None:
     slice_ = Slice.parse(text)
     assert slice_ == TEXTS[text]
     assert Slice.parse(str(slice_)) == slice_
-    assert Slice.of(slice_.to_json()) == Slice.of(text) == slice_
+    assert Slice.from_json(slice_.to_json()) == Slice.from_json(text) == slice_
 
 
-def test_no_fault_has_a_parameter_that_a_slice_would_take_for_its_own() -> None:
+def test_fault_parameters_differ_from_slice_keys() -> None:
     names = {key for fault in FAULTS.values() for key in parameters(fault)}
     assert not names & {"faults", "contact", "only"}
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
-        ("touching", "Available: nominal, contact, no contact"),
+        ("touching", "Available: clean, contact, free motion"),
         ("a:contact=maybe", "yes or no"),
         ("a:contact=yes:contact=no", "'contact=no'"),
         ("a:where=x", "'where=x'"),
@@ -53,21 +53,21 @@ def test_no_fault_has_a_parameter_that_a_slice_would_take_for_its_own() -> None:
         (":contact=yes", "a slice's name is ''"),
     ],
 )
-def test_what_is_wrong_is_said_with_what_is_right(text: str, told: str) -> None:
-    with pytest.raises(BadInput, match=told):
-        Slice.parse(text, slices_of(find_task("door")))
+def test_invalid_text_is_rejected(text: str, message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        Slice.parse(text, standard_slices(find_task("door")))
 
 
 @pytest.mark.parametrize(
     "value",
     ["contact", {"contact": True}, {"name": "a", "where": 1}, {"name": "a", "contact": 1}, {"name": "a", "only": "x"}],
 )
-def test_json_that_is_no_slice_is_refused(value: object) -> None:
+def test_invalid_json_is_rejected(value: object) -> None:
     with pytest.raises(BadInput, match="slice"):
-        Slice.of(value)
+        Slice.from_json(value)
 
 
-def test_a_modality_or_sensor_that_is_not_there_is_refused() -> None:
+def test_unknown_modality_or_sensor_is_rejected() -> None:
     task = find_task("door")
     with pytest.raises(BadInput, match="Available: image, haptics"):
         Slice("a", only=("touch",)).check(task, ("image", "haptics"))
@@ -75,20 +75,20 @@ def test_a_modality_or_sensor_that_is_not_there_is_refused() -> None:
         Slice("a", Faults.parse("delay=sonar:steps=2")).check(task, ("image", "haptics"))
 
 
-def test_contact_and_the_rest_share_out_all_steps(window: Callable[..., Batch]) -> None:
+def test_contact_and_free_motion_partition_all_steps(window: Callable[..., Batch]) -> None:
     batch = window(6, 3)
     batch.contact[2:4, 1] = True
     inside, outside = (Slice("a", contact=contact).mask(batch) for contact in (True, False))
     assert torch.equal(inside, batch.contact)
-    assert torch.equal(inside ^ outside, NOMINAL.mask(batch))
-    assert NOMINAL.mask(batch).all()
+    assert torch.equal(inside ^ outside, CLEAN.mask(batch))
+    assert CLEAN.mask(batch).all()
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
-def test_one_modality_alone_is_beta_one_hot_on_it(name: str) -> None:
+def test_single_modality_equals_one_hot_beta(name: str) -> None:
     filter_ = load_checkpoint(shipped("door", name)).filter
     with open_dataset(sample_path("door")) as data:
-        batch = Steps.of(filter_.task, [data[9]]).windows(torch.tensor([0]), 12)
+        batch = Steps.from_episodes(filter_.task, [data[9]]).windows(torch.tensor([0]), 12)
 
     def means(evidence: object) -> torch.Tensor:
         generator = torch.Generator().manual_seed(0)
@@ -97,12 +97,12 @@ def test_one_modality_alone_is_beta_one_hot_on_it(name: str) -> None:
     with torch.no_grad():
         evidence = filter_.encode(batch)
         for k, model in enumerate(filter_.names):
-            alone = means(Slice("a", only=(model,)).heard(evidence, filter_.names))
-            # Beta is 1 either way, but here as a share of itself: rounding of float32.
-            torch.testing.assert_close(alone, means(evidence.only(k)), atol=1e-5, rtol=0.0)
-            assert not torch.allclose(alone, means(evidence), atol=1e-4)
+            single = means(Slice("a", only=(model,)).select_evidence(evidence, filter_.names))
+            # Beta is 1 in both cases, but normalised here: float32 rounding.
+            torch.testing.assert_close(single, means(evidence.only(k)), atol=1e-5, rtol=0.0)
+            assert not torch.allclose(single, means(evidence), atol=1e-4)
 
 
-def test_the_standard_slices_are_those_that_the_task_has_the_sensors_for() -> None:
-    names = [one.name for one in slices_of(find_task("push"))]
-    assert names == ["nominal", "contact", "no contact", "blackout 0.8", "image alone", "haptics alone"]
+def test_standard_slices_of_a_task() -> None:
+    names = [slice_.name for slice_ in standard_slices(find_task("push"))]
+    assert names == ["clean", "contact", "free motion", "blackout 0.8", "image only", "haptics only"]

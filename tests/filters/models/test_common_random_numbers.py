@@ -57,11 +57,11 @@ def subsets(evidence: Evidence) -> Tensor:
 def test_subsets_side_by_side(name: str, window: Callable[..., Batch]) -> None:
     filter_, evidence, start = made(name, window)
     present = subsets(evidence)
-    both = run(filter_, evidence.of(present), start)
+    both = run(filter_, evidence.select_models(present), start)
     # All that there is changes nothing; rounding alone differs between batches of one and of four.
     torch.testing.assert_close(both[:, -1:], run(filter_, evidence, start), rtol=0, atol=1e-5)
     for i in range(present.shape[1]):
-        alone = run(filter_, evidence.of(present[:, i : i + 1]), start)
+        alone = run(filter_, evidence.select_models(present[:, i : i + 1]), start)
         torch.testing.assert_close(both[:, i : i + 1], alone, rtol=0, atol=1e-5)
     if evidence.log_weights is not None:
         for k in range(2):
@@ -74,7 +74,7 @@ def test_without_any_model_observations_do_not_matter(name: str, window: Callabl
     filter_, evidence, start = made(name, window)
     other = replace(evidence, observation=evidence.observation + 1.0)
     present = subsets(evidence)
-    runs = [run(filter_, one.of(present), start) for one in (evidence, other)]
+    runs = [run(filter_, one.select_models(present), start) for one in (evidence, other)]
     assert torch.equal(runs[0][:, 0], runs[1][:, 0])
     assert not torch.equal(runs[0][:, -1], runs[1][:, -1])
 
@@ -82,7 +82,7 @@ def test_without_any_model_observations_do_not_matter(name: str, window: Callabl
 def test_without_any_model_a_kalman_filter_only_predicts(window: Callable[..., Batch]) -> None:
     filter_, evidence, start = made("crossmodal-ekf", window)
     mean = start.mean
-    for t, estimate in enumerate(run(filter_, evidence.of(subsets(evidence)), start)[:, 0]):
+    for t, estimate in enumerate(run(filter_, evidence.select_models(subsets(evidence)), start)[:, 0]):
         mean = filter_.dynamics(mean, evidence.control[t])
         torch.testing.assert_close(estimate, mean[0], rtol=0, atol=1e-5)
 
@@ -90,7 +90,7 @@ def test_without_any_model_a_kalman_filter_only_predicts(window: Callable[..., B
 def test_without_any_model_particles_keep_their_weights(window: Callable[..., Batch]) -> None:
     filter_, evidence, start = made("crossmodal-pf", window)
     belief = filter_.start(start, PARTICLES, torch.Generator().manual_seed(0))
-    none = evidence.of(subsets(evidence)[:, :1])
+    none = evidence.select_models(subsets(evidence)[:, :1])
     _, step = filter_.step(belief, none[0], torch.Generator().manual_seed(0))
     log_weights = step.posterior.log_weights  # type: ignore[union-attr]
     torch.testing.assert_close(log_weights, belief.log_weights)  # type: ignore[union-attr]
@@ -104,7 +104,7 @@ def three(log_weights: Tensor) -> Evidence:
 
 def test_beta_of_those_left_keeps_its_proportions() -> None:
     beta = torch.tensor([[0.5, 0.2], [0.3, 0.2], [0.2, 0.6]])
-    left = three(beta.log()).of(torch.tensor([[[True, False, True], [False, False, False]]]))
+    left = three(beta.log()).select_models(torch.tensor([[[True, False, True], [False, False, False]]]))
     assert left.log_weights is not None
     assert left.present is not None
     shares = torch.softmax(left.log_weights[0], dim=-2)
@@ -118,7 +118,7 @@ def test_beta_of_those_left_keeps_its_proportions() -> None:
 def test_beta_zero_is_not_present() -> None:
     beta = torch.tensor([[0.6], [0.4], [0.0]])
     asked = torch.tensor([[[True, True, True], [False, False, True]]])
-    left = three(beta.log()).of(asked)
+    left = three(beta.log()).select_models(asked)
     assert left.present is not None
     assert left.present[0].tolist() == [[True, True, False], [False, False, False]]
     assert left.log_weights is not None

@@ -1,4 +1,4 @@
-"""A study in miniature, by its command: killed and resumed, shared between processes, and with a cell that fails."""
+"""A study with the smoke schedule: killed and resumed, shared between processes, with failed cells, and its outputs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ import pytest
 import torch
 from PIL import Image
 from scipy.stats import chi2
-from tensorboardX.proto.event_pb2 import Event
 
 from beliefscope.app.cli.main import main
 from beliefscope.datasets.catalog import find_task
@@ -34,39 +32,34 @@ from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
 from beliefscope.filters.training import study
-from beliefscope.filters.training.stages import BLACKOUTS
-from beliefscope.filters.training.study import TRIVIAL, Cell, Row, nees_bounds, rows_of, run_cell, run_ray
-from beliefscope.recordings.rerun_log.figures import looks, results
+from beliefscope.filters.training.plan import BLACKOUTS
+from beliefscope.filters.training.study import Cell, run_cell, run_ray
+from beliefscope.filters.training.study_table import TRIVIAL, Row, rows_of
+from beliefscope.recordings.study_figures import bar_styles, results
 
 FILTERS = ("haptics-ekf", "lstm")
 NAMES = [f"door/{name}/seed{seed}" for seed in range(2) for name in FILTERS]
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes to train with, one for validation, two for tests; the first 45 steps of each."""
+def data(tmp_path_factory: pytest.TempPathFactory, short_episodes: Callable[..., list[Episode]]) -> Path:
+    """Two training episodes, one validation and two test episodes; the first 45 steps of each."""
     path = tmp_path_factory.mktemp("data") / "door.h5"
     with open_dataset(sample_path("door")) as dataset:
         by_split = {s: [e.index for e in dataset.summaries if e.split == s] for s in ("train", "val", "test")}
-        chosen = by_split["train"][:2] + by_split["val"][:1] + by_split["test"][:2]
-        write_dataset(path, find_task("door"), [shortened(dataset[i]) for i in chosen])
+    indices = by_split["train"][:2] + by_split["val"][:1] + by_split["test"][:2]
+    write_dataset(path, find_task("door"), short_episodes("door", indices, 45))
     return path
-
-
-def shortened(episode: Episode, steps: int = 45) -> Episode:
-    arrays = {key: getattr(episode, key)[:steps] for key in ("states", "controls", "contact", "qpos")}
-    observations = {key: value[:steps] for key, value in episode.observations.items()}
-    return replace(episode, **arrays, observations=observations)
 
 
 def arguments(data: Path, folder: Path, *more: str) -> list[str]:
     filters = [word for name in FILTERS for word in ("--filter", name)]
-    given = ["--preset", "smoke", "--task", "door", "--data", f"door={data}", *filters, "--seeds", "2"]
-    return ["study", *given, *more, "-o", str(folder)]
+    options = ["--preset", "smoke", "--task", "door", "--data", f"door={data}", *filters, "--seeds", "2"]
+    return ["study", *options, *more, "-o", str(folder)]
 
 
 def run(words: list[str]) -> int:
-    """Runs a command line in this process: its exit code."""
+    """Runs a command line in this process; returns its exit code."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["beliefscope", *words])
         with pytest.raises(SystemExit) as end:
@@ -74,17 +67,17 @@ def run(words: list[str]) -> int:
     return int(end.value.code or 0)
 
 
-def killed_when(words: list[str], reached: Callable[[], bool]) -> None:
-    """Runs a command line in another process and ends that with SIGKILL as soon as it has got that far."""
+def kill_when(words: list[str], reached: Callable[[], bool]) -> None:
+    """Runs a command line in another process and kills it with SIGKILL as soon as ``reached`` returns true."""
     words = [sys.executable, "-m", "beliefscope", *words]
-    # As many threads as here: sums in another order differ in their last bits.
+    # The same number of threads as here, since the order of sums affects rounding.
     env = os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())}
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=env)
     try:
         for _ in range(60_000):
             if reached():
                 break
-            assert process.poll() is None, "it ended before it could be killed"
+            assert process.poll() is None, "ended before it could be killed"
             time.sleep(0.002)
     finally:
         process.send_signal(signal.SIGKILL)
@@ -93,16 +86,16 @@ def killed_when(words: list[str], reached: Callable[[], bool]) -> None:
 
 
 def without_seconds(path: Path) -> str:
-    """Hash of a checkpoint with the one thing left out that no two trainings share: how long it took."""
+    """Hash of a checkpoint without the duration of its training."""
     checkpoint = load_checkpoint(path)
     record = {key: value for key, value in checkpoint.record.items() if key != "seconds"}
     return save_checkpoint(checkpoint.filter, checkpoint.name, record, path.with_name("compared.safetensors"))
 
 
 @pytest.fixture(scope="module")
-def whole(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A study that ran through in one go."""
-    folder = tmp_path_factory.mktemp("whole") / "study"
+def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a finished study that was not interrupted."""
+    folder = tmp_path_factory.mktemp("finished") / "study"
     with redirect_stdout(io.StringIO()) as out:
         assert run(arguments(data, folder, "--json", "-")) == 0
     printed = json.loads(out.getvalue())
@@ -116,41 +109,41 @@ def document(folder: Path, name: str) -> dict[str, Any]:
     return json.loads((folder / "cells" / f"{name}.json").read_text())
 
 
-def test_a_study_that_was_killed_goes_on_to_the_same_results(data: Path, whole: Path, tmp_path: Path) -> None:
+def test_killed_study_resumes_to_the_same_results(data: Path, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "study"
     first = folder / "cells" / f"{NAMES[0]}.json"
     partial = folder / "cells" / f"{NAMES[1]}.safetensors.partial"
-    killed_when(arguments(data, folder), lambda: first.exists() and partial.exists())
+    kill_when(arguments(data, folder), lambda: first.exists() and partial.exists())
     before = first.stat().st_mtime_ns
     overview = json.loads((folder / "study.json").read_text())
     assert overview["cells"][NAMES[3]] == "missing"
     assert f"| {FILTERS[1]} | 80% | 0 of 2 | missing |" in (folder / "table.md").read_text()
 
     assert run(arguments(data, folder)) == 0
-    assert first.stat().st_mtime_ns == before, "a finished cell ran again"
+    assert first.stat().st_mtime_ns == before, "finished cells do not run again"
     assert not partial.exists()
     for name in NAMES:
-        paths = [place / "cells" / f"{name}.safetensors" for place in (whole, folder)]
+        paths = [study / "cells" / f"{name}.safetensors" for study in (finished, folder)]
         assert without_seconds(paths[0]) == without_seconds(paths[1])
-        once, again = document(whole, name), document(folder, name)
+        first_run, resumed = document(finished, name), document(folder, name)
         for key in ("seconds", "checkpoint_hash"):
-            once.pop(key), again.pop(key)
-        assert once == again
+            first_run.pop(key), resumed.pop(key)
+        assert first_run == resumed
 
 
-def test_table_and_csv_hold_the_numbers_of_the_cells(whole: Path) -> None:
-    with (whole / "table.csv").open() as file:
+def test_tables_contain_the_results_of_the_cells(finished: Path) -> None:
+    with (finished / "table.csv").open() as file:
         table = list(csv.DictReader(file))
     assert [(row["filter"], row["blackout"]) for row in table] == [
         *((name, str(b)) for name in FILTERS for b in BLACKOUTS),
         (TRIVIAL, ""),
     ]
-    markdown = (whole / "table.md").read_text()
+    markdown = (finished / "table.md").read_text()
     for row in table[:-1]:
-        cells = [document(whole, f"door/{row['filter']}/seed{seed}") for seed in range(2)]
+        cells = [document(finished, f"door/{row['filter']}/seed{seed}") for seed in range(2)]
         fused = [cell["metrics"][f"{float(row['blackout']):g}"]["fused"] for cell in cells]
-        numbers = {key: [one["rmse"][key] for one in fused] for key in fused[0]["rmse"]}
-        numbers |= {key: [one[key] for one in fused] for key in ("nll", "nees", "coverage95")}
+        numbers = {key: [metrics["rmse"][key] for metrics in fused] for key in fused[0]["rmse"]}
+        numbers |= {key: [metrics[key] for metrics in fused] for key in ("nll", "nees", "coverage95")}
         numbers["seconds"] = [cell["seconds"] for cell in cells]
         for key, values in numbers.items():
             if values[0] is None:
@@ -170,34 +163,27 @@ def test_table_and_csv_hold_the_numbers_of_the_cells(whole: Path) -> None:
             assert [float(bound) for bound in bounds] == pytest.approx(expected, rel=1e-12)
 
 
-def test_the_trivial_predictor_says_the_training_mean(whole: Path, data: Path) -> None:
+def test_trivial_predictor_returns_the_training_mean(finished: Path, data: Path) -> None:
     with open_dataset(data) as dataset:
         mean = np.concatenate([e.states for e in dataset if e.split == "train"]).mean(0, dtype=float)
         error = np.concatenate([e.states[30:] for e in dataset if e.split == "test"]) - mean
     rms = np.sqrt((error**2).mean(0))
-    found = document(whole, NAMES[0])["trivial"]
-    assert found["hinge_x_cm"] == pytest.approx(100 * rms[0], rel=1e-5)
-    assert found["angle_deg"] == pytest.approx(np.degrees(rms[2]), rel=1e-5)
-    assert f"| {TRIVIAL} | any |  | {100 * rms[0]:.2f} |" in (whole / "table.md").read_text()
+    trivial = document(finished, NAMES[0])["trivial"]
+    assert trivial["hinge_x_cm"] == pytest.approx(100 * rms[0], rel=1e-5)
+    assert trivial["angle_deg"] == pytest.approx(np.degrees(rms[2]), rel=1e-5)
+    assert f"| {TRIVIAL} | any |  | {100 * rms[0]:.2f} |" in (finished / "table.md").read_text()
 
 
-def test_bounds_hold_95_percent_of_consistent_filters() -> None:
-    low, high = nees_bounds(3, 14)
-    drawn = np.random.default_rng(0).standard_normal((20_000, 14, 3))
-    nees = (drawn**2).sum(-1).mean(-1) / 3
-    assert np.mean((nees > low) & (nees < high)) == pytest.approx(0.95, abs=0.006)
-
-
-def test_the_figure_shows_what_the_table_says(whole: Path) -> None:
-    picture = np.asarray(Image.open(whole / "results.png").convert("RGB"))
-    assert picture.shape[1] == round(300 * 7.16)
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
-    text = (whole / "results.svg").read_text()
-    for word in ("door: hinge", "door: angle", "RMSE (cm)", "RMSE (deg)", "40% black pictures", *FILTERS, TRIVIAL):
+def test_figure_contains_filters_and_quantities(finished: Path) -> None:
+    image = np.asarray(Image.open(finished / "results.png").convert("RGB"))
+    assert image.shape[1] == round(300 * 7.16)
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 20
+    text = (finished / "results.svg").read_text()
+    for word in ("door: hinge", "door: angle", "RMSE (cm)", "RMSE (deg)", "40% image blackout", *FILTERS, TRIVIAL):
         assert word in text, word
 
 
-def test_bars_spread_and_missing_filters_of_the_figure() -> None:
+def test_figure_has_bars_error_bars_and_missing_filters() -> None:
     def row(name: str, blackout: float | None, value: float | None, spread: float | None = None) -> Row:
         mean, spreads = ({}, {}) if value is None else ({"position_cm": value}, {"position_cm": spread})
         return Row("push", name, blackout, 0 if value is None else 3, 3, 0, mean, spreads)
@@ -213,7 +199,7 @@ def test_bars_spread_and_missing_filters_of_the_figure() -> None:
     dashed = [line for line in axis.lines if line.get_linestyle() == "--"]
     assert [line.get_ydata()[0] for line in dashed] == [10.0]
     assert sum(line.get_marker() == "x" for line in axis.lines) == 3
-    # Far above all bars the trivial predictor is told, not drawn: it would press them flat.
+    # Far above all bars, the trivial predictor is only in the title.
     (axis,) = results([*rows[:3], row(TRIVIAL, None, 10.0)]).axes
     assert axis.get_ylim()[1] == pytest.approx(1.06 * 3.05)
     assert axis.get_title(loc="right") == f"{TRIVIAL}: 10.0 cm"
@@ -221,7 +207,7 @@ def test_bars_spread_and_missing_filters_of_the_figure() -> None:
 
 
 def test_filters_look_different() -> None:
-    found = looks(list(filters_of(find_task("door"))))
+    found = bar_styles(list(filters_of(find_task("door"))))
     assert len({(one["facecolor"], one["hatch"]) for one in found.values()}) == len(found) == 12
 
 
@@ -232,30 +218,30 @@ def cell(data: Path, name: str = "haptics-ekf", **changes: Any) -> Cell:
     return Cell("door", name, **values)
 
 
-def test_what_a_cell_depends_on_makes_it_another(whole: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert cell(data).finished(whole) is not None
-    assert cell(data, preset="cpu").finished(whole) is None
-    assert cell(data, data_hash="0" * 64).finished(whole) is None
+def test_cells_with_other_inputs_are_not_finished(finished: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cell(data).finished(finished) is not None
+    assert cell(data, preset="cpu").finished(finished) is None
+    assert cell(data, data_hash="0" * 64).finished(finished) is None
     monkeypatch.setattr(study, "versions", lambda: {"torch": "0.1"})
-    assert cell(data).finished(whole) is None
+    assert cell(data).finished(finished) is None
 
 
-def test_a_checkpoint_that_was_changed_is_not_finished(data: Path, whole: Path, tmp_path: Path) -> None:
-    one, folder = cell(data), tmp_path / "study"
-    shutil.copytree(whole, folder)
-    path = one.path(folder, ".safetensors")
+def test_cell_with_a_changed_checkpoint_is_not_finished(data: Path, finished: Path, tmp_path: Path) -> None:
+    first, folder = cell(data), tmp_path / "study"
+    shutil.copytree(finished, folder)
+    path = first.path(folder, ".safetensors")
     path.write_bytes(path.read_bytes()[:-1] + bytes([path.read_bytes()[-1] ^ 1]))
-    assert one.finished(folder) is None
+    assert first.finished(folder) is None
 
 
-def test_a_failed_cell_is_shown_and_the_others_go_on(
-    data: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_failed_cell_is_reported_and_the_others_run(
+    data: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A folder is in the way of one cell's checkpoint: it cannot be saved."""
-    shutil.copytree(whole, tmp_path / "study")
-    in_the_way = tmp_path / "study" / "cells" / "door" / "lstm" / "seed0.safetensors"
-    in_the_way.unlink()
-    in_the_way.mkdir()
+    """A folder with the name of one cell's checkpoint prevents writing it."""
+    shutil.copytree(finished, tmp_path / "study")
+    obstacle = tmp_path / "study" / "cells" / "door" / "lstm" / "seed0.safetensors"
+    obstacle.unlink()
+    obstacle.mkdir()
     assert run(arguments(data, tmp_path / "study")) == 1
     out, err = capsys.readouterr()
     assert "error: 1 of 4 cells failed; the first: door/lstm/seed0: " in err
@@ -264,25 +250,25 @@ def test_a_failed_cell_is_shown_and_the_others_go_on(
     states = json.loads((tmp_path / "study" / "study.json").read_text())["cells"]
     assert "Is a directory" in states.pop("door/lstm/seed0")
     assert set(states.values()) == {"finished"}
-    # Mended, it is tried again, and it alone.
-    in_the_way.rmdir()
+    # Only the failed cell runs again.
+    obstacle.rmdir()
     assert run(arguments(data, tmp_path / "study")) == 0
 
 
-def test_a_cell_that_another_process_is_at_is_left_to_it(data: Path, tmp_path: Path) -> None:
-    one = cell(data, "lstm")
-    lock = one.path(tmp_path, "").with_name(".seed0.lock")
+def test_cell_locked_by_another_process_is_skipped(data: Path, tmp_path: Path) -> None:
+    locked = cell(data, "lstm")
+    lock = locked.path(tmp_path, "").with_name(".seed0.lock")
     lock.parent.mkdir(parents=True)
     code = "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
     words = [sys.executable, "-c", code, str(lock)]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         other.stdout.readline()
-        assert run_cell(one, tmp_path, wait=False) is None
-        assert rows_of({one: one.document(tmp_path)})[0].seeds == 0
+        assert run_cell(locked, tmp_path, wait=False) is None
+        assert rows_of({locked: locked.document(tmp_path)})[0].seeds == 0
         other.kill()
-    # With the process its lock is gone.
-    assert run_cell(one, tmp_path, wait=False) == one.finished(tmp_path) is not None
+    # The lock ends with its process.
+    assert run_cell(locked, tmp_path, wait=False) == locked.finished(tmp_path) is not None
 
 
 @pytest.mark.parametrize(
@@ -299,7 +285,7 @@ def test_a_cell_that_another_process_is_at_is_left_to_it(data: Path, tmp_path: P
         ("--data door=train.h5", "train.h5 has episodes of train; a study needs train and test or val"),
     ],
 )
-def test_bad_input(
+def test_invalid_options_are_rejected(
     words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -312,41 +298,44 @@ def test_bad_input(
 
 
 def logged(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """(step, value) by tag, of TensorBoard's event files: length, its checksum, protobuf, its checksum."""
-    found: dict[str, list[tuple[int, float]]] = {}
+    """(step, value) by tag of TensorBoard's event files: length, checksum, protobuf, checksum."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    values: dict[str, list[tuple[int, float]]] = {}
     for path in sorted(folder.glob("events.out.tfevents.*")):
-        left = path.read_bytes()
-        while left:
-            (size,) = struct.unpack("<Q", left[:8])
-            event = Event.FromString(left[12 : 12 + size])
+        data = path.read_bytes()
+        while data:
+            (size,) = struct.unpack("<Q", data[:8])
+            event = Event.FromString(data[12 : 12 + size])
             for value in event.summary.value:
-                found.setdefault(value.tag, []).append((event.step, value.simple_value))
-            left = left[16 + size :]
-    return found
+                values.setdefault(value.tag, []).append((event.step, value.simple_value))
+            data = data[16 + size :]
+    return values
 
 
 @pytest.mark.long
-def test_train_goes_on_after_a_kill_and_logs_its_losses(
+def test_killed_training_resumes_and_logs_losses(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def words(output: Path, *more: str) -> list[str]:
-        given = ["--filter", "crossmodal-ekf", "--data", str(data), "--preset", "smoke", "--seed", "3"]
-        return ["train", "door", *given, *more, "-o", str(output)]
+        options = ["--filter", "crossmodal-ekf", "--data", str(data), "--preset", "smoke", "--seed", "3"]
+        return ["train", "door", *options, *more, "-o", str(output)]
 
-    once, again = tmp_path / "once.safetensors", tmp_path / "again.safetensors"
-    assert run(words(once, "--log", str(tmp_path / "log"))) == 0
-    assert "goes on" not in capsys.readouterr().err
-    partial = tmp_path / "again.safetensors.partial"
-    killed_when(words(again), partial.exists)
-    assert not again.exists()
-    assert run(words(again)) == 0
-    assert re.search(r"goes on after stage '.+', from again\.safetensors\.partial", capsys.readouterr().err)
+    pytest.importorskip("tensorboardX")
+    first, resumed = tmp_path / "first.safetensors", tmp_path / "resumed.safetensors"
+    assert run(words(first, "--log", str(tmp_path / "log"))) == 0
+    assert "resuming" not in capsys.readouterr().err
+    partial = tmp_path / "resumed.safetensors.partial"
+    kill_when(words(resumed), partial.exists)
+    assert not resumed.exists()
+    assert run(words(resumed)) == 0
+    assert re.search(r"resuming after stage '.+', from resumed\.safetensors\.partial", capsys.readouterr().err)
     assert not partial.exists()
-    assert without_seconds(once) == without_seconds(again)
+    assert without_seconds(first) == without_seconds(resumed)
 
     losses = logged(tmp_path / "log")
     stages = {tag.rsplit("/", 1)[0] for tag in losses}
-    assert {"dynamics_8_steps", "haptics_model", "image_alone", "weights", "together_4_steps"} <= stages
+    assert {"dynamics_8_steps", "haptics_model", "image_only", "weights", "end_to_end_4_steps"} <= stages
     for stage in stages:
         assert losses[f"{stage}/validation"], stage
         assert all(np.isfinite(value) for _, value in losses[f"{stage}/training"])
@@ -354,11 +343,11 @@ def test_train_goes_on_after_a_kill_and_logs_its_losses(
 
 
 @pytest.mark.long
-def test_cells_on_a_ray_cluster(data: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_on_a_ray_cluster(data: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray", reason="pip install 'beliefscope[ray]'")
     assert os.environ.get("RAY_ADDRESS") is None
     cells = [cell(data, "haptics-ekf"), cell(data, "lstm", data_hash="0" * 64)]
     answers = dict(run_ray(cells, tmp_path))
     assert answers[cells[0]] == cells[0].finished(tmp_path)
-    assert answers[cells[0]]["metrics"] == document(whole, NAMES[0])["metrics"]
+    assert answers[cells[0]]["metrics"] == document(finished, NAMES[0])["metrics"]
     assert "was changed while the study ran" in answers[cells[1]]["error"]

@@ -23,7 +23,7 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import Slice
-from beliefscope.inspect.compare.checkpoints import Change, change_of
+from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compare_checkpoints
 from beliefscope.inspect.compare.effects import Difference, differences
 from beliefscope.inspect.compare.modules import heard
 from beliefscope.inspect.statistics.episode_sums import measures_of, spread
@@ -66,17 +66,17 @@ HURT = altered(EKF, off_by_haptics)
 
 
 @cache
-def changed(there: bool) -> Change:
+def changed(there: bool) -> CheckpointComparison:
     """From the shipped filter to the hurt one and back."""
     pair = (EKF, HURT) if there else (HURT, EKF)
     with open_dataset(sample_path("door")) as episodes:
-        return change_of(*pair, {i: episode_of(episodes, i, 60) for i in EPISODES})
+        return compare_checkpoints(*pair, {i: episode_of(episodes, i, 60) for i in EPISODES})
 
 
 @pytest.mark.parametrize("checkpoint", [EKF, PF], ids=["ekf", "pf"])
 def test_a_filter_has_not_changed_from_itself(checkpoint: Checkpoint, data: Dataset) -> None:
     short = [episode_of(data, index, 40) for index in EPISODES]
-    found = change_of(checkpoint, altered(checkpoint, lambda _: None), short, particles=20)
+    found = compare_checkpoints(checkpoint, altered(checkpoint, lambda _: None), short, particles=20)
     assert all(d.effect == d.low == d.high == 0.0 for d in found.differences)
     assert not found.mended()
     assert not found.damaged()
@@ -181,7 +181,7 @@ def test_listening_leaves_nothing_behind(data: Dataset) -> None:
 def test_numbers_are_those_of_evaluate(data: Dataset) -> None:
     black = Slice("black", Faults.parse("blackout=0.4"))
     episodes = [data[i] for i in EPISODES[:2]]
-    found = change_of(EKF, PF, episodes, slices=[black], particles=20, seed=3)
+    found = compare_checkpoints(EKF, PF, episodes, slices=[black], particles=20, seed=3)
     for name, faults, only in (
         ("nominal", Faults(), None),
         ("black", black.faults, None),
@@ -219,7 +219,7 @@ def test_intervals_cover() -> None:
 
 def test_a_slice_without_a_step_is_left_out(data: Dataset) -> None:
     free = [replace(episode_of(data, i, 40), contact=np.zeros(40, bool)) for i in EPISODES[:5]]
-    found = change_of(EKF, HURT, free)
+    found = compare_checkpoints(EKF, HURT, free)
     assert "contact" not in {d.slice for d in found.differences}
     assert next(p for p in found.parts if p.slice.name == "contact").steps == 0
 
@@ -229,7 +229,7 @@ def test_a_filter_without_covariance_is_compared_by_its_errors(data: Dataset) ->
 
     filters = [build(architecture("door", "lstm"), seed) for seed in (0, 1)]
     a, b = (Checkpoint(f.eval().requires_grad_(False), "lstm", str(i), {}) for i, f in enumerate(filters))
-    found = change_of(a, b, [episode_of(data, i, 34) for i in EPISODES[:5]])
+    found = compare_checkpoints(a, b, [episode_of(data, i, 34) for i in EPISODES[:5]])
     assert {d.measure for d in found.differences} == {"position", "hinge_x", "hinge_y", "angle"}
     assert any("image alone" in line for line in found.left_out)
     json.dumps(found.views(), allow_nan=False)
@@ -237,9 +237,9 @@ def test_a_filter_without_covariance_is_compared_by_its_errors(data: Dataset) ->
 
 def test_what_cannot_be_compared_is_refused(data: Dataset) -> None:
     with pytest.raises(BadInput, match="'door' and 'push'"):
-        change_of(EKF, load_checkpoint(shipped("push", "crossmodal-ekf")), data)
+        compare_checkpoints(EKF, load_checkpoint(shipped("push", "crossmodal-ekf")), data)
     with pytest.raises(BadInput, match="Available: image, haptics"):
-        change_of(EKF, HURT, data, slices=[Slice("a", only=("touch",))])
+        compare_checkpoints(EKF, HURT, data, slices=[Slice("a", only=("touch",))])
 
 
 def test_it_is_shown_as_every_diagnostic_is() -> None:

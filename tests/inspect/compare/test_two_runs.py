@@ -58,8 +58,8 @@ def test_numbers_are_those_of_each_run_by_itself(ekf: Trace, pf: Trace) -> None:
     assert result.names == ("crossmodal-ekf", "crossmodal-pf")
     for i, one in enumerate((ekf, pf)):
         alone = consistency([one])
-        for s, split in enumerate(result.splits):
-            layer = alone.of("fused", split)
+        for s, phase in enumerate(result.phases):
+            layer = alone.entry("fused", phase)
             assert result.steps[s] == layer.steps
             np.testing.assert_allclose(result.rmse[s, :, i], layer.rmse)
             np.testing.assert_allclose([result.nees[s, i], result.nll[s, i]], [layer.nees, layer.nll])
@@ -89,14 +89,14 @@ def test_a_planted_shift_is_found(ekf: Trace) -> None:
 def test_black_pictures_of_either_run_are_a_kind_of_step(ekf: Trace, broken: Trace) -> None:
     result = compare_runs(ekf, broken)
     assert result.names == ("as recorded", BROKEN)
-    black = result.splits.index("blackout")
+    black = result.phases.index("blackout")
     assert 0 < result.steps[black] < result.steps[0]
     assert result.steps[black] == (result.blackout & (np.arange(len(ekf)) >= 30)).sum()
-    assert result.share is not None
+    assert result.effective_weights is not None
     image = result.modalities.index("image")
-    before, after = result.share[black, image]
+    before, after = result.effective_weights[black, image]
     assert after < before
-    np.testing.assert_allclose(result.share.sum(1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(result.effective_weights.sum(1), 1.0, atol=1e-5)
     np.testing.assert_allclose(result.nees_at[:, 1], nees(broken)[:, -1])
 
 
@@ -106,9 +106,9 @@ def test_runs_of_two_episodes_are_refused(ekf: Trace) -> None:
 
 
 def test_a_run_without_covariance_has_no_nees(ekf: Trace) -> None:
-    without = replace(ekf, estimate_covariance=np.full_like(ekf.estimate_covariance, np.nan), acting=None)
+    without = replace(ekf, estimate_covariance=np.full_like(ekf.estimate_covariance, np.nan), effective_weights=None)
     result = compare_runs(ekf, without, ("ekf", "lstm"))
     assert rows(result)["all", "NEES/n"][1:] == (None, None)
-    assert result.share is None
+    assert result.effective_weights is None
     assert "NEES" not in result.verdict
     result.views()

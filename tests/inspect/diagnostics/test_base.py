@@ -1,4 +1,4 @@
-"""What every diagnostic of a trace gives, and what it refuses."""
+"""Interface of diagnostics: JSON, views, figures and refusals."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import pytest
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.filters.evaluate import LEFT_OUT
+from beliefscope.filters.evaluate import WARMUP
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnostics.base import Diagnostic, Entry, as_json
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.plotting import write_figure
+from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.statistics.measures import blackout
 from beliefscope.inspect.trace import Trace
 
@@ -26,10 +27,10 @@ import planted_traces as plant
 OF_TRACES = [entry for entry in DIAGNOSTICS.values() if entry.needs == "trace"]
 
 
-def blind(steps: int = 60) -> Trace:
-    """As an LSTM's trace is: estimates, and nothing else."""
+def estimates_only(steps: int = 60) -> Trace:
+    """A trace like an LSTM's: estimates only."""
     base = plant.real("crossmodal-ekf", steps)
-    others = ("weights", "acting", "predicted_mean", "predicted_covariance")
+    others = ("weights", "effective_weights", "predicted_mean", "predicted_covariance")
     none: dict[str, Any] = dict.fromkeys((*others, "observation_mean", "observation_covariance"))
     return replace(
         base,
@@ -51,58 +52,58 @@ PAIRS = [
 ]
 
 
-@pytest.fixture(params=PAIRS, ids=lambda pair: f"{pair[0].name}-{pair[1]}")
-def made(request: pytest.FixtureRequest) -> tuple[Diagnostic, Diagnostic, Trace]:
-    """Of one trace and of six."""
+@pytest.fixture(scope="module", params=PAIRS, ids=lambda pair: f"{pair[0].name}-{pair[1]}")
+def results(request: pytest.FixtureRequest) -> tuple[Diagnostic, Diagnostic, Trace]:
+    """Results of one trace and of six."""
     entry, name = request.param
     trace = plant.real(name)
     return entry([trace]), entry([trace] * 6), trace
 
 
-def test_json_has_all_and_no_nan(made: tuple[Diagnostic, Diagnostic, Trace]) -> None:
-    for found in made[:2]:
-        numbers = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-        assert numbers["verdict"] == found.verdict
-        assert numbers["filter"] == made[2].filter
-        shown = json.loads(json.dumps(found.views(), allow_nan=False))
-        assert [table["title"] for table in shown["tables"]] == [table.title for table in found.tables()]
+def test_json_is_complete_without_nan(results: tuple[Diagnostic, Diagnostic, Trace]) -> None:
+    for result in results[:2]:
+        numbers = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+        assert numbers["verdict"] == result.verdict
+        assert numbers["filter"] == results[2].filter
+        shown = json.loads(json.dumps(result.views(), allow_nan=False))
+        assert [table["title"] for table in shown["tables"]] == [table.title for table in result.tables()]
 
 
-def test_not_a_number_becomes_none() -> None:
+def test_non_finite_numbers_become_none() -> None:
     numbers = DIAGNOSTICS["consistency"]([plant.real("crossmodal-pf")]).to_dict()
-    assert numbers["by_layer"][0]["nis"] is None  # of no Kalman filter
+    assert numbers["by_layer"][0]["nis"] is None  # not a Kalman filter
     values = {"a": np.array([1.0, np.nan]), "b": (np.float32("inf"), np.int64(3)), "c": np.array([True])}
     assert as_json(values) == {"a": [1.0, None], "b": [None, 3], "c": [True]}
 
 
-def test_bands_behind_the_maps_numbers_are_those_of_all_steps() -> None:
+def test_bands_of_map_statistics_include_warm_up_steps() -> None:
     trace, checkpoint = plant.real("crossmodal-ekf"), load_checkpoint(shipped("door", "crossmodal-ekf"))
-    assert trace.episode.contact[:LEFT_OUT].any()
+    assert trace.episode.contact[:WARMUP].any()
     bands = DIAGNOSTICS["maps"]([trace], checkpoint, size=5).bands()
     np.testing.assert_array_equal(bands["contact"], trace.episode.contact)
     np.testing.assert_array_equal(bands["blackout"], blackout(trace))
 
 
-def test_views_fit_the_trace(made: tuple[Diagnostic, Diagnostic, Trace]) -> None:
-    one, several, trace = made
-    assert one.verdict[0].isupper()
-    assert one.verdict.endswith(".")
-    assert {curve.values.shape for curve in one.curves()} == {(len(trace),)}
-    np.testing.assert_array_equal(one.bands()["contact"], trace.episode.contact)
+def test_views_match_the_trace(results: tuple[Diagnostic, Diagnostic, Trace]) -> None:
+    single, several, trace = results
+    assert single.verdict[0].isupper()
+    assert single.verdict.endswith(".")
+    assert {curve.values.shape for curve in single.curves()} == {(len(trace),)}
+    np.testing.assert_array_equal(single.bands()["contact"], trace.episode.contact)
     assert not several.curves()
     assert not several.bands()
-    for found in (one, several):
-        assert found.tables()
-        for table in found.tables():
+    for result in (single, several):
+        assert result.tables()
+        for table in result.tables():
             assert {len(row) for row in table.rows} == {len(table.columns)}, table.title
 
 
-def test_figures_are_written(made: tuple[Diagnostic, Diagnostic, Trace], tmp_path: Path) -> None:
-    figure = made[0].plot()
-    curves = made[0].curves()
+def test_figures_are_written(results: tuple[Diagnostic, Diagnostic, Trace], tmp_path: Path) -> None:
+    figure = results[0].plot()
+    curves = results[0].curves()
     assert sum(len(axes.lines) for axes in figure.axes) >= len(curves)
     write_figure(figure, tmp_path / "one.svg")
-    write_figure(made[1].plot(), tmp_path / "several.png")
+    write_figure(results[1].plot(), tmp_path / "several.png")
     text = (tmp_path / "one.svg").read_text(encoding="utf-8")
     assert "</svg>" in text
     assert curves[0].name in text
@@ -116,25 +117,25 @@ def test_figures_are_written(made: tuple[Diagnostic, Diagnostic, Trace], tmp_pat
 def test_no_traces_and_traces_of_two_filters_are_refused(entry: Entry) -> None:
     with pytest.raises(BadInput, match=f"{entry.name} needs at least one trace"):
         entry([])
-    one = plant.real("crossmodal-pf")
-    with pytest.raises(BadInput, match=f"traces of two checkpoints, {one.checkpoint_hash[:12]} and ffff"):
-        entry([one, replace(one, checkpoint_hash="f" * 64)])
+    single = plant.real("crossmodal-pf")
+    with pytest.raises(BadInput, match=f"traces of two checkpoints, {single.checkpoint_hash[:12]} and ffff"):
+        entry([single, replace(single, checkpoint_hash="f" * 64)])
 
 
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("weights", "lstm does not weigh its modalities: one network sees them all"),
-        ("consistency", "lstm states no covariance, so there is nothing that its errors could be held against"),
+        ("weights", "lstm has no fusion weights: one network processes all modalities"),
+        ("consistency", "lstm has no covariance to compare its errors with"),
         ("particles", "lstm has no particles"),
     ],
 )
-def test_an_lstm_has_none_of_them(name: str, why: str) -> None:
-    assert DIAGNOSTICS[name].refusal(blind(), None) == why
+def test_diagnostics_that_do_not_apply_to_an_lstm(name: str, why: str) -> None:
+    assert DIAGNOSTICS[name].refusal(estimates_only(), None) == why
     with pytest.raises(BadInput, match=why):
-        DIAGNOSTICS[name]([blind()])
+        DIAGNOSTICS[name]([estimates_only()])
 
 
-def test_a_checkpoint_is_asked_for_where_it_is_needed() -> None:
+def test_missing_checkpoint_is_refused() -> None:
     why = DIAGNOSTICS["maps"].refusal(plant.real("crossmodal-pf"), None)
     assert why == "maps needs the filter's checkpoint, not only its trace"

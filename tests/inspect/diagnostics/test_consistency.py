@@ -1,4 +1,4 @@
-"""Consistency and calibration: exact filters of a simulated system, closed forms, and other people's packages."""
+"""Consistency and calibration: exact filters of a simulated system, closed forms, and reference packages."""
 
 from __future__ import annotations
 
@@ -28,59 +28,59 @@ import planted_traces as plant
 
 
 @pytest.fixture(scope="module")
-def true() -> Consistency:
+def exact() -> Consistency:
     return consistency(plant.simulated())
 
 
-def test_an_exact_filter_is_consistent(true: Consistency) -> None:
-    assert true.layers == ("image", "haptics", "fused")
-    for one in true.by_layer:
-        # 2000 steps, some 500 of them independent: the mean of chi2_3 / 3 is right to sqrt(2 / 3 / 500) = 0.04.
-        assert one.nees == pytest.approx(1.0, abs=0.12), (one.layer, one.split)
-        assert one.bounds[0] < one.nees < one.bounds[1]
-        assert one.judgement == "consistent"
-        assert one.coverage95 == pytest.approx(0.95, abs=0.02)
-        assert one.miscalibration < 0.03
-        np.testing.assert_allclose(one.rmse, one.sharpness, rtol=0.1)
+def test_an_exact_filter_is_consistent(exact: Consistency) -> None:
+    assert exact.layers == ("image", "haptics", "fused")
+    for entry in exact.by_layer:
+        # 2000 steps, some 500 of them independent: the mean of chi2_3 / 3 has a standard error of sqrt(2 / 3 / 500) = 0.04.
+        assert entry.nees == pytest.approx(1.0, abs=0.12), (entry.layer, entry.phase)
+        assert entry.bounds[0] < entry.nees < entry.bounds[1]
+        assert entry.assessment == "consistent"
+        assert entry.coverage95 == pytest.approx(0.95, abs=0.02)
+        assert entry.miscalibration < 0.03
+        np.testing.assert_allclose(entry.rmse, entry.sharpness, rtol=0.1)
         # The mean CRPS of a true N(m, s^2) is s / sqrt(pi).
-        np.testing.assert_allclose(one.crps, one.sharpness / math.sqrt(math.pi), rtol=0.1)
-        if one.layer != "fused":
-            assert one.nis == pytest.approx(1.0, abs=0.1)
-    assert true.verdict.startswith("Consistent (NEES/n ")
-    assert "So it is in each kind of step: contact, no contact." in true.verdict
-    assert "Each modality alone is consistent." in true.verdict
-    assert "Innovations are white." in true.verdict
+        np.testing.assert_allclose(entry.crps, entry.sharpness / math.sqrt(math.pi), rtol=0.1)
+        if entry.layer != "fused":
+            assert entry.nis == pytest.approx(1.0, abs=0.1)
+    assert exact.verdict.startswith("Consistent (NEES/n ")
+    assert "Also consistent in each phase: contact, free motion." in exact.verdict
+    assert "All unimodal posteriors are consistent." in exact.verdict
+    assert "Innovations are white." in exact.verdict
 
 
-def test_density_of_the_truth_is_the_entropy_of_a_true_filter(true: Consistency) -> None:
+def test_nll_of_a_consistent_filter_is_the_entropy(exact: Consistency) -> None:
     covariance = plant.simulated(1)[0].estimate_covariance[-1].astype(float)
     entropy = 0.5 * np.linalg.slogdet(2.0 * math.pi * math.e * covariance)[1]
-    assert true.of("fused").nll == pytest.approx(entropy, abs=0.15)  # 1.5 x what NEES / n may be off
+    assert exact.entry("fused").nll == pytest.approx(entropy, abs=0.15)  # 1.5 x tolerance of NEES / n
 
 
-@pytest.mark.parametrize(("stated", "said"), [(0.25, "Over"), (4.0, "Under")])
-def test_covariances_a_quarter_or_four_times_the_true_ones(true: Consistency, stated: float, said: str) -> None:
-    found = consistency(plant.simulated(stated=stated))
-    assert re.match(rf"{said}-confident by (1\.9|2|2\.1) x ", found.verdict)
-    for layer in found.layers:
-        # The same errors over other covariances; a floor of 1e-8 beside 2e-5 at the least.
-        assert found.of(layer).nees == pytest.approx(true.of(layer).nees / stated, rel=2e-3)
-        assert np.all(found.of(layer).rmse == true.of(layer).rmse)
-    assert found.of("fused").nll > true.of("fused").nll + 0.3
-    coverage = found.of("fused").coverage95
-    assert coverage == pytest.approx(chi2.cdf(stated * chi2.ppf(0.95, 3), 3), abs=0.04)
-    assert found.of("fused").crps.mean() > true.of("fused").crps.mean()
+@pytest.mark.parametrize(("scale", "prefix"), [(0.25, "Over"), (4.0, "Under")])
+def test_scaled_covariances_are_over_or_underconfident(exact: Consistency, scale: float, prefix: str) -> None:
+    result = consistency(plant.simulated(scale=scale))
+    assert re.match(rf"{prefix}confident by a factor of (1\.9|2|2\.1) ", result.verdict)
+    for layer in result.layers:
+        # Same errors, other covariances; tolerance for the floor of 1e-8 relative to 2e-5.
+        assert result.entry(layer).nees == pytest.approx(exact.entry(layer).nees / scale, rel=2e-3)
+        assert np.all(result.entry(layer).rmse == exact.entry(layer).rmse)
+    assert result.entry("fused").nll > exact.entry("fused").nll + 0.3
+    coverage = result.entry("fused").coverage95
+    assert coverage == pytest.approx(chi2.cdf(scale * chi2.ppf(0.95, 3), 3), abs=0.04)
+    assert result.entry("fused").crps.mean() > exact.entry("fused").crps.mean()
 
 
-def test_noise_with_memory_is_not_white() -> None:
-    found = consistency(plant.simulated(memory=0.9))
-    assert "Innovations are not white" in found.verdict
-    assert "one error returns at every step" in found.verdict
-    assert max(one.p for one in found.whiteness) < 1e-6
-    assert found.verdict.startswith("Over-confident")  # evidence counted again and again
+def test_correlated_noise_is_not_white() -> None:
+    result = consistency(plant.simulated(memory=0.9))
+    assert "Innovations are not white" in result.verdict
+    assert "errors persist over steps" in result.verdict
+    assert max(entry.p_value for entry in result.whiteness) < 1e-6
+    assert result.verdict.startswith("Overconfident")
 
 
-def test_angles_wrap(true: Consistency) -> None:
+def test_angles_wrap(exact: Consistency) -> None:
     turned = []
     for trace in plant.simulated():
         move = {}
@@ -89,36 +89,36 @@ def test_angles_wrap(true: Consistency) -> None:
             move[name][..., 2] += turns * 2.0 * np.pi
         turned.append(replace(trace, **move))
     again = consistency(turned)
-    for one, other in zip(true.by_layer, again.by_layer, strict=True):
-        assert one.nees == pytest.approx(other.nees, rel=1e-3)  # float32 at 4 pi: 1e-6 rad of 0.03
-        np.testing.assert_allclose(one.crps, other.crps, rtol=1e-3)
-    found = innovations(turned[0])
-    assert found is not None
-    assert np.abs(found[0][..., 2]).max() < 1.0
+    for entry, other in zip(exact.by_layer, again.by_layer, strict=True):
+        assert entry.nees == pytest.approx(other.nees, rel=1e-3)  # float32 at 4 pi: 1e-6 rad of 0.03
+        np.testing.assert_allclose(entry.crps, other.crps, rtol=1e-3)
+    result = innovations(turned[0])
+    assert result is not None
+    assert np.abs(result[0][..., 2]).max() < 1.0
 
 
-def test_modalities_in_another_order_give_the_same() -> None:
+def test_order_of_modalities_is_irrelevant() -> None:
     traces = plant.simulated(5)
-    one, other = consistency(traces), consistency([plant.swapped(trace) for trace in traces])
+    entry, other = consistency(traces), consistency([plant.swapped(trace) for trace in traces])
     assert other.layers == ("haptics", "image", "fused")
-    for found in one.by_layer:
-        assert found.nees == other.of(found.layer, found.split).nees
-    assert {(w.modality, w.component, w.p) for w in one.whiteness} == {
-        (w.modality, w.component, w.p) for w in other.whiteness
+    for result in entry.by_layer:
+        assert result.nees == other.entry(result.layer, result.phase).nees
+    assert {(w.modality, w.component, w.p_value) for w in entry.whiteness} == {
+        (w.modality, w.component, w.p_value) for w in other.whiteness
     }
 
 
-def test_few_trajectories_tell_little() -> None:
-    found = consistency(plant.simulated(1))
-    assert "as far as 1 trajectory tells" in found.verdict
-    assert found.of("fused").bounds[1] > 3.0
-    assert found.nees.shape == (130, 3)
-    assert found.nis.shape == (130, 2)
+def test_few_trajectories_qualify_the_verdict() -> None:
+    result = consistency(plant.simulated(1))
+    assert "based on 1 trajectory only" in result.verdict
+    assert result.entry("fused").bounds[1] > 3.0
+    assert result.nees.shape == (130, 3)
+    assert result.nis.shape == (130, 2)
     assert len(consistency(plant.simulated(2)).curves()) == 0
 
 
-def test_a_particle_set_that_is_true_is_calibrated() -> None:
-    """Truth and particles from one distribution, about pi: levels are uniform, and the mean CRPS is s / sqrt(pi)."""
+def test_exact_particle_set_is_calibrated() -> None:
+    """True states and particles of one distribution: levels are uniform, and the mean CRPS is s / sqrt(pi)."""
     rng = np.random.default_rng(3)
     steps, count = 630, 400
     centre = np.array([0.5, -0.2, np.pi])
@@ -128,7 +128,7 @@ def test_a_particle_set_that_is_true_is_calibrated() -> None:
     mean, away = particles.mean(1), particles - particles.mean(1, keepdims=True)
     covariance = np.einsum("tmi,tmj->tij", away, away) / count
     flat = np.full((steps, count), -np.log(count))
-    found = consistency(
+    result = consistency(
         [
             plant.planted(
                 plant.real("crossmodal-pf"),
@@ -145,13 +145,13 @@ def test_a_particle_set_that_is_true_is_calibrated() -> None:
             )
         ]
     )
-    assert found.whiteness == ()
-    for layer in found.layers:
-        one = found.of(layer)
-        assert one.nees == pytest.approx(1.0, abs=0.1)  # sqrt(2 / 3 / 600) = 0.033
-        assert one.miscalibration < 0.03
-        assert one.coverage95 == pytest.approx(0.95, abs=0.03)
-        np.testing.assert_allclose(one.crps, plant.SCALE / math.sqrt(math.pi), rtol=0.1)
+    assert result.whiteness == ()
+    for layer in result.layers:
+        entry = result.entry(layer)
+        assert entry.nees == pytest.approx(1.0, abs=0.1)  # sqrt(2 / 3 / 600) = 0.033
+        assert entry.miscalibration < 0.03
+        assert entry.coverage95 == pytest.approx(0.95, abs=0.03)
+        np.testing.assert_allclose(entry.crps, plant.SCALE / math.sqrt(math.pi), rtol=0.1)
 
 
 def test_crps_of_a_gaussian() -> None:
@@ -173,21 +173,21 @@ def test_crps_of_particles() -> None:
     x, w = rng.normal(size=(4, 40)), rng.dirichlet(np.full(40, 0.3), 4)
     pairs = (w[:, :, None] * w[:, None] * np.abs(x[:, :, None] - x[:, None])).sum((1, 2))
     np.testing.assert_allclose(particle_crps(x, w), (w * np.abs(x)).sum(1) - 0.5 * pairs, rtol=1e-12)
-    assert particle_crps(np.full(5, -0.3), np.full(5, 0.2)) == pytest.approx(0.3)  # of a point, the distance
-    # Quantiles of N(0.5, 2^2) as particles: it converges to the Gaussian's.
+    assert particle_crps(np.full(5, -0.3), np.full(5, 0.2)) == pytest.approx(0.3)  # distance of a point
+    # With quantiles of N(0.5, 2^2) as particles it converges to the CRPS of the Gaussian.
     exact = gaussian_crps(np.array(0.5), np.array(2.0))
-    off = []
+    errors_of = []
     for count in (10, 100, 1000):
         quantiles = 0.5 + 2.0 * norm.ppf((np.arange(count) + 0.5) / count)
-        off.append(abs(particle_crps(quantiles, np.full(count, 1.0 / count)) - exact))
-    assert off[0] > 4.0 * off[1] > 16.0 * off[2]
-    # The same Gaussian from draws of another, by importance weights: noise of 1 / sqrt(200000), some times over.
+        errors_of.append(abs(particle_crps(quantiles, np.full(count, 1.0 / count)) - exact))
+    assert errors_of[0] > 4.0 * errors_of[1] > 16.0 * errors_of[2]
+    # The same Gaussian by importance sampling; standard error of order 1 / sqrt(200000).
     draws = rng.normal(0.0, 3.0, 200_000)
     weights = norm.pdf(draws, 0.5, 2.0) / norm.pdf(draws, 0.0, 3.0)
     assert particle_crps(draws, weights / weights.sum()) == pytest.approx(exact, rel=0.02)
 
 
-def test_levels_are_uniform_where_the_distribution_is_true() -> None:
+def test_levels_are_uniform_for_an_exact_distribution() -> None:
     rng = np.random.default_rng(2)
     covariance = np.diag(np.square(plant.SCALE))
     error = rng.multivariate_normal(np.zeros(3), covariance, 300)

@@ -1,4 +1,4 @@
-"""Bands behind charts: every step that has what they stand for, from half a step before to half a step after it."""
+"""Drawing of bands and panels."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from beliefscope.inspect.diagnostics.base import Picture, Plot
-from beliefscope.inspect.diagnostics.plotting import draw_bands, png_of
-from beliefscope.inspect.statistics.measures import stretches
+from beliefscope.inspect.diagnostics.plotting import draw_bands, panel_png
+from beliefscope.inspect.diagnostics.views import ImagePanel, Plot
+from beliefscope.inspect.statistics.measures import intervals
 
 
 @pytest.mark.parametrize(
     ("mask", "spans"),
     [("", []), ("...", []), ("#", [(0, 1)]), (".#.##", [(1, 2), (3, 5)]), ("##.#", [(0, 2), (3, 4)])],
 )
-def test_stretches(mask: str, spans: list[tuple[int, int]]) -> None:
-    found = stretches(np.array([c == "#" for c in mask], dtype=bool))
-    assert [tuple(span) for span in found.tolist()] == spans
+def test_intervals(mask: str, spans: list[tuple[int, int]]) -> None:
+    result = intervals(np.array([c == "#" for c in mask], dtype=bool))
+    assert [tuple(span) for span in result.tolist()] == spans
 
 
-def test_a_band_covers_its_steps_whole_lone_ones_and_those_at_the_ends_too() -> None:
+def test_bands_cover_complete_steps() -> None:
     mask = np.random.default_rng(0).random(60) < 0.4
     mask[[0, 59, 7]] = True
-    mask[[6, 8]] = False  # step 7 is alone
+    mask[[6, 8]] = False  # step 7 is isolated
     axes = Figure().add_subplot()
     draw_bands(axes, {"contact": mask, "blackout": np.zeros(60, dtype=bool)})
-    (drawn,) = axes.collections  # nothing for a kind that no step has
-    spans = [tuple(path.get_extents().intervalx) for path in drawn.get_paths()]
+    (collection,) = axes.collections  # no band for a phase without steps
+    spans = [tuple(path.get_extents().intervalx) for path in collection.get_paths()]
     for x in np.arange(-0.45, 59.5, 0.1):
         step = int(np.rint(x))
         assert any(low <= x <= high for low, high in spans) == mask[step], (x, step)
@@ -36,5 +36,5 @@ def test_a_band_covers_its_steps_whole_lone_ones_and_those_at_the_ends_too() -> 
 
 def test_plots_and_pictures_by_themselves() -> None:
     rng = np.random.default_rng(0)
-    for panel in (Plot("title", "x", "y", ()), Picture("title", rng.normal(size=(4, 4)), "1")):
-        assert png_of(panel).startswith(b"\x89PNG")
+    for panel in (Plot("title", "x", "y", ()), ImagePanel("title", rng.normal(size=(4, 4)), "1")):
+        assert panel_png(panel).startswith(b"\x89PNG")

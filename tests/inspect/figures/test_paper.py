@@ -125,7 +125,7 @@ def test_drawn_weights_and_estimates_are_the_traces(ekf: tuple[Checkpoint, Trace
     """Weights for each component; those of a network that act by other shares are drawn beside them."""
     made = ekf[1]
     assert made.weights is not None
-    assert made.acting is not None
+    assert made.effective_weights is not None
     made = replace(made, weights=0.5 * made.weights)
     x, y, weight_x, weight_y = paper.weights_figure(made).axes
     for i, (above, below) in enumerate(((x, weight_x), (y, weight_y))):
@@ -135,7 +135,7 @@ def test_drawn_weights_and_estimates_are_the_traces(ekf: tuple[Checkpoint, Trace
         for k, name in enumerate(made.modalities):
             np.testing.assert_allclose(estimates[name], 100.0 * made.modality_mean[:, k, i])
             np.testing.assert_array_equal(weights[f"{name} beta"], made.weights[:, k, i])
-            np.testing.assert_array_equal(weights[f"{name} acting"], made.acting[:, k, i])
+            np.testing.assert_array_equal(weights[f"{name} effective_weights"], made.effective_weights[:, k, i])
 
 
 def test_bands_cover_the_steps_in_contact(pf: tuple[Checkpoint, Trace]) -> None:
@@ -164,7 +164,7 @@ def test_refusals_say_why(tmp_path: Path) -> None:
     checkpoint, made = run("image-ekf")
     with pytest.raises(BadInput, match="one measurement model, image, and nothing to weigh it against"):
         paper.weights_figure(made)
-    blind = replace(made, modalities=(), acting=None)
+    blind = replace(made, modalities=(), effective_weights=None)
     with pytest.raises(BadInput, match="does not weigh its modalities"):
         paper.weights_figure(blind)
     with pytest.raises(BadInput, match="was made by checkpoint"):

@@ -14,7 +14,7 @@ from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.plotting import write_figure
-from beliefscope.inspect.figures.top_view import footprint, outline, seen, snapshot
+from beliefscope.inspect.figures.top_view import draw_step, footprint, outline, scene_footprints
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
 from beliefscope.inspect.statistics.measures import contours
 from beliefscope.inspect.trace import Trace, trace
@@ -48,7 +48,7 @@ def test_an_outline_holds_its_points() -> None:
 
 
 def test_the_hand_is_drawn_where_it_was_felt(run: Trace) -> None:
-    around = seen(run, DOOR, STEP)
+    around = scene_footprints(run, DOOR, STEP)
     effector = 100.0 * run.episode.observations["effector_position"][STEP, :2]
     assert any(np.linalg.norm(one.outline.mean(axis=0) - effector) < 5.0 for one in around)
     assert [one.top for one in around] == sorted(one.top for one in around)
@@ -59,12 +59,12 @@ def test_a_footprint_is_the_objects_own(name: str) -> None:
     task = TASKS[name]
     with open_dataset(sample_path(name)) as data:
         episode = data[9]
-    assert task.ghost is not None
+    assert task.outline is not None
     run = trace(load_checkpoint(shipped(name, "crossmodal-ekf")), episode)
-    corners = footprint(task.ghost(episode.states[STEP]))
+    corners = footprint(task.outline(episode.states[STEP]))
     x, y = corners.T
     area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-    drawn = [one.outline for one in seen(run, task, STEP)]
+    drawn = [one.outline for one in scene_footprints(run, task, STEP)]
     nearest = min(drawn, key=lambda one: np.abs(one.max(axis=0) - corners.max(axis=0)).max())
     # The puck's rim has 24 corners in one and 48 in the other: a hundredth of its radius.
     np.testing.assert_allclose(nearest.max(axis=0), corners.max(axis=0), atol=0.06)
@@ -84,7 +84,7 @@ def test_an_ellipse_has_the_covariance_that_it_is_drawn_for() -> None:
 
 
 def test_contours_hold_86_percent_of_their_gaussian(run: Trace) -> None:
-    belief = snapshot(run, STEP).axes[1]
+    belief = draw_step(run, STEP).axes[1]
     ellipses = [patch for patch in belief.patches if isinstance(patch, Ellipse)]
     assert len(ellipses) == 3
     covariance = run.estimate_covariance[STEP][:2, :2].astype(float)
@@ -95,7 +95,7 @@ def test_contours_hold_86_percent_of_their_gaussian(run: Trace) -> None:
 
 
 def test_the_map_lies_about_the_truth_and_stays_white_where_nothing_is(run: Trace, map_: LikelihoodMap) -> None:
-    scene, belief = snapshot(run, STEP, map_).axes
+    scene, belief = draw_step(run, STEP, map_).axes
     for axes in (scene, belief):
         (image,) = axes.images
         left, right, bottom, top = image.get_extent()
@@ -109,16 +109,16 @@ def test_the_map_lies_about_the_truth_and_stays_white_where_nothing_is(run: Trac
 
 def test_the_object_is_drawn_twice_and_force_only_in_contact(run: Trace) -> None:
     task = DOOR
-    assert task.ghost is not None
-    scene = snapshot(run, STEP).axes[0]
+    assert task.outline is not None
+    scene = draw_step(run, STEP).axes[0]
     truth, estimate = scene.patches[-2:]
     for patch, states in ((truth, run.episode.states), (estimate, run.estimate_mean)):
         assert isinstance(patch, Polygon)
-        np.testing.assert_allclose(patch.get_xy()[:-1], footprint(task.ghost(states[STEP])))
+        np.testing.assert_allclose(patch.get_xy()[:-1], footprint(task.outline(states[STEP])))
     newtons = np.linalg.norm(run.episode.observations["force"][STEP])
     assert [text.get_text() for text in scene.texts if text.get_text()] == [f"{newtons:.0f} N"]
     free = int(np.flatnonzero(~run.episode.contact.astype(bool))[0])
-    assert not snapshot(run, free).axes[0].texts
+    assert not draw_step(run, free).axes[0].texts
 
 
 def test_what_a_run_has_not_is_left_out(run: Trace, tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_what_a_run_has_not_is_left_out(run: Trace, tmp_path: Path) -> None:
         modality_mean=np.full_like(run.modality_mean, np.nan),
         episode=replace(run.episode, qpos=run.episode.qpos[:, :0]),
     )
-    (belief,) = snapshot(bare, STEP).axes
+    (belief,) = draw_step(bare, STEP).axes
     assert not belief.collections
     assert not belief.patches
     assert [line.get_label() for line in belief.lines] == ["fused", "truth"]
@@ -138,6 +138,6 @@ def test_what_a_run_has_not_is_left_out(run: Trace, tmp_path: Path) -> None:
 
 def test_the_same_moment_gives_the_same_file(run: Trace, map_: LikelihoodMap, tmp_path: Path) -> None:
     for name in ("a.svg", "b.svg"):
-        write_figure(snapshot(run, STEP, map_), tmp_path / name)
+        write_figure(draw_step(run, STEP, map_), tmp_path / name)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     assert "<path" in (tmp_path / "a.svg").read_text()

@@ -13,7 +13,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.likelihood_maps import ENTRY
 from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.maps.statistics import MapNumbers, measure_maps
+from beliefscope.inspect.maps.statistics import MapStatistics, measure_maps
 from beliefscope.inspect.trace import trace
 
 SIZE, HALF = 135, 0.135
@@ -32,7 +32,7 @@ def turned(sd: tuple[float, float], angle: float) -> np.ndarray:
     return turn @ np.diag(np.square(sd)) @ turn.T
 
 
-def numbers(*layers: np.ndarray) -> MapNumbers:
+def numbers(*layers: np.ndarray) -> MapStatistics:
     names = tuple(f"layer{i}" for i in range(len(layers)))
     map_ = LikelihoodMap(0, math.nan, names, OFFSETS, OFFSETS, np.zeros(2, np.float32), np.stack(layers))
     trace: Any = SimpleNamespace(episode=SimpleNamespace(observations={"effector_position": EFFECTOR}))

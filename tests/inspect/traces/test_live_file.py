@@ -18,14 +18,16 @@ import pytest
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.trace import Trace, arrays_of, header_of, save_trace, trace, trace_of
-from beliefscope.inspect.traces.live_file import MARK, GrowingReader, GrowingWriter
+from beliefscope.inspect.trace import Trace, arrays_of, header_of, save_trace, trace, trace_from_arrays
+from beliefscope.inspect.traces.live_file import MARK, LiveFileReader, LiveFileWriter
 
 
 def cut(whole: Trace, first: int, last: int) -> Trace:
     """Steps ``first`` to ``last - 1``, without a file."""
     static = ("start_mean", "start_covariance")
-    return trace_of(header_of(whole), {n: a if n in static else a[first:last] for n, a in arrays_of(whole).items()})
+    return trace_from_arrays(
+        header_of(whole), {n: a if n in static else a[first:last] for n, a in arrays_of(whole).items()}
+    )
 
 
 def same(one: Trace, other: Trace) -> bool:
@@ -38,7 +40,7 @@ def same(one: Trace, other: Trace) -> bool:
 
 def write(path: Path, whole: Trace, blocks: list[int], end: bool = True) -> list[int]:
     """Writes it in blocks that end after so many steps; the file's size after each."""
-    writer, sizes, first = GrowingWriter(path, whole, expected=len(whole)), [path.stat().st_size], 0
+    writer, sizes, first = LiveFileWriter(path, whole, expected=len(whole)), [path.stat().st_size], 0
     for last in blocks:
         writer.append(cut(whole, first, last))
         sizes.append(path.stat().st_size)
@@ -88,7 +90,7 @@ def small(whole: Trace) -> Trace:
 
 def test_what_was_read_is_the_trace(whole: Trace, tmp_path: Path) -> None:
     write(tmp_path / "run.live", whole, [1, 2, 9, 30])
-    reader = GrowingReader(tmp_path / "run.live")
+    reader = LiveFileReader(tmp_path / "run.live")
     assert (reader.poll(), reader.finished, reader.alive, reader.expected) == (30, True, False, 30)
     assert same(reader.part(), whole)
     save_trace(reader.part(), tmp_path / "again.trace")
@@ -99,14 +101,14 @@ def test_what_was_read_is_the_trace(whole: Trace, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("first", "last"), [(0, 0), (0, 30), (5, 6), (1, 9), (2, 30), (30, 30)])
 def test_any_part_is_that_part(whole: Trace, tmp_path: Path, first: int, last: int) -> None:
     write(tmp_path / "run.live", whole, [1, 2, 9, 30])
-    reader = GrowingReader(tmp_path / "run.live")
+    reader = LiveFileReader(tmp_path / "run.live")
     reader.poll()
     assert same(reader.part(first, last), cut(whole, first, last))
 
 
 def test_a_reader_follows_the_writer(whole: Trace, tmp_path: Path) -> None:
-    writer = GrowingWriter(tmp_path / "run.live", whole)
-    reader = GrowingReader(tmp_path / "run.live")
+    writer = LiveFileWriter(tmp_path / "run.live", whole)
+    reader = LiveFileReader(tmp_path / "run.live")
     assert (len(reader.read()), len(reader.part()), reader.expected, reader.alive) == (0, 0, None, True)
     known: list[Trace] = []
     for step in range(30):
@@ -123,7 +125,7 @@ def test_a_reader_follows_the_writer(whole: Trace, tmp_path: Path) -> None:
 
 def test_nothing_is_read_where_nothing_is_new(whole: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "run.live", whole, list(range(1, 31)), end=False)
-    reader = GrowingReader(tmp_path / "run.live")
+    reader = LiveFileReader(tmp_path / "run.live")
     assert (reader.poll(), len(reader.read())) == (30, 30)
     monkeypatch.setattr("os.pread", lambda *_: pytest.fail("read again"))
     assert (reader.poll(), len(reader.read())) == (30, 0)
@@ -140,10 +142,10 @@ def test_cut_at_every_byte(small: Trace, tmp_path: Path) -> None:
         path.write_bytes(content[:length])
         if length < sizes[0]:
             with pytest.raises(BadInput, match=r"no whole header|not a live run") as caught:
-                GrowingReader(path)
+                LiveFileReader(path)
             assert "\n" not in str(caught.value)
             continue
-        reader = GrowingReader(path)
+        reader = LiveFileReader(path)
         complete = max(count for count, size in zip(steps, sizes, strict=True) if size <= length)
         assert (reader.poll(), reader.finished, reader.alive) == (complete, False, False)
         assert same(reader.part(), cut(small, 0, complete))
@@ -160,7 +162,7 @@ def test_every_damaged_byte_is_noticed(small: Trace, tmp_path: Path) -> None:
         path.write_bytes(content[:place] + bytes([content[place] ^ 0x41]) + content[place + 1 :])
         reader = None
         with suppress(BadInput):
-            reader = GrowingReader(path)
+            reader = LiveFileReader(path)
             reader.poll()
         assert (reader is None) == (place < sizes[0])
         if reader is not None:
@@ -183,7 +185,7 @@ def test_absurd_headers_are_refused(whole: Trace, tmp_path: Path) -> None:
     header, _ = json.JSONDecoder().raw_decode(content[MARK.size :].decode("latin-1"))
     start = whole.start_mean.tobytes() + whole.start_covariance.tobytes()
     path.write_bytes(forged(header, start))
-    GrowingReader(path).close()
+    LiveFileReader(path).close()
     arrays = header["arrays"]
     for bad, why in (
         (header | {"format": 2}, "format 2; this version reads 1"),
@@ -192,11 +194,11 @@ def test_absurd_headers_are_refused(whole: Trace, tmp_path: Path) -> None:
         (header | {"arrays": arrays | {"estimate_mean": [[3], "O"]}}, "'estimate_mean' of type 'O'"),
         (header | {"arrays": arrays | {"estimate_mean": [[3], "nonsense"]}}, "makes no sense"),
         (header | {"arrays": arrays | {"estimate_mean": [[3], "9" * 5000]}}, "makes no sense"),
-        (header | {"expected": math.nan}, "NaN is no number"),
+        (header | {"expected": math.nan}, "NaN is not a JSON number"),
         (header | {"expected": 10**400}, "401 digits"),
         (header | {"expected": 2.5}, r"it expects 2\.5 steps"),
         (header | {"expected": -1}, "it expects -1 steps"),
-        (header | {"started": "\ud800"}, "half a character"),
+        (header | {"started": "\ud800"}, "lone surrogate"),
         (header | {"pid": "me"}, "makes no sense"),
         (header | {"arrays": {k: v for k, v in arrays.items() if k != "estimate_mean"}}, "estimate_mean"),
         (header | {"trace": header["trace"] | {"colour": 3}}, "colour"),
@@ -206,25 +208,25 @@ def test_absurd_headers_are_refused(whole: Trace, tmp_path: Path) -> None:
     ):
         path.write_bytes(forged(bad, start))
         with pytest.raises(BadInput, match=why):
-            GrowingReader(path)
+            LiveFileReader(path)
     path.write_bytes(MARK.pack(b"BsL\n", 2**32 - 1, 0) + content)
     with pytest.raises(BadInput, match="no whole header"):
-        GrowingReader(path)
+        LiveFileReader(path)
     for other in (b"", b"RRF2" + bytes(100), bytes(100)):
         path.write_bytes(other)
         with pytest.raises(BadInput, match="not a live run"):
-            GrowingReader(path)
+            LiveFileReader(path)
     for missing in (tmp_path / "nothing.live", tmp_path):
         with pytest.raises(BadInput, match="does not exist"):
-            GrowingReader(missing)
+            LiveFileReader(missing)
 
 
 def test_one_file_has_one_writer_and_one_shape(whole: Trace, tmp_path: Path) -> None:
-    writer = GrowingWriter(tmp_path / "run.live", whole)
+    writer = LiveFileWriter(tmp_path / "run.live", whole)
     with pytest.raises(BadInput, match="File exists"):
-        GrowingWriter(tmp_path / "run.live", whole)
+        LiveFileWriter(tmp_path / "run.live", whole)
     with pytest.raises(BadInput, match="cannot write"):
-        GrowingWriter(tmp_path / "nowhere" / "run.live", whole)
+        LiveFileWriter(tmp_path / "nowhere" / "run.live", whole)
     writer.append(cut(whole, 0, 2))
     with pytest.raises(BadInput, match=r"estimate_mean as float32 \(2,\), the run began with float32 \(3,\)"):
         writer.append(replace(whole, estimate_mean=whole.estimate_mean[:, :2]))
@@ -232,7 +234,7 @@ def test_one_file_has_one_writer_and_one_shape(whole: Trace, tmp_path: Path) -> 
         writer.append(replace(whole, weights=np.zeros((30, 7), np.float32)))
     writer.append(cut(whole, 2, 3))
     writer.finish()
-    reader = GrowingReader(tmp_path / "run.live")
+    reader = LiveFileReader(tmp_path / "run.live")
     assert same(reader.read(), cut(whole, 0, 3))
     with pytest.raises(BadInput, match=r"steps 2 to 4 are not in .*: it has 3"):
         reader.part(2, 4)
@@ -242,11 +244,11 @@ FULL = """
 import resource, sys
 from pathlib import Path
 from beliefscope.datasets.errors import BadInput
-from beliefscope.inspect.traces.live_file import GrowingReader, GrowingWriter
+from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter
 from beliefscope.inspect.trace import load_trace
 whole = load_trace(sys.argv[1])
 path = Path(sys.argv[2])
-writer = GrowingWriter(path, whole)
+writer = LiveFileWriter(path, whole)
 size = path.stat().st_size
 writer.append(whole)
 step = (path.stat().st_size - size)
@@ -259,7 +261,7 @@ except BadInput as error:
 resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 writer.append(whole)
 writer.finish()
-reader = GrowingReader(path)
+reader = LiveFileReader(path)
 assert (reader.poll(), reader.finished) == (2 * len(whole), True)
 """
 

@@ -1,0 +1,90 @@
+"""Models of JSON responses: traces, live runs and views."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from beliefscope.app.api.models.catalog import Component, Reply, TaskInfo
+from beliefscope.app.protocol.messages import SceneLayer
+
+
+class LiveState(Reply):
+    """State of a live run. message: explanation of an abnormal state, or empty."""
+
+    name: str
+    state: Literal["running", "ended", "died", "damaged"]
+    message: str
+
+
+class LiveRun(LiveState):
+    """A live run. expected: number of steps, if announced. started: s since 1970."""
+
+    data: str
+    task: str
+    episode: int
+    faults: str
+    steps: int
+    expected: int | None
+    started: float
+
+
+class ListedLiveRun(LiveRun):
+    """A live run in the list. filter: its name in the catalog. available: whether its checkpoint is available."""
+
+    filter: str
+    available: bool
+    kind: str
+
+
+class LiveList(Reply):
+    """Live runs, newest first, and their tasks; an unreadable file has only its state."""
+
+    runs: list[ListedLiveRun | LiveState]
+    tasks: list[TaskInfo]
+
+
+class Column(Reply):
+    """A float32 array in the columns buffer; offset in bytes."""
+
+    name: str
+    shape: list[int]
+    offset: int
+
+
+class TraceHeader(Reply):
+    """Metadata of a trace.
+
+    Attributes:
+        weight_width: 0 for a filter without weights. settings: of the run.
+        nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
+        no_maps: why there are no likelihood maps, or None. pictures: height and width of the camera images, or None.
+        scene: layers of its 3D scene. live: present while the trace is of a live run.
+    """
+
+    steps: int
+    dt: float
+    kind: str
+    filter: str
+    episode: int
+    components: list[Component]
+    modalities: list[str]
+    weight_width: int
+    checkpoint_hash: str
+    data_hash: str
+    seed: int
+    faults: str
+    settings: dict[str, Any]
+    nees_bounds: tuple[float, float] | None
+    no_maps: str | None
+    pictures: tuple[int, int] | None
+    columns: list[Column]
+    scene: list[SceneLayer]
+    live: LiveRun | None = None
+
+
+class ViewAddresses(Reply):
+    """Addresses of an open view."""
+
+    view: str
+    scene: str
+    socket: str

@@ -1,0 +1,66 @@
+"""Routes of views: the page's socket and its 3D scene."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated
+
+from fastapi import APIRouter, Body, HTTPException, Request, WebSocket
+from fastapi.responses import Response
+from pydantic import BaseModel, ConfigDict
+
+from beliefscope.app.api.models.traces import ViewAddresses
+from beliefscope.app.protocol.etag import tagged
+from beliefscope.app.protocol.messages import close_reason
+from beliefscope.app.views.embedded_viser import client_page
+from beliefscope.app.views.registry import Views
+from beliefscope.app.views.view import View
+
+
+class ViewRequest(BaseModel):
+    """Body of ``POST /api/views``."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    dark: bool = False
+
+
+def routes(views: Views) -> APIRouter:
+    """Create the router."""
+    router = APIRouter()
+    scene = client_page("/static/scene/viser_frame_throttle.js")
+    scene_tag = hashlib.sha256(scene).hexdigest()[:24]
+
+    @router.post("/api/views", status_code=201)
+    async def open_view(options: Annotated[ViewRequest | None, Body()] = None) -> ViewAddresses:
+        name = (await views.open(options is not None and options.dark)).name
+        return ViewAddresses(view=name, scene=f"/scene/{name}/", socket=f"/api/views/{name}")
+
+    @router.websocket("/api/views/{name}")
+    async def view_socket(websocket: WebSocket, name: str) -> None:
+        if view := await _find_view(views, websocket, name):
+            await view.serve(websocket)
+
+    @router.get("/scene/{name}/")
+    async def scene_page(name: str, request: Request) -> Response:
+        try:
+            views[name]
+        except KeyError:
+            raise HTTPException(404, f"View {name!r} is not open.") from None
+        return tagged(request, scene_tag, lambda: scene, "text/html; charset=utf-8")
+
+    @router.websocket("/scene/{name}")
+    async def scene_socket(websocket: WebSocket, name: str) -> None:
+        if view := await _find_view(views, websocket, name):
+            await view.scene.viser.connect(websocket)
+
+    return router
+
+
+async def _find_view(views: Views, websocket: WebSocket, name: str) -> View | None:
+    try:
+        return views[name]
+    except KeyError:
+        # Browsers do not expose the response to a refused handshake, but they do expose a close code.
+        await websocket.accept()
+        await websocket.close(4004, close_reason(f"View {name!r} is not open."))
+        return None

@@ -1,0 +1,61 @@
+"""Job that writes the report of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from beliefscope.app.jobs.worker import Report
+from beliefscope.app.protocol.permalinks import permalink
+from beliefscope.app.runs.command_lines import report_command, serve_command, trace_command
+from beliefscope.app.runs.selection import Selection
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.recordings.report.pdf import browser, print_page
+
+
+def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Write the report's folder; a stored trace is reused. ``options``: see ``api.reports.ReportRequest``."""
+    from beliefscope.recordings.report.compose import compose, write_report  # imports Rerun
+
+    options = arguments["options"]
+    events, slow, title = options["events"], options["slow"], options["title"]
+    store = TraceStore(Settings.from_json(arguments["settings"]))
+    try:
+        selection = Selection.from_json(arguments["selection"])
+        report(0.0, "running the filter")
+        traced = store.request(selection)
+        trace, task = traced.trace, traced.checkpoint.task
+        settings = store.settings
+        checkpoint, data = settings.checkpoints.get(selection.filter), settings.data.get(selection.data)
+        path = str(checkpoint) if isinstance(checkpoint, Path) else ""
+        serve = serve_command(filter(None, [path]), data, settings.seed)
+
+        def link(index: int, step: int) -> str:
+            faults = str(selection.faults)
+            query = permalink(task, selection.filter, selection.data, selection.episode, step, faults)
+            return arguments["url"] + query
+
+        composed = compose(
+            [trace],
+            traced.checkpoint,
+            title=title,
+            steps=[(0, step) for step in events],
+            slow=slow,
+            link=link,
+            links_note=f"Permalinks work while this command runs: {serve}.",
+            commands=(
+                trace_command(trace, "run.trace", path, data),
+                report_command(["run.trace"], events, slow, title),
+            ),
+            progress=lambda share: report(0.1 + 0.4 * share, "computing diagnostics"),
+        )
+        folder = Path(arguments["folder"])
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        chromium = browser() if options["pdf"] else None
+        to_pdf = None if chromium is None else lambda page, pdf: print_page(chromium, page, pdf)
+        document = write_report(composed, folder, to_pdf, lambda share: report(0.5 + 0.5 * share, "drawing figures"))
+        return {"folder": str(folder), "files": document["files"]}
+    finally:
+        store.close()

@@ -1,0 +1,83 @@
+/** Keyboard shortcuts and buttons of the page. */
+
+/** @import { Page } from './page.js' */
+
+import { element, html } from './dom.js';
+import { bindKeys } from './keys.js';
+
+/** @param {Page} page */
+export function bindControls(page) {
+  const { clock, timeline, undo, theme } = page;
+  const showHelp = () => element('#keys', HTMLDialogElement).showModal();
+  /** @param {string} tab */
+  const openTab = (tab) => () => page.openTab(tab);
+  /** @param {number} steps */
+  const stepBy = (steps) => (/** @type {KeyboardEvent} */ event) =>
+    page.stepBy(event.shiftKey ? 10 * steps : steps, event.timeStamp);
+  bindKeys({
+    ' ': () => clock.toggle(),
+    ArrowLeft: stepBy(-1),
+    ArrowRight: stepBy(1),
+    PageUp: ({ timeStamp }) => page.stepBy(timeline.pageStep, timeStamp),
+    PageDown: ({ timeStamp }) => page.stepBy(-timeline.pageStep, timeStamp),
+    Home: ({ timeStamp }) => page.stepBy(-Infinity, timeStamp),
+    End: ({ timeStamp }) => page.stepBy(Infinity, timeStamp),
+    '<': () => clock.changeSpeed(-1),
+    '>': () => clock.changeSpeed(1),
+    '[': () => page.markIntervention('from'),
+    ']': () => page.markIntervention('last'),
+    'ctrl+z': () => undo.undo(),
+    'ctrl+shift+z': () => undo.redo(),
+    'ctrl+y': () => undo.redo(),
+    '+': () => timeline.zoom(0.5),
+    '=': () => timeline.zoom(0.5),
+    '-': () => timeline.zoom(2),
+    0: () => timeline.showAll(),
+    1: openTab('scene'),
+    2: openTab('rerun'),
+    3: openTab('diagnostics'),
+    f: openTab('failures'),
+    o: openTab('compare'),
+    r: openTab('recordings'),
+    t: openTab('finetune'),
+    u: openTab('study'),
+    n: ({ timeStamp }) => page.failures.go(1, timeStamp),
+    b: ({ timeStamp }) => page.failures.go(-1, timeStamp),
+    c: () => page.selectNextComponent(),
+    d: () => theme.toggle(),
+    e: () => page.goToLargestError(),
+    j: () => page.jobs.toggle(),
+    l: () => page.live.newest(),
+    m: () => page.maps.togglePin(),
+    s: () => page.save(),
+    '?': showHelp,
+  });
+  bindButtons(page, showHelp);
+}
+
+/**
+ * @param {Page} page
+ * @param {() => void} showHelp
+ */
+function bindButtons(page, showHelp) {
+  /** @type {[string, (event: MouseEvent) => void][]} */
+  const actions = [
+    ['#play', () => page.clock.toggle()],
+    ['#back', ({ timeStamp }) => page.stepBy(-1, timeStamp)],
+    ['#forward', ({ timeStamp }) => page.stepBy(1, timeStamp)],
+    ['#theme', () => page.theme.toggle()],
+    ['#help', showHelp],
+    ['#reset-zoom', () => page.timeline.showAll()],
+    ['#largest-error', () => page.goToLargestError()],
+  ];
+  for (const [selector, action] of actions) html(selector).addEventListener('click', action);
+  for (const selector of ['#heatmaps', '#camera'])
+    html(selector).addEventListener(
+      'wheel',
+      (event) => {
+        event.preventDefault();
+        page.stepBy(Math.sign(event.deltaY || event.deltaX), event.timeStamp);
+      },
+      { passive: false },
+    );
+}

@@ -1,0 +1,55 @@
+/** Typed access to elements of the page. */
+
+/**
+ * Returns the first element that matches a selector. Throws if there is none, or if it has another type.
+ * @template {Element} T
+ * @param {string} selector
+ * @param {new () => T} type such as HTMLButtonElement
+ * @param {ParentNode} [root]
+ * @returns {T}
+ */
+export function element(selector, type, root = document) {
+  const node = root.querySelector(selector);
+  if (node instanceof type) return node;
+  throw new Error(`The page has no ${type.name} “${selector}”.`);
+}
+
+/**
+ * Returns the first HTML element that matches a selector.
+ * @param {string} selector
+ * @param {ParentNode} [root]
+ */
+export const html = (selector, root = document) => element(selector, HTMLElement, root);
+
+/**
+ * Creates an element with properties and children.
+ * @template {keyof HTMLElementTagNameMap} K
+ * @param {K} tag
+ * @param {Partial<Omit<HTMLElementTagNameMap[K], 'style'>>} [properties]
+ * @param {...(Node | string)} children
+ * @returns {HTMLElementTagNameMap[K]}
+ */
+export function create(tag, properties = {}, ...children) {
+  const node = document.createElement(tag);
+  Object.assign(node, properties);
+  node.append(...children);
+  return node;
+}
+
+/**
+ * Returns the drawing context of a canvas.
+ * @param {HTMLCanvasElement} canvas
+ * @param {CanvasRenderingContext2DSettings} [settings]
+ * @returns {CanvasRenderingContext2D}
+ */
+export function context2d(canvas, settings) {
+  const context = canvas.getContext('2d', settings);
+  if (!context) throw new Error('The browser cannot draw on a canvas.');
+  return context;
+}
+
+/**
+ * Returns the message of anything thrown.
+ * @param {unknown} error
+ */
+export const messageOf = (error) => (error instanceof Error ? error.message : String(error));

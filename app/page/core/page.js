@@ -1,0 +1,502 @@
+/** The page: its panels, which follow the state and the displayed trace. */
+
+/** @import { Catalog, LiveRun, Selection, Task } from '../data/api.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Handlers } from '../data/view_socket.js' */
+/** @import { Messages } from '../widgets/panel_state.js' */
+/** @import { State, Store } from './state.js' */
+
+import * as api from '../data/api.js';
+import { ViewSocket } from '../data/view_socket.js';
+import { AngleSlider } from '../maps/angle_slider.js';
+import { mapMenu } from '../maps/map_menu.js';
+import { MapPanel } from '../maps/map_panel.js';
+import { Camera } from '../scene/camera.js';
+import { SceneFrame } from '../scene/scene_frame.js';
+import { SceneMenu } from '../scene/scene_menu.js';
+import { stepSummary } from '../step/step_summary.js';
+import { StepTable } from '../step/step_table.js';
+import { Compare } from '../tabs/comparison.js';
+import { Diagnostics } from '../tabs/diagnostics.js';
+import { Failures } from '../tabs/failures.js';
+import { Finetune } from '../tabs/finetune.js';
+import { Live } from '../tabs/live_runs.js';
+import { Library } from '../tabs/recordings.js';
+import { Rerun } from '../tabs/rerun.js';
+import { Study } from '../tabs/study.js';
+import { Timeline } from '../timeline/timeline.js';
+import { FaultSheet } from '../widgets/fault_dialog.js';
+import { Jobs } from '../widgets/jobs.js';
+import { say } from '../widgets/panel_state.js';
+import { choice, pickers } from '../widgets/pickers.js';
+import { ReportSheet } from '../widgets/report_dialog.js';
+import { saving } from '../widgets/save_button.js';
+import { Clock } from './clock.js';
+import { bindControls } from './controls.js';
+import { element, html, messageOf } from './dom.js';
+import { assignSpareColours, swatch } from './palette.js';
+import { parsePermalink } from './state.js';
+import { addLatency, stats } from './stats.js';
+import { tabBar } from './tab_bar.js';
+import { Theme } from './theme.js';
+import { Undo } from './undo.js';
+import { displayName, fixed, sentence } from './units.js';
+
+const MAX_SCENE_DELAY = 1000; // ms until the 3D scene starts, which slows down the other panels
+const LOADING_DELAY = 150; // ms until a panel shows that it loads
+
+/** Bodies of the panels that display the trace; the first one contains the maps. */
+export const panelBodies = ['#heatmaps', '#step .body', '#timeline .body'].map((selector) =>
+  html(selector),
+);
+
+/** @param {number} ms */
+const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
+/** Whether the timeline, and the maps if there are any, are displayed. */
+let markUseful = () => {};
+const useful = new Promise((resolve) => {
+  markUseful = () => requestAnimationFrame(resolve);
+}).then(() => (stats.useful = performance.now()));
+
+export class Page {
+  #catalog;
+  #store;
+  #messages;
+  /** @type {Trace | null} */
+  #trace = null;
+  #loading = new AbortController();
+  #failed = false; // whether the last trace could not be loaded
+
+  /**
+   * @param {Catalog} catalog
+   * @param {Store} store
+   * @param {{runs: LiveRun[], tasks: Task[]}} live
+   * @param {Messages} messages
+   */
+  constructor(catalog, store, live, messages) {
+    this.#catalog = catalog;
+    this.#store = store;
+    this.#messages = messages;
+    const faultDialog = new FaultSheet(element('#fault-dialog', HTMLDialogElement), catalog.faults);
+    const refreshPickers = pickers(catalog, store, faultDialog);
+    this.undo = new Undo(store);
+    this.theme = new Theme((dark) => this.#changeTheme(dark));
+    this.clock = new Clock(store);
+    this.timeline = new Timeline(html('#timeline .body'), store);
+    this.maps = new MapPanel(html('#maps'), store, (cursor) => this.socket.requestMaps(cursor));
+    this.adaptMapMenu = mapMenu(html('#maps-options'), html('#maps-view'), store, this.maps);
+    this.camera = new Camera(html('#camera'));
+    this.stepTable = new StepTable(html('#step-table'));
+    this.angleSlider = new AngleSlider(
+      html('#angle-label'),
+      element('#angle-reset', HTMLButtonElement),
+      store,
+    );
+    this.scene = new SceneFrame(html('#scene'));
+    this.sceneMenu = new SceneMenu(
+      html('#scene'),
+      store,
+      (options) => this.socket.setScene(options),
+      (at) => this.socket.setViewpoint(at),
+    );
+    this.jobs = new Jobs(html('#jobs'), element('#jobs-button', HTMLButtonElement));
+    this.rerun = new Rerun(html('#rerun'), this.jobs, (/** @type {number} */ step) =>
+      store.set({ step, playing: false }, { origin: 'rerun' }),
+    );
+    this.diagnostics = new Diagnostics(html('#diagnostics'), store, this.jobs);
+    this.failures = new Failures(html('#failures'), store, this.jobs, this.timeline, catalog);
+    this.compare = new Compare(
+      html('#compare'),
+      catalog,
+      store,
+      faultDialog,
+      (/** @type {Trace | null} */ trace, /** @type {string} */ name) =>
+        this.#setComparison(trace, name),
+    );
+    this.finetune = new Finetune(html('#finetune'), catalog, store, this.jobs, faultDialog);
+    this.study = new Study(html('#study'), catalog, store, this.failures, this.jobs);
+    this.live = new Live(document.body, catalog, store, this.#liveHandlers(refreshPickers), live);
+    this.recordings = new Library(html('#recordings'), catalog, store, this.jobs, this.rerun);
+    this.selectTab = tabBar(store);
+    this.socket = new ViewSocket(
+      this.#socketHandlers(),
+      () => this.theme.dark,
+      () => this.sceneMenu.options,
+    );
+    this.save = this.#bindSaveButton();
+    this.report = new ReportSheet(
+      element('#report', HTMLButtonElement),
+      () => ({ step: store.state.step, pinned: this.maps.pinned }),
+      (/** @type {Trace} */ trace, /** @type {api.ReportOptions} */ options) =>
+        this.#createReport(trace.selection, options),
+    );
+    this.#start();
+  }
+
+  #start() {
+    const store = this.#store;
+    store.listen((state, changed) => this.#follow(state, changed));
+    window.addEventListener('popstate', () => {
+      const { state, problems } = parsePermalink(location.search, this.#catalog);
+      this.#messages.say('link', problems.join('\n'));
+      store.restore(state);
+    });
+    bindControls(this);
+    this.#showTab(store.state.tab);
+    this.#load();
+    const { timeline, live, rerun } = this;
+    window.beliefscope = {
+      state: () => ({ ...store.state }),
+      stats,
+      timeline,
+      live,
+      rerun: {
+        getState: () => rerun.getState(),
+        files: (files) => rerun.files(files),
+      },
+    };
+  }
+
+  #bindSaveButton() {
+    return saving(
+      element('#save', HTMLButtonElement),
+      html('#save-status'),
+      this.jobs,
+      () => this.#trace && api.recordingRequest(this.#trace),
+      () => this.openTab('rerun'),
+      (/** @type {string} */ name) => {
+        this.openTab('recordings');
+        this.recordings.point(name);
+      },
+    );
+  }
+
+  /**
+   * Starts a job that writes a report, and shows the list of jobs.
+   * @param {Selection} selection
+   * @param {api.ReportOptions} options
+   */
+  async #createReport(selection, options) {
+    await api.createReport(selection, options);
+    if (html('#jobs').hidden) this.jobs.toggle();
+    else this.jobs.refresh();
+  }
+
+  /** @param {() => void} refreshPickers */
+  #liveHandlers(refreshPickers) {
+    return {
+      grown: (/** @type {Trace} */ trace, /** @type {boolean} */ hasNewColumns) =>
+        this.#grow(trace, hasNewColumns),
+      ended: (/** @type {Trace} */ trace) => {
+        this.timeline.grow();
+        this.diagnostics.show(trace);
+        this.failures.show(trace);
+      },
+      listed: refreshPickers,
+      say: (/** @type {string} */ line) => this.#messages.say('live', line),
+    };
+  }
+
+  /** @returns {Handlers} */
+  #socketHandlers() {
+    return {
+      view: ({ scene }) => this.scene.open(scene, Promise.race([useful, pause(MAX_SCENE_DELAY)])),
+      pace: (factor) => this.scene.pace(factor),
+      maps: (maps, inputTime) => {
+        if (!this.#trace) return;
+        this.maps.draw(maps, this.#trace, this.compare.name);
+        say(html('#heatmaps'), 'ready');
+        stats.maps = { serial: maps.serial, step: maps.step, size: maps.size };
+        if (inputTime !== null) addLatency(stats.scrub, performance.now() - inputTime);
+        markUseful();
+      },
+      noMaps: (step, size) => {
+        stats.maps = { step, size };
+        markUseful();
+      },
+      drawn: (step, { inputTime }) => {
+        this.scene.drawn();
+        stats.drawn = { step };
+        if (inputTime) addLatency(stats.scene, performance.now() - inputTime);
+      },
+      moved: (step) =>
+        this.#store.set({ step: this.#clamp(step), playing: false }, { origin: 'scene' }),
+      error: (line) => this.#messages.say('cursor', line),
+      connection: (problem) => {
+        this.#messages.say('connection', problem ?? '');
+        if (!problem && this.#failed) this.#load();
+      },
+    };
+  }
+
+  /**
+   * Updates everything that depends on the changed keys of the state.
+   * @param {State} state
+   * @param {Set<string>} changed
+   */
+  #follow(state, changed) {
+    /** @param {...string} keys */
+    const any = (...keys) => keys.some((key) => changed.has(key));
+    if (any('task', 'filter', 'data', 'episode', 'faults')) this.#load();
+    if (any('tab')) this.#showTab(state.tab);
+    if (any('diagnostic', 'options', 'over')) this.diagnostics.choose();
+    if (any('against') && this.#trace) this.compare.choose();
+    if (any('task', 'filter', 'data', 'faults', 'among')) this.failures.load();
+    else if (any('by', 'phase', 'list')) this.failures.draw();
+    if (any('task', 'filter', 'run')) this.finetune.load();
+    if (any('playing')) this.#showPlaying(state.playing);
+    if (!this.#trace) return;
+    if (any('component', 'weights', 'track')) this.#showComponent(this.#trace);
+    if (any('step', 'angle', 'beside')) this.#move(this.#trace);
+  }
+
+  /** Loads the trace that the state selects. */
+  async #load() {
+    const { task: name, filter, data, episode, faults } = this.#store.state;
+    const task = this.#catalog.tasks.find((item) => item.name === name);
+    if (!task) return;
+    this.#loading.abort();
+    const loading = (this.#loading = new AbortController());
+    [this.#trace, this.#failed] = [null, false];
+    this.clock.show(null);
+    /** @param {string} text @param {number} [share] */
+    const showLoading = (text, share) => {
+      for (const body of panelBodies) say(body, 'loading', text, share);
+    };
+    const timer = setTimeout(() => showLoading('Loading …'), LOADING_DELAY);
+    /** @param {number} share */
+    const progress = (share) => {
+      clearTimeout(timer);
+      showLoading('Running the filter …', share);
+    };
+    try {
+      const selection = { task: name, filter, data, episode, faults };
+      const trace = await api.loadTrace(task, selection, progress, loading.signal);
+      clearTimeout(timer);
+      this.#show(trace);
+    } catch (error) {
+      clearTimeout(timer);
+      if (!loading.signal.aborted) this.#showError(error);
+    }
+  }
+
+  /** @param {unknown} error */
+  #showError(error) {
+    if (!(error instanceof api.ServerError)) console.error(error);
+    this.#failed = true;
+    html('#step-summary').textContent = '';
+    for (const body of panelBodies) say(body, 'error', messageOf(error));
+  }
+
+  /** @param {Trace} trace */
+  #show(trace) {
+    this.#trace = trace;
+    this.live.show(trace);
+    const { step } = this.#store.state;
+    if (step >= trace.steps) {
+      const range = `0 to ${trace.steps - 1}`;
+      this.#messages.say('step', `Step ${step} does not exist. The steps are ${range}.`);
+      this.#store.set({ step: trace.steps - 1 });
+    }
+    assignSpareColours(trace.modalities);
+    for (const body of panelBodies.slice(1)) say(body, 'ready');
+    this.clock.show(trace);
+    this.camera.show(trace);
+    this.timeline.show(trace);
+    this.angleSlider.show(trace);
+    this.rerun.show(trace);
+    this.diagnostics.show(trace);
+    this.failures.show(trace);
+    this.report.show(trace);
+    this.#showProperties(trace);
+    this.adaptMapMenu(trace);
+    this.sceneMenu.show(trace);
+    this.compare.show(trace);
+    this.#showComponent(trace);
+    this.#move(trace);
+  }
+
+  /**
+   * Adapts titles, legends and buttons to a trace.
+   * @param {Trace} trace
+   */
+  #showProperties(trace) {
+    const { no_maps: noMaps } = trace.header;
+    const position = displayName(trace.task.map.x).replace(/(^| )x$/, '');
+    html('#maps-quantity').textContent = position || 'position';
+    const { classList } = html('#maps');
+    classList.toggle('single', !trace.fuses);
+    classList.toggle('no-effector', !trace.has('effector_position'));
+    classList.toggle('unavailable', Boolean(noMaps));
+    if (noMaps) say(html('#heatmaps'), 'empty', sentence(noMaps));
+    html('#blackout-key').hidden = !trace.blackout.some(Boolean);
+    html('#sigma-key').hidden = !trace.has('estimate_sigma');
+    element('#largest-error', HTMLButtonElement).disabled = !trace.truth(0).some(Number.isFinite);
+    html('#swatches').replaceChildren(
+      ...['truth', ...trace.sources].flatMap((name) => [swatch(name), ` ${trace.label(name)}  `]),
+    );
+  }
+
+  /**
+   * Displays the new steps of a live run.
+   * @param {Trace} trace
+   * @param {boolean} hasNewColumns
+   */
+  #grow(trace, hasNewColumns) {
+    if (hasNewColumns) {
+      this.#show(trace);
+      return;
+    }
+    this.clock.show(trace);
+    this.angleSlider.show(trace);
+    this.timeline.grow();
+    html('#blackout-key').hidden = !trace.blackout.some(Boolean);
+    this.#showCount(trace);
+  }
+
+  /**
+   * Displays a comparison run in the timeline and in the scene, or removes it.
+   * @param {Trace | null} trace
+   * @param {string} name
+   */
+  #setComparison(trace, name) {
+    this.timeline.compareWith(trace, name);
+    if (this.#trace) this.#move(this.#trace);
+  }
+
+  /**
+   * Displays the selected component, kind of weights and lowest chart.
+   * @param {Trace} trace
+   */
+  #showComponent(trace) {
+    const { state } = this.#store;
+    choice(
+      html('#components'),
+      trace.components.map(({ name }) => [name, displayName(name)]),
+      state.component,
+      (component) => this.#store.set({ component }),
+    );
+    const hasBoth = trace.has('weights') && trace.has('effective_weights');
+    choice(
+      html('#weights'),
+      hasBoth
+        ? [
+            ['raw', 'β raw'],
+            ['effective', 'effective'],
+          ]
+        : [],
+      state.weights,
+      (weights) => this.#store.set({ weights }),
+    );
+    this.timeline.redraw();
+    this.stepTable.show(trace, state.component);
+    this.stepTable.move(state.step);
+    this.#showSummary(trace);
+  }
+
+  /** @param {Trace} trace */
+  #move(trace) {
+    const { state, origin, inputTime } = this.#store;
+    const { step, angle, against } = state;
+    this.timeline.move(step);
+    this.camera.move(step);
+    this.stepTable.move(step);
+    this.angleSlider.move(step);
+    this.diagnostics.move(step);
+    this.failures.move(step);
+    this.compare.move(step);
+    this.rerun.move(step, origin === 'rerun');
+    const beside = state.beside === 'gain';
+    this.socket.move({ ...trace.selection, step, angle, against, beside }, inputTime);
+    this.#showSummary(trace);
+    this.#showCount(trace);
+  }
+
+  /** @param {Trace} trace */
+  #showCount({ steps, dt }) {
+    const { step } = this.#store.state;
+    html('#readout b').textContent = `${step} / ${steps - 1}`;
+    html('#readout span').textContent = `${fixed(step * dt)} s`;
+  }
+
+  /** @param {Trace} trace */
+  #showSummary(trace) {
+    const { step, component } = this.#store.state;
+    const index = trace.components.findIndex(({ name }) => name === component);
+    const { tone, text } = stepSummary(trace, step, index);
+    const line = html('#step-summary');
+    line.dataset.tone = tone;
+    line.textContent = line.title = text;
+  }
+
+  /** @param {string} tab */
+  #showTab(tab) {
+    this.selectTab(tab);
+    this.rerun.open = tab === 'rerun';
+    this.diagnostics.open = tab === 'diagnostics';
+    this.failures.draw();
+    this.compare.open = tab === 'compare';
+    this.recordings.open = tab === 'recordings';
+    this.finetune.open = tab === 'finetune';
+    this.study.open = tab === 'study';
+    if (this.#trace) this.rerun.move(this.#store.state.step, false);
+  }
+
+  /** @param {boolean} playing */
+  #showPlaying(playing) {
+    document.body.classList.toggle('playing', playing);
+    html('#play').ariaLabel = playing ? 'Pause' : 'Play';
+  }
+
+  /** @param {boolean} dark */
+  #changeTheme(dark) {
+    this.socket.setTheme(dark);
+    this.timeline.redraw();
+    this.maps.redraw();
+    this.diagnostics.redraw();
+    this.compare.redraw();
+    this.finetune.redraw();
+  }
+
+  /** @param {number} step */
+  #clamp(step) {
+    return Math.min(Math.max(step, 0), (this.#trace?.steps ?? 1) - 1);
+  }
+
+  /**
+   * Moves the cursor by a number of steps.
+   * @param {number} steps
+   * @param {number} inputTime
+   */
+  stepBy(steps, inputTime) {
+    const step = this.#clamp(this.#store.state.step + steps);
+    this.#store.set({ step, playing: false }, { inputTime });
+  }
+
+  /** @param {string} tab */
+  openTab(tab) {
+    this.#store.set({ tab });
+  }
+
+  goToLargestError() {
+    if (!this.#trace) return;
+    const inputTime = performance.now();
+    this.#store.set({ step: this.timeline.largestError, playing: false }, { inputTime });
+  }
+
+  /**
+   * Sets the first or the last step of the intervention to the cursor.
+   * @param {'from' | 'last'} end
+   */
+  markIntervention(end) {
+    this.openTab('compare');
+    this.compare.mark(end, this.#store.state.step);
+  }
+
+  selectNextComponent() {
+    const names = this.#trace?.components.map(({ name }) => name) ?? [];
+    const index = names.indexOf(this.#store.state.component);
+    if (names.length) this.#store.set({ component: names[(index + 1) % names.length] });
+  }
+}

@@ -1,0 +1,33 @@
+/** The tabs on the left of the page. */
+
+/** @import { Store } from './state.js' */
+
+import { element, html } from './dom.js';
+import { TABS } from './state.js';
+
+/**
+ * @param {Store} store
+ * @returns {(tab: string) => void} displays a tab
+ */
+export function tabBar(store) {
+  const buttons = TABS.map((name) => element(`#tab-${name}`, HTMLButtonElement));
+  buttons.forEach((button, i) => {
+    button.addEventListener('click', () => store.set({ tab: TABS[i] }));
+    button.addEventListener('keydown', (event) => {
+      if (event.key !== 'ArrowLeft' && event.key !== 'ArrowRight') return;
+      event.stopPropagation();
+      const next = (i + (event.key === 'ArrowRight' ? 1 : TABS.length - 1)) % TABS.length;
+      store.set({ tab: TABS[next] });
+      buttons[next].focus();
+    });
+  });
+  return (selected) => {
+    TABS.forEach((name, i) => {
+      buttons[i].ariaSelected = String(name === selected);
+      buttons[i].tabIndex = name === selected ? 0 : -1;
+      html(`#${name}`).hidden = name !== selected;
+    });
+    // Where the bar is too narrow for all tabs, it scrolls.
+    buttons[TABS.indexOf(selected)].scrollIntoView({ block: 'nearest', inline: 'nearest' });
+  };
+}

@@ -1,0 +1,462 @@
+/** The panel with the likelihood maps, one per layer. */
+
+/** @import { ColourMap } from '../core/palette.js' */
+/** @import { Store } from '../core/state.js' */
+/** @import { Selection } from '../data/api.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Cursor } from '../data/view_socket.js' */
+/** @import { Layer, MapOptions } from './draw_map.js' */
+/** @import { Maps, Range, Scale, Shade } from './map_values.js' */
+
+import { context2d, create, html } from '../core/dom.js';
+import { colour, cssVariable, gradient } from '../core/palette.js';
+import { displayName } from '../core/units.js';
+import { MARGIN, drawMap, paintCells } from './draw_map.js';
+import { layerMeasures, pairwiseMeasures, positionText, valuesAt } from './map_summary.js';
+import { borders, rangeDigits, rangeLabels, shades } from './map_values.js';
+
+const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom']; // keys of the state
+const REGION_SHARES = [0.5, 0.95];
+const CLOSE_UP = 4; // zoom while all maps of the run fit into it
+const MIN_SIDE = 60; // px
+/** @type {Record<string, number[]>} */
+const ARROWS = {
+  ArrowLeft: [-1, 0],
+  ArrowRight: [1, 0],
+  ArrowUp: [0, 1],
+  ArrowDown: [0, -1],
+};
+
+/**
+ * @typedef {object} Figure of a layer
+ * @property {string} name
+ * @property {HTMLElement} figure
+ * @property {HTMLCanvasElement} canvas
+ * @property {HTMLElement} head
+ * @property {{element: HTMLElement, low: HTMLElement, gradient: HTMLElement, high: HTMLElement}} bar
+ * @property {HTMLElement} caption
+ * @property {HTMLElement[]} lines
+ * @property {HTMLCanvasElement} cells
+ * @property {Shade} shade
+ * @property {ColourMap} colourMap
+ * @property {number[][]} borders
+ *
+ * @typedef {{maps: Maps, selection: Selection}} Pinned
+ * @typedef {{maps: Maps, name: string, selection: Selection | null}} Reference of likelihood ratios; selection: null for the comparison run
+ * @typedef {{trace: Trace, maps: Maps, layers: Layer[], title: string, options: MapOptions}} DisplayedMaps
+ */
+
+export class MapPanel {
+  /** Called when maps were pinned or released. */
+  changed = () => {};
+  #panel;
+  #host;
+  #store;
+  #requestMaps;
+  /** @type {Figure[]} */
+  #figures = [];
+  /** @type {Maps | null} */
+  #maps = null;
+  /** @type {Trace | null} */
+  #trace = null;
+  /** @type {Pinned | null} */
+  #pinned = null;
+  #requestedPin = '';
+  #comparisonName = '';
+  /** Offset of the crosshair in m. @type {number[] | null} */
+  #hover = null;
+  /** Whether some maps of the run did not fit into the close-up. */
+  #wide = false;
+  #side = 0; // px
+
+  /**
+   * @param {HTMLElement} panel
+   * @param {Store} store
+   * @param {(cursor: Cursor) => Promise<Maps>} requestMaps requests the fine maps of another step
+   */
+  constructor(panel, store, requestMaps) {
+    this.#panel = panel;
+    this.#store = store;
+    this.#requestMaps = requestMaps;
+    this.#host = html('#heatmaps', panel);
+    new ResizeObserver(() => this.#resize()).observe(this.#host);
+    store.listen((_, changed) => {
+      if (OPTIONS.some((key) => changed.has(key))) this.#shade();
+      if (changed.has('pin')) this.#restorePin();
+    });
+  }
+
+  /**
+   * Displays maps.
+   * @param {Maps} maps
+   * @param {Trace} trace
+   * @param {string} [comparisonName] label of the comparison run
+   */
+  draw(maps, trace, comparisonName = '') {
+    this.#comparisonName = comparisonName;
+    const rebuild = this.#maps === null || this.#maps.layers.join() !== maps.layers.join();
+    // The zoom does not return to the close-up: axes that change from step to step are hard to read.
+    this.#wide = (this.#wide && this.#trace === trace) || !fitsCloseUp(maps);
+    [this.#maps, this.#trace] = [maps, trace];
+    // With a single measurement model the fused map equals that of the model.
+    if (rebuild)
+      this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
+    const pinned = this.#pinned;
+    if (
+      pinned &&
+      (pinned.selection.task !== trace.selection.task || !comparable(pinned.maps, maps))
+    )
+      this.togglePin();
+    this.#restorePin();
+    this.#shade();
+  }
+
+  /** Pins the displayed maps as the reference of later ones, or releases the pinned ones. */
+  togglePin() {
+    const [maps, trace] = [this.#maps, this.#trace];
+    if (!maps || !trace) return;
+    this.#setPinned(this.#pinned ? null : { maps, selection: trace.selection });
+    const pin = this.#pinned ? pinText(trace.selection, maps.step, this.#store.state.angle) : '';
+    this.#store.set({ pin });
+  }
+
+  /** @param {Pinned | null} pinned */
+  #setPinned(pinned) {
+    this.#pinned = pinned;
+    this.#shade();
+    this.changed();
+  }
+
+  /** Follows the state: requests the maps of a pinned step that a link names, or releases them. */
+  async #restorePin() {
+    const { pin, task } = this.#store.state;
+    if (!pin && this.#pinned) this.#setPinned(null);
+    if (!pin || !this.#maps || this.#pinned || this.#requestedPin === pin) return;
+    this.#requestedPin = pin;
+    const { selection, step, angle } = parsePin(pin, task);
+    const maps = await this.#requestMaps({ ...selection, step, angle });
+    if (this.#store.state.pin !== pin || this.#pinned) return;
+    if (comparable(maps, this.#maps)) this.#setPinned({ maps, selection });
+    else this.#store.set({ pin: '' });
+  }
+
+  /** Maps to which the displayed ones are compared: the pinned ones, or those of the comparison run. @returns {Reference | null} */
+  get #reference() {
+    if (this.#pinned) return { ...this.#pinned, name: `step ${this.#pinned.maps.step}` };
+    const beside = this.#maps?.beside;
+    if (!beside || !this.#maps || !comparable(beside, this.#maps)) return null;
+    return { maps: beside, name: this.#comparisonName, selection: null };
+  }
+
+  get pinned() {
+    return this.#pinned;
+  }
+
+  /** The displayed maps, for an export. @returns {DisplayedMaps | null} */
+  get displayed() {
+    const [maps, trace] = [this.#maps, this.#trace];
+    if (!maps || !trace) return null;
+    return {
+      maps,
+      trace,
+      layers: this.#figures.map((figure, index) => ({ ...figure, index, maps, trace })),
+      title: this.#title(),
+      options: this.#options(0),
+    };
+  }
+
+  #resize() {
+    if (this.#figures.length) this.#side = this.#availableSide();
+    this.redraw();
+  }
+
+  redraw() {
+    const [maps, trace] = [this.#maps, this.#trace];
+    if (!maps || !trace) return;
+    if (!this.#side) this.#side = this.#availableSide();
+    this.#figures.forEach((figure, index) => this.#drawLayer(figure, { maps, trace, index }));
+  }
+
+  /** Computes the colours and borders of the maps. */
+  #shade() {
+    const maps = this.#maps;
+    if (!maps) return;
+    const { scale, range, colours, regions } = this.#store.state;
+    const reference = this.#reference;
+    const layers = shades(
+      maps,
+      /** @type {Scale} */ (scale),
+      /** @type {Range} */ (range),
+      reference?.maps ?? null,
+    );
+    this.#figures.forEach((figure, layer) => {
+      figure.shade = layers[layer];
+      figure.colourMap = reference ? 'diverging' : /** @type {ColourMap} */ (colours);
+      figure.borders = regions === 'shown' ? borders(maps, layer, REGION_SHARES) : [];
+      paintCells(figure.cells, figure.shade, maps.size, figure.colourMap);
+      this.#showBar(figure);
+    });
+    this.#showTitle(reference);
+    const pairs = html('#maps-pairs', this.#panel);
+    pairs.textContent = pairs.title = pairwiseMeasures(maps);
+    this.redraw();
+  }
+
+  /** @param {Reference | null} reference */
+  #showTitle(reference) {
+    const log = this.#store.state.scale === 'log';
+    const kind = html('#maps-kind', this.#panel);
+    kind.textContent = log ? 'Log-likelihood' : 'Likelihood';
+    if (reference) kind.textContent = `Gain on ${reference.name}`;
+    html('h2', this.#panel).title = this.#title();
+    const quantity = html('#maps-of', this.#panel);
+    quantity.hidden = Boolean(reference);
+    quantity.classList.toggle('wide-only', log);
+  }
+
+  /** Describes what the colours show. */
+  #title() {
+    const { scale, range } = this.#store.state;
+    const reference = this.#reference;
+    if (reference) {
+      const { selection, name } = reference;
+      const run = selection
+        ? `${name} (${selection.filter}, episode ${selection.episode})`
+        : `the comparison run (${name})`;
+      return `log of the likelihood relative to ${run}, both as densities over the displayed area`;
+    }
+    if (scale === 'log') return 'log-likelihood';
+    return range === 'same'
+      ? 'likelihood relative to the highest peak'
+      : 'likelihood relative to its own peak';
+  }
+
+  /** @param {string[]} layers */
+  #build(layers) {
+    this.#side = 0;
+    for (const { figure } of this.#figures) figure.remove();
+    this.#figures = layers.map((name, layer) => this.#figure(name, layer, layers.length > 1));
+    this.#host.append(...this.#figures.map(({ figure }) => figure));
+  }
+
+  /**
+   * @param {string} name
+   * @param {number} layer
+   * @param {boolean} fuses
+   * @returns {Figure}
+   */
+  #figure(name, layer, fuses) {
+    const label = fuses || name !== 'fused' ? name.replaceAll('+', ' + ') : 'estimate';
+    const [low, high] = [create('b'), create('b')];
+    const colours = create('i');
+    const bar = create('span', { className: 'colours' }, low, colours, high);
+    const head = create('div', { className: 'head' }, create('h3', { textContent: label }), bar);
+    const lines = [create('p'), create('p'), create('p')];
+    const caption = create('figcaption', {}, ...lines);
+    const canvas = create('canvas', { role: 'img', tabIndex: 0 });
+    canvas.addEventListener('pointermove', (event) => this.#point(event, layer));
+    canvas.addEventListener('pointerleave', () => this.#setHover(null));
+    canvas.addEventListener('pointerdown', (event) => event.preventDefault()); // keeps the focus
+    canvas.addEventListener('keydown', (event) => this.#moveCrosshair(event));
+    canvas.addEventListener('blur', () => this.#setHover(null));
+    const figure = create('figure', {}, head, canvas, caption);
+    figure.style.setProperty('--line', `var(${cssVariable(fuses ? name : 'fused')})`);
+    return {
+      name,
+      figure,
+      canvas,
+      head,
+      bar: { element: bar, low, gradient: colours, high },
+      caption,
+      lines,
+      cells: create('canvas'),
+      shade: { values: new Float32Array(), low: 0, high: 1, clipped: false },
+      colourMap: 'viridis',
+      borders: [],
+    };
+  }
+
+  /** Returns the side of a map's square that fits the panel, in px. */
+  #availableSide() {
+    const count = this.#figures.length;
+    const { clientWidth, clientHeight } = this.#host;
+    const { paddingLeft, paddingRight, paddingTop, paddingBottom } = getComputedStyle(this.#host);
+    const width = clientWidth - parseFloat(paddingLeft) - parseFloat(paddingRight);
+    const horizontal =
+      (width - MARGIN.left - (count - 1) * MARGIN.gap - count * MARGIN.right) / count;
+    const { caption, head } = this.#figures[0];
+    const texts =
+      caption.offsetHeight + head.offsetHeight + parseFloat(paddingTop) + parseFloat(paddingBottom);
+    const vertical = clientHeight - MARGIN.bottom - MARGIN.top - texts;
+    return Math.max(MIN_SIDE, Math.floor(Math.min(horizontal, vertical)));
+  }
+
+  get #zoom() {
+    const { zoom } = this.#store.state;
+    return zoom === 'fit' ? (this.#wide ? 1 : CLOSE_UP) : Number(zoom);
+  }
+
+  get #world() {
+    return this.#store.state.axes === 'world';
+  }
+
+  /** @param {number} layer */
+  #leftMargin(layer) {
+    return layer === 0 ? MARGIN.left : MARGIN.gap;
+  }
+
+  /**
+   * @param {number} layer
+   * @returns {MapOptions}
+   */
+  #options(layer) {
+    const { axes, cloud } = this.#store.state;
+    return {
+      axes,
+      zoom: this.#zoom,
+      cloud: cloud === 'shown',
+      textColour: colour('muted'),
+      withY: layer === 0,
+      hover: this.#hover,
+    };
+  }
+
+  /**
+   * @param {Figure} figure
+   * @param {{maps: Maps, trace: Trace, index: number}} layer
+   */
+  #drawLayer(figure, { maps, trace, index }) {
+    const { canvas, name } = figure;
+    const [side, left, ratio] = [this.#side, this.#leftMargin(index), devicePixelRatio];
+    const [width, height] = [left + side + MARGIN.right, MARGIN.top + side + MARGIN.bottom];
+    const [pixelWidth, pixelHeight] = [Math.round(width * ratio), Math.round(height * ratio)];
+    if (canvas.width !== pixelWidth || canvas.height !== pixelHeight) {
+      [canvas.width, canvas.height] = [pixelWidth, pixelHeight];
+      [canvas.style.width, canvas.style.height] = [`${width}px`, `${height}px`];
+      figure.figure.style.width = `${width}px`;
+    }
+    const context = context2d(canvas);
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, width, height);
+    context.translate(left, MARGIN.top);
+    drawMap(context, { ...figure, index, maps, trace }, side, this.#options(index));
+    const { lines, description } = layerMeasures(maps, index, this.#world);
+    canvas.ariaLabel = `${name}: ${this.#title()}; ${description}. Arrow keys read values.`;
+    figure.caption.title = description;
+    const texts = this.#hover ? this.#values(maps, index, this.#hover) : lines;
+    figure.lines.forEach((line, i) => (line.textContent = texts[i] ?? ''));
+  }
+
+  /** @param {Figure} figure */
+  #showBar({ bar, shade, colourMap }) {
+    const [low, high] = rangeLabels(shade, rangeDigits(shade));
+    [bar.low.textContent, bar.high.textContent] = [low, high];
+    bar.gradient.style.background = gradient(colourMap);
+    const [from, to] = rangeLabels(shade, 2);
+    bar.element.title = `Colour: ${this.#title()}, from ${from} to ${to}`;
+  }
+
+  /**
+   * @param {Maps} maps
+   * @param {number} layer
+   * @param {number[]} offset
+   */
+  #values(maps, layer, offset) {
+    const ratios = this.#reference ? this.#figures[layer].shade.values : null;
+    return valuesAt(maps, layer, offset, ratios);
+  }
+
+  /**
+   * @param {PointerEvent} event
+   * @param {number} layer
+   */
+  #point(event, layer) {
+    if (!this.#maps) return;
+    const half = this.#maps.half_width / this.#zoom;
+    const x = (event.offsetX - this.#leftMargin(layer)) / this.#side;
+    const y = (event.offsetY - MARGIN.top) / this.#side;
+    const inside = x >= 0 && x <= 1 && y >= 0 && y <= 1;
+    this.#setHover(inside ? [(2 * x - 1) * half, (1 - 2 * y) * half] : null);
+  }
+
+  /**
+   * Moves the crosshair cell by cell with the arrow keys and announces the values.
+   * @param {KeyboardEvent} event
+   */
+  #moveCrosshair(event) {
+    if (event.key === 'Escape') this.#setHover(null);
+    const direction = ARROWS[event.key];
+    const maps = this.#maps;
+    if (!direction || !maps) return;
+    event.preventDefault();
+    const cell = (2 * maps.half_width) / maps.size;
+    const limit = maps.half_width / this.#zoom - cell / 2;
+    const from = this.#hover ?? [0, 0];
+    const distance = (event.shiftKey ? 5 : 1) * cell;
+    const offset = direction.map((d, i) =>
+      Math.min(Math.max(from[i] + distance * d, -limit), limit),
+    );
+    this.#setHover(offset);
+    const values = this.#figures.map(
+      ({ name }, layer) => `${displayName(name)} ${this.#values(maps, layer, offset).join(', ')}`,
+    );
+    html('#maps-announcement', this.#panel).textContent =
+      `${positionText(maps, offset, this.#world)} cm: ${values.join('; ')}`;
+  }
+
+  /** @param {number[] | null} offset m */
+  #setHover(offset) {
+    if (offset === this.#hover) return;
+    this.#hover = offset;
+    html('#maps-value', this.#panel).textContent =
+      offset && this.#maps ? `at ${positionText(this.#maps, offset, this.#world)} cm` : '';
+    this.redraw();
+  }
+}
+
+/**
+ * @param {Maps} a
+ * @param {Maps} b
+ */
+const comparable = (a, b) =>
+  a.layers.join() === b.layers.join() && Math.abs(a.half_width - b.half_width) < 1e-6;
+
+/**
+ * Returns whether peaks and 95 % regions, approximated by ellipses, fit into the close-up.
+ * @param {Maps} maps
+ */
+function fitsCloseUp({ half_width: half, peak, numbers }) {
+  return peak.every((offset, layer) => {
+    const radius = Math.sqrt((numbers.area95[layer] / Math.PI) * numbers.elongation[layer]);
+    return Math.max(...offset.map(Math.abs)) + radius <= half / CLOSE_UP;
+  });
+}
+
+/**
+ * Writes a step of the page's task as URL parameters.
+ * @param {Selection} selection
+ * @param {number} step
+ * @param {number | null} angle
+ */
+function pinText({ filter, data, episode, faults }, step, angle) {
+  const query = new URLSearchParams({ filter, data, episode: String(episode), step: String(step) });
+  if (faults) query.set('faults', faults);
+  if (angle !== null) query.set('angle', angle.toFixed(4));
+  return String(query);
+}
+
+/**
+ * Reads a step from URL parameters.
+ * @param {string} pin
+ * @param {string} task
+ */
+function parsePin(pin, task) {
+  const query = new URLSearchParams(pin);
+  const [filter, data, faults] = ['filter', 'data', 'faults'].map((key) => query.get(key) ?? '');
+  const angle = query.get('angle');
+  return {
+    selection: { task, filter, data, episode: Number(query.get('episode')), faults },
+    step: Number(query.get('step')),
+    angle: angle === null ? null : Number(angle),
+  };
+}

@@ -1,0 +1,64 @@
+/** The frame of the 3D scene. */
+
+import { html } from '../core/dom.js';
+import { say } from '../widgets/panel_state.js';
+
+/**
+ * Interface of viser_frame_throttle.js, in the frame.
+ * @typedef {object} FrameThrottle
+ * @property {(factor: number) => boolean} pause sets the pause after each slow rendering as a multiple of its duration, and returns whether the next may start now
+ * @property {() => boolean} slow whether rendering is slow
+ * @property {((slow: boolean) => void) | null} changed called after each rendering
+ */
+
+export class SceneFrame {
+  #host;
+  #frame = document.createElement('iframe');
+
+  /** @param {HTMLElement} host */
+  constructor(host) {
+    this.#host = host;
+    this.#frame.addEventListener('load', () => {
+      const throttle = this.#throttle;
+      if (throttle)
+        throttle.changed = (slow) => {
+          html('#software-rendering').hidden = !slow;
+        };
+    });
+    this.#frame.title = '3D scene: robot, true state and estimates';
+    say(host, 'loading', 'Starting the 3D scene …');
+  }
+
+  /**
+   * Loads the scene of a view.
+   * @param {string} url
+   * @param {Promise<unknown>} ready when loading may start: it delays other parts of the page
+   */
+  async open(url, ready) {
+    say(this.#host, 'loading', 'Starting the 3D scene …');
+    await ready;
+    if (this.#frame.isConnected) {
+      this.#frame.contentWindow?.location.replace(url); // without a history entry
+      return;
+    }
+    this.#frame.src = url;
+    this.#host.append(this.#frame);
+  }
+
+  /**
+   * Sets the pause between slow renderings. Returns whether the scene may render now.
+   * @param {number} factor
+   */
+  pace(factor) {
+    return this.#throttle?.pause(factor) ?? true;
+  }
+
+  /** Called when the scene shows the cursor. */
+  drawn() {
+    if (this.#host.dataset.state !== 'ready') say(this.#host, 'ready');
+  }
+
+  get #throttle() {
+    return this.#frame.contentWindow?.frameThrottle;
+  }
+}

@@ -1,0 +1,122 @@
+/** A sentence that summarises a step: error, consistency and the dominant modality. */
+
+/** @import { Trace } from '../data/trace.js' */
+
+import { displayName, fixed, percent } from '../core/units.js';
+
+const MAX_SIGMAS = 2; // an error up to this many standard deviations is consistent
+const DOMINANT_SHARE = 0.6; // effective weight from which a modality is dominant
+const FEW_PARTICLES = 0.05; // share of the particles
+/** Another estimate counts as more accurate if its error is lower by this many cm, and by this factor. */
+const MIN_GAIN = { consistent: 1, other: 0.2 };
+const MAX_RATIO = 0.8;
+
+/** @typedef {'good' | 'warn' | 'bad' | 'none'} Tone */
+
+/**
+ * @param {Trace} trace
+ * @param {number} step
+ * @param {number} component whose effective weights are compared
+ * @returns {{tone: Tone, text: string}}
+ */
+export function stepSummary(trace, step, component) {
+  const { tone, text } = trace.hasTruth(step)
+    ? accuracy(trace, step)
+    : { tone: /** @type {Tone} */ ('none'), text: 'True state unknown.' };
+  const sentences = [text];
+  const dominant = dominantModality(trace, step, component);
+  if (dominant) {
+    const uninformative = uninformativeReason(dominant.name, trace, step);
+    const better = moreAccurateModality(dominant.name, trace, step, tone);
+    if (dominant.weight >= DOMINANT_SHARE || better) {
+      const scope =
+        trace.weightWidth > 1 ? ` in ${displayName(trace.components[component].name)}` : '';
+      const reasons = [uninformative, better].filter(Boolean).join(' and ');
+      sentences.push(
+        `Dominated by ${dominant.name} (${percent(dominant.weight)}${scope})${reasons && `, although ${reasons}`}.`,
+      );
+    }
+  }
+  if (trace.blackout[step] && dominant?.name !== 'image') sentences.push('Image blacked out.');
+  const size = trace.effectiveSampleSize?.[step];
+  const count = trace.header.settings?.particles;
+  if (size && count && size < FEW_PARTICLES * count)
+    sentences.push(`Effective sample size ${fixed(size, 0)} of ${count} particles.`);
+  return { tone, text: sentences.join(' ') };
+}
+
+/**
+ * Compares the error of the estimate with its predicted standard deviation.
+ * @param {Trace} trace
+ * @param {number} step
+ * @returns {{tone: Tone, text: string}}
+ */
+function accuracy(trace, step) {
+  const name = trace.fuses ? 'Fused estimate' : 'Estimate';
+  const error = `${name}: error ${fixed(trace.error('fused', 'position')?.[step], 1)} cm`;
+  const deviation = trace.largestDeviation(step);
+  if (!deviation) return { tone: 'none', text: `${error}; no predicted standard deviation.` };
+  const { sigmas, component } = deviation;
+  /** @type {[Tone, string]} */
+  const [tone, verdict] =
+    sigmas <= MAX_SIGMAS
+      ? ['good', 'consistent']
+      : sigmas <= 2 * MAX_SIGMAS
+        ? ['warn', 'larger than predicted']
+        : ['bad', 'overconfident'];
+  const text = `${error}; largest deviation ${fixed(sigmas, 1)}σ in ${displayName(component)}: ${verdict}.`;
+  return { tone, text };
+}
+
+/**
+ * Explains why a modality carries no information at a step; empty if it may.
+ * @param {string} modality
+ * @param {Trace} trace
+ * @param {number} step
+ */
+function uninformativeReason(modality, trace, step) {
+  if (modality === 'image' && trace.blackout[step]) return 'the image is blacked out';
+  return modality === 'haptics' && !trace.contact[step] ? 'there is no contact' : '';
+}
+
+/**
+ * Describes the most accurate modality if it is clearly more accurate than the fused estimate.
+ * @param {string} dominant modality
+ * @param {Trace} trace
+ * @param {number} step
+ * @param {Tone} tone
+ */
+function moreAccurateModality(dominant, trace, step, tone) {
+  const best = mostAccurateModality(trace, step);
+  const error = trace.error('fused', 'position')?.[step] ?? NaN;
+  const gain = tone === 'good' ? MIN_GAIN.consistent : MIN_GAIN.other;
+  if (!best || best.name === dominant) return '';
+  if (!(best.error < Math.min(error - gain, MAX_RATIO * error))) return '';
+  return `the ${best.name}-only error is ${fixed(best.error, 1)} cm`;
+}
+
+/**
+ * @param {Trace} trace
+ * @param {number} step
+ */
+function mostAccurateModality(trace, step) {
+  const modalities = trace.has('modality_mean') ? trace.modalities : [];
+  const errors = modalities.map((name) => ({
+    name,
+    error: trace.error(name, 'position')?.[step] ?? NaN,
+  }));
+  return errors.sort((a, b) => a.error - b.error)[0];
+}
+
+/**
+ * @param {Trace} trace
+ * @param {number} step
+ * @param {number} component
+ */
+function dominantModality(trace, step, component) {
+  const weights = trace.modalities.flatMap((name) => {
+    const weight = trace.weight('effective', name, component)?.[step];
+    return weight === undefined ? [] : [{ name, weight }];
+  });
+  return weights.sort((a, b) => b.weight - a.weight)[0];
+}

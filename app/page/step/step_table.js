@@ -1,0 +1,144 @@
+/** The table of the current step: a row for each modality's update and for the fused estimate. */
+
+/** @import { Trace } from '../data/trace.js' */
+
+import { create } from '../core/dom.js';
+import { cssVariable, swatch } from '../core/palette.js';
+import { displayName, fixed, percent } from '../core/units.js';
+
+/**
+ * @typedef {object} Column
+ * @property {string} title
+ * @property {string} unit
+ * @property {string} help
+ * @property {(source: string, step: number) => string} text
+ * @property {(source: string, step: number) => number} [share] of the cell that is filled, 0..1
+ */
+
+export class StepTable {
+  #table;
+  /** @type {Trace | null} */
+  #trace = null;
+  /** @type {Column[]} */
+  #columns = [];
+  /** @type {HTMLElement[][]} */
+  #cells = [];
+
+  /** @param {HTMLElement} table */
+  constructor(table) {
+    this.#table = table;
+  }
+
+  /**
+   * @param {Trace} trace
+   * @param {string} component whose weights are displayed if each component has its own
+   */
+  show(trace, component) {
+    this.#trace = trace;
+    const index = trace.components.findIndex((c) => c.name === component);
+    this.#columns = [...errorColumns(trace), ...weightColumns(trace, index)];
+    const heads = this.#columns.map(({ title, unit, help }) =>
+      create(
+        'th',
+        { scope: 'col', title: help },
+        title,
+        create('small', { textContent: unit || ' ' }),
+      ),
+    );
+    this.#cells = trace.sources.map(() =>
+      this.#columns.map(({ share }) => create('td', { className: share ? 'share' : '' })),
+    );
+    const rows = trace.sources.map((source, i) => {
+      const title = create('th', { scope: 'row' }, swatch(source), trace.label(source));
+      const row = create('tr', { className: source }, title, ...this.#cells[i]);
+      row.style.setProperty('--line', `var(${cssVariable(source)})`);
+      return row;
+    });
+    this.#table.replaceChildren(
+      create('thead', {}, create('tr', {}, create('td'), ...heads)),
+      create('tbody', {}, ...rows),
+    );
+  }
+
+  /** @param {number} step */
+  move(step) {
+    this.#trace?.sources.forEach((source, row) =>
+      this.#columns.forEach(({ text, share }, i) => {
+        const cell = this.#cells[row][i];
+        cell.textContent = text(source, step);
+        if (share) cell.style.setProperty('--share', String(share(source, step)));
+      }),
+    );
+  }
+}
+
+/**
+ * @param {Trace} trace
+ * @returns {Column[]}
+ */
+function errorColumns(trace) {
+  /** @type {Column[]} */
+  const columns = [
+    {
+      title: 'error',
+      unit: 'cm',
+      help: 'Distance to the true position',
+      text: (source, t) => fixed(trace.error(source, 'position')?.[t], 2),
+    },
+    {
+      title: 'σ',
+      unit: 'cm',
+      help: 'Predicted standard deviation of the position: root of the summed variances',
+      text: (source, t) => fixed(trace.positionSigma(source)?.[t], 2),
+    },
+  ];
+  for (const angle of trace.angles) {
+    const name = displayName(trace.components[angle].name);
+    columns.push(
+      {
+        title: name,
+        unit: 'err. °',
+        help: `Error of the ${name}`,
+        text: (source, t) => fixed(trace.error(source, angle)?.[t], 1),
+      },
+      {
+        title: 'σ',
+        unit: '°',
+        help: `Predicted standard deviation of the ${name}`,
+        text: (source, t) => fixed(trace.sigma(source, angle)?.[t], 1),
+      },
+    );
+  }
+  return columns.filter(({ title }) => title !== 'σ' || trace.has('estimate_sigma'));
+}
+
+/**
+ * @param {Trace} trace
+ * @param {number} component
+ * @returns {Column[]} none if the table has no rows for modalities
+ */
+function weightColumns(trace, component) {
+  /** @type {Column[]} */
+  const columns = [];
+  if (trace.sources.length < 2) return columns;
+  const name = displayName(trace.components[component].name);
+  if (trace.has('weights'))
+    columns.push({
+      title: 'β',
+      unit: trace.weightWidth > 1 ? name : 'raw',
+      help: `Fusion weight, the output of the network${trace.weightWidth > 1 ? `, for ${name}` : ''}`,
+      text: (source, t) => fixed(trace.weight('raw', source, component)?.[t], 2),
+    });
+  if (trace.has('effective_weights')) {
+    /** @param {string} source @param {number} t */
+    const weight = (source, t) => trace.weight('effective', source, component)?.[t];
+    columns.push({
+      title: 'weight',
+      unit: 'effective',
+      help: 'Effective weight: share of the modality in the posterior',
+      text: (source, t) => percent(weight(source, t)),
+      share: (source, t) => weight(source, t) ?? 0,
+    });
+  }
+  return columns;
+}

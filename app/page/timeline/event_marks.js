@@ -1,0 +1,115 @@
+/** Marks of events, as triangles above the charts. A click moves the cursor there. */
+
+/** @import { Store } from '../core/state.js' */
+
+import { create } from '../core/dom.js';
+
+/**
+ * @typedef {object} EventMark
+ * @property {number} step
+ * @property {string} label description with a value and its unit
+ * @property {string} [measure] that selected the event: error, NEES …
+ *
+ * @typedef {{step: number, button: HTMLButtonElement, current: boolean}} Mark
+ */
+
+export class EventMarks {
+  #host;
+  #store;
+  /** @type {Mark[]} */
+  #marks = [];
+
+  /**
+   * @param {HTMLElement} host
+   * @param {Store} store
+   */
+  constructor(host, store) {
+    this.#host = host;
+    this.#store = store;
+    host.addEventListener('keydown', (event) => this.#moveFocus(event));
+  }
+
+  /**
+   * Replaces the marks.
+   * @param {EventMark[]} events
+   */
+  set(events) {
+    const sorted = [...events].sort((a, b) => a.step - b.step);
+    this.#marks = sorted.map((event) => this.#mark(event));
+    this.#host.replaceChildren(...this.#marks.map(({ button }) => button));
+    this.#host.hidden = !events.length;
+  }
+
+  /**
+   * Places the marks horizontally.
+   * @param {(step: number) => number | null} x px; null for an invisible step
+   * @param {number} width px
+   */
+  place(x, width) {
+    for (const { step, button } of this.#marks) {
+      const position = x(step);
+      button.hidden = position === null;
+      button.style.transform = `translateX(${(position ?? 0).toFixed(2)}px)`;
+      button.classList.toggle('leftward', (position ?? 0) > width / 2);
+    }
+    const visible = this.#visible;
+    if (!visible.some((button) => button.tabIndex === 0)) this.#setTabStop(visible[0]);
+  }
+
+  /**
+   * Highlights the mark at the cursor.
+   * @param {number} step
+   */
+  move(step) {
+    for (const mark of this.#marks) {
+      const current = mark.step === step;
+      if (mark.current === current) continue;
+      mark.current = current;
+      mark.button.ariaCurrent = current ? 'true' : null;
+    }
+  }
+
+  /**
+   * @param {EventMark} event
+   * @returns {Mark}
+   */
+  #mark({ step, label, measure }) {
+    const prefix = measure && !label.startsWith(measure) ? `${measure}, ` : '';
+    const button = create('button', {
+      type: 'button',
+      tabIndex: -1,
+      ariaLabel: `Step ${step}: ${prefix}${label}`,
+    });
+    button.addEventListener('pointerdown', (event) => event.stopPropagation()); // no scrubbing
+    button.addEventListener('click', (event) => {
+      this.#store.set({ step, playing: false }, { inputTime: event.timeStamp });
+      if (event.detail) button.blur(); // after a mouse click the page's keys work again
+    });
+    return { step, button, current: false };
+  }
+
+  /**
+   * Moves the focus with the arrow keys. The tab key stops at one mark only.
+   * @param {KeyboardEvent} event
+   */
+  #moveFocus(event) {
+    const direction = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    const visible = this.#visible;
+    const index = visible.findIndex((button) => button === document.activeElement);
+    if (!direction || index < 0) return;
+    event.preventDefault();
+    event.stopPropagation();
+    const next = visible[Math.min(Math.max(index + direction, 0), visible.length - 1)];
+    this.#setTabStop(next);
+    next.focus();
+  }
+
+  get #visible() {
+    return this.#marks.map(({ button }) => button).filter((button) => !button.hidden);
+  }
+
+  /** @param {HTMLButtonElement | undefined} target */
+  #setTabStop(target) {
+    for (const { button } of this.#marks) button.tabIndex = button === target ? 0 : -1;
+  }
+}

@@ -1,0 +1,62 @@
+/** Legends of the charts: names, line samples and current values. */
+
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Track } from './chart.js' */
+
+import { create } from '../core/dom.js';
+import { cssVariable, lineSample } from '../core/palette.js';
+import { fixed, significant } from '../core/units.js';
+import { seriesStyle } from './chart.js';
+
+/** @typedef {{text: Text, track: Track, index: number}} ValueCell index of the series in the track */
+
+/**
+ * Creates the legend of a track.
+ * @param {Track} track
+ * @param {Trace} trace
+ * @param {boolean} compared whether a comparison run is displayed
+ * @returns {{element: HTMLElement, cells: ValueCell[]}}
+ */
+export function legend(track, trace, compared) {
+  const { title, unit, help, series } = track;
+  const heading = create('h3', { textContent: unit ? `${title} (${unit})` : title });
+  heading.title = help ?? heading.textContent ?? '';
+  const list = create('dl');
+  /** @type {ValueCell[]} */
+  const cells = [];
+  for (const name of new Set(series.map((item) => item.name))) {
+    const first = series.find((item) => item.name === name) ?? { name };
+    const { dash, width } = seriesStyle(first, compared);
+    const sample = lineSample(cssVariable(name), dash, width);
+    const label = trace.label(name);
+    list.append(create('dt', { title: label }, sample, label));
+    for (const comparison of compared ? [false, true] : [false]) {
+      const text = new Text();
+      const index = series.findIndex(
+        (item) => item.name === name && Boolean(item.comparison) === comparison,
+      );
+      if (index >= 0) cells.push({ text, track, index });
+      list.append(create('dd', {}, text));
+    }
+  }
+  return { element: create('div', { className: 'legend' }, heading, list), cells };
+}
+
+/**
+ * Writes the values at a step into a legend.
+ * @param {ValueCell[]} cells
+ * @param {number} step
+ */
+export function updateLegend(cells, step) {
+  for (const { text, track, index } of cells) {
+    const value = formatValue(track.series[index].values[step], track);
+    if (text.data !== value) text.data = value;
+  }
+}
+
+/**
+ * @param {number} value
+ * @param {Track} track
+ */
+export const formatValue = (value, { digits }) =>
+  digits === undefined ? significant(value) : fixed(value, digits);

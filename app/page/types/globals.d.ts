@@ -1,0 +1,18 @@
+import type { FrameThrottle } from '../scene/scene_frame.js';
+import type { Page } from '../core/page.js';
+import type { State } from '../core/state.js';
+
+declare global {
+  interface Window {
+    /** Access for the browser tests and the benchmarks. */
+    beliefscope: {
+      state(): State;
+      stats: typeof import('../core/stats.js').stats;
+      timeline: Page['timeline'];
+      live: Page['live'];
+      rerun: Pick<Page['rerun'], 'getState' | 'files'>;
+    };
+    /** In the frame of the 3D scene. */
+    frameThrottle?: FrameThrottle;
+  }
+}

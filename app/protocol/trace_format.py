@@ -1,0 +1,103 @@
+"""Traces as the page reads them: a JSON header and little-endian float32 columns (docs/api.md)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.app.protocol.messages import LAYERS, SceneLayer
+from beliefscope.datasets.task import Task
+from beliefscope.filters.evaluate import nees_bounds
+from beliefscope.inspect.diagnostics.consistency import innovations
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.trace import Trace
+
+SENSORS = ("effector_position", "force")
+
+
+def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
+    """The trace's time series.
+
+    Returns:
+        Descriptions ``{"name", "shape", "offset"}`` (offset in bytes) and the float32 buffer they refer to.
+    """
+    innovation = innovations(trace)
+    unimodal = bool(trace.modalities_with_posterior)
+    arrays: dict[str, NDArray[Any] | None] = {
+        "truth": trace.episode.states,
+        "estimate_mean": trace.estimate_mean,
+        "estimate_sigma": _sigma(trace.estimate_covariance) if trace.has_covariance else None,
+        "modality_mean": trace.modality_mean if unimodal else None,
+        "modality_sigma": _sigma(trace.modality_covariance) if unimodal else None,
+        "nees": measures.nees(trace) if trace.has_covariance else None,
+        "innovation": None if innovation is None else innovation[0],
+        "innovation_sigma": None if innovation is None else _sigma(innovation[1]),
+        "weights": trace.weights,
+        "effective_weights": trace.effective_weights,
+        "contact": trace.episode.contact,
+        "effective_sample_size": trace.effective_sample_size,
+    }
+    arrays |= {key: trace.episode.observations.get(key) for key in SENSORS}
+    descriptions: list[dict[str, Any]] = []
+    buffers: list[bytes] = []
+    offset = 0
+    for name, array in arrays.items():
+        if array is not None:
+            descriptions.append({"name": name, "shape": list(array.shape), "offset": offset})
+            buffers.append(np.ascontiguousarray(array, dtype="<f4").tobytes())
+            offset += len(buffers[-1])
+    return descriptions, b"".join(buffers)
+
+
+def camera_images(trace: Trace) -> NDArray[np.uint8] | None:
+    """(T, H, W) the first image observation, as the filter received it; None if there is none."""
+    observations = trace.episode.observations.values()
+    return next((array for array in observations if array.ndim == 3 and array.dtype == np.uint8), None)
+
+
+def scene_layers(task: Task, trace: Trace, no_maps: str | None) -> list[SceneLayer]:
+    """The layers that the 3D scene of a trace has."""
+    present = {
+        "replay": task.replay is not None and trace.episode.qpos.shape[1] > 0,
+        "objects": task.outline is not None,
+        "estimates": True,
+        "contours": trace.has_covariance,
+        "particles": trace.particles is not None and trace.log_weights is not None,
+        "force": trace.episode.observations.keys() >= set(SENSORS),
+        "map": no_maps is None,
+        "camera": task.camera is not None and camera_images(trace) is not None,
+    }
+    return [layer for layer in LAYERS if present[layer]]
+
+
+def header(trace: Trace, column_descriptions: list[dict[str, Any]], task: Task, no_maps: str | None) -> dict[str, Any]:
+    """Metadata of a trace, as in ``responses.TraceHeader``. no_maps: why there are no likelihood maps, or None."""
+    images = camera_images(trace)
+    components = [{"name": c.name, "unit": c.unit} for c in task.components]
+    return {
+        "steps": len(trace),
+        "dt": trace.episode.dt,
+        "kind": trace.kind,
+        "filter": trace.filter,
+        "episode": trace.episode_index,
+        "components": components,
+        "modalities": list(trace.modalities),
+        "weight_width": 0 if trace.weights is None else trace.weights.shape[-1],
+        "checkpoint_hash": trace.checkpoint_hash,
+        "data_hash": trace.data_hash,
+        "seed": trace.seed,
+        "faults": str(trace.faults),
+        "settings": dict(trace.settings),
+        "nees_bounds": nees_bounds(len(components), 1) if trace.has_covariance else None,
+        "no_maps": no_maps,
+        "pictures": None if images is None else list(images.shape[1:]),
+        "columns": column_descriptions,
+        "scene": scene_layers(task, trace, no_maps),
+    }
+
+
+def _sigma(covariance: NDArray[Any]) -> NDArray[Any]:
+    """(..., n, n) -> (..., n): standard deviations."""
+    return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

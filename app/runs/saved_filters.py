@@ -1,0 +1,88 @@
+"""Fine-tuned filters that are saved in a workspace and listed by its servers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from pydantic import TypeAdapter
+
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.workspace.json_files import read_record
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.filters.checkpoint import load_checkpoint
+
+FILE = "kept.json"
+
+
+@dataclass(frozen=True)
+class SavedFilter:
+    """A saved filter. path: its checkpoint file. default: whether it is listed first for its task."""
+
+    task: str
+    name: str
+    path: str
+    default: bool
+
+
+RECORDS = TypeAdapter(list[SavedFilter])
+
+
+def read_saved_filters(workspace: Path) -> list[SavedFilter]:
+    """The saved filters whose checkpoint exists; none if the list cannot be read."""
+    with suppress(BadInput):
+        return _read(workspace)
+    return []
+
+
+def with_saved_filters(settings: Settings) -> Settings:
+    """The settings, extended by the saved filters of the workspace."""
+    filters = read_saved_filters(settings.workspace)
+    first = {saved.name: Path(saved.path) for saved in filters if saved.default}
+    last = {saved.name: Path(saved.path) for saved in filters if not saved.default}
+    return replace(settings, checkpoints={**first, **settings.checkpoints, **last}) if filters else settings
+
+
+def save_filter(store: TraceStore, new: SavedFilter) -> None:
+    """Add a filter to the catalog and to the list. A default replaces the previous default of its task.
+
+    Raises:
+        BadInput: the checkpoint or the list cannot be read.
+    """
+    others = [saved for saved in _read(store.settings.workspace) if (saved.task, saved.name) != (new.task, new.name)]
+    if new.default:
+        others = [replace(saved, default=saved.default and saved.task != new.task) for saved in others]
+    path = Path(new.path)
+    store.add_filter(new.task, new.name, load_checkpoint(path), path, first=new.default)
+    _write(store.settings.workspace, [new, *others])
+
+
+def remove_filter(store: TraceStore, task: str, name: str) -> None:
+    """Remove a filter from the catalog and the list. Its checkpoint file is kept."""
+    workspace = store.settings.workspace
+    others = [saved for saved in _read(workspace) if (saved.task, saved.name) != (task, name)]
+    store.remove_filter(task, name)
+    _write(workspace, others)
+
+
+def _read(workspace: Path) -> list[SavedFilter]:
+    """Raises BadInput for a list that cannot be read, such as a later version's, so that it is not overwritten."""
+    path = workspace / FILE
+    try:
+        return [saved for saved in read_record(RECORDS, path) if Path(saved.path).is_file()]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError):
+        raise BadInput(
+            f"{str(path)!r} is damaged or was written by another version: move it away to start a new list"
+        ) from None
+
+
+def _write(workspace: Path, filters: Sequence[SavedFilter]) -> None:
+    workspace.mkdir(parents=True, exist_ok=True)
+    write_atomically(workspace / FILE, json.dumps([asdict(saved) for saved in filters], indent=2).encode())

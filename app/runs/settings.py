@@ -1,0 +1,73 @@
+"""Settings of a server: which data and filters it offers, and its workspace."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from beliefscope.datasets.catalog import load_task
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter, load_external
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a server.
+
+    Attributes:
+        workspace: folder for recordings, traces and caches; created when needed.
+        data: displayed name -> file or folder of episodes, listed before the sample sets.
+        checkpoints: displayed name -> checkpoint file or external filter; listed before the pretrained filters, of
+            which it replaces those with the same name.
+        hosts: additional host names that the server answers to.
+        particles: number of particles of particle filters.
+        seed: seed of the filters.
+        views: maximum number of pages open at a time.
+        tasks: user-defined tasks, as accepted by ``load_task``.
+        studies: displayed name -> folder of a study.
+    """
+
+    workspace: Path
+    data: Mapping[str, Path] = field(default_factory=dict)
+    checkpoints: Mapping[str, Path | Checkpoint] = field(default_factory=dict)
+    hosts: tuple[str, ...] = ()
+    particles: int = 300
+    seed: int = 0
+    views: int = 32
+    tasks: tuple[str, ...] = ()
+    studies: Mapping[str, Path] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything a job needs, as JSON values. External filters are represented by their source."""
+        return {
+            "workspace": str(self.workspace),
+            "data": {name: str(path) for name, path in self.data.items()},
+            "checkpoints": {
+                name: {"source": filter_.source, "task": filter_.task.name}
+                if isinstance(filter_, ExternalFilter)
+                else str(filter_)
+                for name, filter_ in self.checkpoints.items()
+            },
+            "tasks": list(self.tasks),
+            "particles": self.particles,
+            "seed": self.seed,
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Settings:
+        """Inverse of ``to_json``. Registers the user-defined tasks and loads the external filters."""
+        for task in values["tasks"]:
+            load_task(task)
+        return cls(
+            Path(values["workspace"]),
+            {name: Path(path) for name, path in values["data"].items()},
+            {
+                name: Path(filter_) if isinstance(filter_, str) else load_external(filter_["source"], filter_["task"])
+                for name, filter_ in values["checkpoints"].items()
+            },
+            particles=values["particles"],
+            seed=values["seed"],
+            tasks=tuple(values["tasks"]),
+        )

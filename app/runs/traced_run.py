@@ -1,0 +1,132 @@
+"""A filter run that is being computed or complete, and the values derived from its trace."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from functools import cached_property
+from typing import Any
+
+from beliefscope.app.protocol.map_format import EncodedMaps, encode_maps
+from beliefscope.app.protocol.messages import MAP_SIZES
+from beliefscope.app.protocol.trace_format import columns, header
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, no_maps
+from beliefscope.inspect.trace import Trace, arrays_of
+
+COARSE, FINE = MAP_SIZES
+MAP_CACHE_BYTES = 12 << 20  # per trace: about 300 coarse maps
+
+
+class TracedRun:
+    """A run and its trace. Methods may be called from any thread.
+
+    Attributes:
+        key: hash of everything the trace depends on: checkpoint, episode, seed, particles, faults, intervention.
+        checkpoint: the filter.
+        future: the trace, or the error that ended its computation.
+        progress: completed fraction, 0..1.
+        scene_key: identifies what a 3D scene draws; equal for all states of a live run.
+        growing: whether the run is live and may get more steps (``app/runs/live_runs.py``).
+    """
+
+    growing = False
+
+    def __init__(self, key: str, checkpoint: Checkpoint) -> None:
+        self.key = self.scene_key = key
+        self.checkpoint = checkpoint
+        self.future: Future[Trace] = Future()
+        self.future.set_running_or_notify_cancel()  # a client that stops waiting must not cancel it
+        self.progress = 0.0
+        self._engine_lock = threading.Lock()
+        self._cache_lock = threading.Lock()
+        self._cache: OrderedDict[tuple[int, float | None, int], EncodedMaps] = OrderedDict()
+        self._cache_bytes = 0
+
+    def result(self, timeout: float | None = None) -> Trace:
+        """Wait for the trace. Raises the error of its computation, or TimeoutError of ``concurrent.futures``."""
+        return self.future.result(timeout)
+
+    def ready(self, timeout: float) -> bool:
+        """Whether the trace is complete within ``timeout`` s. Raises the error of its computation."""
+        try:
+            self.future.result(timeout)
+        except FutureTimeout:
+            return False
+        return True
+
+    @property
+    def trace(self) -> Trace:
+        """The trace; waits until it is complete."""
+        return self.result()
+
+    def __len__(self) -> int:
+        """Number of steps."""
+        return len(self.trace)
+
+    def at(self, step: int) -> tuple[Trace, int]:
+        """A trace that contains the step, and the index of the step in it."""
+        return self.trace, step
+
+    @cached_property
+    def no_maps(self) -> str | None:
+        """Reason why the run has no likelihood maps; None if it has."""
+        return no_maps(self.checkpoint, self.trace)
+
+    def header(self) -> dict[str, Any]:
+        """Description of the trace for the page."""
+        return header(self.trace, self.columns[0], self.checkpoint.task, self.no_maps)
+
+    @cached_property
+    def columns(self) -> tuple[list[dict[str, Any]], bytes]:
+        """Time series of the trace for the page: descriptions and one buffer."""
+        return columns(self.trace)
+
+    def map(self, step: int, angle: float | None, size: int) -> LikelihoodMap:
+        """Compute one likelihood map. The map engine keeps caches, so it computes one map at a time."""
+        with self._engine_lock:
+            return self._engine.map(step, angle=angle, size=size)
+
+    def maps(self, steps: Iterable[int]) -> Iterator[LikelihoodMap]:
+        """Compute fine maps of several steps. Other threads get their maps in between."""
+        return (self.map(step, None, FINE) for step in steps)
+
+    def encoded_maps(self, step: int, angle: float | None, size: int) -> EncodedMaps:
+        """One likelihood map in its binary encoding. The most recent ones are cached for all views of the run."""
+        key = step, angle, size
+        with self._cache_lock:
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+        maps = encode_maps(self.checkpoint.task, *self.at(step), self.map(step, angle, size))
+        with self._cache_lock:
+            if key not in self._cache:
+                self._cache[key] = maps
+                self._cache_bytes += maps.nbytes
+            while self._cache_bytes > MAP_CACHE_BYTES:
+                self._cache_bytes -= self._cache.popitem(last=False)[1].nbytes
+        return maps
+
+    def missing_maps(self, step: int, angle: float | None, count: int) -> list[int]:
+        """Of the ``count`` steps nearest to ``step``, those whose coarse map is not cached; the nearest first."""
+        near = range(max(0, step - count), min(len(self), step + count + 1))
+        nearest = sorted(near, key=lambda index: abs(index - step))[:count]
+        with self._cache_lock:
+            return [index for index in nearest if (index, angle, COARSE) not in self._cache]
+
+    @property
+    def nbytes(self) -> int:
+        """Approximate memory of the trace, once complete, and its cached maps."""
+        complete = self.future.done() and self.future.exception() is None
+        return self._cache_bytes + (self._trace_bytes if complete else 0)
+
+    @cached_property
+    def _trace_bytes(self) -> int:
+        return sum(array.nbytes for array in arrays_of(self.trace).values())
+
+    @cached_property
+    def _engine(self) -> MapEngine:
+        return MapEngine(self.checkpoint, self.trace)

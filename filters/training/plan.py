@@ -1,0 +1,66 @@
+"""Training schedules: the number of optimiser steps of each stage, and the settings shared by all stages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+Report = Callable[[str, int, int, float], None]
+"""Progress callback, called with the stage's name, steps done, total steps, and the loss."""
+
+BLACKOUTS = (0.0, 0.4, 0.8)
+"""Probabilities of an image blackout: one is drawn for each training window, and all are evaluated."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Schedule of a training. Counts are optimiser steps and upper limits: see ``patience``.
+
+    Attributes:
+        dynamics: for each of the lengths 1, 4, 8, 16. images: for the image encoders. models: for each virtual sensor
+            or likelihood. single: for the filter reduced to one modality, each in turn. weights: for the weight model.
+        together: end to end, for each of ``lengths``. fine: end to end, image encoders included.
+        lengths: of the subsequences in end-to-end stages. window: length in the stages ``single`` and ``weights``.
+        batch: subsequences of 16 steps in a batch; shorter ones are proportionally more. particles: in training.
+        rate: Adam's learning rate. fine_rate: the same where whole filters train end to end.
+        likelihood_weight: weight of the negative log-likelihood relative to the squared error of the mean, end to end.
+            With the squared error alone, as in the authors' code, the covariance is not calibrated.
+        check: steps between two evaluations of the validation loss. patience: evaluations without improvement that end
+            a stage.
+    """
+
+    dynamics: int = 150
+    images: int = 500
+    models: int = 1500
+    single: int = 300
+    weights: int = 300
+    together: tuple[int, ...] = (100, 150, 250)
+    fine: int = 60
+    lengths: tuple[int, ...] = (4, 16, 32)
+    window: int = 32
+    batch: int = 32
+    particles: int = 30
+    rate: float = 1e-3
+    fine_rate: float = 3e-4
+    likelihood_weight: float = 0.05
+    check: int = 50
+    patience: int = 6
+
+
+PLANS = {
+    "cpu": Plan(),
+    "full": Plan(
+        dynamics=2000,
+        images=8000,
+        models=20_000,
+        single=1500,
+        weights=1500,
+        together=(1500, 1500, 4000),
+        fine=2000,
+        batch=64,
+        check=250,
+    ),
+    "smoke": Plan(
+        dynamics=2, images=2, models=2, single=1, weights=1, together=(1,), fine=1, lengths=(4,), window=4, batch=4
+    ),
+}

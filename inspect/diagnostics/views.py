@@ -1,0 +1,139 @@
+"""Views of a result: tables, curves, plots and image panels, shared by page, recordings, figures and reports.
+
+Values are in display units: cm and degrees.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Value = str | int | float | None
+VIEWS = ("tables", "curves", "bands", "plots", "images")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of values, None where a value is not available. Column names include the unit."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Value, ...], ...]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A quantity over the steps of one trace.
+
+    Attributes:
+        name: legend text.
+        values: (T,), NaN where undefined.
+        chart: title of the chart; curves of one chart share its axes.
+        unit: display unit.
+        layer: modality, ``fused`` or ``truth``; determines the colour.
+        bounds: expected range of the values, if any.
+    """
+
+    name: str
+    values: Array
+    chart: str
+    unit: str = ""
+    layer: str = ""
+    bounds: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Line:
+    """One series of a plot: x and y (S,), and the layer that determines its colour."""
+
+    name: str
+    x: Array
+    y: Array
+    layer: str = ""
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A plot whose x axis is not time.
+
+    Attributes:
+        diagonal: whether to draw the ideal y = x.
+        names: category names of x = 0, 1, ...
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: tuple[Line, ...]
+    kind: Literal["line", "points", "bars"] = "line"
+    diagonal: bool = False
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ImagePanel:
+    """A value per pixel (H, W), such as an attribution. ``signed``: use a colour map symmetric about zero."""
+
+    title: str
+    values: Array
+    unit: str = ""
+    signed: bool = True
+
+
+class Views(ABC):
+    """A result with a verdict and views; subclasses are frozen dataclasses whose fields are its numbers."""
+
+    @property
+    @abstractmethod
+    def verdict(self) -> str:
+        """Summary of the numbers in one or two sentences."""
+
+    def tables(self) -> list[Table]:
+        """The numbers as tables."""
+        return []
+
+    def curves(self) -> list[Curve]:
+        """Curves over the steps of one trace; empty for results over several traces."""
+        return []
+
+    def bands(self) -> dict[str, NDArray[np.bool_]]:
+        """Phase (``contact``, ``blackout``) -> mask (T,), shaded behind the curves."""
+        return {}
+
+    def plots(self) -> list[Plot]:
+        """Plots over other quantities than time."""
+        return []
+
+    def images(self) -> list[ImagePanel]:
+        """Values per pixel."""
+        return []
+
+    def to_dict(self) -> dict[str, Any]:
+        """Verdict and all fields as JSON values: arrays as lists, non-finite numbers as None."""
+        values = {f.name: as_json(getattr(self, f.name)) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return {"verdict": self.verdict, **values}
+
+    def views(self) -> dict[str, Any]:
+        """Verdict and all ``VIEWS`` as JSON values."""
+        return {"verdict": self.verdict, **{name: as_json(getattr(self, name)()) for name in VIEWS}}
+
+
+def as_json(value: Any) -> Any:
+    """Dataclasses, arrays and mappings as JSON values; non-finite floats as None."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: as_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): as_json(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return as_json(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [as_json(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

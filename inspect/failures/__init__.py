@@ -1,0 +1,5 @@
+"""Failure search over data sets."""
+
+from beliefscope.inspect.failures.events import find_failures
+
+__all__ = ["find_failures"]

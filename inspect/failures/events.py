@@ -1,0 +1,394 @@
+"""Failure search: ranked events over a data set, and their distribution over phases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtrc
+
+from beliefscope.datasets.dataset import Dataset
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.task import Task
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.evaluate import UNITS
+from beliefscope.inspect.diagnostics.base import Diagnostic
+from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
+from beliefscope.inspect.failures.step_scores import PHASES, RECENT, Score, Survey, scores_of
+from beliefscope.inspect.statistics.measures import Mask
+from beliefscope.inspect.trace import Trace, trace
+
+HIGH = 0.9
+"""Quantile of the scores of all steps above which a step is part of an event."""
+
+SIGNIFICANCE = 0.05
+"""Significance level of over-represented phases, with Bonferroni correction."""
+
+MAX_ROWS = 20
+"""Maximum number of events in the table."""
+
+PROBABILITIES = np.linspace(0.0, 1.0, 51)
+
+
+@dataclass(frozen=True)
+class Event:
+    """Consecutive steps with a high score, and values at the step with the highest score (peak); SI units.
+
+    Attributes:
+        episode: index in the data set.
+        first, last, step: first and last step, and the peak.
+        score: score at the peak, in the ``unit`` of its ``Failures``.
+        phase: phase of the peak.
+        other_phases: other phases that apply to the peak.
+        scores: all scores at the peak by name.
+        error: (L,) m, position error by layer.
+        angle_error: (L, A) rad.
+        nees: (L,) NEES / n.
+        ess: effective sample size, or None.
+        beta, effective_weights: (K,), or None.
+    """
+
+    episode: int
+    first: int
+    last: int
+    step: int
+    score: float
+    phase: str
+    other_phases: tuple[str, ...]
+    scores: dict[str, float]
+    error: Array
+    angle_error: Array
+    nees: Array
+    ess: float | None
+    beta: Array | None
+    effective_weights: Array | None
+
+
+@dataclass(frozen=True)
+class PhaseStatistics:
+    """Events of one phase in comparison with all steps.
+
+    Attributes:
+        name: one of ``PHASES``.
+        steps, events: number of steps, and of events whose peak is in the phase.
+        share, event_share: shares of all steps and of all events.
+        lift: ``event_share / share``, the relative frequency of events in the phase.
+        p_value: probability of at least this number of events if peaks were uniform over all steps (binomial).
+        inside, outside: mean score of the steps in the phase, and of all others.
+    """
+
+    name: str
+    steps: int
+    events: int
+    share: float
+    event_share: float
+    lift: float
+    p_value: float
+    inside: float
+    outside: float
+
+
+@dataclass(frozen=True)
+class Failures(Diagnostic):
+    """Events of a data set with high scores; SI units.
+
+    Attributes:
+        task, filter, checkpoint_hash, faults, seed, particles: of the runs.
+        by: name of the score.
+        title, unit: display name and unit of the score: m, rad, sigma, x (ratio) or none.
+        threshold: minimum score of an event.
+        episodes, steps: numbers of episodes and steps.
+        layers: L names: the K modalities, then ``fused``.
+        angles: names of the A components in rad.
+        phases: statistics of phases with steps, in the order of ``PHASES``.
+        events: all events, highest score first.
+        quantiles: phase or ``all`` -> (51,) quantiles of the scores, ascending.
+    """
+
+    task: str
+    filter: str
+    checkpoint_hash: str
+    faults: str
+    seed: int
+    particles: int | None
+    by: str
+    title: str
+    unit: str
+    threshold: float
+    episodes: int
+    steps: int
+    layers: tuple[str, ...]
+    angles: tuple[str, ...]
+    phases: tuple[PhaseStatistics, ...]
+    events: tuple[Event, ...]
+    quantiles: Mapping[str, Array]
+
+    @property
+    def over_represented(self) -> list[PhaseStatistics]:
+        """Phases with significantly more events than expected, highest lift first."""
+        limit = SIGNIFICANCE / max(1, len(self.phases))
+        return sorted((p for p in self.phases if p.lift > 1 and p.p_value < limit), key=lambda p: -p.lift)
+
+    @property
+    def verdict(self) -> str:
+        """Number of events, the worst event, and over-represented phases."""
+        scope = f"in {self.episodes} episode{'s' * (self.episodes != 1)}, {self.steps} steps, by {self.title}"
+        if not self.events:
+            return f"No events {scope}."
+        worst = self.events[0]
+        where = f"{self.format(worst.score)} at step {worst.step} of episode {worst.episode} ({worst.phase})"
+        count = f"{len(self.events)} event{'s' * (len(self.events) != 1)} {scope}, above {self.format(self.threshold)}"
+        phases = "; ".join(
+            f"{p.name}, {_percent(p.share)} of steps and {_percent(p.event_share)} of events ({p.lift:.1f} x)"
+            for p in self.over_represented
+        )
+        return f"{count}; worst: {where}. " + (
+            f"Over-represented: {phases}." if phases else "No phase is over-represented."
+        )
+
+    def worst(self, top: int | None = None, phase: str | None = None) -> tuple[Event, ...]:
+        """The ``top`` worst events, of one phase or of all. Raises BadInput for an unknown phase."""
+        if phase is not None and phase not in PHASES:
+            raise unknown_name("phase", phase, PHASES)
+        return tuple(event for event in self.events if phase in (None, event.phase))[:top]
+
+    def format(self, value: float) -> str:
+        """A score in its display unit."""
+        unit, factor = self._display
+        return f"{value * factor:.3g} {unit}".rstrip()
+
+    def tables(self) -> list[Table]:
+        return [self.phase_table(), self.event_table(self.worst(MAX_ROWS))]
+
+    def phase_table(self) -> Table:
+        """One row per phase."""
+        factor = self._display[1]
+        columns = ("phase", "steps %", "events", "events %", "lift x", "p-value", "mean inside", "mean outside")
+        rows = [
+            (
+                g.name,
+                100 * g.share,
+                g.events,
+                100 * g.event_share,
+                g.lift,
+                g.p_value,
+                factor * g.inside,
+                factor * g.outside,
+            )
+            for g in self.phases
+        ]
+        return Table(f"Events by phase: {self._label}", columns, tuple(rows))
+
+    def event_table(self, events: Sequence[Event]) -> Table:
+        """One row per event with the values at its peak."""
+        columns = ("episode", "step", "from", "to", self._label, "phase", *(f"{layer} cm" for layer in self.layers))
+        columns += tuple(f"{name.replace('_', ' ')} deg" for name in self.angles)
+        columns += ("NEES", *(("ESS",) if self.particles else ()))
+        columns += tuple(f"{layer} effective weight %" for layer in self.layers[:-1] if len(self.layers) > 2)
+        return Table("Worst events", columns, tuple(map(self._row, events)))
+
+    def _row(self, event: Event) -> tuple[Value, ...]:
+        numbers = [*(100.0 * event.error), *np.degrees(event.angle_error[-1]), event.nees[-1]]
+        numbers += [event.ess] if self.particles else []
+        numbers += [] if event.effective_weights is None else [*(100.0 * event.effective_weights)]
+        values = (float(value) if np.isfinite(value) else None for value in numbers)
+        score = self._display[1] * event.score
+        return (event.episode, event.step, event.first, event.last, score, event.phase, *values)
+
+    @property
+    def _display(self) -> tuple[str, float]:
+        """Display unit of the score and the conversion factor."""
+        return UNITS.get(self.unit, (self.unit, 1.0))
+
+    @property
+    def _label(self) -> str:
+        return f"{self.title} ({self._display[0]})" if self.unit else self.title
+
+    def plots(self) -> list[Plot]:
+        """Distribution of the score over all steps and over the phases with the highest lift."""
+        worst = sorted((g for g in self.phases if g.events), key=lambda g: -g.lift)[:3]
+        names = {"all steps": "all"} | {g.name: g.name for g in worst}
+        lines = tuple(
+            Line(
+                name,
+                self._display[1] * self.quantiles[key],
+                100.0 * (1.0 - PROBABILITIES),
+                "fused" if key == "all" else key,
+            )
+            for name, key in names.items()
+        )
+        return [Plot(f"{self.title} by phase", self._label, "steps with at least this value (%)", lines)]
+
+
+def find_failures(
+    checkpoint: Checkpoint,
+    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    episodes: Iterable[int] | None = None,
+    *,
+    by: str = "error",
+    faults: Faults = NO_FAULTS,
+    seed: int = 0,
+    particles: int = 300,
+    progress: Callable[[float], None] | None = None,
+) -> Failures:
+    """Run a filter over the episodes of a data set and rank its failures.
+
+    Args:
+        episodes: indices in ``data``; by default the held-out episodes of a ``Dataset``, otherwise all.
+        by: one of ``scores_of(checkpoint.task)``.
+        progress: called with the completed fraction, 0..1.
+
+    Raises BadInput for an unknown score, and as ``trace``.
+    """
+    _find_score(by, checkpoint.task)
+    if episodes is None and isinstance(data, Dataset):
+        episodes = data.held_out()
+    elif episodes is None:
+        episodes = data if isinstance(data, Mapping) else range(len(data))
+    survey = survey_of(checkpoint, data, episodes, faults=faults, seed=seed, particles=particles, progress=progress)
+    return failures_of(survey, by)
+
+
+def survey_of(
+    checkpoint: Checkpoint,
+    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    episodes: Iterable[int],
+    *,
+    faults: Faults = NO_FAULTS,
+    seed: int = 0,
+    particles: int = 300,
+    progress: Callable[[float], None] | None = None,
+) -> Survey:
+    """Run a filter over episodes of a data set. Raises BadInput as ``trace``."""
+    indices = list(episodes)
+
+    def traces() -> Iterator[Trace]:
+        for done, index in enumerate(indices):
+            yield trace(
+                checkpoint, data[index], index, seed, particles, faults, _partial_progress(progress, done, len(indices))
+            )
+
+    return Survey.from_traces(traces())
+
+
+def failures_of(survey: Survey, by: str = "error") -> Failures:
+    """Rank the events of a survey. Raises BadInput with the reason for a score that does not apply."""
+    definition = _find_score(by, survey.task)
+    if by in survey.refused:
+        raise BadInput(f"no failures by {by}: {survey.refused[by]}")
+    score = survey.scores[by]
+    threshold = float(np.nanquantile(score, HIGH)) if np.isfinite(score).any() else np.nan
+    gap = max(1, round(RECENT / survey.task.dt))
+    phase = survey.phase_index
+    spans = event_spans(score > threshold, survey.episode, gap)
+    events = [_event(survey, score, first, last) for first, last in spans]
+    events.sort(key=lambda event: (-event.score, event.episode, event.step))
+    quantiles = {"all": _quantiles(score)}
+    quantiles |= {name: _quantiles(score[phase == i]) for i, name in enumerate(PHASES) if (phase == i).any()}
+    return Failures(
+        task=survey.task.name,
+        filter=survey.filter,
+        checkpoint_hash=survey.checkpoint_hash,
+        faults=survey.faults,
+        seed=survey.seed,
+        particles=survey.particles,
+        by=by,
+        title=definition.title,
+        unit=definition.unit,
+        threshold=threshold,
+        episodes=len(np.unique(survey.episode)),
+        steps=len(score),
+        layers=survey.layers,
+        angles=survey.angles,
+        phases=tuple(
+            _phase_statistics(name, phase == i, score, events) for i, name in enumerate(PHASES) if (phase == i).any()
+        ),
+        events=tuple(events),
+        quantiles=quantiles,
+    )
+
+
+def event_spans(high: Mask, episode: NDArray[np.int_], gap: int) -> list[tuple[int, int]]:
+    """First and last index of each interval of high steps, merged across gaps of up to ``gap`` steps in an episode.
+
+    Since each interval has one peak, this is a non-maximum suppression. Arrays are (S,) over concatenated episodes.
+    """
+    at = np.flatnonzero(high)
+    if not len(at):
+        return []
+    apart = (np.diff(at) > gap + 1) | (np.diff(episode[at]) != 0)
+    firsts, lasts = at[np.r_[True, apart]], at[np.r_[apart, True]]
+    return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
+
+
+def _event(survey: Survey, score: Array, first: int, last: int) -> Event:
+    peak = first + int(np.nanargmax(score[first : last + 1]))
+    phases = [name for name in PHASES if survey.phases[name][peak]]
+
+    def at(array: Array | None) -> Array | None:
+        return None if array is None else array[peak]
+
+    return Event(
+        episode=int(survey.episode[peak]),
+        first=int(survey.step[first]),
+        last=int(survey.step[last]),
+        step=int(survey.step[peak]),
+        score=float(score[peak]),
+        phase=phases[0],
+        other_phases=tuple(phases[1:]),
+        scores={name: float(values[peak]) for name, values in survey.scores.items()},
+        error=survey.error[peak],
+        angle_error=survey.angle_error[peak],
+        nees=survey.nees[peak],
+        ess=None if survey.ess is None else float(survey.ess[peak]),
+        beta=at(survey.beta),
+        effective_weights=at(survey.effective_weights),
+    )
+
+
+def _phase_statistics(name: str, inside: Mask, score: Array, events: Sequence[Event]) -> PhaseStatistics:
+    share = float(inside.mean())
+    count = sum(event.phase == name for event in events)
+    event_share = count / len(events) if events else 0.0
+    return PhaseStatistics(
+        name=name,
+        steps=int(inside.sum()),
+        events=count,
+        share=share,
+        event_share=event_share,
+        lift=event_share / share,
+        p_value=float(bdtrc(count - 1, len(events), share)),
+        inside=_mean(score[inside]),
+        outside=_mean(score[~inside]),
+    )
+
+
+def _find_score(by: str, task: Task) -> Score:
+    scores = scores_of(task)
+    if by not in scores:
+        raise unknown_name(f"score of task {task.name!r}", by, scores)
+    return scores[by]
+
+
+def _partial_progress(
+    progress: Callable[[float], None] | None, done: int, count: int
+) -> Callable[[float], None] | None:
+    return None if progress is None else lambda share: progress((done + share) / count)
+
+
+def _mean(values: Array) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else np.nan
+
+
+def _quantiles(values: Array) -> Array:
+    finite = values[np.isfinite(values)]
+    return np.quantile(finite, PROBABILITIES) if len(finite) else np.full(len(PROBABILITIES), np.nan)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"

@@ -1,0 +1,122 @@
+"""The trace: intermediate results of a filter at every step of one episode.
+
+Page, recordings, diagnostics and reports read only this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.filters.models.resampling import effective_sample_size
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """T steps, K modalities, n state components, M particles; SI units (m, rad), float32 unless noted.
+
+    Index t is step t of the episode. ``start_mean`` and ``start_covariance`` are the belief before step 0.
+    Fields that do not apply to a kind of filter are None.
+
+    Attributes:
+        episode: filter input: true states, contact, observations after fault injection, data for the replay.
+        modalities: names of the K measurement models, in the order of every K axis: a modality, or several joined by
+            ``+`` that share one model. Empty for an LSTM, which has no measurement models (K = 0).
+        kind: ``ekf``, ``ukf``, ``pf``, ``lstm`` or ``external``. An external filter has the fields that could be
+            captured. Statements about EKFs below hold for UKFs as well.
+        filter: filter name.
+        estimate_mean, estimate_covariance: (T, n), (T, n, n) fused posterior. LSTM: the covariance is NaN.
+        modality_mean, modality_covariance: (T, K, n), (T, K, n, n) posterior after an update with one modality only.
+            EKF: posterior of the unimodal filter; PF: predicted particles weighted by one likelihood.
+        start_mean, start_covariance: (n,), (n, n) belief before the first step.
+        weights: (T, K, W) fusion weights beta, the network's output; W is n (per component) or 1.
+        effective_weights: (T, K, W) share of each modality in the posterior; sums to one over K. None where K < 2.
+            Crossmodal EKF: beta normalised over modalities. Unimodal EKF, W = n: the diagonal of S S_k^-1, its share
+            of each mean. PF: prior weight x beta x likelihood of one modality over the total, summed over particles.
+        predicted_mean, predicted_covariance: EKF: (T, K, n), (T, K, n, n) prior before the observation.
+        observation_mean, observation_covariance: EKF: (T, K, n), (T, K, n, n) virtual sensor output z and R.
+        particles: PF: (T, M, n) predicted particles.
+        prior_log_weights, log_weights: PF: (T, M) normalised, before and after the observation.
+        log_likelihood: PF: (T, K, M), not normalised.
+        ancestors: PF: (T, M) int32 index of the particle that each resampled particle was copied from.
+        checkpoint_hash, data_hash: SHA-256 of the checkpoint file and of the episode (``Episode.digest``).
+        episode_index: index in the data set.
+        seed: seed of the filter and of the fault injection.
+        faults: injected sensor faults; ``data_hash`` is of the episode before injection.
+        settings: JSON values: particles, versions, edits.
+    """
+
+    episode: Episode
+    modalities: tuple[str, ...]
+    kind: str
+    filter: str
+    estimate_mean: Array
+    estimate_covariance: Array
+    modality_mean: Array
+    modality_covariance: Array
+    start_mean: Array
+    start_covariance: Array
+    weights: Array | None = None
+    effective_weights: Array | None = None
+    predicted_mean: Array | None = None
+    predicted_covariance: Array | None = None
+    observation_mean: Array | None = None
+    observation_covariance: Array | None = None
+    particles: Array | None = None
+    prior_log_weights: Array | None = None
+    log_weights: Array | None = None
+    log_likelihood: Array | None = None
+    ancestors: NDArray[np.int32] | None = None
+    checkpoint_hash: str = ""
+    data_hash: str = ""
+    episode_index: int = 0
+    seed: int = 0
+    faults: Faults = NO_FAULTS
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.estimate_mean)
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the estimates have a covariance; those of an LSTM do not."""
+        return not np.isnan(self.estimate_covariance).all() or not len(self)
+
+    @property
+    def modalities_with_posterior(self) -> tuple[str, ...]:
+        """The modalities if their unimodal posteriors are available, otherwise empty."""
+        return () if np.isnan(self.modality_mean).all() else self.modalities
+
+    @property
+    def anchors(self) -> Array:
+        """(T, n) centres of likelihood maps and drawings: the true state, or the estimate where it is unknown."""
+        truth = self.episode.states
+        return np.where(np.isnan(truth), self.estimate_mean, truth)
+
+    @property
+    def effective_sample_size(self) -> Array | None:
+        """(T,) ``1 / sum w_i^2`` of the posterior weights, between 1 and M; None for a filter without particles."""
+        return None if self.log_weights is None else effective_sample_size(torch.from_numpy(self.log_weights)).numpy()
+
+
+ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type))
+"""Names of the array fields of a trace."""
+
+
+def arrays_of(trace: Trace) -> dict[str, NDArray[Any]]:
+    """All arrays of a trace by name; those of its episode start with ``episode/``."""
+    episode = trace.episode
+    arrays: dict[str, NDArray[Any]] = {
+        name: getattr(trace, name) for name in ARRAYS if getattr(trace, name) is not None
+    }
+    arrays |= {f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")}
+    return arrays | {f"episode/observations/{key}": value for key, value in episode.observations.items()}

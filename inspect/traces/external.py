@@ -1,0 +1,71 @@
+"""Traces of external filters: the values that the filter returns and those that hooks can capture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.traces.data import Trace
+
+
+def trace_external(
+    external: ExternalFilter,
+    episode: Episode,
+    episode_index: int = 0,
+    seed: int = 0,
+    faults: Faults = NO_FAULTS,
+    progress: Callable[[float], None] | None = None,
+) -> Trace:
+    """Run an external filter over an episode from the true state, with the arguments of ``trace``.
+
+    Values that are not available are None, or NaN for required fields: covariances and unimodal posteriors. K is 0
+    if the filter does not report separate modalities.
+
+    Raises BadInput as ``trace``, and if the filter fails or returns invalid values.
+    """
+    if episode.task != external.task.name:
+        raise BadInput(
+            f"filter {external.name!r} is for task {external.task.name!r}, the episode is of {episode.task!r}"
+        )
+    data_hash = episode.digest()
+    episode = faults.apply(episode, seed)
+    values, modalities = external.run([episode], seed, progress)
+    start = external.start([episode])
+    arrays = {name: np.ascontiguousarray(value[:, 0].numpy()) for name, value in values.items()}
+    settings: dict[str, Any] = {"torch": torch.__version__, "source": external.source}
+    if "particles" in arrays:
+        settings["particles"] = arrays["particles"].shape[1]
+    return Trace(
+        episode=episode,
+        modalities=modalities,
+        kind=external.kind,
+        filter=external.name,
+        start_mean=start.mean[0].numpy(),
+        start_covariance=np.ascontiguousarray(start.covariance[0].numpy()),
+        checkpoint_hash=external.hash,
+        data_hash=data_hash,
+        episode_index=episode_index,
+        seed=seed,
+        faults=faults,
+        settings=settings,
+        **fill_missing(arrays, len(modalities)),
+    )
+
+
+def fill_missing(arrays: Mapping[str, NDArray[Any]], k: int) -> dict[str, NDArray[Any]]:
+    """The arrays, with NaN for required arrays of K models that are missing."""
+    steps, n = arrays["estimate_mean"].shape
+    shapes = {
+        "estimate_covariance": (steps, n, n),
+        "modality_mean": (steps, k, n),
+        "modality_covariance": (steps, k, n, n),
+    }
+    return {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items()} | dict(arrays)

@@ -1,0 +1,119 @@
+"""Trace files: safetensors with a JSON header. Loading validates the content and accepts names of earlier versions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.inspect.traces.data import ARRAYS, Trace, arrays_of
+from beliefscope.inspect.traces.validate import validate_trace
+
+FORMAT = 1
+
+_RENAMED_ARRAYS = {"acting": "effective_weights"}
+_RENAMED_KINDS = {"foreign": "external"}
+
+
+def save_trace(trace: Trace, path: Path) -> None:
+    """Write a trace atomically. Raises BadInput if the folder does not exist."""
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays_of(trace).items()}
+    write_atomically(
+        path, save(contiguous, metadata={"beliefscope-trace": json.dumps(header_of(trace), sort_keys=True)})
+    )
+
+
+def header_of(trace: Trace) -> dict[str, Any]:
+    """All fields of a trace except the arrays, as JSON values."""
+    episode = trace.episode
+    separate = (*ARRAYS, "episode", "faults", "settings")
+    return {
+        "format": FORMAT,
+        **{f.name: getattr(trace, f.name) for f in fields(Trace) if f.name not in separate},
+        "faults": trace.faults.to_json(),
+        "settings": dict(trace.settings),
+        "episode": {
+            "task": episode.task,
+            "dt": episode.dt,
+            "seed": episode.seed,
+            "split": episode.split,
+            "provenance": dict(episode.provenance),
+        },
+    }
+
+
+def load_trace(path: Path) -> Trace:
+    """Read a trace. Raises BadInput if the file is missing, truncated or not a trace."""
+    path = Path(path)
+    if not path.is_file():
+        raise BadInput(f"trace {str(path)!r} does not exist")
+    try:
+        with safe_open(path, framework="np") as file:
+            metadata = file.metadata() or {}
+            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+        header = read_json(metadata.get("beliefscope-trace", "null"))
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
+        raise BadInput(f"{str(path)!r} is not a readable trace: {error}") from None
+    if not isinstance(header, dict):
+        raise BadInput(f"{str(path)!r} is a safetensors file, but not a Beliefscope trace")
+    if (version := header.pop("format", None)) != FORMAT:
+        raise BadInput(f"{str(path)!r} has trace format {version!r}; this version reads format {FORMAT}")
+    try:
+        return trace_from_arrays(header, arrays)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise BadInput(f"{str(path)!r} is not a complete trace: {error}") from None
+
+
+def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> Trace:
+    """Inverse of ``header_of`` and ``arrays_of``.
+
+    Raises AttributeError, KeyError, TypeError or ValueError (including BadInput) for inconsistent content.
+    """
+    episode_arrays: dict[str, Any] = {
+        name.removeprefix("episode/"): a for name, a in arrays.items() if name.startswith("episode/")
+    }
+    prefix = "observations/"
+    episode = Episode(
+        **header["episode"],
+        **{name: episode_arrays[name] for name in ("states", "controls", "contact", "qpos")},
+        observations={n.removeprefix(prefix): a for n, a in episode_arrays.items() if n.startswith(prefix)},
+    )
+    values = {name: value for name, value in header.items() if name not in ("format", "episode", "recipe")}
+    values |= {
+        "modalities": tuple(values["modalities"]),
+        "kind": current_kind(values["kind"]),
+        "faults": stored_faults(header),
+    }
+    own_arrays = {current_array(n): a for n, a in arrays.items() if not n.startswith("episode/")}
+    trace = Trace(**values, episode=episode, **own_arrays)
+    validate_trace(trace)
+    return trace
+
+
+def stored_faults(header: Mapping[str, Any]) -> Faults:
+    """Faults of a stored header; earlier versions wrote ``recipe``, or a blackout probability in the settings."""
+    faults = header.get("faults", header.get("recipe"))
+    if faults is None and (blackout := header["settings"].get("blackout")):
+        faults = {"blackout": blackout}
+    return Faults.from_json(faults or [])
+
+
+def current_array(stored: str) -> str:
+    """Current name of a stored trace array."""
+    return _RENAMED_ARRAYS.get(stored, stored)
+
+
+def current_kind(stored: Any) -> Any:
+    """Current name of a stored kind of filter; other values are returned unchanged and fail validation."""
+    return _RENAMED_KINDS.get(stored, stored) if isinstance(stored, str) else stored

@@ -1,0 +1,194 @@
+"""Run a filter over an episode and assemble the trace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.filters.batch import Steps
+from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace, moments
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.filter import Filter, Kind
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.inspect.traces.data import Trace
+from beliefscope.inspect.traces.external import trace_external
+
+
+@torch.no_grad()
+def trace(
+    checkpoint: Checkpoint,
+    episode: Episode,
+    episode_index: int = 0,
+    seed: int = 0,
+    particles: int = 300,
+    faults: Faults = NO_FAULTS,
+    progress: Callable[[float], None] | None = None,
+) -> Trace:
+    """Run a filter over an episode from the true state, covariance 0.1 I (standardised), and keep every step.
+
+    Estimates are bit-identical to those of an untraced run with the same seed.
+
+    Args:
+        faults: sensor faults to inject; the trace's episode holds the observations after injection.
+        progress: called with the completed fraction, 0..1.
+
+    Raises:
+        BadInput: the episode or the faults do not fit the checkpoint's task, or a setting is out of range.
+    """
+    if isinstance(checkpoint, ExternalFilter):
+        return trace_external(checkpoint, episode, episode_index, seed, faults, progress)
+    run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
+    result = rollout(
+        checkpoint.filter, run.evidence, run.start, run.generator(), particles, keep=True, progress=progress
+    )
+    return assemble_trace(checkpoint, run.episode, run.start, run.evidence, result.steps, **run.provenance)
+
+
+@dataclass(frozen=True)
+class FilterRun:
+    """A run over an episode before its first step.
+
+    Attributes:
+        episode: filter input, after fault injection.
+        start: belief before step 0, N = 1.
+        evidence: evidence of all steps.
+        provenance: trace fields that identify the run.
+    """
+
+    episode: Episode
+    start: Gaussian
+    evidence: Evidence
+    provenance: Mapping[str, Any]
+
+    def generator(self) -> torch.Generator:
+        """A new generator of the run's random numbers."""
+        return torch.Generator().manual_seed(self.provenance["seed"])
+
+
+@torch.no_grad()
+def start_run(
+    checkpoint: Checkpoint, episode: Episode, episode_index: int, seed: int, particles: int, faults: Faults
+) -> FilterRun:
+    """Inject faults and encode the episode. Arguments and errors as for ``trace``."""
+    if particles < 1:
+        raise BadInput(f"particles must be at least 1, not {particles}")
+    if episode.task != checkpoint.task.name:
+        raise BadInput(
+            f"filter {checkpoint.name!r} is for task {checkpoint.task.name!r}, the episode is of {episode.task!r}"
+        )
+    filter_ = checkpoint.filter
+    provenance = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "faults": faults}
+    episode = faults.apply(episode, seed)
+    batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
+    settings = {"particles": particles, "torch": torch.__version__}
+    return FilterRun(
+        episode, start_at_truth(filter_, batch), filter_.encode(batch), provenance | {"settings": settings}
+    )
+
+
+def assemble_trace(
+    checkpoint: Checkpoint,
+    episode: Episode,
+    start: Gaussian,
+    evidence: Evidence,
+    steps: Sequence[StepTrace],
+    **provenance: Any,
+) -> Trace:
+    """Build the trace of T steps with N = 1."""
+    filter_ = checkpoint.filter
+    si = filter_.statistics
+    arrays = ARRAYS_OF[checkpoint.kind](filter_, steps, evidence)
+    arrays |= {
+        "estimate_mean": si.state_to_si(torch.cat([s.estimate.mean for s in steps])),
+        "estimate_covariance": si.covariance_to_si(torch.cat([s.estimate.covariance for s in steps])),
+        "start_mean": si.state_to_si(start.mean[0]),
+        "start_covariance": si.covariance_to_si(start.covariance[0]),
+    }
+    if evidence.log_weights is not None:
+        arrays["weights"] = evidence.log_weights[:, 0].exp()
+    return Trace(
+        episode=episode,
+        modalities=filter_.names[: arrays["modality_mean"].shape[1]],
+        kind=checkpoint.kind,
+        filter=checkpoint.name,
+        checkpoint_hash=checkpoint.hash,
+        **(provenance | {name: np.ascontiguousarray(value.numpy()) for name, value in arrays.items()}),
+    )
+
+
+def _stack(filter_: Filter, beliefs: list[Gaussian]) -> tuple[Tensor, Tensor]:
+    """Means (T, K, n) and covariances (T, K, n, n) in SI units of T banks with N = 1."""
+    si = filter_.statistics
+    mean = torch.cat([belief.mean for belief in beliefs])
+    return si.state_to_si(mean), si.covariance_to_si(torch.cat([belief.covariance for belief in beliefs]))
+
+
+def _ekf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+    assert evidence.noise is not None
+    predicted = [s.predicted for s in steps if isinstance(s.predicted, Gaussian)]
+    modality = [s.modality for s in steps if s.modality is not None]
+    arrays: dict[str, Tensor] = {}
+    arrays["predicted_mean"], arrays["predicted_covariance"] = _stack(filter_, predicted)
+    arrays["modality_mean"], arrays["modality_covariance"] = _stack(filter_, modality)
+    z = Gaussian(evidence.observation[:, 0], torch.diag_embed(evidence.noise[:, 0] ** 2))
+    arrays["observation_mean"], arrays["observation_covariance"] = _stack(filter_, [z])
+    if evidence.log_weights is not None:
+        arrays["effective_weights"] = torch.softmax(evidence.log_weights[:, 0], dim=1)
+    elif len(filter_.names) > 1:
+        information = torch.linalg.inv(torch.cat([belief.covariance for belief in modality]))
+        fused = torch.cat([s.estimate.covariance for s in steps])
+        arrays["effective_weights"] = (fused.unsqueeze(1) @ information).diagonal(dim1=-2, dim2=-1)
+    return arrays
+
+
+def _pf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+    predicted = [s.predicted for s in steps if isinstance(s.predicted, Particles)]
+    states = torch.cat([p.states for p in predicted])
+    prior = torch.cat([p.log_weights for p in predicted])
+    posterior = torch.cat([s.posterior.log_weights for s in steps if isinstance(s.posterior, Particles)])
+    log_likelihood = torch.cat([s.log_likelihood for s in steps if s.log_likelihood is not None])
+    alone = torch.log_softmax(prior.unsqueeze(1) + log_likelihood, dim=-1)
+    modality = moments(states.unsqueeze(1), alone)
+    si = filter_.statistics
+    arrays = {
+        "particles": si.state_to_si(states),
+        "prior_log_weights": prior,
+        "log_weights": posterior,
+        "log_likelihood": log_likelihood,
+        "ancestors": torch.cat([s.ancestors for s in steps if s.ancestors is not None]).int(),
+        "modality_mean": si.state_to_si(modality.mean),
+        "modality_covariance": si.covariance_to_si(modality.covariance),
+    }
+    assert isinstance(filter_, ParticleFilter)
+    if len(filter_.names) == 1:
+        return arrays
+    scaled = log_likelihood - filter_.scale(prior, log_likelihood)
+    modality_evidence = torch.logsumexp(prior.unsqueeze(1) + scaled, dim=-1, keepdim=True)
+    if evidence.log_weights is not None:
+        modality_evidence = modality_evidence + evidence.log_weights[:, 0]
+    arrays["effective_weights"] = torch.softmax(modality_evidence, dim=1)
+    return arrays
+
+
+def _lstm_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+    none = torch.zeros(len(steps), 0, filter_.n)
+    return {"modality_mean": none, "modality_covariance": none.unsqueeze(-1).expand(-1, -1, -1, filter_.n)}
+
+
+ARRAYS_OF: dict[Kind, Callable[[Filter, Sequence[StepTrace], Evidence], dict[str, Tensor]]] = {
+    "ekf": _ekf_arrays,
+    "ukf": _ekf_arrays,
+    "pf": _pf_arrays,
+    "lstm": _lstm_arrays,
+}
+"""Kind of filter -> function that converts its steps to trace arrays."""

@@ -1,0 +1,157 @@
+"""Results of a study: tables, and bar charts as SVG and PNG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.task import Task
+from beliefscope.filters.training.study import Cell, write_tables
+from beliefscope.filters.training.study_table import TRIVIAL, Document, Row
+from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
+from beliefscope.inspect.palette import COLOURS, SPARE_COLOURS
+
+FAMILIES = {
+    "crossmodal": COLOURS["fused"],
+    "unimodal": SPARE_COLOURS[2],
+    "feature": SPARE_COLOURS[1],
+    "lstm": SPARE_COLOURS[0],
+}
+"""Colour of filters by the first word of their name, in addition to those of the modalities."""
+
+SPARE = ("#000000", COLOURS["contact"], COLOURS["truth"])
+"""Colours of other families of filters."""
+
+HATCHES = {"pf": "/////", "ukf": "....."}
+"""Hatching and lighter colour by kind of filter, for print and colour-blind readers."""
+
+CLIP = 2.0
+"""Multiple of the trivial predictor's error at which bars are clipped and labelled with their value."""
+
+LINE_LIMIT = 2.0
+"""Multiple of the tallest bar above which the trivial predictor's error is shown in the title instead of as a line."""
+
+
+def write_study(folder: Path, cells: Sequence[Cell], preset: str) -> tuple[list[Row], Document]:
+    """Writes the tables and figures of the finished cells; returns the rows and the content of ``study.json``."""
+    rows, overview = write_tables(folder, cells, preset)
+    write_results(rows, folder)
+    return rows, overview
+
+
+def write_results(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Write ``results.svg`` and ``results.png`` (300 dpi); see ``results``."""
+    paths = []
+    with rc_context(STYLE):
+        figure = results(rows)
+        for suffix, options in (("svg", {"metadata": {"Date": None}}), ("png", {"dpi": 300})):
+            data = io.BytesIO()
+            figure.savefig(data, format=suffix, **options)
+            paths.append(folder / f"results.{suffix}")
+            write_atomically(paths[-1], data.getvalue())
+    return paths
+
+
+def results(rows: Sequence[Row]) -> Figure:
+    """RMSE by probability of image blackout: one panel per task and quantity, one bar with spread per filter.
+
+    The dashed line is the error of predicting the training mean; if far above all bars, it is given in the title. A
+    cross marks a filter without results.
+    """
+    filters = list(dict.fromkeys(row.filter for row in rows if row.filter != TRIVIAL))
+    panels = [(task, key, title) for task in dict.fromkeys(r.task for r in rows) for key, title in panels_of(task)]
+    columns = min(2, len(panels))
+    lines = -(-len(panels) // columns)
+    legend_lines = -(-(len(filters) + 2) // 5)
+    figure = Figure(figsize=(WIDTH, 1.85 * lines + 0.17 * legend_lines + 0.1), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(lines, columns, squeeze=False).flatten()
+    for unused in axes[len(panels) :]:
+        unused.set_axis_off()
+    styles = bar_styles(filters)
+    for axis, (task, key, title) in zip(axes, panels, strict=False):
+        bars(axis, [r for r in rows if r.task == task], key, styles)
+        axis.set_title(f"{task}: {title}", loc="left")
+    handles: list[Patch | Line2D] = [Patch(label=name, **styles[name]) for name in filters]
+    if any(line.get_linestyle() == "--" for axis in axes for line in axis.lines):
+        handles.append(Line2D([], [], color="black", linestyle="--", linewidth=0.8, label=TRIVIAL))
+    if any(not row.seeds for row in rows if row.filter != TRIVIAL):
+        handles.append(Line2D([], [], color="gray", linestyle="", marker="x", markersize=3, label="missing"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, handlelength=1.6)
+    return figure
+
+
+def panels_of(task_name: str) -> list[tuple[str, str]]:
+    """Keys and titles of the panels of a task: the position on the map, and each other component."""
+    task: Task = find_task(task_name)
+    position = task.map_components[0].rpartition("_")[0] or "position"
+    others = [c for c in task.components if c.name not in task.map_components]
+    keys = {"m": "cm", "rad": "deg"}
+    return [("position_cm", position), *((f"{c.name}_{keys[c.unit]}", c.name) for c in others)]
+
+
+def bar_styles(filters: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Style of each filter's bars: colour by fusion, hatching by kind of filter."""
+    unknown = [f for f in dict.fromkeys(name.rsplit("-", 1)[0] for name in filters) if f not in {**FAMILIES, **COLOURS}]
+    others = {family: SPARE[i % len(SPARE)] for i, family in enumerate(unknown)}
+    styles: dict[str, dict[str, Any]] = {}
+    for name in filters:
+        family, _, kind = name.rpartition("-")
+        colour = np.array(to_rgb({**COLOURS, **FAMILIES, **others}[family or kind]))
+        hatch = HATCHES.get(kind)
+        face = colour if hatch is None else 0.45 * colour + 0.55
+        styles[name] = {"facecolor": tuple(face), "edgecolor": tuple(0.55 * colour), "hatch": hatch, "linewidth": 0.4}
+    return styles
+
+
+def bars(axis: Axes, rows: Sequence[Row], key: str, styles: Mapping[str, Mapping[str, Any]]) -> None:
+    """Draw one panel: groups of bars by probability of image blackout."""
+    filters = [name for name in styles if any(row.filter == name for row in rows)]
+    blackouts = list(dict.fromkeys(row.blackout for row in rows if row.blackout is not None))
+    width = 0.84 / len(filters)
+    mean = next((row.mean[key] for row in rows if row.filter == TRIVIAL), None)
+    unit = key.rsplit("_", 1)[1]
+    rows = [row for row in rows if row.filter != TRIVIAL]
+    tops = [value + (row.spread.get(key) or 0.0) for row in rows if (value := row.mean.get(key)) is not None]
+    top = max(tops, default=mean or 1.0)
+    if mean is not None:
+        top = min(max(top, mean) if mean < LINE_LIMIT * top else top, CLIP * mean)
+        if mean <= top:
+            axis.axhline(mean, color="black", linestyle="--", linewidth=0.8, zorder=3)
+        else:
+            axis.set_title(f"{TRIVIAL}: {mean:.1f} {unit}", loc="right", fontsize=7, color="#555555")
+    for row in rows:
+        if row.blackout is None:
+            continue
+        x = blackouts.index(row.blackout) + (filters.index(row.filter) - (len(filters) - 1) / 2) * width
+        value, spread = row.mean.get(key), row.spread.get(key)
+        if value is None:
+            axis.plot(x, 0.03 * top, color="gray", marker="x", markersize=3, linestyle="")
+            continue
+        axis.bar(x, value, 0.92 * width, **styles[row.filter])
+        if spread is not None:
+            axis.errorbar(x, value, spread, color="black", linewidth=0.6, capsize=1.2, capthick=0.6, zorder=4)
+        if value > top:
+            box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
+            axis.text(x, 1.03 * top, f"{value:.0f}", rotation=90, ha="center", va="top", fontsize=6, zorder=5, bbox=box)
+    axis.set_xlim(-0.5, len(blackouts) - 0.5)
+    axis.set_ylim(0, 1.06 * top)
+    axis.set_xticks(range(len(blackouts)), [f"{b:.0%} image blackout" for b in blackouts])
+    axis.tick_params(axis="x", length=0)
+    axis.tick_params(axis="y", width=0.6, length=2)
+    axis.set_ylabel(f"RMSE ({unit})")
+    axis.set_axisbelow(True)
+    axis.grid(axis="y", linewidth=0.3, color="#cccccc")

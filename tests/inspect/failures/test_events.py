@@ -1,0 +1,268 @@
+"""Failure search: planted failures, merging of events, ranking and phases."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.inspect.diagnostics.weight_audit import position_regret
+from beliefscope.inspect.failures.events import event_spans, failures_of, find_failures
+from beliefscope.inspect.failures.step_scores import PHASES, Survey, disagreement, scores_of
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.trace import Trace, trace
+
+EPISODES = 5
+CUT = 60  # steps; enough for all phases
+
+
+@pytest.fixture(scope="module")
+def checkpoint() -> Checkpoint:
+    return load_checkpoint(shipped("push", "crossmodal-pf"))
+
+
+@pytest.fixture(scope="module")
+def episodes() -> dict[int, Episode]:
+    with open_dataset(sample_path("push")) as data:
+        return {index: shortened(data[index]) for index in data.held_out()[:EPISODES]}
+
+
+def shortened(episode: Episode) -> Episode:
+    arrays = {name: getattr(episode, name)[:CUT] for name in ("states", "controls", "contact", "qpos")}
+    return replace(episode, **arrays, observations={k: v[:CUT] for k, v in episode.observations.items()})
+
+
+@pytest.fixture(scope="module")
+def traces(checkpoint: Checkpoint, episodes: dict[int, Episode]) -> list[Trace]:
+    return [trace(checkpoint, episode, index, particles=50) for index, episode in episodes.items()]
+
+
+@pytest.fixture(scope="module")
+def survey(traces: list[Trace]) -> Survey:
+    return Survey.from_traces(traces)
+
+
+def with_contact(run: Trace, contact: np.ndarray) -> Trace:
+    return replace(run, episode=replace(run.episode, contact=contact))
+
+
+def shifted(run: Trace, first: int, last: int, metres: float) -> Trace:
+    """Exact estimates with an error over some steps that is largest in their middle."""
+    mean = run.episode.states.copy()
+    hump = 1.0 + np.sin(np.linspace(0.0, np.pi, last - first + 1))
+    mean[first : last + 1, measures.task_of(run).map_indices[0]] += metres * hump
+    return replace(run, estimate_mean=mean)
+
+
+def test_planted_error_is_the_worst_event(traces: list[Trace]) -> None:
+    contact = np.zeros(CUT, dtype=bool)
+    contact[40:] = True
+    shifted_trace = shifted(with_contact(traces[2], contact), 37, 47, 1.0)
+    failures = failures_of(Survey.from_traces([*traces[:2], shifted_trace, *traces[3:]]))
+    worst = failures.events[0]
+    assert (worst.episode, worst.first, worst.last, worst.step) == (shifted_trace.episode_index, 37, 47, 42)
+    assert worst.phase == "contact made"
+    assert worst.score == pytest.approx(2.0)  # 1 m x (1 + 1)
+    assert f"step 42 of episode {shifted_trace.episode_index}" in failures.verdict
+    release = failures_of(Survey.from_traces([shifted(with_contact(traces[2], ~contact), 37, 47, 1.0)]))
+    assert release.events[0].phase == "contact lost"
+
+
+def test_injected_faults_are_found_in_their_episode_and_phase(
+    checkpoint: Checkpoint, episodes: dict[int, Episode], traces: list[Trace]
+) -> None:
+    index = traces[1].episode_index
+    faults = Faults.parse("blackout=1:from=35:to=55")
+    faulty = trace(checkpoint, episodes[index], index, particles=50, faults=faults)
+    steady = with_contact(faulty, np.ones(CUT, dtype=bool))
+    others = [replace(run, faults=faults) for k, run in enumerate(traces) if k != 1]
+    failures = failures_of(Survey.from_traces([steady, *others]))
+    worst = failures.events[0]
+    assert worst.episode == index
+    assert 35 <= worst.step <= 55
+    assert worst.phase == "blackout"
+    phase = next(g for g in failures.phases if g.name == "blackout")
+    assert phase.steps == measures.blackout(steady).sum() > 0
+    assert phase.lift > 1
+    assert phase.inside > phase.outside
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_events_are_disjoint_and_cover_high_steps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    episode = np.repeat(np.arange(6), rng.integers(1, 60, 6))
+    high, gap_limit = rng.random(len(episode)) < rng.choice([0.05, 0.3, 0.9]), int(rng.integers(0, 8))
+    spans = event_spans(high, episode, gap_limit)
+    inside = np.zeros(len(high), dtype=int)
+    for first, last in spans:
+        inside[first : last + 1] += 1
+        assert episode[first] == episode[last]
+        assert high[first]
+        assert high[last]
+    assert inside.max(initial=0) <= 1
+    assert (inside >= high).all()
+    for (_, before), (after, _) in pairwise(spans):
+        assert after - before > gap_limit + 1 or episode[after] != episode[before]
+    gap = np.diff(np.flatnonzero(inside & ~high), prepend=-2)
+    assert not spans or longest_run(gap) <= gap_limit
+
+
+def longest_run(gaps: np.ndarray) -> int:
+    longest = run = 0
+    for gap in gaps:
+        run = run + 1 if gap == 1 else 1
+        longest = max(longest, run)
+    return longest
+
+
+@pytest.mark.parametrize("by", ["error", "nees", "ess", "disagreement", "regret"])
+def test_order_of_episodes_is_irrelevant(traces: list[Trace], survey: Survey, by: str) -> None:
+    order = np.random.default_rng(1).permutation(len(traces))
+    assert failures_of(Survey.from_traces(traces[i] for i in order), by).to_dict() == failures_of(survey, by).to_dict()
+
+
+@pytest.mark.parametrize("by", ["error", "nees", "ess", "disagreement", "regret"])
+def test_events_are_ranked_and_match_the_trace(traces: list[Trace], survey: Survey, by: str) -> None:
+    failures = failures_of(survey, by)
+    assert [m.score for m in failures.events] == sorted((m.score for m in failures.events), reverse=True)
+    by_index = {run.episode_index: run for run in traces}
+    for event in failures.events:
+        run = by_index[event.episode]
+        score = scores_of(survey.task)[by].values(run)
+        assert event.first <= event.step <= event.last
+        assert event.score == score[event.step] == score[event.first : event.last + 1].max() > failures.threshold
+        np.testing.assert_array_equal(event.error, measures.position_error(run)[event.step])
+        np.testing.assert_array_equal(event.nees, measures.nees(run)[event.step])
+        assert event.ess == run.effective_sample_size[event.step]  # type: ignore[index]
+        assert event.effective_weights is not None
+        assert event.effective_weights.sum() == pytest.approx(1.0, abs=1e-5)  # float32 softmax
+    assert json.loads(json.dumps(failures.to_dict()))["events"][0]["step"] == failures.events[0].step
+
+
+def test_phases_partition_steps_and_events(survey: Survey) -> None:
+    failures = failures_of(survey, "disagreement")
+    assert sum(g.steps for g in failures.phases) == failures.steps == EPISODES * CUT
+    assert sum(g.events for g in failures.phases) == len(failures.events)
+    for g in failures.phases:
+        assert g.events == len(failures.worst(phase=g.name))
+        assert g.lift == pytest.approx((g.events / len(failures.events)) / (g.steps / failures.steps))
+        overall = survey.scores["disagreement"].mean()  # mean of inside and outside, weighted by share
+        assert g.share * g.inside + (1 - g.share) * g.outside == pytest.approx(overall)
+    assert [g.name for g in failures.phases] == [name for name in PHASES if name in {g.name for g in failures.phases}]
+
+
+def test_contact_changes_last_half_a_second(traces: list[Trace]) -> None:
+    contact = np.zeros(CUT, dtype=bool)
+    contact[20:30] = True
+    phases = Survey.from_traces([with_contact(traces[0], contact)]).phases
+    assert traces[0].episode.dt == 0.1
+    assert np.flatnonzero(phases["contact made"]).tolist() == [20, 21, 22, 23, 24]
+    assert np.flatnonzero(phases["contact lost"]).tolist() == [30, 31, 32, 33, 34]
+    assert np.flatnonzero(phases["start"]).tolist() == list(range(30))
+
+
+def test_fast_motion_is_the_fastest_twentieth_of_each_speed(traces: list[Trace], survey: Survey) -> None:
+    states = np.stack([run.episode.states[:, list(survey.task.map_indices)] for run in traces])
+    speed = np.linalg.norm(np.diff(states, axis=1, prepend=states[:, :1]), axis=-1).ravel()
+    fastest = speed > np.quantile(speed, 0.95)
+    assert survey.phases["fast motion"][fastest].all()
+    speeds = 2  # puck and end effector
+    assert survey.phases["fast motion"].mean() <= speeds * 0.05 + 1e-9
+
+
+def test_disagreement_is_one_if_covariances_match_the_distance(traces: list[Trace]) -> None:
+    run, n = traces[0], 2
+    covariance = np.broadcast_to(0.01 * np.eye(n, dtype=np.float32), run.modality_covariance.shape)
+    mean = np.zeros_like(run.modality_mean)
+    mean[:, 1] = np.sqrt(0.02)  # components differ by sqrt(S_1 + S_2)
+    got = disagreement(replace(run, modality_mean=mean, modality_covariance=covariance))
+    np.testing.assert_allclose(got, 1.0, atol=1e-5)  # covariance floor
+
+
+def test_regret_equals_a_scan_over_weights(traces: list[Trace]) -> None:
+    run = traces[0]
+    errors = measures.errors(run)
+    shares = np.linspace(0.0, 1.0, 2001)[:, None, None]
+    mixed = np.linalg.norm(shares * errors[:, 0] + (1 - shares) * errors[:, 1], axis=-1).min(axis=0)
+    expected = measures.position_error(run)[:, -1] - mixed
+    distance = np.linalg.norm(errors[:, 0] - errors[:, 1], axis=-1).max()
+    np.testing.assert_allclose(position_regret(run), expected, atol=distance / 4000)  # half the resolution of the scan
+    assert run.effective_weights is not None
+    assert run.effective_weights.shape[-1] == 1
+    each = replace(
+        run, effective_weights=np.repeat(run.effective_weights, 2, axis=-1)
+    )  # a weight for each component can do no worse
+    assert (position_regret(each) >= position_regret(run) - 1e-12).all()
+
+
+def test_angles_have_a_score_and_wrap() -> None:
+    door = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    with open_dataset(sample_path("door")) as data:
+        run = trace(door, shortened(data[9]), 9)
+    turned = run.estimate_mean.copy()
+    turned[50, 2] += 2 * np.pi - 0.5
+    failures = failures_of(Survey.from_traces([replace(run, estimate_mean=turned)]), "angle")
+    assert failures.events[0].step == 50
+    assert failures.events[0].score == pytest.approx(0.5, abs=0.1)
+    assert failures.unit == "rad"
+    assert "deg at step 50" in failures.verdict
+    with pytest.raises(BadInput, match="no failures by ess: this filter has no particles"):
+        failures_of(Survey.from_traces([run]), "ess")
+
+
+def test_failures_match_the_traces(checkpoint: Checkpoint, episodes: dict[int, Episode]) -> None:
+    progress: list[float] = []
+    two = dict(list(episodes.items())[:2])
+    failures = find_failures(checkpoint, two, seed=3, particles=20, progress=progress.append)
+    event = failures.events[0]
+    expected = trace(checkpoint, two[event.episode], event.episode, seed=3, particles=20)
+    assert event.score == measures.position_error(expected)[event.step, -1]
+    assert progress == sorted(progress)
+    assert progress[-1] == 1.0
+    assert failures.episodes == 2
+
+
+def test_figures_and_tables(survey: Survey) -> None:
+    failures = failures_of(survey, "nees")
+    phases, worst = failures.tables()
+    assert len(phases.rows) == len(failures.phases)
+    assert all(len(row) == len(table.columns) for table in (phases, worst) for row in table.rows)
+    assert len(worst.rows) == min(20, len(failures.events))
+    (axes,) = failures.plot().axes
+    assert len(axes.lines) == len(failures.plots()[0].lines) >= 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda traces: [], "at least one trace"),
+        (lambda traces: [traces[0], traces[0]], "two traces of episode"),
+        (lambda traces: [traces[0], replace(traces[1], seed=1)], "traces differ in seed, '0' and '1'"),
+    ],
+)
+def test_inconsistent_traces_are_refused(traces: list[Trace], change, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(BadInput, match=message):
+        Survey.from_traces(change(traces))
+
+
+def test_unknown_names_list_the_available_ones(checkpoint: Checkpoint, survey: Survey) -> None:
+    with pytest.raises(BadInput, match=r"'eror' does not exist\. Available: error, nees, ess, disagreement, regret"):
+        find_failures(checkpoint, {}, by="eror")
+    with pytest.raises(BadInput, match=r"phase 'contact' does not exist\. Available: contact made, contact lost"):
+        failures_of(survey).worst(phase="contact")
+
+
+def test_exact_estimates_have_no_events(traces: list[Trace]) -> None:
+    exact = replace(traces[0], estimate_mean=traces[0].episode.states)
+    failures = failures_of(Survey.from_traces([exact]))
+    assert failures.events == ()
+    assert failures.verdict == f"No events in 1 episode, {CUT} steps, by position error."
+    assert failures.tables()[0].rows[0][2] == 0

@@ -1,0 +1,103 @@
+/** Objects for the tests, in the format of the server. */
+
+import { Trace } from '../../app/page/data/trace.js';
+
+/** @type {import('../../app/page/data/api.js').Task} */
+export const TASK = {
+  name: 'door',
+  components: [
+    { name: 'hinge_x', unit: 'm' },
+    { name: 'hinge_y', unit: 'm' },
+    { name: 'angle', unit: 'rad' },
+  ],
+  modalities: ['image', 'haptics'],
+  dt: 0.1,
+  map: { x: 'hinge_x', y: 'hinge_y', half_width: 0.2 },
+  fault_presets: [],
+  filters: ['crossmodal-pf', 'crossmodal-ekf'].map((name) => ({
+    name,
+    kind: name.slice(-3),
+    checkpoint_hash: '',
+    training: {},
+    metrics: {},
+  })),
+  data: [
+    {
+      name: 'door',
+      first: 9,
+      episodes: [8, 9].map((index) => ({
+        index,
+        steps: 4,
+        policy: 'scripted',
+        split: 'test',
+        seed: 0,
+        contact_fraction: 0.5,
+      })),
+    },
+  ],
+};
+
+/** @type {import('../../app/page/data/api.js').Catalog} */
+export const CATALOG = { version: '0', read_only: false, faults: [], tasks: [TASK], problems: [] };
+
+/**
+ * Encodes columns end to end, as the server does.
+ * @param {Record<string, {shape: number[], values: number[]}>} arrays
+ */
+export function encodeColumns(arrays) {
+  let offset = 0;
+  const columns = Object.entries(arrays).map(([name, { shape, values }]) => {
+    const column = { name, shape, offset };
+    offset += 4 * values.length;
+    return column;
+  });
+  const values = Object.values(arrays).flatMap((array) => array.values);
+  return { columns, buffer: Float32Array.from(values).buffer };
+}
+
+/**
+ * Creates a trace.
+ * @param {Record<string, {shape: number[], values: number[]}>} arrays
+ * @param {object} [header]
+ * @param {ArrayBuffer | null} [images]
+ */
+export function makeTrace(arrays, header = {}, images = null) {
+  const { columns, buffer } = encodeColumns(arrays);
+  const selection = { task: 'door', filter: 'ekf', data: 'door', episode: 9, faults: '' };
+  return new Trace(
+    TASK,
+    selection,
+    /** @type {import('../../app/page/data/api.js').TraceHeader} */ ({
+      steps: arrays.truth.shape[0],
+      dt: 0.1,
+      kind: 'ekf',
+      components: TASK.components,
+      modalities: TASK.modalities,
+      settings: {},
+      pictures: null,
+      nees_bounds: null,
+      no_maps: null,
+      columns,
+      ...header,
+    }),
+    buffer,
+    images,
+  );
+}
+
+/** Columns of a filter that fuses two modalities, over two steps. */
+export const FUSION = {
+  truth: { shape: [2, 3], values: [0, 0, 0, 0.1, 0.2, 3.1] },
+  estimate_mean: { shape: [2, 3], values: [0.03, 0.04, 0, 0.1, 0.2, -3.1] },
+  estimate_sigma: { shape: [2, 3], values: [0.01, 0.02, 0.1, 0.03, 0.04, 0.1] },
+  modality_mean: {
+    shape: [2, 2, 3],
+    values: [0, 0, 0, 0.3, 0, 0, 0.1, 0.2, 3.1, 0.1, 0.3, 3.1],
+  },
+  weights: {
+    shape: [2, 2, 3],
+    values: [0.9, 0.9, 0.5, 0.1, 0.1, 0.5, 0.2, 0.2, 0.2, 0.8, 0.8, 0.8],
+  },
+  effective_weights: { shape: [2, 2, 3], values: [0.7, 0.6, 0.5, 0.3, 0.4, 0.5, 1, 1, 1, 0, 0, 0] },
+  contact: { shape: [2], values: [0, 1] },
+};

@@ -1,0 +1,163 @@
+import assert from 'node:assert/strict';
+import test from 'node:test';
+
+import { CELL_STEPS } from '../../app/page/core/constants.js';
+import { layerMeasures, pairwiseMeasures, valuesAt } from '../../app/page/maps/map_summary.js';
+import {
+  borders,
+  cellAt,
+  rangeDigits,
+  rangeLabels,
+  readMaps,
+  shades,
+  valueAt,
+} from '../../app/page/maps/map_values.js';
+import { SvgContext } from '../../app/page/maps/svg_context.js';
+
+const HEADER = {
+  type: 'maps',
+  serial: 7,
+  other: false,
+  step: 2,
+  size: 3,
+  angle: null,
+  layers: ['image', 'haptics', 'fused'],
+  half_width: 0.3,
+  centre: [1, 2],
+  truth: [1, 2, 0],
+  estimate: [1, 2, 0],
+  log_max: [0, -1, 2],
+  log_range: [10, 64, 20],
+  peak: [
+    [0, 0],
+    [0.1, -0.1],
+    [0, 0],
+  ],
+  effector: null,
+  particles: 2,
+  numbers: {
+    truth: [0, -1, 0],
+    entropy: [1, 1, 1],
+    area50: [0.001, 0.01, 0.001],
+    area95: [0.01, 0.1, 0.01],
+    axis: [0, Math.PI / 2, 0],
+    elongation: [1, 3, 2],
+    off_line: [null, Math.PI / 6, null],
+    divergence: [
+      [0, 1.25],
+      [20, 0],
+    ],
+    overlap: [
+      [1, 0.5],
+      [0.5, 1],
+    ],
+  },
+};
+
+/** Maps as the server encodes them: the middle cell of each layer is the peak, all others are at the lowest value. */
+function encodedMaps() {
+  const text = new TextEncoder().encode(JSON.stringify(HEADER));
+  const start = 4 + Math.ceil(text.length / 4) * 4;
+  const { particles, layers, size } = HEADER;
+  const floats = 2 * particles + layers.length * particles;
+  const buffer = new ArrayBuffer(start + 4 * floats + 2 * layers.length * size * size);
+  new DataView(buffer).setUint32(0, text.length, true);
+  new Uint8Array(buffer).set(text, 4);
+  new Float32Array(buffer, start, floats).set([1, 2, 1.1, 2.1, 0.25, 0.75, 0.5, 0.5, 1, 0]);
+  const cells = new Uint16Array(buffer, start + 4 * floats);
+  layers.forEach((_, layer) => (cells[9 * layer + 4] = CELL_STEPS));
+  return buffer;
+}
+
+const maps = readMaps(encodedMaps());
+
+test('maps are decoded', () => {
+  assert.equal(maps.serial, 7);
+  assert.equal(maps.positions.length, 4);
+  assert.deepEqual([...maps.weights[0]], [0.25, 0.75]);
+  assert.deepEqual([...maps.cells[2]], [0, 0, 0, 0, CELL_STEPS, 0, 0, 0, 0]);
+});
+
+test('colours span each layer or all layers', () => {
+  const [image] = shades(maps, 'normalised', 'own', null);
+  assert.deepEqual([image.low, image.high, image.values[4]], [0, 1, 1]);
+  const log = shades(maps, 'log', 'own', null);
+  assert.deepEqual(
+    log.map(({ low, high, clipped }) => [low, high, clipped]),
+    [
+      [-10, 0, false],
+      [-41, -1, true],
+      [-18, 2, false],
+    ],
+  );
+  for (const { low, high } of shades(maps, 'log', 'same', null))
+    assert.deepEqual([low, high], [-38, 2]);
+});
+
+test('the ratio of maps to themselves is zero', () => {
+  for (const { values, low, high } of shades(maps, 'log', 'own', maps)) {
+    assert.ok(values.every((v) => Math.abs(v) < 1e-5));
+    assert.equal(low, -high);
+  }
+});
+
+test('labels of colour bars', () => {
+  const values = new Float32Array();
+  assert.deepEqual(rangeLabels({ values, low: 0, high: 1, clipped: false }, 1), ['0', '1']);
+  assert.deepEqual(rangeLabels({ values, low: -40, high: 0, clipped: true }, 0), ['≤−40', '0']);
+  assert.deepEqual(rangeLabels({ values, low: -12, high: 12, clipped: true }, 0), ['≤−12', '≥+12']);
+  assert.deepEqual(
+    [0.1, 1, 5, 50].map((high) => rangeDigits({ values, low: 0, high, clipped: false })),
+    [3, 2, 1, 0],
+  );
+});
+
+test('values of cells', () => {
+  assert.equal(cellAt(maps, [0, 0]), 4);
+  assert.equal(cellAt(maps, [-0.29, 0.29]), 6);
+  assert.equal(cellAt(maps, [9, 9]), 8);
+  assert.deepEqual(valueAt(maps, 0, 4), { log: 0, relative: 1, clipped: false });
+  assert.equal(valueAt(maps, 1, 0).clipped, true);
+  assert.deepEqual(valuesAt(maps, 0, [0, 0], null), ['1.000 of peak, ln 0.00']);
+  assert.equal(valuesAt(maps, 1, [0.2, 0.2], new Float32Array(9))[1], 'gain 0.00 nats');
+});
+
+test('the border of a peak is a closed contour around it', () => {
+  const [segments] = borders(maps, 0, [0.5]);
+  assert.equal(segments.length, 4 * 4);
+  for (let i = 0; i < segments.length; i += 2)
+    assert.ok(Math.hypot(segments[i] - 0.5, segments[i + 1] - 0.5) < 0.34);
+});
+
+test('measures as text', () => {
+  assert.deepEqual(layerMeasures(maps, 1, false).lines, [
+    'peak +10.0, −10.0 cm',
+    '50 % 100, 95 % 1000 cm²',
+    'ridge at 30° · entropy 10.21',
+  ]);
+  assert.match(layerMeasures(maps, 1, true).lines[0], /^peak 110\.0, 190\.0 cm$/);
+  assert.match(layerMeasures(maps, 0, false).lines[2], /^no ridge/);
+  assert.match(layerMeasures(maps, 2, false).lines[2], /^axis 0°/);
+  assert.equal(
+    pairwiseMeasures(maps),
+    'KL(image‖haptics) 1.3, KL(haptics‖image) 20 nats, overlap 50 %',
+  );
+});
+
+test('SVG drawing', () => {
+  const context = new SvgContext();
+  context.save();
+  context.translate(1, 2);
+  context.strokeStyle = 'rgb(0 0 0 / 0.3)';
+  context.beginPath();
+  context.moveTo(0, 0);
+  context.lineTo(1.234, 5);
+  context.stroke();
+  context.fillText('a < b', 0, 0);
+  context.restore();
+  const svg = context.document(10, 20);
+  assert.match(svg, /^<svg [^>]*viewBox="0 0 10 20">/);
+  assert.match(svg, /d="M0 0L1\.23 5" fill="none" stroke="rgb\(0,0,0\)" stroke-opacity="0\.3"/);
+  assert.match(svg, />a &#60; b</);
+  assert.equal(svg.split('<g').length, svg.split('</g').length);
+});

@@ -1,0 +1,99 @@
+import assert from 'node:assert/strict';
+import test from 'node:test';
+
+import { Store, parsePermalink, permalink } from '../../app/page/core/state.js';
+import { Undo } from '../../app/page/core/undo.js';
+import { history, runFrames } from './browser.js';
+import { CATALOG } from './fixtures.js';
+
+/** @param {string} search */
+const stateOf = (search) => parsePermalink(search, CATALOG).state;
+
+test('an empty link selects the first of everything', () => {
+  const { state, problems } = parsePermalink('', CATALOG);
+  assert.deepEqual(problems, []);
+  assert.equal(state.filter, 'crossmodal-pf');
+  assert.equal(state.episode, 9);
+  assert.equal(state.component, 'hinge_x');
+  assert.equal(state.tab, 'scene');
+  assert.equal(state.angle, null);
+  assert.equal(
+    permalink(state),
+    '?task=door&filter=crossmodal-pf&data=door&episode=9&step=0&component=hinge_x&weights=raw&track=error&tab=scene',
+  );
+});
+
+test('a permalink restores every key', () => {
+  const search =
+    '?task=door&filter=crossmodal-ekf&data=door&episode=8&step=3&component=angle&weights=effective' +
+    '&track=nees&tab=compare&faults=blackout%3D0.4&against=filter%3Dx&window=1-3&diagnostic=consistency' +
+    '&options=size%3D21&run=r&study=s&quantity=q&pin=step%3D2&by=angle&phase=contact&hide=map' +
+    '&ground=image&height=belief&tint=share&scale=log&range=same&colours=cividis&over=held-out' +
+    '&list=episodes&among=all&axes=world&regions=hidden&zoom=4&cloud=shown&beside=gain&angle=0.5236';
+  const { state, problems } = parsePermalink(search, CATALOG);
+  assert.deepEqual(problems, []);
+  const [given, written] = [search, permalink(state)].map((text) => [...new URLSearchParams(text)]);
+  assert.deepEqual(new Map(written), new Map(given));
+  assert.deepEqual(stateOf(permalink(state)), state);
+});
+
+test('links of earlier versions are read', () => {
+  const state = stateOf('?recipe=blackout%3D0.4&weights=acting&list=moments&group=contact');
+  assert.equal(state.faults, 'blackout=0.4');
+  assert.equal(state.weights, 'effective');
+  assert.equal(state.list, 'events');
+  assert.equal(state.phase, 'contact');
+});
+
+test('unknown names are reported and replaced', () => {
+  const search = '?filter=none&episode=77&step=-1&window=9-2&tab=none';
+  const { state, problems } = parsePermalink(search, CATALOG);
+  assert.equal(problems.length, 5);
+  assert.match(
+    problems.join('\n'),
+    /filter “none”, which does not exist\. Available: crossmodal-pf/,
+  );
+  assert.match(problems.join('\n'), /episode “77”, which does not exist\. Available: 8 to 9/);
+  assert.deepEqual(
+    [state.filter, state.episode, state.step, state.window, state.tab],
+    ['crossmodal-pf', 9, 0, '', 'scene'],
+  );
+});
+
+test('listeners are called once per frame with all changes', () => {
+  const store = new Store(stateOf(''));
+  /** @type {string[][]} */
+  const calls = [];
+  store.listen((_, changed) => calls.push([...changed]));
+  store.set({ step: 1 }, { inputTime: 5 });
+  store.set({ step: 2, track: 'nees' });
+  store.set({ step: 2 });
+  assert.deepEqual(calls, []);
+  runFrames();
+  assert.deepEqual(calls, [['step', 'track']]);
+  assert.equal(store.inputTime, null);
+});
+
+test('a change of the selection adds a history entry', () => {
+  const store = new Store(stateOf(''));
+  const before = history.length;
+  store.set({ episode: 8 });
+  store.flush();
+  assert.equal(history.length, before + 1);
+  assert.match(history.at(-1) ?? '', /episode=8/);
+});
+
+test('undo and redo restore the selection with its step', () => {
+  const store = new Store(stateOf('?step=2'));
+  const undo = new Undo(store);
+  store.set({ faults: 'blackout=1' });
+  store.flush();
+  store.set({ step: 3 });
+  store.flush();
+  undo.undo();
+  assert.deepEqual([store.state.faults, store.state.step], ['', 2]);
+  undo.redo();
+  assert.deepEqual([store.state.faults, store.state.step], ['blackout=1', 3]);
+  undo.redo();
+  assert.equal(store.state.faults, 'blackout=1');
+});

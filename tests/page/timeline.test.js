@@ -1,0 +1,133 @@
+import assert from 'node:assert/strict';
+import test from 'node:test';
+
+import { stepSummary } from '../../app/page/step/step_summary.js';
+import { chartData, valueRange } from '../../app/page/timeline/chart.js';
+import { formatValue } from '../../app/page/timeline/legend.js';
+import {
+  fitWindow,
+  formatWindow,
+  parseWindow,
+  zoomWindow,
+} from '../../app/page/timeline/step_window.js';
+import { TRACKS, selectedError, tracks } from '../../app/page/timeline/tracks.js';
+import { FUSION, makeTrace } from './fixtures.js';
+
+const trace = makeTrace(FUSION);
+const state = { component: 'hinge_x', weights: 'effective', track: 'error' };
+
+test('windows fit into the episode', () => {
+  assert.deepEqual(fitWindow([-5, 15], [0, 100]), [0, 20]);
+  assert.deepEqual(fitWindow([95, 105], [0, 100]), [90, 100]);
+  assert.deepEqual(fitWindow([50, 51], [0, 100]), [50, 58]);
+  assert.deepEqual(fitWindow([-10, 500], [0, 100]), [0, 100]);
+  assert.deepEqual(fitWindow([2, 3], [0, 4]), [0, 4]);
+});
+
+test('zoom keeps a visible step in place', () => {
+  assert.deepEqual(zoomWindow([0, 100], 20, 0.5), [10, 60]);
+  assert.deepEqual(zoomWindow([50, 100], 20, 0.5), [50, 75]);
+});
+
+test('windows as text', () => {
+  assert.equal(formatWindow([0, 100], [0, 100]), '');
+  assert.equal(formatWindow([20, 60.25], [0, 100]), '20-60.3');
+  assert.deepEqual(parseWindow('20-60.3', [0, 100]), [20, 60.3]);
+  assert.deepEqual(parseWindow('', [0, 100]), [0, 100]);
+});
+
+test('the timeline has weights, estimates and the selected chart', () => {
+  const [weights, estimates, error] = tracks(trace, state);
+  assert.equal(weights.title, 'Effective weight, hinge x');
+  assert.deepEqual(
+    weights.series.map(({ name }) => name),
+    ['image', 'haptics'],
+  );
+  assert.deepEqual(
+    estimates.series.map(({ name }) => name),
+    ['truth', 'image', 'haptics', 'fused'],
+  );
+  assert.equal(error.title, 'Position error');
+  assert.equal(error.unit, 'cm');
+});
+
+test('missing quantities are explained', () => {
+  const plain = makeTrace({ truth: FUSION.truth, estimate_mean: FUSION.estimate_mean });
+  for (const track of Object.keys(TRACKS)) {
+    const chart = tracks(plain, { ...state, track })[2];
+    assert.ok(chart.series.length || chart.note?.startsWith('None: '), track);
+  }
+  assert.match(tracks(plain, state)[0].note ?? '', /does not report its fusion weights/);
+});
+
+test('a comparison run adds its lines', () => {
+  const other = makeTrace({ truth: FUSION.truth, estimate_mean: FUSION.estimate_mean });
+  const [weights, estimates] = tracks(trace, state, other);
+  assert.equal(weights.series.length, 2);
+  assert.deepEqual(estimates.series.at(-1)?.comparison, true);
+  assert.equal(estimates.series.length, 5);
+});
+
+test('the error of the selected component', () => {
+  assert.equal(selectedError(trace, state), trace.error('fused', 'position'));
+  assert.equal(selectedError(trace, { component: 'angle' }), trace.error('fused', 2));
+});
+
+test('chart data has steps, bands and lines', () => {
+  const values = Float32Array.of(1, 2);
+  const sigma = Float32Array.of(0.5, 1);
+  const series = [
+    { name: 'truth', values },
+    { name: 'fused', values, sigma },
+  ];
+  const data = chartData({ title: '', unit: '', series }, 2).map((row) => [...row]);
+  assert.deepEqual(data, [
+    [0, 1],
+    [2, 4],
+    [0, 0],
+    [1, 2],
+    [1, 2],
+  ]);
+});
+
+test('the y axis fits the fused estimate and most values of a modality', () => {
+  const fused = { name: 'fused', values: Float32Array.of(0, 10), sigma: Float32Array.of(0, 0) };
+  const outlier = Float32Array.from({ length: 200 }, (_, i) => (i === 100 ? 1e6 : 5));
+  const track = { title: '', unit: '', series: [fused, { name: 'image', values: outlier }] };
+  const [low, high] = valueRange(track, [0, 199]);
+  assert.ok(low < 0 && low > -1 && high > 10 && high < 11);
+  assert.deepEqual(valueRange({ ...track, limits: [1, 2] }, [0, 1]), [1, 2]);
+  assert.deepEqual(valueRange({ ...track, series: [], note: 'None' }, [0, 1]), [0, 1]);
+  const bounds = /** @type {[number, number]} */ ([0.1, 3]);
+  const log = valueRange({ ...track, series: [fused], log: true, bounds }, [0, 1]);
+  assert.ok(log[0] >= 0.01 - 1e-9 && log[1] === 13);
+});
+
+test('values in legends', () => {
+  const track = { title: '', unit: '', series: [] };
+  assert.equal(formatValue(1.2345, track), '1.23');
+  assert.equal(formatValue(1.2345, { ...track, digits: 1 }), '1.2');
+});
+
+test('the summary of a step names error, deviation and dominant modality', () => {
+  const first = stepSummary(trace, 0, 0);
+  assert.equal(first.tone, 'warn');
+  assert.equal(
+    first.text,
+    'Fused estimate: error 5.0 cm; largest deviation 3.0σ in hinge x: larger than predicted. ' +
+      'Dominated by image (70 % in hinge x).',
+  );
+  const second = stepSummary(trace, 1, 0);
+  assert.match(second.text, /Dominated by image \(100 % in hinge x\)/);
+});
+
+test('the summary explains an uninformative dominant modality', () => {
+  const images = new Uint8Array(8).buffer;
+  const dark = makeTrace(FUSION, { pictures: [2, 2] }, images);
+  assert.match(stepSummary(dark, 1, 0).text, /although the image is blacked out\.$/);
+  const truth = { shape: [2, 3], values: [NaN, NaN, 0, NaN, NaN, 0] };
+  assert.deepEqual(stepSummary(makeTrace({ truth, estimate_mean: FUSION.estimate_mean }), 0, 0), {
+    tone: 'none',
+    text: 'True state unknown.',
+  });
+});

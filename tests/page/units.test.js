@@ -1,0 +1,45 @@
+import assert from 'node:assert/strict';
+import test from 'node:test';
+
+import {
+  displayName,
+  fixed,
+  formatBytes,
+  percent,
+  sentence,
+  signed,
+  significant,
+  wrapDegrees,
+} from '../../app/page/core/units.js';
+
+test('fixed uses a true minus sign and a dash for missing values', () => {
+  assert.equal(fixed(1.25, 2), '1.25');
+  assert.equal(fixed(-1.25, 2), '−1.25');
+  assert.equal(fixed(-0.01), '0.0');
+  for (const value of [null, undefined, NaN, Infinity]) assert.equal(fixed(value), '–');
+});
+
+test('signed adds a plus only to values that round to a positive number', () => {
+  assert.equal(signed(0.5), '+0.5');
+  assert.equal(signed(0.01), '0.0');
+  assert.equal(signed(-0.5), '−0.5');
+});
+
+test('significant keeps three digits', () => {
+  assert.equal(significant(123.45), '123');
+  assert.equal(significant(0.012345), '0.0123');
+  assert.equal(significant(42), '42');
+  assert.equal(significant(0.0000123), '1.23e−5');
+  assert.equal(significant(2e7), '2.00e7');
+  assert.equal(significant(null), '–');
+});
+
+test('percentages, sizes, angles and names', () => {
+  assert.equal(percent(0.416), '42 %');
+  assert.equal(percent(undefined), '–');
+  assert.deepEqual([512, 2.5e6, 3e9].map(formatBytes), ['1 kB', '2.5 MB', '3.0 GB']);
+  assert.deepEqual([190, -190, 10].map(wrapDegrees), [-170, 170, 10]);
+  assert.equal(displayName('hinge_x'), 'hinge x');
+  assert.equal(sentence('no maps'), 'No maps.');
+  assert.equal(sentence('Really?'), 'Really?');
+});
