@@ -85,13 +85,13 @@ lint-page: install
 	@if command -v node >/dev/null && command -v npm >/dev/null; then \
 	  $(MAKE) --no-print-directory node_modules && npm run --silent check && \
 	  $(BIN)/python -m beliefscope.app.protocol.page_constants --check && \
-	  $(BIN)/python -m beliefscope.app.server.openapi > $(VENV)/openapi.json && \
+	  $(BIN)/python -m beliefscope.app.server.openapi --models > $(VENV)/openapi.json && \
 	  npm run --silent api-types -- --check; \
 	else echo "lint-page skipped: Node.js and npm are not installed."; fi
 
 api-types: install node_modules
 	@$(BIN)/python -m beliefscope.app.protocol.page_constants
-	@$(BIN)/python -m beliefscope.app.server.openapi > $(VENV)/openapi.json
+	@$(BIN)/python -m beliefscope.app.server.openapi --models > $(VENV)/openapi.json
 	@npm run --silent api-types
 
 check: lint test

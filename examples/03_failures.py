@@ -15,7 +15,7 @@ with open_dataset(sample_path("push")) as data:
 
 print(failures.verdict)
 for event in failures.worst(5):
-    print(f"{failures.format(event.score):>12}  {event.phase:<15} fused {100 * event.error[-1]:.1f} cm error")
+    print(f"{failures.format(event.score):>12}  {event.phase:<15} fused error {100 * event.error[-1]:.1f} cm")
     print("  ", permalink(checkpoint.task, "crossmodal-pf", "sample", event.episode, event.step, by=failures.by))
 
 if len(sys.argv) > 1:

@@ -250,7 +250,7 @@ def shift_positions(batch: Batch, task: Task, scale: Tensor, generator: torch.Ge
     This augments positions for models without images: forces do not change, and images are not adapted.
 
     Args:
-        scale: (n,) standard deviations, of which the map components' are used. generator: on the CPU.
+        scale: (n,) standard deviations of the state; only the map components are used. generator: on the CPU.
     """
     on_map = list(task.map_indices)
     offset = torch.randn(batch.states.shape[1], 2, generator=generator).to(scale) * scale[on_map]

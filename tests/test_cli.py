@@ -228,17 +228,21 @@ BAD = [
 ]
 
 
+def contents(folder: Path) -> dict[Path, int]:
+    """File -> modification time in ns."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
 @pytest.mark.parametrize("line", BAD)
 def test_invalid_input_prints_one_line_and_exits_with_2(
     run: Run, files: Path, monkeypatch: pytest.MonkeyPatch, line: str
 ) -> None:
     monkeypatch.chdir(files)  # shared by all lines, because none may write
-    before = {path: path.stat().st_mtime_ns for path in files.rglob("*") if path.is_file()}
+    before = contents(files)
     code, out, err = run(line)
     assert (code, out) == (2, "")
     assert re.fullmatch(r"error: .+\n", err)
-    after = {path: path.stat().st_mtime_ns for path in files.rglob("*") if path.is_file()}
-    assert after == before, "partial files remain"
+    assert contents(files) == before, "partial files remain"
     assert err.strip() == golden().get(line, err.strip())
 
 
@@ -252,7 +256,8 @@ def test_every_golden_error_is_tested() -> None:
     assert not golden().keys() - set(BAD)
 
 
-def test_busy_port(run: Run, folder: Path) -> None:
+def test_busy_port(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()
@@ -262,7 +267,7 @@ def test_busy_port(run: Run, folder: Path) -> None:
     assert len(err.splitlines()) == 1
     assert f"port {port}" in err
     assert "--port" in err
-    assert not (folder / "workspace").exists()
+    assert not (tmp_path / "workspace").exists()
 
 
 def test_unexpected_errors_exit_with_1_and_a_traceback_on_request(

@@ -1,4 +1,4 @@
-"""What the commands do, one after the other as their users run them."""
+"""Sequences of commands: each output is a valid input of the next command."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ EKF = "door --filter ekf.safetensors"
 
 
 @pytest.mark.parametrize("task", ["door", "push"])
-def test_collect_shows_the_authors_statistics_beside_its_own(run: Run, folder: Path, task: str) -> None:
+def test_collect_compares_statistics_with_the_paper(run: Run, folder: Path, task: str) -> None:
     from beliefscope.datasets.statistics import PAPER_DATA
 
     code, out, _ = run(f"collect {task} --episodes 1 --steps 4 --workers 1 -o one.h5")
     assert code == 0
-    head, empty, title, *rows = out.splitlines()
-    assert (empty, title.split()) == ("", ["this", "set", "authors", "ratio"])
+    head, _, _, title, *rows = out.splitlines()
+    assert title.split() == ["this", "dataset", "paper", "ratio"]
     assert head.startswith("one.h5")
-    row = next(row for row in rows if row.startswith("contact fraction"))
+    row = next(row for row in rows if row.startswith("  contact fraction"))
     assert row.split()[3] == str(PAPER_DATA[task].statistics["contact_fraction"])
-    force = next(row for row in rows if row.startswith("force std, N"))
+    force = next(row for row in rows if row.startswith("  force std, N"))
     assert len(force.split()) == 3 + 3 * 3, "three axes each"
 
 
-def test_collect_to_recording(run: Run, folder: Path) -> None:
-    """The whole line: what one command writes, the next one reads, and the JSON agrees with the files."""
+def test_from_collect_to_record(run: Run, folder: Path) -> None:
+    """Each command reads the output of the previous one, and the JSON documents match the files."""
     code, out, _ = run("collect door --episodes 2 --steps 12 --seed 3 --workers 1 -o few.h5 --json -")
     collected = json.loads(out)
     assert code == 0
@@ -71,7 +71,7 @@ def test_collect_to_recording(run: Run, folder: Path) -> None:
 
 
 def test_figures_of_the_paper(run: Run, folder: Path) -> None:
-    """What is shown is said, the same command gives the same bytes, and --step moves only its own state's map."""
+    """Output is deterministic, and --step changes only the map of its own phase."""
     line = f"figure maps {EKF} --json - -o"
     first, again = (json.loads(run(f"{line} {name}.svg")[1]) for name in ("first", "again"))
     assert first["shown"] == again["shown"] == {"free motion": 66, "contact": 31}
@@ -81,32 +81,32 @@ def test_figures_of_the_paper(run: Run, folder: Path) -> None:
     assert (folder / "moved.pdf").read_bytes().startswith(b"%PDF")
     code, out, _ = run(f"figure weights {EKF} -o weights.png")
     assert (code, out) == (0, "weights.png (0.2 MB): crossmodal-ekf over 100 steps of door episode 9\n")
-    for wrong in (f"maps {EKF} --step 100000", "weights door --filter image-ekf"):
-        code, out, err = run(f"figure {wrong} -o wrong.svg")
+    for arguments in (f"maps {EKF} --step 100000", "weights door --filter image-ekf"):
+        code, out, err = run(f"figure {arguments} -o invalid.svg")
         assert (code, out) == (2, "")
         assert err.splitlines()[-1].startswith("error: ")
-        assert not (folder / "wrong.svg").exists()
+        assert not (folder / "invalid.svg").exists()
 
 
-def test_counterfactual_says_what_an_edit_did(run: Run, folder: Path) -> None:
-    """The text, the JSON, the figure and the edited trace agree, and a trace keeps what was edited."""
+def test_counterfactual_outputs_agree(run: Run, folder: Path) -> None:
+    """Text, JSON, figure and trace agree, and the trace contains the intervention."""
     line = "counterfactual door --filter crossmodal-pf --particles 50 --from 40 --to 60"
     outputs = "-o what.svg --trace edited.trace"
     code, out, _ = run(f"{line} --faults blackout --weights image=0.9 {outputs} --json -")
-    found = json.loads(out)
+    document = json.loads(out)
     assert code == 0
-    assert found["edit"]["weights"] == {"image": 0.9}
-    assert (found["edit"]["from"], found["edit"]["to"]) == (40, 60)
+    assert document["edit"]["weights"] == {"image": 0.9}
+    assert (document["edit"]["from"], document["edit"]["to"]) == (40, 60)
     edited = load_trace(folder / "edited.trace")
-    assert edited.settings["edits"] == [found["edit"]]
+    assert edited.settings["edits"] == [document["edit"]]
     assert str(edited.faults) == "blackout:from=40:to=60"
     assert edited.weights is not None
     np.testing.assert_allclose(edited.weights[40:60, 0], 0.9, rtol=1e-6)  # float32, through a logarithm
-    np.testing.assert_array_equal(edited.estimate_mean, np.float32(found["edited"]))
+    np.testing.assert_array_equal(edited.estimate_mean, np.float32(document["edited"]))
     assert (folder / "what.svg").read_text().startswith("<?xml")
     code, out, _ = run(f"{line} --faults blackout --weights image=0.9")
     title, *tables = out.split("\n\n")
-    assert (code, title) == (0, found["verdict"])
+    assert (code, title) == (0, document["verdict"])
     assert "Blackout, beta of image 0.9 over steps 40 to 59 moved the estimate by at most " in title
     assert [table.splitlines()[0] for table in tables] == [
         "Mean over steps",
@@ -115,7 +115,7 @@ def test_counterfactual_says_what_an_edit_did(run: Run, folder: Path) -> None:
     ]
 
 
-def test_one_option_breaks_any_sensor(run: Run, folder: Path) -> None:
+def test_all_faults_can_be_combined(run: Run, folder: Path) -> None:
     run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
     faults = json.loads(run("faults --json -")[1])
     names = [fault["fault"] for fault in faults["faults"]]
@@ -134,7 +134,7 @@ def test_one_option_breaks_any_sensor(run: Run, folder: Path) -> None:
     )
 
 
-def test_every_way_to_write_a_faults_is_the_same(run: Run, folder: Path) -> None:
+def test_all_notations_of_faults_are_equal(run: Run, folder: Path) -> None:
     run("collect door --episodes 1 --steps 40 --workers 1 -o one.h5")
     (folder / "faults.json").write_text('[{"fault": "blackout", "probability": 0.4}]')
 
@@ -143,32 +143,32 @@ def test_every_way_to_write_a_faults_is_the_same(run: Run, folder: Path) -> None
         assert code == 0
         return dict(json.loads(out))
 
-    whole = evaluated("")
-    assert (whole["faults"], whole["only"]) == ([], None)
-    asked = evaluated("--faults blackout=0.4")
-    assert asked["faults"] == [{"fault": "blackout", "probability": 0.4}]
-    assert asked["rmse"] != whole["rmse"]
+    clean = evaluated("")
+    assert (clean["faults"], clean["only"]) == ([], None)
+    faulty = evaluated("--faults blackout=0.4")
+    assert faulty["faults"] == [{"fault": "blackout", "probability": 0.4}]
+    assert faulty["rmse"] != clean["rmse"]
     for other in (
         """'{"blackout": 0.4}'""",
         "faults.json",
         "./faults.json",
         """'[{"fault": "blackout", "probability": 0.4}]'""",
     ):
-        assert evaluated(f"--faults {other}") == asked
-    alone = evaluated("--faults blackout=0.4 --only image")
-    assert alone["only"] == "image"
-    assert alone["rmse"] != asked["rmse"]
-    assert evaluated("""--faults '{"blackout": 0.4, "only": "image"}'""") == alone
+        assert evaluated(f"--faults {other}") == faulty
+    unimodal = evaluated("--faults blackout=0.4 --only image")
+    assert unimodal["only"] == "image"
+    assert unimodal["rmse"] != faulty["rmse"]
+    assert evaluated("""--faults '{"blackout": 0.4, "only": "image"}'""") == unimodal
 
 
-def test_what_is_bad_can_be_left_out(run: Run, folder: Path) -> None:
+def test_skip_bad(run: Run, folder: Path) -> None:
     line = f"trace {EKF} --data shape.h5 -o some.trace"
     assert run(line)[0] == 2
     code, out, err = run(f"{line} --skip-bad --json -")
     assert code == 0
-    left_out = "left out: shape.h5: 'states' of trajectory9 has shape (100, 2), expected (100, 3)."
-    assert err.splitlines()[0] == left_out
-    assert json.loads(out)["episode"] == 18, "the first of the held-out ones, now that the tenth is gone"
+    note = "skipped: shape.h5: 'states' of trajectory9 has shape (100, 2), expected (100, 3)."
+    assert err.splitlines()[0] == note
+    assert json.loads(out)["episode"] == 18, "the first remaining held-out episode"
 
 
 def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> None:
@@ -181,8 +181,8 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert trained["record"]["command"].startswith("beliefscope train door --filter crossmodal-pf --data ten.h5")
     assert trained["record"]["faults"] == []
     episodes = trained["record"]["episodes"]
-    more = "--faults force_bias:x=5,blackout=0.4 --blackouts 0,0.8 --json"
-    hardened = json.loads(run(line.replace("--json", more))[1])["record"]
+    options = "--faults force_bias:x=5,blackout=0.4 --blackouts 0,0.8 --json"
+    hardened = json.loads(run(line.replace("--json", options))[1])["record"]
     assert (trained["record"]["blackouts"], hardened["blackouts"]) == ([0.0, 0.4, 0.8], [0.0, 0.8])
     assert hardened["command"].partition("--blackouts ")[2].startswith("0,0.8")
     assert [fault["fault"] for fault in hardened["faults"]] == ["force_bias", "blackout"]
@@ -195,7 +195,7 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert json.loads(out)["episodes"] == 1
 
 
-def test_inspect_says_what_applies_and_why_the_rest_does_not(run: Run, folder: Path) -> None:
+def test_inspect_reports_applicable_diagnostics_and_reasons(run: Run, folder: Path) -> None:
     for episode in (9, 19):
         assert run(f"trace {EKF} --episode {episode} -o {episode}.trace")[0] == 0
     code, out, _ = run("inspect 9.trace 19.trace --filter ekf.safetensors --figures figures --format png --json -")
@@ -206,17 +206,17 @@ def test_inspect_says_what_applies_and_why_the_rest_does_not(run: Run, folder: P
     assert "--only maps" in document["not_made"]["maps"]
     assert {path.stem for path in (folder / "figures").iterdir()} == set(document["diagnostics"])
     assert [trace["episode"] for trace in document["traces"]] == [9, 19]
-    for name, found in document["diagnostics"].items():
-        alone = json.loads(run(f"inspect 9.trace 19.trace --only {name} --json -")[1])["diagnostics"]
-        assert alone == {name: found}
-    # Its filter does not ship: what needs the checkpoint says so.
+    for name, result in document["diagnostics"].items():
+        single = json.loads(run(f"inspect 9.trace 19.trace --only {name} --json -")[1])["diagnostics"]
+        assert single == {name: result}
+    # The filter is not built in, so diagnostics that need its checkpoint are not available.
     code, out, _ = run("inspect 9.trace")
     assert code == 0
-    assert "Particle health: not made" in out
-    assert "Likelihood maps: not made. maps needs the filter's checkpoint" in out
+    assert "Particle health: not available" in out
+    assert "Likelihood maps: not available: maps needs the filter's checkpoint" in out
     code, _, err = run("inspect 9.trace --only particles")
     assert (code, err.splitlines()[-1]) == (2, "error: crossmodal-ekf has no particles")
     assert run("trace door --filter crossmodal-pf --particles 10 -o pf.trace")[0] == 0
     code, _, err = run("inspect 9.trace pf.trace")
     assert code == 2
-    assert "another checkpoint" in err
+    assert "different checkpoints" in err

@@ -39,7 +39,7 @@ def clean_tasks() -> Iterator[None]:
     yield
     TASKS.clear()
     TASKS.update(tasks)
-    catalog._FOREIGN.clear()
+    catalog._user_tasks.clear()
 
 
 def run(*arguments: object) -> tuple[int, str, str]:
@@ -85,14 +85,14 @@ def example(name: str, argument: object, capsys: pytest.CaptureFixture[str]) -> 
 def test_diagnose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = example("01_diagnose.py", tmp_path, capsys)
     assert all(f"{entry.title}. {entry.question}\n  " in output for entry in DIAGNOSTICS.values())
-    assert "an oracle would" in output
-    assert "95 % -" in output, "five trajectories are enough for intervals"
+    assert "; oracle: " in output
+    assert "95 % interval -" in output, "five trajectories are enough for intervals"
     assert {path.stem for path in tmp_path.glob("*.pdf")} == {"weights", "consistency", "particles"}
 
 
 def test_counterfactual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = example("02_counterfactual.py", tmp_path / "what.svg", capsys)
-    blackout, trusted, _ = re.findall(r"the error went from ([\d.]+) to ([\d.]+) cm", output)
+    blackout, trusted, _ = re.findall(r"over the edited steps: ([\d.]+) -> ([\d.]+) cm", output)
     assert blackout[0] == trusted[0], "both are compared with the same run"
     assert float(blackout[1]) < float(trusted[1]), "trusting a blacked out image increases the error"
     assert (tmp_path / "what.svg").read_text().startswith("<?xml")

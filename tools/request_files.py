@@ -2,8 +2,8 @@
 
     python tools/request_files.py [--list]
 
-The requests go to a test client on the shipped data. A file counts if one of its functions is called in the server
-process, in any thread. Filters run in a thread here, so the count of the first trace includes the filter itself.
+The requests go to a test client on the included data. A file counts if one of its functions is called in the server
+process, in any thread. If the filter runs in a thread, the count of a trace includes the filter's own files.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from typing import Any
 
 from starlette.testclient import TestClient
 
-from beliefscope.app.server.main import Settings, create_app
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.server.main import create_app
 
 ROOT = Path(__file__).resolve().parents[1]
 ORIGIN = "http://localhost:8000"
-CURSOR = {"type": "cursor", "task": "door", "filter": "crossmodal-ekf", "episode": 9, "angle": None, "size": 41}
+CURSOR = {"type": "cursor", "task": "door", "filter": "crossmodal-ekf", "episode": 9, "size": 41}
 
 
 class CallRecorder:
@@ -59,31 +60,37 @@ def wait_for_trace(client: TestClient, url: str) -> None:
     assert response.status_code == 200, response.text
 
 
-def measure(workspace: Path) -> Iterator[tuple[str, list[str]]]:
+def measure(folder: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield each kind of request with its files."""
     recorder = CallRecorder()
-    app = create_app(Settings(workspace), warm=False)
-    with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
-        url = "/api/trace/door/crossmodal-ekf/9"
-        client.get("/api/catalog")
-        with recorder.files() as files:
-            wait_for_trace(client, url)
-        yield "trace, computed", files
-        with recorder.files() as files:
-            wait_for_trace(client, url)
-        yield "trace, in memory", files
-        view = client.post("/api/views").json()["socket"]
-        with client.websocket_connect(f"ws://{ORIGIN.removeprefix('http://')}{view}") as socket:
-            for serial, name in enumerate(("first cursor", "next cursor")):
-                with recorder.files() as files:
-                    socket.send_json(CURSOR | {"serial": serial, "step": 20 + serial})
-                    socket.receive_bytes()
-                    assert socket.receive_json()["type"] == "drawn"
-                yield name, files
-        with recorder.files() as files:
-            response = client.post("/api/finetune/door/crossmodal-ekf", json={"steps": 1})
-        assert response.status_code in (200, 201, 202), response.text
-        yield "fine-tune start", files
+    url = "/api/trace/door/crossmodal-ekf/9"
+    for name, subprocess in (("trace, computed in a worker process", True), ("trace, computed in a thread", False)):
+        app = create_app(Settings(folder / name), warm=False, subprocess=subprocess)
+        with TestClient(app, base_url=ORIGIN, headers={"Origin": ORIGIN}) as client:
+            client.get("/api/catalog")
+            if subprocess:
+                app.state.store._worker.start()
+            with recorder.files() as files:
+                wait_for_trace(client, url)
+            yield name, files
+            if subprocess:
+                continue
+            with recorder.files() as files:
+                wait_for_trace(client, url)
+            yield "trace, in memory", files
+            view = client.post("/api/views").json()["socket"]
+            with client.websocket_connect(f"ws://{ORIGIN.removeprefix('http://')}{view}") as socket:
+                for serial, request in enumerate(("first cursor", "next cursor")):
+                    cursor = CURSOR | {"serial": serial, "step": 20 + serial, "angle": 0.1 * serial}
+                    with recorder.files() as files:
+                        socket.send_json(cursor)
+                        socket.receive_bytes()
+                        assert socket.receive_json()["type"] == "drawn"
+                    yield request, files
+            with recorder.files() as files:
+                response = client.post("/api/finetune/door/crossmodal-ekf", json={"steps": 1})
+            assert response.status_code in (200, 201, 202), response.text
+            yield "fine-tune start", files
 
 
 def main() -> None:

@@ -275,13 +275,13 @@ def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
     The command receives the checkpoint, the trace and its own options; ``output`` is checked before the run.
     """
     signatures = [inspect.signature(function) for function in (run_filter, command)]
-    shared, own = (list(signature.parameters.values()) for signature in signatures)
+    shared, other = (list(signature.parameters.values()) for signature in signatures)
     # The two classes are imported only when a command runs.
     names = {"Checkpoint": Any, "Trace": Any}
     hints = {
         k: v for f in (run_filter, command) for k, v in get_type_hints(f, None, names, include_extras=True).items()
     }
-    options = [p.replace(kind=p.KEYWORD_ONLY, annotation=hints[p.name]) for p in (*shared, *own[2:])]
+    options = [p.replace(kind=p.KEYWORD_ONLY, annotation=hints[p.name]) for p in (*shared, *other[2:])]
 
     @wraps(command)
     def run(**values: Any) -> None:
@@ -293,9 +293,9 @@ def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def trace_document(trace: Trace, path: Path) -> dict[str, Any]:
-    """JSON description of a file created from a trace."""
-    return {
+def print_trace(trace: Trace, path: Path, json: str | None, **extra: Any) -> None:
+    """Print the description of a file created from a trace. extra: additional values of the JSON document."""
+    document = {
         "task": trace.episode.task,
         "filter": trace.filter,
         "episode": trace.episode_index,
@@ -307,12 +307,17 @@ def trace_document(trace: Trace, path: Path) -> dict[str, Any]:
         "path": str(path),
         "bytes": path.stat().st_size,
     }
-
-
-def trace_summary(trace: Trace, path: Path) -> str:
-    """One-line description of a file created from a trace."""
     run = f"{trace.filter} over {len(trace)} steps of {trace.episode.task} episode {trace.episode_index}"
-    return f"{path_and_size(path)}: {run}" + (f" with {trace.faults}" if trace.faults else "")
+    text = f"{path_and_size(path)}: {run}" + (f" with {trace.faults}" if trace.faults else "")
+    console.result(document | extra, text, json)
+
+
+def print_checkpoint(
+    path: Path, task: str, name: str, digest: str, record: dict[str, Any], text: str, json: str | None
+) -> None:
+    """Print the description of a trained checkpoint. text: printed instead of the JSON document."""
+    document = {"task": task, "filter": name, "checkpoint_hash": digest, "path": str(path)}
+    console.result(document | {"bytes": path.stat().st_size, "record": record}, text, json)
 
 
 def path_and_size(path: Path) -> str:

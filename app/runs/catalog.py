@@ -29,11 +29,16 @@ DEFAULT_FILTER = "crossmodal-pf"
 
 @dataclass
 class TaskCatalog:
-    """Filters and data sets of one task by name. What ships is loaded on first use."""
+    """Filters and data sets of one task by name. The included ones are loaded on first use.
+
+    Attributes:
+        paths: filter -> checkpoint file; external filters have none.
+    """
 
     task: Task
     user_filters: dict[str, Checkpoint] = field(default_factory=dict)
     user_data: dict[str, Dataset] = field(default_factory=dict)
+    paths: dict[str, Path] = field(default_factory=dict)
 
     @cached_property
     def filters(self) -> dict[str, Checkpoint]:
@@ -41,7 +46,8 @@ class TaskCatalog:
         for name in sorted(filters_of(self.task), key=lambda name: name != DEFAULT_FILTER):
             if name not in filters:
                 with suppress(BadInput):  # no pretrained checkpoint ships
-                    filters[name] = load_checkpoint(shipped(self.task.name, name))
+                    self.paths[name] = shipped(self.task.name, name)
+                    filters[name] = load_checkpoint(self.paths[name])
         return filters
 
     @cached_property
@@ -52,8 +58,9 @@ class TaskCatalog:
                 data[SAMPLE] = open_dataset(sample_path(self.task.name), self.task)
         return data
 
-    def add_filter(self, name: str, checkpoint: Checkpoint, first: bool) -> None:
+    def add_filter(self, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
         """Add a filter before all others, or after the user's other filters."""
+        self.paths[name] = path
         others = {key: value for key, value in self.user_filters.items() if key != name}
         self.user_filters = {name: checkpoint, **others} if first else {**others, name: checkpoint}
         vars(self).pop("filters", None)
@@ -128,8 +135,10 @@ def task_catalogs(
     for name, source in checkpoints.items():
         with _collect_error(problems):
             checkpoint = source if isinstance(source, Checkpoint) else load_checkpoint(source)
-            task = checkpoint.task
-            catalogs.setdefault(task.name, TaskCatalog(task)).user_filters[name] = checkpoint
+            catalog = catalogs.setdefault(checkpoint.task.name, TaskCatalog(checkpoint.task))
+            catalog.user_filters[name] = checkpoint
+            if isinstance(source, Path):
+                catalog.paths[name] = source
     tasks_with_filters = [catalog.task for catalog in catalogs.values()]
     for name, path in data.items():
         with _collect_error(problems):

@@ -77,8 +77,9 @@ class FilterRunner:
 def _run_or_load(request: RunRequest, checkpoint: Checkpoint, episode: Episode, progress: Progress) -> Trace:
     """The trace of the run without intervention: from its file if that is readable, else computed and saved."""
     path = Path(request.original)
-    with suppress(BadInput):
-        return load_trace(path)
+    if path.is_file():
+        with suppress(BadInput):
+            return load_trace(path)
     result = trace(
         checkpoint,
         episode,

@@ -25,7 +25,7 @@ from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.filters.checkpoint import Checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.trace import Trace, load_trace
 
@@ -168,7 +168,7 @@ class TraceStore:
     def add_filter(self, task: str, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
         """Add a filter to the catalog and the settings, so that jobs find it by its name."""
         with self._lock:
-            self._catalog(task).add_filter(name, checkpoint, first)
+            self._catalog(task).add_filter(name, checkpoint, path, first)
             self.settings = replace(self.settings, checkpoints={**self.settings.checkpoints, name: path})
 
     def remove_filter(self, task: str, name: str) -> None:
@@ -249,20 +249,18 @@ class TraceStore:
             if isinstance(checkpoint, ExternalFilter):
                 source, external_task = checkpoint.source, checkpoint.task.name
             else:
-                name, external_task = selection.filter, ""
-                files = self.settings.checkpoints
-                source = str(files[name] if name in catalog.user_filters else shipped(selection.task, name))
-            original = self._trace_file(replace(selection, edit=None))
+                source, external_task = str(catalog.paths[selection.filter]), ""
+            original = str(self._trace_file(replace(selection, edit=None)))
             return RunRequest(
                 selection,
-                source,
-                external_task,
-                str(data),
-                str(original),
-                str(original if selection.edit is None else self._trace_file(selection)),
-                self.settings.seed,
-                self.settings.particles,
-                self.settings.tasks,
+                checkpoint=source,
+                external_task=external_task,
+                data=str(data),
+                original=original,
+                output=original if selection.edit is None else str(self._trace_file(selection)),
+                seed=self.settings.seed,
+                particles=self.settings.particles,
+                user_tasks=self.settings.tasks,
             )
 
     def _trace_file(self, selection: Selection) -> Path:
@@ -272,9 +270,10 @@ class TraceStore:
 def _run_in_worker(worker: TraceWorker, request: RunRequest, progress: Callable[[float], None]) -> Trace:
     """The trace from its file; the worker writes the file if it is missing or unreadable."""
     path = Path(request.output)
-    with suppress(BadInput):
-        return load_trace(path)
-    path.unlink(missing_ok=True)
+    if path.is_file():
+        with suppress(BadInput):
+            return load_trace(path)
+        path.unlink()
     worker.run(request, progress)
     try:
         return load_trace(path)

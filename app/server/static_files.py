@@ -21,7 +21,7 @@ from starlette.responses import Response
 from beliefscope.app.protocol.etag import IMMUTABLE, REVALIDATE, tagged
 
 ENTRY = "core/main.js"
-_IMPORT = re.compile(rb"""^(?:import|export)\b[^'"]*['"](\.\.?/[\w./-]+)['"]""", re.MULTILINE)
+_IMPORT = re.compile(rb"""^(?:import|export)\b[\w\s{},*$]*['"](\.\.?/[\w./-]+)['"]""", re.MULTILINE)
 _NAMED = re.compile(r"/static/([\w./-]+)")
 
 

@@ -194,7 +194,7 @@ def model_names(
     """Names of the measurement models: as given, or the task's modalities if there are as many, or numbered.
 
     Args:
-        axis: of the values that indexes the models. models: indices of those that took part, if not all did.
+        axis: of the values that indexes the models. models: indices of the participating models, if not all.
 
     Raises BadInput if the number of given names does not match.
     """

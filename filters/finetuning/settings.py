@@ -46,8 +46,8 @@ class FineTune:
             the filter's accuracy elsewhere; 1 without slices.
         events: restricts the slices to these steps; without, they cover all training episodes.
         length: steps in a window. windows: in a batch. steps: of the optimiser, at most.
-        rate: Adam's learning rate, which decays to a twentieth. rates: patterns with their own rate, of which the last
-            match counts; by default ``dynamics.log_noise`` has ten times the rate, image encoders a third.
+        rate: Adam's learning rate, which decays to a twentieth. rates: patterns with their own rate, the last
+            match takes precedence; by default ``dynamics.log_noise`` has ten times the rate, image encoders a third.
         l2_sp: strength of the decay towards the base checkpoint's weights. check: steps between two validations.
             patience: validations without improvement that end the run.
         particles, likelihood_weight: as in training (``Plan``). seed: of all random numbers.

@@ -58,7 +58,7 @@ class Trainer:
     Args:
         train, val: steps of the training and validation episodes. Each stage keeps the weights that do best on ``val``;
             without ``val``, the last ones.
-        blackouts: probabilities of an image blackout, one of which is drawn for each window.
+        blackouts: probabilities of an image blackout; one is drawn for each window.
         shared: store of dynamics models and image encoders, shared by filters of the same task, data, plan and seed;
             shared_key: identifies these.
         on_validation: called like ``report`` with each validation loss.

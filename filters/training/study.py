@@ -171,7 +171,7 @@ def _finite(value: Any) -> Any:
 def run_local(
     cells: Sequence[Cell], folder: Path, report: Callable[[Cell], Report] | None = None
 ) -> Iterator[tuple[Cell, Document]]:
-    """Runs the cells one after the other, last those that another process runs; yields each when it is done."""
+    """Runs the cells one after the other, cells locked by another process last; yields each when it is done."""
     busy = []
     for cell in cells:
         document = run_cell(cell, folder, report and report(cell), wait=False)

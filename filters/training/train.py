@@ -54,7 +54,7 @@ def train(
     number of threads the weights are identical, whether or not the training was interrupted and resumed.
 
     Args:
-        blackouts: probabilities of an image blackout, one of which is drawn for each training window.
+        blackouts: probabilities of an image blackout; one is drawn for each training window.
         on_validation: called like ``report`` with each validation loss.
         on_resume: called with the name of the last finished stage if the training resumes.
         partial: file of the finished stages, from which an interrupted training resumes; removed at the end.
@@ -82,7 +82,7 @@ def train(
         "versions": versions(),
         "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
     }
-    # The number of steps tells data sets apart that were extended by faulty copies, which their hash does not cover.
+    # The number of steps distinguishes data sets extended by faulty copies, which their hash does not cover.
     inputs = {key: record[key] for key in ("seed", "plan", "data_hash", "versions", "device")}
     inputs |= {"task": architecture.task, "steps": len(steps.states)}
     store = None if shared is None else SharedModules(shared)

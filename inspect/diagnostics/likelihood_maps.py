@@ -151,8 +151,8 @@ def maps(
 ENTRY = Entry(
     name="maps",
     title="Likelihood maps",
-    question="Which positions does each modality consider likely, and does the haptics map have a ridge along the line to "
-    "the end effector?",
+    question="Which positions does each modality consider likely, and does the haptics map have a ridge towards the "
+    "end effector?",
     run=maps,
     why_not=lambda trace, checkpoint: None if checkpoint is None else no_maps(checkpoint, trace),
     needs="checkpoint",

@@ -29,7 +29,7 @@ from beliefscope.inspect.traces.replay import Replay
 Mask = NDArray[np.bool_]
 
 MAX_MODALITIES = 6
-"""K modalities have 2^K subsets, each of which is a run."""
+"""K modalities have 2^K subsets, with one run each."""
 
 REPLAY_TIME = 0.3
 """Approximate share of the computing time for the replay of the original run."""

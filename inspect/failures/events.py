@@ -320,8 +320,8 @@ def event_spans(high: Mask, episode: NDArray[np.int_], gap: int) -> list[tuple[i
     at = np.flatnonzero(high)
     if not len(at):
         return []
-    apart = (np.diff(at) > gap + 1) | (np.diff(episode[at]) != 0)
-    firsts, lasts = at[np.r_[True, apart]], at[np.r_[apart, True]]
+    breaks = (np.diff(at) > gap + 1) | (np.diff(episode[at]) != 0)
+    firsts, lasts = at[np.r_[True, breaks]], at[np.r_[breaks, True]]
     return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
 
 

@@ -58,7 +58,7 @@ class GridEvaluator:
             encoder, join, head = layers([*model.state_encoder][1:]), model.join_state.weight.T, layers(inner)
             for begin, end in chunks(size):
                 x, y = self._buffers.narrow(1, 0, (end - begin) * size)
-                here = slice(begin * size, end * size)
+                rows_slice = slice(begin * size, end * size)
                 if not cached:
                     torch.add(columns, rows[begin:end, None], out=x.view(-1, size, self._units))
                     apply_layers(encoder, x, y)
@@ -66,10 +66,10 @@ class GridEvaluator:
                     torch.addmm(features, x, join, out=y)
                 else:
                     if not cached:
-                        torch.mm(x, join, out=part[k, here])
-                    torch.add(part[k, here], features, out=y)
+                        torch.mm(x, join, out=part[k, rows_slice])
+                    torch.add(part[k, rows_slice], features, out=y)
                 apply_layers(head, y, x)
-                torch.addmv(last.bias, y, last.weight[0], out=values[k, here])
+                torch.addmv(last.bias, y, last.weight[0], out=values[k, rows_slice])
         return values
 
     def _cached_part(self, size: int, middle: tuple[float, ...]) -> tuple[bool, Tensor | None]:

@@ -91,10 +91,10 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
 def _area(ordered: Array, mass: float) -> Array:
     """(B, L) number of cells, largest first, with that share of the total; the last cell counts in part."""
     cumulative = ordered.cumsum(axis=-1)
-    whole = (cumulative < mass).sum(axis=-1, keepdims=True)
-    last = np.take_along_axis(ordered, whole, axis=-1)
-    before = np.take_along_axis(cumulative, whole, axis=-1) - last
-    return np.asarray((whole + (mass - before) / last)[..., 0], dtype=np.float64)
+    complete = (cumulative < mass).sum(axis=-1, keepdims=True)
+    last = np.take_along_axis(ordered, complete, axis=-1)
+    before = np.take_along_axis(cumulative, complete, axis=-1) - last
+    return np.asarray((complete + (mass - before) / last)[..., 0], dtype=np.float64)
 
 
 def _principal(share: Array, x: Array, y: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Traces of external filters: the values that the filter returns and those that hooks can capture."""
+"""Traces of external filters: returned values and values captured by hooks."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class LiveFileWriter:
         self._write(HEADER, len(content), content)
 
     def append(self, part: Trace) -> None:
-        """Append the steps of a trace. Raises BadInput if its arrays differ from the template, or if the disk is full."""
+        """Append the steps of a trace. Raises BadInput if its arrays differ from the template or the disk is full."""
         arrays = {name: array for name, array in arrays_of(part).items() if name not in STATIC}
         new_shapes = _shapes_of_step(arrays)
         for name in self._shapes | new_shapes:

@@ -62,12 +62,7 @@ def log_diagnostic(stream: rr.RecordingStream | None, diagnostic: Diagnostic, na
         if bounds:
             path = f"{root}/bounds/{slug(chart)}"
             ends = np.unique([0, len(trace) - 1])
-            rr.log(
-                path,
-                line(NEUTRAL_COLOUR, 0.8, *["bounds"] * len(bounds)),
-                static=True,
-                recording=stream,
-            )
+            rr.log(path, line(NEUTRAL_COLOUR, 0.8, *["bounds"] * len(bounds)), static=True, recording=stream)
             rr.send_columns(
                 path,
                 time_columns(ends, trace.episode.dt),
@@ -87,7 +82,7 @@ def diagnostic_tab(diagnostic: Diagnostic, name: str) -> rrb.Container:
     root = f"diagnostics/{slug(name)}"
     panels: list[tuple[str, Plot | ImagePanel]] = [
         *(("plots", plot) for plot in diagnostic.plots()),
-        *(("images", picture) for picture in diagnostic.images()),
+        *(("images", image) for image in diagnostic.images()),
     ]
     views = [
         rrb.TextDocumentView(origin=f"{root}/about", name="Verdict"),

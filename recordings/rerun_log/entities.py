@@ -36,11 +36,7 @@ KINDS = {
     "lstm": "An LSTM without covariance and likelihood",
     "external": "An external filter",
 }
-MEANINGS = {
-    "truth": "true state",
-    "fused": "estimate from all modalities",
-    "contact": "the robot touches the object",
-}
+MEANINGS = {"truth": "true state", "fused": "estimate from all modalities", "contact": "the robot touches the object"}
 
 
 def sources(trace: Trace) -> tuple[str, ...]:

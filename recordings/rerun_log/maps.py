@@ -24,10 +24,7 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
     side = len(first.offsets_x)
     depth = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8")
     for layer in first.layers:
-        yield (
-            f"maps/{layer}",
-            rr.DepthImage.from_fields(format=depth, colormap="Inferno", depth_range=[0.0, 255.0]),
-        )
+        yield (f"maps/{layer}", rr.DepthImage.from_fields(format=depth, colormap="Inferno", depth_range=[0.0, 255.0]))
         yield f"maps/{layer}/truth", _frame(colour("truth", trace.modalities), side / 18)
         yield f"maps/{layer}/estimate", _frame(colour(layer, trace.modalities), side / 30)
     cells = first.offsets_x[:: _stride(first)]

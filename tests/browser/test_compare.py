@@ -30,7 +30,7 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     page.until("() => !document.querySelector('#compare').hidden")
     assert [form.locator(f"[name={name}]").input_value() for name in ("from", "last")] == ["45", "55"]
     form.get_by_role("button", name="Compare").click()
-    assert "Nothing is edited yet" in form.locator(".wrong").text_content()
+    assert "Nothing is edited yet" in form.locator(".error").text_content()
     form.locator("[name=edit_faults]").select_option("blackout=0.8")
     form.get_by_role("button", name="Compare").click()
     page.until(READY)

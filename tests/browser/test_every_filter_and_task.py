@@ -44,14 +44,14 @@ def test_what_a_filter_has_not_is_said(open_page: Any, serve: Any, tmp_path: Pat
     assert page.state["filter"] == "my-feature-ekf"
     assert text("#heatmaps h3").all_text_contents() == ["image + haptics"]
     assert text("#step-table tbody th").all_text_contents() == ["estimate"]
-    assert "go into one measurement model" in text("#timeline .track-note").text_content()
+    assert "a single measurement model uses" in text("#timeline .track-note").text_content()
     assert text("#data").locator("option").all_text_contents() == ["door", "sample"]
     page.picture("one-model")
 
     choose(page, "filter", "my-lstm")
     page.until("() => document.querySelector('#heatmaps').dataset.state === 'empty'")
     assert "an LSTM estimates the state" in text("#heatmaps .note").text_content()
-    assert text("#step-summary").text_content().endswith("how sure it is, this filter does not say.")
+    assert text("#step-summary").text_content().endswith("no predicted standard deviation.")
     assert "\N{GREEK SMALL LETTER SIGMA}" not in text("#step-table thead").text_content()
     assert not text("#angle-label").is_visible()
     page.page.keyboard.press("ArrowRight")
@@ -79,7 +79,7 @@ def test_a_task_of_ones_own(open_page: Any, serve: Any, tmp_path: Path, monkeypa
     finally:
         for other in TASKS.keys() - before.keys():
             del TASKS[other]  # for good: whoever comes next has not heard of it
-        catalog._FOREIGN.clear()
+        catalog._user_tasks.clear()
     page = open_page(url=serve(0, "--task", f"{EXAMPLE}:TASK", "--data", str(data), "--filter", str(own)).url)
     text = page.page.locator
     assert page.state["task"] == name

@@ -41,7 +41,7 @@ def test_filters_from_outside(open_page: Any, serve: Any, tmp_path: Path) -> Non
     assert text("#heatmaps h3").all_text_contents() == ["estimate"]
     assert text("#step-table tbody th").all_text_contents() == ["estimate"]
     assert "\N{GREEK SMALL LETTER SIGMA}" in text("#step-table thead").text_content()
-    assert "does not say which of its senses it follows" in text("#timeline .track-note").text_content()
+    assert "does not report its modalities" in text("#timeline .track-note").text_content()
     page.page.keyboard.press("ArrowRight")
     page.settle(1)
     page.picture("foreign")
@@ -49,7 +49,7 @@ def test_filters_from_outside(open_page: Any, serve: Any, tmp_path: Path) -> Non
     text("#filter").select_option("mine-Blind")
     page.until("() => document.querySelector('#heatmaps').dataset.state === 'empty'")
     assert "does not say how likely others are" in text("#heatmaps .note").text_content()
-    assert text("#step-summary").text_content().endswith("how sure it is, this filter does not say.")
+    assert text("#step-summary").text_content().endswith("no predicted standard deviation.")
 
     text("#filter").select_option("mine-Weighs")
     page.until("() => document.querySelector('#step-table tbody th')?.textContent === 'fused'")

@@ -22,7 +22,7 @@ def test_a_filter_is_tuned_judged_accepted_and_rolled_back(open_page: Any, serve
     panel.get_by_label("Train virtual_sensors.haptics", exact=True).uncheck()
     assert panel.locator("select[name=preset]").input_value() == "own"
     panel.get_by_role("button", name="Fine-tune").click()
-    assert "nothing to train" in panel.locator(".wrong").text_content()
+    assert "nothing to train" in panel.locator(".error").text_content()
     panel.get_by_label("Show what is in virtual_sensors.haptics", exact=True).click()
     panel.get_by_label("Train virtual_sensors.haptics.state", exact=True).check()
     panel.locator("select[name=slice]").select_option("haptics alone")

@@ -154,7 +154,7 @@ def test_looks_are_in_the_address_and_a_pinned_moment_is_what_others_gain_on(
 
 def test_a_moment_is_told_and_drawn_close_where_its_maps_fit(open_page: Any) -> None:
     page = open_page("?task=push&filter=crossmodal-ekf&episode=79&step=68")
-    assert page.page.locator("#step-summary").text_content().endswith("though image alone is 0.8 cm off.")
+    assert page.page.locator("#step-summary").text_content().endswith("although the image-only error is 0.8 cm.")
     shown = {"fit": page.maps()}
     for zoom in ("4", "1"):
         page.page.evaluate(f"""() => document.querySelector('#maps-zoom input[value="{zoom}"]').click()""")

@@ -178,7 +178,7 @@ def test_any_faults_can_be_typed_and_a_bad_one_leaves_the_view(open_page: Any) -
     assert sheet.locator("tr").count() == 15
     text.fill("blackout=1.5,force_bias:x=5")
     text.press("Enter")
-    page.until("() => document.querySelector('#fault-dialog .wrong').textContent.includes(\"'probability' is 1.5\")")
+    page.until("() => document.querySelector('#fault-dialog .error').textContent.includes(\"'probability' is 1.5\")")
     page.picture("faults-wrong")
     assert page.state["faults"] == "image_occluded=16:x=0:y=0"
     assert page.maps() == before

@@ -97,7 +97,7 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     second = open_page("?" + page.page.url.partition("?")[2])
     assert second.state == page.state
     assert slider.get_attribute("aria-valuenow") == "44"
-    assert re.fullmatch(r"step 44, 4\.4 s, \d\.\d cm off(, in contact)?", slider.get_attribute("aria-valuetext"))
+    assert re.fullmatch(r"step 44, 4\.4 s, error \d\.\d cm(, in contact)?", slider.get_attribute("aria-valuetext"))
     page.page.keyboard.press("0")
     assert page.state["window"] == ""
 
@@ -120,7 +120,7 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     image, haptics = 100 * column(page, "innovation")[44, :, 0]
     assert told(page, 2) == {"image": [near(image)], "haptics": [near(haptics)]}
     page.page.locator("#track").select_option("particles")
-    page.until("() => document.querySelector('#tracks .track-note')?.textContent.includes('a Gaussian and no particles')")
+    page.until("() => document.querySelector('#tracks .track-note')?.textContent.includes('a Gaussian belief and no particles')")
     page.until("() => location.search.includes('track=particles')")
     page.picture("timeline-why-not")
 

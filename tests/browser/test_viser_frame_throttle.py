@@ -30,7 +30,7 @@ class Frame:
     def __init__(self, page: Any, url: str) -> None:
         self.page = page
         page.goto(url + "healthz")
-        page.add_script_tag(url=url + "static/frame.js")
+        page.add_script_tag(url=url + "static/scene/viser_frame_throttle.js")
 
     def draw(self, cost: int) -> None:
         self.page.evaluate(DRAWING, cost)

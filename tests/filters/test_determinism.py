@@ -46,9 +46,9 @@ def test_repeated_runs_are_identical_and_threads_only_change_rounding(name: str,
     assert write_trace(name, tmp_path / "one") == write_trace(name, tmp_path / "again")
     torch.set_num_threads(2)
     write_trace(name, tmp_path / "two")
-    one, two = (arrays_of(load_trace(tmp_path / file)) for file in ("one", "two"))
+    first, second = (arrays_of(load_trace(tmp_path / file)) for file in ("one", "two"))
     # A sum in two parts rounds differently: float32 has 7 digits, some of which are lost over the steps.
-    np.testing.assert_allclose(two["estimate_mean"], one["estimate_mean"], atol=2e-3)
+    np.testing.assert_allclose(second["estimate_mean"], first["estimate_mean"], atol=2e-3)
 
 
 def test_another_process_gives_an_identical_trace(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -93,6 +93,17 @@ def openapi_schema(client: TestClient) -> dict[str, Any]:
     return document
 
 
+def can_be_invalid(operation: Mapping[str, Any]) -> bool:
+    """Whether a request can violate the schema: free text in the path cannot, and the search for it takes seconds."""
+
+    def is_free_text(schema: Mapping[str, Any]) -> bool:
+        plain = schema.keys() - {"title"} == {"type"} and schema["type"] == "string"
+        return plain or any(map(is_free_text, schema.get("anyOf", ())))
+
+    parameters = operation.get("parameters", ())
+    return "requestBody" in operation or not all(p["in"] == "path" and is_free_text(p["schema"]) for p in parameters)
+
+
 def fuzz_http(client: TestClient, log: ErrorLog, inputs: int, number: int) -> Tally:
     """Send requests to all routes: half valid, half invalid according to the schema."""
     tally = Tally()
@@ -127,14 +138,9 @@ def fuzz_http(client: TestClient, log: ErrorLog, inputs: int, number: int) -> Ta
                 for job in jobs.all():
                     jobs.cancel(job.id)
 
-        for mode, count in ((GenerationMode.POSITIVE, each - each // 2), (GenerationMode.NEGATIVE, each // 2)):
-            try:
-                _for_each(operation.as_strategy(generation_mode=mode), count, number + index)(send)
-            except Exception as error:
-                if type(error).__name__ not in ("SkipTest", "Unsatisfiable", "InvalidArgument"):
-                    raise
-                # A route without parameters has no invalid requests.
-                _for_each(operation.as_strategy(), count, number + index)(send)
+        second = GenerationMode.NEGATIVE if can_be_invalid(operation.definition.raw) else GenerationMode.POSITIVE
+        for mode, count in ((GenerationMode.POSITIVE, each - each // 2), (second, each // 2)):
+            _for_each(operation.as_strategy(generation_mode=mode), count, number + index)(send)
     return tally
 
 

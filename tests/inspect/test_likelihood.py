@@ -1,4 +1,4 @@
-"""Likelihood maps against the naive way, cell by cell, and their geometry."""
+"""Likelihood maps: comparison with a direct evaluation, and geometry."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def ekf() -> MapEngine:
 
 
 def states_of(map_: LikelihoodMap) -> np.ndarray:
-    """(S, S, 3) world states of the cells, from the map's own axes."""
+    """(S, S, 3) states of the cells."""
     x, y = np.meshgrid(map_.centre[0] + map_.offsets_x, map_.centre[1] + map_.offsets_y)
     return np.stack([x, y, np.full_like(x, map_.angle)], axis=-1)
 
 
 @torch.no_grad()
-def test_particle_filter_maps_equal_the_naive_way(pf: MapEngine) -> None:
-    """Whole networks on whole inputs, one observation repeated for every cell."""
+def test_particle_filter_maps_equal_a_direct_evaluation(pf: MapEngine) -> None:
+    """Complete networks evaluated with the observation repeated for every cell."""
     step, size = 40, 21
     map_ = pf.map(step, size=size)
     filter_ = pf.checkpoint.filter
@@ -51,26 +51,26 @@ def test_particle_filter_maps_equal_the_naive_way(pf: MapEngine) -> None:
     }
     cells = torch.from_numpy(states_of(map_).reshape(1, -1, 3).astype(np.float32))
     standard = filter_.statistics.standardise("state", cells)
-    each = []
+    expected = []
     for name in filter_.names:
         model = filter_.measurement_model(name)
         hidden = model.join_observation(model.encoders(observed)) + model.join_state(model.state_encoder(standard))
-        each.append(model.head(hidden).reshape(size, size).numpy())
-    # Float32 through some ten layers: values of order 10 agree to about 1e-5; the grid itself is rounded to 1e-7 m.
-    np.testing.assert_allclose(map_.log_likelihood[0], each[0], atol=2e-4)
-    np.testing.assert_allclose(map_.log_likelihood[1], each[1], atol=2e-4)
+        expected.append(model.head(hidden).reshape(size, size).numpy())
+    # Tolerance for float32 networks with outputs of order 10.
+    np.testing.assert_allclose(map_.log_likelihood[0], expected[0], atol=2e-4)
+    np.testing.assert_allclose(map_.log_likelihood[1], expected[1], atol=2e-4)
     weights = pf.trace.weights
     assert weights is not None
-    # Each likelihood is divided by its evidence: its mean over the particles, weighted as they were before this step.
+    # Each likelihood is divided by its evidence, the mean over the particles under the prior weights.
     assert pf.trace.prior_log_weights is not None
     assert pf.trace.log_likelihood is not None
     prior = np.exp(pf.trace.prior_log_weights[step])
     evidence = [(prior * np.exp(values)).sum() for values in pf.trace.log_likelihood[step]]
-    fused = np.log(sum(weights[step, k] * np.exp(each[k]) / evidence[k] for k in range(2)))
+    fused = np.log(sum(weights[step, k] * np.exp(expected[k]) / evidence[k] for k in range(2)))
     np.testing.assert_allclose(map_.log_likelihood[2], fused, atol=2e-4)
 
 
-def test_ekf_maps_are_its_gaussians(ekf: MapEngine) -> None:
+def test_ekf_maps_are_gaussians(ekf: MapEngine) -> None:
     map_ = ekf.map(50, angle=0.5, size=31)
     cells = states_of(map_)
     trace_ = ekf.trace
@@ -84,7 +84,7 @@ def test_ekf_maps_are_its_gaussians(ekf: MapEngine) -> None:
         np.testing.assert_allclose(layer, expected, rtol=1e-4, atol=1e-3)
 
 
-def test_axes_are_cell_centres_around_the_truth(pf: MapEngine) -> None:
+def test_axes_are_cell_centres_around_the_true_position(pf: MapEngine) -> None:
     map_ = pf.map(3)
     assert map_.layers == ("image", "haptics", "fused")
     assert map_.log_likelihood.shape == (3, 135, 135)
@@ -95,31 +95,31 @@ def test_axes_are_cell_centres_around_the_truth(pf: MapEngine) -> None:
     assert map_.angle == pf.trace.episode.states[3, 2]
 
 
-def test_another_angle_is_another_slice(pf: MapEngine) -> None:
+def test_cross_sections_at_other_angles(pf: MapEngine) -> None:
     same = pf.map(60, angle=float(pf.trace.episode.states[60, 2]), size=41)
     other = pf.map(60, angle=float(pf.trace.episode.states[60, 2]) + 0.5, size=41)
     np.testing.assert_array_equal(same.log_likelihood, pf.map(60, size=41).log_likelihood)
     assert np.abs(other.log_likelihood - same.log_likelihood).max() > 0.1
 
 
-def test_what_is_kept_of_a_grid_changes_nothing(pf: MapEngine) -> None:
-    """A slice that is held is computed, kept and remembered, with other grids of the same and other sizes between."""
+def test_cached_grids_give_equal_maps(pf: MapEngine) -> None:
+    """Maps of a repeated cross-section, interleaved with other grids, equal those of a new engine."""
     fresh = {step: engine("crossmodal-pf").map(step, 0.4, 41).log_likelihood for step in (5, 30)}
     for step in (5, 30, 5, 30, 5):
         pf.map(step, 0.9, size=135)
-        # Sums in another order, once the part is kept: float32 rounding of values of order 10.
+        # The cache changes the order of float32 sums.
         np.testing.assert_allclose(pf.map(step, 0.4, 41).log_likelihood, fresh[step], rtol=0, atol=1e-5)
         if step == 30:
             pf.map(step, 0.9, size=41), pf.map(step, size=21), pf.map(step, size=23)
 
 
-def test_large_grids_go_through_in_parts(pf: MapEngine) -> None:
-    """Every fifth cell of a grid five times as fine is a cell of the coarse one."""
+def test_large_grids_are_evaluated_in_chunks(pf: MapEngine) -> None:
+    """Every fifth cell of a grid with five times the resolution is a cell of the coarse grid."""
     coarse, fine = pf.map(30, size=31), pf.map(30, size=155)
     np.testing.assert_allclose(fine.log_likelihood[:, 2::5, 2::5], coarse.log_likelihood, atol=2e-4)
 
 
-def test_the_number_of_threads_is_left_as_it_was(pf: MapEngine) -> None:
+def test_number_of_threads_is_restored(pf: MapEngine) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -129,11 +129,11 @@ def test_the_number_of_threads_is_left_as_it_was(pf: MapEngine) -> None:
         torch.set_num_threads(before)
 
 
-def test_normalised_peaks_at_255_where_peaks_says(pf: MapEngine) -> None:
+def test_normalised_maps_peak_at_255(pf: MapEngine) -> None:
     map_ = pf.map(60, size=41)
-    shown = map_.normalised()
-    assert shown.dtype == np.uint8
-    for layer, (x, y) in zip(shown, map_.peaks(), strict=True):
+    normalised = map_.normalised()
+    assert normalised.dtype == np.uint8
+    for layer, (x, y) in zip(normalised, map_.peaks(), strict=True):
         iy, ix = np.unravel_index(layer.argmax(), layer.shape)
         assert layer.max() == 255
         assert (map_.offsets_x[ix], map_.offsets_y[iy]) == (x, y)
@@ -144,15 +144,15 @@ def test_normalised_peaks_at_255_where_peaks_says(pf: MapEngine) -> None:
     [
         ({"step": -1}, "step -1 is not in this episode"),
         ({"step": 10**6}, "it has steps 0 to"),
-        ({"step": 0, "size": 1}, "2 to 1024 cells along a side, not 1"),
+        ({"step": 0, "size": 1}, "2 to 1024 cells per side, not 1"),
         ({"step": 0, "angle": float("nan")}, "finite number of rad, not nan"),
     ],
 )
-def test_bad_input(pf: MapEngine, arguments: dict, message: str) -> None:
+def test_invalid_arguments(pf: MapEngine, arguments: dict, message: str) -> None:
     with pytest.raises(BadInput, match=message):
         pf.map(**arguments)
 
 
-def test_a_trace_of_another_checkpoint_is_refused(pf: MapEngine, ekf: MapEngine) -> None:
-    with pytest.raises(BadInput, match="made by checkpoint"):
+def test_trace_of_another_checkpoint_is_refused(pf: MapEngine, ekf: MapEngine) -> None:
+    with pytest.raises(BadInput, match="the trace is from checkpoint"):
         MapEngine(pf.checkpoint, ekf.trace)

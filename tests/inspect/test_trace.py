@@ -1,4 +1,4 @@
-"""Traces of the shipped filters on the sample set: nothing changed by looking, nothing lost on disk."""
+"""Traces of built-in filters: identical to untraced runs, and lossless on disk."""
 
 from __future__ import annotations
 
@@ -18,7 +18,16 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import run
-from beliefscope.inspect.trace import ARRAYS, Trace, load_trace, save_trace, trace
+from beliefscope.inspect.trace import (
+    ARRAYS,
+    Trace,
+    arrays_of,
+    header_of,
+    load_trace,
+    save_trace,
+    trace,
+    trace_from_arrays,
+)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +47,7 @@ def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
     return trace(checkpoint, episode, seed=7, particles=100)
 
 
-def test_tracing_changes_no_bit_of_the_estimates(checkpoint: Checkpoint, episode: Episode, traced: Trace) -> None:
+def test_tracing_does_not_change_the_estimates(checkpoint: Checkpoint, episode: Episode, traced: Trace) -> None:
     filter_ = checkpoint.filter
     batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
     error, covariance = run(filter_, batch, only=None, particles=100, seed=7)
@@ -50,32 +59,32 @@ def test_tracing_changes_no_bit_of_the_estimates(checkpoint: Checkpoint, episode
 def test_saved_and_loaded_without_loss(traced: Trace, tmp_path: Path) -> None:
     path = tmp_path / "run.trace"
     save_trace(traced, path)
-    again = load_trace(path)
+    loaded = load_trace(path)
     for name in ARRAYS:
-        before, after = getattr(traced, name), getattr(again, name)
+        before, after = getattr(traced, name), getattr(loaded, name)
         assert (before is None) == (after is None), name
         if before is not None:
             assert before.dtype == after.dtype
             np.testing.assert_array_equal(before, after, err_msg=name)
-    assert again.episode.digest() == traced.episode.digest() == traced.data_hash
+    assert loaded.episode.digest() == traced.episode.digest() == traced.data_hash
     for name in ("modalities", "kind", "filter", "checkpoint_hash", "episode_index", "seed", "settings"):
-        assert getattr(again, name) == getattr(traced, name), name
+        assert getattr(loaded, name) == getattr(traced, name), name
 
 
-def test_shares_sum_to_one_and_covariances_are_definite(traced: Trace) -> None:
+def test_weights_sum_to_one_and_covariances_are_definite(traced: Trace) -> None:
     assert traced.weights is not None
     assert traced.effective_weights is not None
     np.testing.assert_allclose(traced.weights.sum(1), 1.0, atol=1e-6)
     np.testing.assert_allclose(traced.effective_weights.sum(1), 1.0, atol=1e-6)
-    # Scaled to unit diagonal, so that m and rad compare; a particle set may hold a flat direction, to rounding.
+    # Scaled to unit diagonal because of different units; a particle set may be degenerate up to rounding.
     scale = np.sqrt(np.diagonal(traced.estimate_covariance, axis1=1, axis2=2)) + 1e-9
     correlation = traced.estimate_covariance / scale[:, :, None] / scale[:, None]
-    # Float32: sums over particles are right to some 1e-7 of the variances.
+    # Tolerance for float32 sums over particles.
     np.testing.assert_allclose(correlation, correlation.swapaxes(1, 2), atol=1e-5)
     assert np.linalg.eigvalsh(correlation).min() > -1e-5
 
 
-def test_particle_weights_explain_the_estimate_and_the_ancestors(traced: Trace) -> None:
+def test_particle_weights_match_the_estimate_and_the_ancestors(traced: Trace) -> None:
     if traced.kind != "pf":
         pytest.skip("an EKF has no particles")
     assert traced.particles is not None
@@ -85,65 +94,75 @@ def test_particle_weights_explain_the_estimate_and_the_ancestors(traced: Trace) 
     np.testing.assert_allclose(weights.sum(1), 1.0, atol=1e-5)
     mean = np.einsum("tm,tmn->tn", weights, traced.particles)
     np.testing.assert_allclose(mean, traced.estimate_mean, atol=1e-5)
-    # Captured before resampling: weights differ. Systematic resampling keeps counts within one of the share.
+    # Weights before resampling are not uniform. Systematic resampling keeps counts within one of the expectation.
     assert (weights.std(1) > 1e-6).mean() > 0.9
     counts = np.stack([np.bincount(row, minlength=100) for row in traced.ancestors])
     assert np.abs(counts - 100 * weights).max() < 1.001
 
 
-def test_a_broken_episode_is_kept_as_the_filter_saw_it(
+def test_episode_of_the_trace_has_injected_faults(
     checkpoint: Checkpoint, episode: Episode, traced: Trace, tmp_path: Path
 ) -> None:
     faults = Faults.parse("blackout,force_noise=3,contact_flipped:from=20")
-    broken = trace(checkpoint, episode, seed=7, particles=100, faults=faults)
-    assert not broken.episode.observations["image"].any()
-    assert broken.episode.digest() == faults.apply(episode, 7).digest() != episode.digest()
-    assert broken.data_hash == episode.digest()
-    np.testing.assert_array_equal(broken.start_mean, traced.start_mean)
-    assert not np.array_equal(broken.estimate_mean, traced.estimate_mean)
-    assert np.array_equal(broken.episode.states, traced.episode.states)
-    save_trace(broken, tmp_path / "run.trace")
+    faulty = trace(checkpoint, episode, seed=7, particles=100, faults=faults)
+    assert not faulty.episode.observations["image"].any()
+    assert faulty.episode.digest() == faults.apply(episode, 7).digest() != episode.digest()
+    assert faulty.data_hash == episode.digest()
+    np.testing.assert_array_equal(faulty.start_mean, traced.start_mean)
+    assert not np.array_equal(faulty.estimate_mean, traced.estimate_mean)
+    assert np.array_equal(faulty.episode.states, traced.episode.states)
+    save_trace(faulty, tmp_path / "run.trace")
     assert load_trace(tmp_path / "run.trace").faults == faults
     assert traced.faults == NO_FAULTS
 
 
-@pytest.mark.parametrize(("chance", "faults"), [(0.0, ""), (0.4, "blackout=0.4")])
-def test_a_trace_from_before_there_were_faults(
-    traced: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chance: float, faults: str
+@pytest.mark.parametrize(("probability", "faults"), [(0.0, ""), (0.4, "blackout=0.4")])
+def test_blackout_setting_of_an_earlier_version(
+    traced: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, probability: float, faults: str
 ) -> None:
-    older = replace(traced, settings={"particles": 100, "blackout": chance})
-    real = json.dumps
+    earlier = replace(traced, settings={"particles": 100, "blackout": probability})
+    dumps = json.dumps
 
     def without_faults(header: Any, **options: Any) -> str:
-        return real({key: value for key, value in header.items() if key != "faults"}, **options)
+        return dumps({key: value for key, value in header.items() if key != "faults"}, **options)
 
     with monkeypatch.context() as before:
         before.setattr(json, "dumps", without_faults)
-        save_trace(older, tmp_path / "old.trace")
+        save_trace(earlier, tmp_path / "old.trace")
     assert b'"faults' not in (tmp_path / "old.trace").read_bytes()
-    again = load_trace(tmp_path / "old.trace")
-    assert again.faults == Faults.parse(faults)
-    np.testing.assert_array_equal(again.estimate_mean, traced.estimate_mean)
+    loaded = load_trace(tmp_path / "old.trace")
+    assert loaded.faults == Faults.parse(faults)
+    np.testing.assert_array_equal(loaded.estimate_mean, traced.estimate_mean)
 
 
-def test_a_running_filter_needs_sense(checkpoint: Checkpoint, episode: Episode) -> None:
+def test_invalid_settings(checkpoint: Checkpoint, episode: Episode) -> None:
     with pytest.raises(BadInput, match="particles must be at least 1, not 0"):
         trace(checkpoint, episode, particles=0)
     with pytest.raises(BadInput, match=r"modality of task 'door' 'touch' does not exist"):
         trace(checkpoint, episode, faults=Faults.parse("drop=touch"))
 
 
-def test_bad_trace_files(traced: Trace, tmp_path: Path) -> None:
-    whole = tmp_path / "whole.trace"
-    save_trace(traced, whole)
+def test_invalid_trace_files(traced: Trace, tmp_path: Path) -> None:
+    complete = tmp_path / "whole.trace"
+    save_trace(traced, complete)
     with pytest.raises(BadInput, match="does not exist"):
         load_trace(tmp_path / "none.trace")
-    cut = tmp_path / "cut.trace"
-    cut.write_bytes(whole.read_bytes()[:-1000])
+    truncated = tmp_path / "cut.trace"
+    truncated.write_bytes(complete.read_bytes()[:-1000])
     with pytest.raises(BadInput, match="not a readable trace"):
-        load_trace(cut)
-    with pytest.raises(BadInput, match="not a trace of Beliefscope"):
+        load_trace(truncated)
+    with pytest.raises(BadInput, match="not a Beliefscope trace"):
         load_trace(shipped("door", "crossmodal-pf"))
     with pytest.raises(BadInput, match=r"folder .* does not exist"):
         save_trace(traced, tmp_path / "no" / "folder.trace")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.trace", "whole.trace"]
+
+
+def test_names_of_an_earlier_version(traced: Trace) -> None:
+    header = header_of(replace(traced, kind="external", faults=Faults.parse("blackout=0.4")))
+    header |= {"kind": "foreign", "recipe": header.pop("faults")}
+    arrays = arrays_of(traced)
+    arrays["acting"] = arrays.pop("effective_weights")
+    loaded = trace_from_arrays(header, arrays)
+    assert (loaded.kind, str(loaded.faults)) == ("external", "blackout=0.4")
+    np.testing.assert_array_equal(loaded.effective_weights, traced.effective_weights)

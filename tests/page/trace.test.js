@@ -2,7 +2,7 @@ import assert from 'node:assert/strict';
 import test from 'node:test';
 
 import { decodeBlock } from '../../app/page/data/live_stream.js';
-import { intervals, slice } from '../../app/page/data/trace.js';
+import { intervals, slice } from '../../app/page/data/arrays.js';
 import { FUSION, encodeColumns, makeTrace } from './fixtures.js';
 
 /** @param {ArrayLike<number> | undefined} values @param {number[]} expected */

@@ -43,8 +43,8 @@ def array_of(trace_: Trace, name: str) -> Any:
 
 def test_columns_contain_every_number_once(run: Trace) -> None:
     arrays = {column.name: column.values for column in columns(run)}
-    whole = {name: a for name, a in arrays_of(run).items() if not name.startswith("start_") and a.size}
-    assert sum(values.size for values in arrays.values()) == sum(array.size for array in whole.values())
+    expected = {name: a for name, a in arrays_of(run).items() if not name.startswith("start_") and a.size}
+    assert sum(values.size for values in arrays.values()) == sum(array.size for array in expected.values())
     components = ("hinge_x", "hinge_y", "angle") if run.episode.task == "door" else ("x", "y")
     for i, component in enumerate(components):
         np.testing.assert_array_equal(arrays[f"states.{component}"], run.episode.states[:, i])

@@ -130,15 +130,15 @@ def test_external_filter_without_true_states(tmp_path: Path) -> None:
     recorder = record_external(tmp_path, 23)
     reader = LiveFileReader(recorder.path)
     reader.poll()
-    for found in (reader.part(), read_recording(recorder.path.with_suffix(".rrd"))):
+    for recorded in (reader.part(), read_recording(recorder.path.with_suffix(".rrd"))):
         steps = np.arange(23, dtype=np.float32)
-        np.testing.assert_array_equal(found.estimate_mean, np.repeat(steps[:, None], 3, axis=1))
-        np.testing.assert_array_equal(found.estimate_covariance, (1 + steps)[:, None, None] * np.eye(3))
-        np.testing.assert_array_equal(found.episode.observations["force"][:, 0], steps)
-        assert (found.kind, found.filter, found.modalities, found.weights) == ("external", "own", (), None)
-        assert np.isnan(found.episode.states).all()
-        assert np.isnan(found.start_mean).all()
-        assert found.episode.dt == 0.1
+        np.testing.assert_array_equal(recorded.estimate_mean, np.repeat(steps[:, None], 3, axis=1))
+        np.testing.assert_array_equal(recorded.estimate_covariance, (1 + steps)[:, None, None] * np.eye(3))
+        np.testing.assert_array_equal(recorded.episode.observations["force"][:, 0], steps)
+        assert (recorded.kind, recorded.filter, recorded.modalities, recorded.weights) == ("external", "own", (), None)
+        assert np.isnan(recorded.episode.states).all()
+        assert np.isnan(recorded.start_mean).all()
+        assert recorded.episode.dt == 0.1
     paths = {path for path, _ in content(recorder.path.with_suffix(".rrd"))}
     assert "/world/plane/fused/mean" in paths
     assert "/world/object/truth" not in paths
@@ -161,13 +161,18 @@ def test_all_documented_values_of_external_filters(tmp_path: Path) -> None:
     with LiveRecorder("run", task="door", modalities=names, folder=tmp_path, filter="mine", seed=4) as recorder:
         for _ in range(3):
             recorder.step(values, {"contact": [1.0]}, truth=[0, 0, 0])
-    found = read_recording(recorder.path.with_suffix(".rrd"))
-    assert (found.modalities, found.filter, found.seed, found.settings["particles"]) == (names, "mine", 4, count)
-    assert found.ancestors is not None
-    assert found.ancestors.dtype == np.int32
-    assert found.log_weights is not None
-    np.testing.assert_allclose(np.exp(found.log_weights).sum(1), 1, rtol=1e-6)
-    assert found.episode.contact.all(), "the default is the observation"
+    recorded = read_recording(recorder.path.with_suffix(".rrd"))
+    assert (recorded.modalities, recorded.filter, recorded.seed, recorded.settings["particles"]) == (
+        names,
+        "mine",
+        4,
+        count,
+    )
+    assert recorded.ancestors is not None
+    assert recorded.ancestors.dtype == np.int32
+    assert recorded.log_weights is not None
+    np.testing.assert_allclose(np.exp(recorded.log_weights).sum(1), 1, rtol=1e-6)
+    assert recorded.episode.contact.all(), "the default is the observation"
 
 
 def test_arrays_are_copied(tmp_path: Path) -> None:
@@ -180,8 +185,8 @@ def test_arrays_are_copied(tmp_path: Path) -> None:
             mean[:], force[:] = -1, -1
     reader = LiveFileReader(recorder.path)
     reader.poll()
-    found = reader.part()
-    for array in (found.estimate_mean, found.episode.observations["force"], found.episode.states):
+    recorded = reader.part()
+    for array in (recorded.estimate_mean, recorded.episode.observations["force"], recorded.episode.states):
         np.testing.assert_array_equal(array[:, 0], np.arange(300))
     assert not recorder.path.with_suffix(".rrd").exists()
 
@@ -369,8 +374,8 @@ def record_and_kill(folder: Path, last: int, pause: float, when: str) -> int:
 def test_kill_keeps_every_written_step(run: Run, tmp_path: Path) -> None:
     assert record_and_kill(tmp_path, 47, 0.002, "later") == 47
     recording = tmp_path / "run.rrd"
-    found = read_recording(recording)
-    np.testing.assert_array_equal(found.estimate_mean[:, 0], np.arange(47))
+    recorded = read_recording(recording)
+    np.testing.assert_array_equal(recorded.estimate_mean[:, 0], np.arange(47))
     assert run(f"import {tmp_path}/run.live -o {tmp_path}/run.trace")[0] == 0
     assert len(load_trace(tmp_path / "run.trace")) == 47
     live_views.write_live(tmp_path / "run.live", recording)

@@ -1,4 +1,4 @@
-"""The schema is whole, and the documentation says the same."""
+"""The schema is complete and matches the documentation."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ DOCS = (Path(beliefscope.__file__).resolve().parents[2] / "docs" / "recordings.m
 
 def test_every_array_of_a_trace_has_a_path() -> None:
     stored = {entity.path.removeprefix("trace/") for entity in SCHEMA if entity.archetype == "Trace"}
-    of_episode = {
+    episode_arrays = {
         field.name for field in fields(Episode) if "Array" in str(field.type) and "Mapping" not in str(field.type)
     }
-    assert stored == set(ARRAYS) | of_episode
+    assert stored == set(ARRAYS) | episode_arrays
 
 
 def test_paths_are_documented() -> None:

@@ -64,7 +64,7 @@ class ResultViews(Reply):
     curves: list[Curve]
     bands: dict[str, list[bool]]
     plots: list[Plot]
-    pictures: list[PixelMap]
+    images: list[PixelMap]
 
 
 class DiagnosticResult(ResultViews):

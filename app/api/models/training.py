@@ -59,7 +59,7 @@ class SliceInfo(Reply):
     """A slice of a data set (``filters.finetuning.slices``)."""
 
     name: str
-    faults: str
+    faults: list[dict[str, Any]]
     contact: bool | None
     only: list[str]
     text: str

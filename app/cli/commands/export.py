@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 
 
 def export(
@@ -34,4 +33,4 @@ def export(
     export_format(output)
     trace = opt.open_trace(source)
     export_trace(trace, output)
-    console.result(opt.trace_document(trace, output), opt.trace_summary(trace, output), json)
+    opt.print_trace(trace, output, json)

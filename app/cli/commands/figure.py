@@ -57,7 +57,7 @@ def figure(
     if kind == "weights" and steps:
         raise BadInput(f"--step {steps[0]}: the figure of weights covers all steps; only maps have a step")
     checkpoint, trace = opt.run_filter(task, filter_, data, skip_bad, episode, faults_, particles, seed)
-    document: dict[str, Any] = {"figure": kind}
+    extra: dict[str, Any] = {}
     if kind == "maps":
         if reason := no_maps(checkpoint, trace):
             raise BadInput(reason)
@@ -65,7 +65,7 @@ def figure(
         if False not in selection:
             console.note(f"episode {trace.episode_index} is in contact at every step: no map of free motion")
         write_figure(paper.maps_figure(checkpoint, trace, selection), output)
-        document["shown"] = {paper.STATES[state]: step for state, step in selection.items()}
+        extra["shown"] = {paper.STATES[state]: step for state, step in selection.items()}
     else:
         write_figure(paper.weights_figure(trace), output)
-    console.result(document | opt.trace_document(trace, output), opt.trace_summary(trace, output), json)
+    opt.print_trace(trace, output, json, figure=kind, **extra)

@@ -124,15 +124,8 @@ def finetune(
         command = finetune_command(target, filter_, data, settings)
         tuned = _run(base, list(episodes), settings, partial, log, rerun, data_hash=episodes.hash, command=command)
     checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output)
-    document = {
-        "task": base.task.name,
-        "filter": base.name,
-        "checkpoint_hash": checkpoint_hash,
-        "path": str(output),
-        "bytes": output.stat().st_size,
-        "record": tuned.record,
-    }
-    console.result(document, _summary(opt.path_and_size(output), tuned.record), json)
+    text = _summary(opt.path_and_size(output), tuned.record)
+    opt.print_checkpoint(output, base.task.name, base.name, checkpoint_hash, tuned.record, text, json)
 
 
 def _run(

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 
 
 def import_(
@@ -31,4 +30,4 @@ def import_(
     opt.check_output(output)
     trace = opt.open_recording(recording)
     save_trace(trace, output)
-    console.result(opt.trace_document(trace, output), opt.trace_summary(trace, output), json)
+    opt.print_trace(trace, output, json)

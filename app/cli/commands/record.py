@@ -51,6 +51,4 @@ def record(
     results = quick(trace, checkpoint) if diagnostics else {}
     with console.progress("Recording") as advance:
         write_recording(trace, output, maps=layers, progress=advance, diagnostics=results)
-    document = opt.trace_document(trace, output)
-    document |= {"maps": maps, "map_size": map_size, "diagnostics": list(results)}
-    console.result(document, opt.trace_summary(trace, output), json)
+    opt.print_trace(trace, output, json, maps=maps, map_size=map_size, diagnostics=list(results))

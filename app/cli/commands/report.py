@@ -23,8 +23,7 @@ URL = "http://127.0.0.1:8000"
 
 def report(
     paths: Annotated[
-        list[Path],
-        typer.Argument(metavar="TRACE...", help="Traces or recordings of one filter, or folders of traces."),
+        list[Path], typer.Argument(metavar="TRACE...", help="Traces or recordings of one filter, or folders of traces.")
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FOLDER", help="Output folder; replaces an existing report.")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
@@ -28,4 +27,4 @@ def trace(checkpoint: Checkpoint, trace: Trace, output: opt.TracePath, json: opt
     from beliefscope.inspect.trace import save_trace
 
     save_trace(trace, output)
-    console.result(opt.trace_document(trace, output), opt.trace_summary(trace, output), json)
+    opt.print_trace(trace, output, json)

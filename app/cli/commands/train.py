@@ -17,6 +17,13 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 ARCHITECTURES = "{crossmodal,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf or lstm (docs/filters.md)."
 PRESETS = "cpu: about 10 minutes on 2 cores. full: for a GPU. smoke: quick test."
 
+Blackouts = Annotated[
+    str,
+    typer.Option(
+        metavar="P,P,...", help="Probabilities of image blackout; each training window uses one of them at random."
+    ),
+]
+
 
 def train(
     task: opt.TaskName,
@@ -25,12 +32,7 @@ def train(
     data: opt.DataPath = None,
     skip_bad: opt.SkipBad = False,
     preset: Annotated[str, typer.Option(metavar="NAME", help=PRESETS)] = "cpu",
-    blackouts: Annotated[
-        str,
-        typer.Option(
-            metavar="P,P,...", help="Probabilities of image blackout; each training window uses one of them at random."
-        ),
-    ] = "0,0.4,0.8",
+    blackouts: Blackouts = "0,0.4,0.8",
     faults_: opt.FaultsText = "",
     seed: opt.Seed = 0,
     log: opt.LogFolder = None,
@@ -91,18 +93,10 @@ def train(
         )
     record = trained.record | {"faults": faults.to_json()}
     checkpoint_hash = save_checkpoint(trained.filter, filter_, record, output)
-    document = {
-        "task": task,
-        "filter": filter_,
-        "checkpoint_hash": checkpoint_hash,
-        "path": str(output),
-        "bytes": output.stat().st_size,
-        "record": record,
-    }
     lines = [f"{opt.path_and_size(output)}: {filter_}, trained in {record['seconds']:.0f} s"]
     for name, metrics in record["metrics"].get("0", {}).items():
         lines.append(f"{name}: " + ", ".join(f"{key} {value:.2f}" for key, value in metrics["rmse"].items()))
-    console.result(document, "\n".join(lines), json)
+    opt.print_checkpoint(output, task, filter_, checkpoint_hash, record, "\n".join(lines), json)
 
 
 def _parse_probabilities(text: str) -> tuple[float, ...]:

@@ -2,22 +2,17 @@
 
 import * as api from '../data/api.js';
 import { addLiveRuns } from '../tabs/live_runs.js';
-import { Messages, say } from '../widgets/panel_state.js';
+import { Messages } from '../widgets/panel_state.js';
+import { showError, showLoading } from './common_panels.js';
 import { html, messageOf } from './dom.js';
-import { Page, panelBodies } from './page.js';
+import { Page } from './page.js';
 import { disableChanges } from './read_only.js';
 import { Store, parsePermalink } from './state.js';
 
 const messages = new Messages(html('#messages'));
 
-for (const body of panelBodies) say(body, 'loading', 'Loading …');
-start().catch((error) => {
-  const isReadable = error instanceof api.ServerError;
-  if (!isReadable) console.error(error);
-  const line = isReadable ? error.message : `The page failed: ${messageOf(error)}`;
-  for (const body of panelBodies) say(body, 'error', line);
-  messages.say('start', line);
-});
+showLoading('Loading …');
+start().catch((error) => messages.show('start', showError(error)));
 
 async function start() {
   const [catalog, live] = await Promise.all([
@@ -25,7 +20,7 @@ async function start() {
     api.liveRuns().catch(() => ({ runs: [], tasks: [] })),
   ]);
   addLiveRuns(catalog, live);
-  messages.say('catalog', catalog.problems.join(' '));
+  messages.show('catalog', catalog.problems.join(' '));
   html('#read-only').hidden = !catalog.read_only;
   if (catalog.read_only) disableChanges(document.body);
   if (!catalog.tasks.length)
@@ -40,6 +35,6 @@ async function start() {
       );
       state.faults = '';
     });
-  messages.say('link', problems.join('\n'));
+  messages.show('link', problems.join('\n'));
   new Page(catalog, new Store(state), live, messages);
 }

@@ -1,6 +1,6 @@
 /** The page: its panels, which follow the state and the displayed trace. */
 
-/** @import { Catalog, LiveRun, Selection, Task } from '../data/api.js' */
+/** @import { Catalog, LiveList, Selection } from '../data/api.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Handlers } from '../data/view_socket.js' */
 /** @import { Messages } from '../widgets/panel_state.js' */
@@ -14,7 +14,6 @@ import { MapPanel } from '../maps/map_panel.js';
 import { Camera } from '../scene/camera.js';
 import { SceneFrame } from '../scene/scene_frame.js';
 import { SceneMenu } from '../scene/scene_menu.js';
-import { stepSummary } from '../step/step_summary.js';
 import { StepTable } from '../step/step_table.js';
 import { Compare } from '../tabs/comparison.js';
 import { Diagnostics } from '../tabs/diagnostics.js';
@@ -25,39 +24,37 @@ import { Library } from '../tabs/recordings.js';
 import { Rerun } from '../tabs/rerun.js';
 import { Study } from '../tabs/study.js';
 import { Timeline } from '../timeline/timeline.js';
-import { FaultSheet } from '../widgets/fault_dialog.js';
+import { FaultDialog } from '../widgets/fault_dialog.js';
 import { Jobs } from '../widgets/jobs.js';
-import { say } from '../widgets/panel_state.js';
-import { choice, pickers } from '../widgets/pickers.js';
-import { ReportSheet } from '../widgets/report_dialog.js';
-import { saving } from '../widgets/save_button.js';
+import { setPanelState } from '../widgets/panel_state.js';
+import { choice, connectPickers } from '../widgets/pickers.js';
+import { ReportDialog } from '../widgets/report_dialog.js';
+import { connectSaveButton } from '../widgets/save_button.js';
 import { Clock } from './clock.js';
 import { bindControls } from './controls.js';
-import { element, html, messageOf } from './dom.js';
-import { assignSpareColours, swatch } from './palette.js';
+import {
+  markUseful,
+  showBlackouts,
+  showCount,
+  showError,
+  showProperties,
+  showSummary,
+  startLoading,
+  useful,
+} from './common_panels.js';
+import { element, html } from './dom.js';
+import { assignSpareColours } from './palette.js';
 import { parsePermalink } from './state.js';
 import { addLatency, stats } from './stats.js';
 import { tabBar } from './tab_bar.js';
 import { Theme } from './theme.js';
 import { Undo } from './undo.js';
-import { displayName, fixed, sentence } from './units.js';
+import { displayName } from './units.js';
 
 const MAX_SCENE_DELAY = 1000; // ms until the 3D scene starts, which slows down the other panels
-const LOADING_DELAY = 150; // ms until a panel shows that it loads
-
-/** Bodies of the panels that display the trace; the first one contains the maps. */
-export const panelBodies = ['#heatmaps', '#step .body', '#timeline .body'].map((selector) =>
-  html(selector),
-);
 
 /** @param {number} ms */
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
-
-/** Whether the timeline, and the maps if there are any, are displayed. */
-let markUseful = () => {};
-const useful = new Promise((resolve) => {
-  markUseful = () => requestAnimationFrame(resolve);
-}).then(() => (stats.useful = performance.now()));
 
 export class Page {
   #catalog;
@@ -71,15 +68,18 @@ export class Page {
   /**
    * @param {Catalog} catalog
    * @param {Store} store
-   * @param {{runs: LiveRun[], tasks: Task[]}} live
+   * @param {LiveList} live
    * @param {Messages} messages
    */
   constructor(catalog, store, live, messages) {
     this.#catalog = catalog;
     this.#store = store;
     this.#messages = messages;
-    const faultDialog = new FaultSheet(element('#fault-dialog', HTMLDialogElement), catalog.faults);
-    const refreshPickers = pickers(catalog, store, faultDialog);
+    const faultDialog = new FaultDialog(
+      element('#fault-dialog', HTMLDialogElement),
+      catalog.faults,
+    );
+    const refreshPickers = connectPickers(catalog, store, faultDialog);
     this.undo = new Undo(store);
     this.theme = new Theme((dark) => this.#changeTheme(dark));
     this.clock = new Clock(store);
@@ -125,7 +125,7 @@ export class Page {
       () => this.sceneMenu.options,
     );
     this.save = this.#bindSaveButton();
-    this.report = new ReportSheet(
+    this.report = new ReportDialog(
       element('#report', HTMLButtonElement),
       () => ({ step: store.state.step, pinned: this.maps.pinned }),
       (/** @type {Trace} */ trace, /** @type {api.ReportOptions} */ options) =>
@@ -139,7 +139,7 @@ export class Page {
     store.listen((state, changed) => this.#follow(state, changed));
     window.addEventListener('popstate', () => {
       const { state, problems } = parsePermalink(location.search, this.#catalog);
-      this.#messages.say('link', problems.join('\n'));
+      this.#messages.show('link', problems.join('\n'));
       store.restore(state);
     });
     bindControls(this);
@@ -159,17 +159,15 @@ export class Page {
   }
 
   #bindSaveButton() {
-    return saving(
-      element('#save', HTMLButtonElement),
-      html('#save-status'),
-      this.jobs,
-      () => this.#trace && api.recordingRequest(this.#trace),
-      () => this.openTab('rerun'),
-      (/** @type {string} */ name) => {
+    const button = element('#save', HTMLButtonElement);
+    return connectSaveButton(button, html('#save-status'), this.jobs, {
+      request: () => this.#trace && api.recordingRequest(this.#trace),
+      openRerun: () => this.openTab('rerun'),
+      openRecordings: (name) => {
         this.openTab('recordings');
         this.recordings.point(name);
       },
-    );
+    });
   }
 
   /**
@@ -194,7 +192,7 @@ export class Page {
         this.failures.show(trace);
       },
       listed: refreshPickers,
-      say: (/** @type {string} */ line) => this.#messages.say('live', line),
+      say: (/** @type {string} */ line) => this.#messages.show('live', line),
     };
   }
 
@@ -206,7 +204,7 @@ export class Page {
       maps: (maps, inputTime) => {
         if (!this.#trace) return;
         this.maps.draw(maps, this.#trace, this.compare.name);
-        say(html('#heatmaps'), 'ready');
+        setPanelState(html('#heatmaps'), 'ready');
         stats.maps = { serial: maps.serial, step: maps.step, size: maps.size };
         if (inputTime !== null) addLatency(stats.scrub, performance.now() - inputTime);
         markUseful();
@@ -222,9 +220,9 @@ export class Page {
       },
       moved: (step) =>
         this.#store.set({ step: this.#clamp(step), playing: false }, { origin: 'scene' }),
-      error: (line) => this.#messages.say('cursor', line),
+      error: (line) => this.#messages.show('cursor', line),
       connection: (problem) => {
-        this.#messages.say('connection', problem ?? '');
+        this.#messages.show('connection', problem ?? '');
         if (!problem && this.#failed) this.#load();
       },
     };
@@ -260,33 +258,18 @@ export class Page {
     const loading = (this.#loading = new AbortController());
     [this.#trace, this.#failed] = [null, false];
     this.clock.show(null);
-    /** @param {string} text @param {number} [share] */
-    const showLoading = (text, share) => {
-      for (const body of panelBodies) say(body, 'loading', text, share);
-    };
-    const timer = setTimeout(() => showLoading('Loading …'), LOADING_DELAY);
-    /** @param {number} share */
-    const progress = (share) => {
-      clearTimeout(timer);
-      showLoading('Running the filter …', share);
-    };
+    const loadingState = startLoading();
     try {
       const selection = { task: name, filter, data, episode, faults };
-      const trace = await api.loadTrace(task, selection, progress, loading.signal);
-      clearTimeout(timer);
+      const trace = await api.loadTrace(task, selection, loadingState.progress, loading.signal);
+      loadingState.stop();
       this.#show(trace);
     } catch (error) {
-      clearTimeout(timer);
-      if (!loading.signal.aborted) this.#showError(error);
+      loadingState.stop();
+      if (loading.signal.aborted) return;
+      this.#failed = true;
+      showError(error);
     }
-  }
-
-  /** @param {unknown} error */
-  #showError(error) {
-    if (!(error instanceof api.ServerError)) console.error(error);
-    this.#failed = true;
-    html('#step-summary').textContent = '';
-    for (const body of panelBodies) say(body, 'error', messageOf(error));
   }
 
   /** @param {Trace} trace */
@@ -296,11 +279,10 @@ export class Page {
     const { step } = this.#store.state;
     if (step >= trace.steps) {
       const range = `0 to ${trace.steps - 1}`;
-      this.#messages.say('step', `Step ${step} does not exist. The steps are ${range}.`);
+      this.#messages.show('step', `Step ${step} does not exist. The steps are ${range}.`);
       this.#store.set({ step: trace.steps - 1 });
     }
     assignSpareColours(trace.modalities);
-    for (const body of panelBodies.slice(1)) say(body, 'ready');
     this.clock.show(trace);
     this.camera.show(trace);
     this.timeline.show(trace);
@@ -309,33 +291,12 @@ export class Page {
     this.diagnostics.show(trace);
     this.failures.show(trace);
     this.report.show(trace);
-    this.#showProperties(trace);
+    showProperties(trace);
     this.adaptMapMenu(trace);
     this.sceneMenu.show(trace);
     this.compare.show(trace);
     this.#showComponent(trace);
     this.#move(trace);
-  }
-
-  /**
-   * Adapts titles, legends and buttons to a trace.
-   * @param {Trace} trace
-   */
-  #showProperties(trace) {
-    const { no_maps: noMaps } = trace.header;
-    const position = displayName(trace.task.map.x).replace(/(^| )x$/, '');
-    html('#maps-quantity').textContent = position || 'position';
-    const { classList } = html('#maps');
-    classList.toggle('single', !trace.fuses);
-    classList.toggle('no-effector', !trace.has('effector_position'));
-    classList.toggle('unavailable', Boolean(noMaps));
-    if (noMaps) say(html('#heatmaps'), 'empty', sentence(noMaps));
-    html('#blackout-key').hidden = !trace.blackout.some(Boolean);
-    html('#sigma-key').hidden = !trace.has('estimate_sigma');
-    element('#largest-error', HTMLButtonElement).disabled = !trace.truth(0).some(Number.isFinite);
-    html('#swatches').replaceChildren(
-      ...['truth', ...trace.sources].flatMap((name) => [swatch(name), ` ${trace.label(name)}  `]),
-    );
   }
 
   /**
@@ -351,8 +312,8 @@ export class Page {
     this.clock.show(trace);
     this.angleSlider.show(trace);
     this.timeline.grow();
-    html('#blackout-key').hidden = !trace.blackout.some(Boolean);
-    this.#showCount(trace);
+    showBlackouts(trace);
+    showCount(trace, this.#store.state.step);
   }
 
   /**
@@ -392,7 +353,7 @@ export class Page {
     this.timeline.redraw();
     this.stepTable.show(trace, state.component);
     this.stepTable.move(state.step);
-    this.#showSummary(trace);
+    showSummary(trace, state.step, state.component);
   }
 
   /** @param {Trace} trace */
@@ -409,25 +370,8 @@ export class Page {
     this.rerun.move(step, origin === 'rerun');
     const beside = state.beside === 'gain';
     this.socket.move({ ...trace.selection, step, angle, against, beside }, inputTime);
-    this.#showSummary(trace);
-    this.#showCount(trace);
-  }
-
-  /** @param {Trace} trace */
-  #showCount({ steps, dt }) {
-    const { step } = this.#store.state;
-    html('#readout b').textContent = `${step} / ${steps - 1}`;
-    html('#readout span').textContent = `${fixed(step * dt)} s`;
-  }
-
-  /** @param {Trace} trace */
-  #showSummary(trace) {
-    const { step, component } = this.#store.state;
-    const index = trace.components.findIndex(({ name }) => name === component);
-    const { tone, text } = stepSummary(trace, step, index);
-    const line = html('#step-summary');
-    line.dataset.tone = tone;
-    line.textContent = line.title = text;
+    showSummary(trace, step, state.component);
+    showCount(trace, step);
   }
 
   /** @param {string} tab */

@@ -3,32 +3,42 @@
 /** @import { State } from '../core/state.js' */
 
 import { loadLiveTrace } from './live_stream.js';
+import { ServerError } from './server_error.js';
 import { Trace } from './trace.js';
+
+export { ServerError };
 
 /**
  * @typedef {import('../types/server.js').Catalog} Catalog
- * @typedef {import('../types/server.js').Task} Task
- * @typedef {import('../types/server.js').Component} Component
- * @typedef {import('../types/server.js').Fault} Fault
- * @typedef {import('../types/server.js').Selection} Selection
- * @typedef {import('../types/server.js').TraceHeader} TraceHeader
- * @typedef {import('../types/server.js').LiveRun} LiveRun
- * @typedef {import('../types/server.js').Job} Job
- * @typedef {import('../types/server.js').Recording} Recording
- * @typedef {import('../types/server.js').DiagnosticEntry} DiagnosticEntry
+ * @typedef {import('../types/server.js').Comparison} Comparison
  * @typedef {import('../types/server.js').DiagnosticResult} DiagnosticResult
- * @typedef {import('../types/server.js').PendingResult} PendingResult
- * @typedef {import('../types/server.js').StartedJob} StartedJob
- * @typedef {import('../types/server.js').Failures} Failures
  * @typedef {import('../types/server.js').FailureEvent} FailureEvent
+ * @typedef {import('../types/server.js').Failures} Failures
+ * @typedef {import('../types/server.js').FineTuneDetails} FineTuneDetails
+ * @typedef {import('../types/server.js').FineTuneOffer} FineTuneOffer
+ * @typedef {import('../types/server.js').FineTuneRunInfo} FineTuneRunInfo
+ * @typedef {import('../types/server.js').Job} Job
+ * @typedef {import('../types/server.js').JobReply} JobReply
+ * @typedef {import('../types/server.js').JobWithLog} JobWithLog
+ * @typedef {import('../types/server.js').Lineage} Lineage
+ * @typedef {import('../types/server.js').LiveList} LiveList
+ * @typedef {import('../types/server.js').LiveRun} LiveRun
+ * @typedef {import('../types/server.js').RecordingEntry} RecordingEntry
+ * @typedef {import('../types/server.js').RecordingList} RecordingList
+ * @typedef {import('../types/server.js').ReportList} ReportList
+ * @typedef {import('../types/server.js').Selection} Selection
+ * @typedef {import('../types/server.js').StartedJob} StartedJob
+ * @typedef {import('../types/server.js').StudyList} StudyList
+ * @typedef {import('../types/server.js').Task} Task
+ * @typedef {import('../types/server.js').TraceDiagnosticInfo} TraceDiagnosticInfo
+ * @typedef {import('../types/server.js').TraceHeader} TraceHeader
+ * @typedef {import('../types/server.js').WrittenRecording} Recording
+ * @typedef {import('../types/server.js').FaultInfo} Fault
  */
 /** @typedef {Selection & {maps: number, automatic: boolean}} RecordingRequest maps: steps from one map to the next */
 
 const POLL_INTERVAL = 150; // ms
 const MAPS_PER_RECORDING = 40; // computed within a few seconds
-
-/** An error with a message for the user. */
-export class ServerError extends Error {}
 
 /**
  * Sends a request. Throws ServerError if it fails.
@@ -100,7 +110,7 @@ export const catalog = () => get('/api/catalog');
 
 /**
  * Gets the live runs, the newest first, and their tasks.
- * @returns {Promise<{runs: LiveRun[], tasks: Task[]}>}
+ * @returns {Promise<LiveList>}
  */
 export const liveRuns = () => get('/api/live');
 
@@ -130,7 +140,7 @@ export const checkSelection = (selection) => request(traceUrl(selection));
  * Compares a run with another one.
  * @param {Selection} selection with `against`
  * @param {AbortSignal} [signal]
- * @returns {Promise<DiagnosticResult>} with `names`
+ * @returns {Promise<Comparison>}
  */
 export const comparison = ({ task, filter, data, episode, faults, against = '' }, signal) =>
   poll(path(['compare', task, filter, episode], { data, faults, against }), signal);
@@ -178,7 +188,7 @@ const diagnosticUrl = ({ task, filter, data, episode, faults }, name, query = {}
  * Lists the diagnostics of a run.
  * @param {Selection} selection
  * @param {AbortSignal} [signal]
- * @returns {Promise<DiagnosticEntry[]>}
+ * @returns {Promise<TraceDiagnosticInfo[]>}
  */
 export const diagnostics = (selection, signal) => poll(diagnosticUrl(selection, []), signal);
 
@@ -188,7 +198,7 @@ export const diagnostics = (selection, signal) => poll(diagnosticUrl(selection, 
  * @param {string} name
  * @param {Record<string, string>} query options, and `episodes`
  * @param {AbortSignal} [signal]
- * @returns {Promise<DiagnosticResult | PendingResult>}
+ * @returns {Promise<DiagnosticResult | JobReply>}
  */
 export const diagnostic = (selection, name, query, signal) =>
   poll(diagnosticUrl(selection, [name], query), signal);
@@ -213,7 +223,7 @@ const failuresUrl = ({ task, filter, data, faults, among }) =>
  * Gets the failures of a filter over a data set, or the job of the search.
  * @param {FailureQuery} query
  * @param {AbortSignal} [signal]
- * @returns {Promise<Failures | PendingResult>}
+ * @returns {Promise<Failures | JobReply>}
  */
 export const failures = (query, signal) => poll(failuresUrl(query), signal);
 
@@ -224,16 +234,23 @@ export const failures = (query, signal) => poll(failuresUrl(query), signal);
  */
 export const startFailureSearch = (query) => send(failuresUrl(query));
 
-/** Lists the recordings of the workspace. */
+/**
+ * Lists the recordings of the workspace.
+ * @returns {Promise<RecordingList>}
+ */
 export const recordings = () => get('/api/recordings');
 
-/** Lists the reports of the workspace. */
+/**
+ * Lists the reports of the workspace.
+ * @returns {Promise<ReportList>}
+ */
 export const reports = () => get('/api/reports');
 
 /**
  * Renames a recording, changes its tags, or keeps an automatic one.
  * @param {{url: string}} file
  * @param {{name?: string, tags?: string[], automatic?: false}} change
+ * @returns {Promise<RecordingEntry>}
  */
 export const changeRecording = ({ url }, change) => send(url, change, 'PATCH');
 
@@ -270,7 +287,7 @@ export const jobs = () => get('/api/jobs');
 
 /**
  * @param {string} id
- * @returns {Promise<Job & {log: string}>}
+ * @returns {Promise<JobWithLog>}
  */
 export const job = (id) => get(path(['jobs', id]));
 
@@ -318,6 +335,7 @@ const finetuneUrl = ({ task, filter, data }) => path(['finetune', task, filter],
  * Gets the modules and the slices for fine-tuning a filter, and the previous runs.
  * @param {Pick<Selection, 'task' | 'filter' | 'data'>} selection
  * @param {AbortSignal} [signal]
+ * @returns {Promise<FineTuneOffer>}
  */
 export const finetuneOptions = (selection, signal) => get(finetuneUrl(selection), signal);
 
@@ -325,6 +343,7 @@ export const finetuneOptions = (selection, signal) => get(finetuneUrl(selection)
  * Starts fine-tuning, or resumes the run with the same settings.
  * @param {Pick<Selection, 'task' | 'filter' | 'data'>} selection
  * @param {object} settings
+ * @returns {Promise<FineTuneRunInfo>}
  */
 export const startFinetune = (selection, settings) => send(finetuneUrl(selection), settings);
 
@@ -332,6 +351,7 @@ export const startFinetune = (selection, settings) => send(finetuneUrl(selection
  * Gets a fine-tuning run with its progress and its results.
  * @param {string} run
  * @param {AbortSignal} [signal]
+ * @returns {Promise<FineTuneDetails>}
  */
 export const finetuneRun = (run, signal) => get(path(['tuned', run]), signal);
 
@@ -339,6 +359,7 @@ export const finetuneRun = (run, signal) => get(path(['tuned', run]), signal);
  * Promotes a fine-tuned checkpoint to the default filter, saves it, or discards it.
  * @param {string} run
  * @param {'promote' | 'save' | 'discard'} action
+ * @returns {Promise<FineTuneRunInfo>}
  */
 export const decideFinetune = (run, action) => send(path(['tuned', run, action]));
 
@@ -346,10 +367,14 @@ export const decideFinetune = (run, action) => send(path(['tuned', run, action])
  * Gets the fine-tuned checkpoints of a task and their base checkpoints.
  * @param {string} task
  * @param {AbortSignal} [signal]
+ * @returns {Promise<Lineage>}
  */
 export const lineage = (task, signal) => get(path(['lineage', task]), signal);
 
-/** Lists the studies with their results. */
+/**
+ * Lists the studies with their results.
+ * @returns {Promise<StudyList>}
+ */
 export const studies = () => get('/api/studies');
 
 /**

@@ -1,8 +1,9 @@
 /** The steps of a live run, received block by block on request (docs/api.md). */
 
 /** @import { LiveRun, Selection, Task, TraceHeader } from './api.js' */
-/** @import { ColumnHeader } from '../types/server.js' */
+/** @import { Column } from '../types/server.js' */
 
+import { ServerError } from './server_error.js';
 import { Trace } from './trace.js';
 
 const RECONNECT_DELAY = 1000; // ms
@@ -13,7 +14,7 @@ const NOT_FOUND = 4000; // close code if the run does not exist
  * @property {number} first
  * @property {number} steps
  * @property {number} total steps of the run so far
- * @property {ColumnHeader[]} columns
+ * @property {Column[]} columns
  * @property {ArrayBuffer} buffer of the columns
  * @property {ArrayBuffer | null} images
  * @property {number} written time in s since 1970
@@ -113,7 +114,7 @@ export async function loadLiveTrace(task, selection, header, run, signal) {
   let block = await stream.next(0, run.state);
   while (block && !block.steps) block = await stream.next(0, block.state);
   signal.throwIfAborted();
-  if (!block) throw new Error(`The live run cannot be read: ${stream.error}.`);
+  if (!block) throw new ServerError(`The live run cannot be read: ${stream.error}.`);
   const { steps, columns, buffer, images } = block;
   const trace = new Trace(task, selection, { ...header, steps, columns }, buffer, images);
   return Object.assign(trace, { stream, live: { ...run, ...liveStatus(block) } });

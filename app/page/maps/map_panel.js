@@ -6,14 +6,17 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Cursor } from '../data/view_socket.js' */
 /** @import { Layer, MapOptions } from './draw_map.js' */
-/** @import { Maps, Range, Scale, Shade } from './map_values.js' */
+/** @import { Figure } from './map_figure.js' */
+/** @import { Maps, Range, Scale } from './map_values.js' */
 
-import { context2d, create, html } from '../core/dom.js';
-import { colour, cssVariable, gradient } from '../core/palette.js';
+import { context2d, html } from '../core/dom.js';
+import { colour } from '../core/palette.js';
 import { displayName } from '../core/units.js';
 import { MARGIN, drawMap, paintCells } from './draw_map.js';
+import { createFigure, updateColourBar } from './map_figure.js';
 import { layerMeasures, pairwiseMeasures, positionText, valuesAt } from './map_summary.js';
-import { borders, rangeDigits, rangeLabels, shades } from './map_values.js';
+import { borders, shades } from './map_values.js';
+import { formatPin, parsePin } from './pin.js';
 
 const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom']; // keys of the state
 const REGION_SHARES = [0.5, 0.95];
@@ -28,19 +31,6 @@ const ARROWS = {
 };
 
 /**
- * @typedef {object} Figure of a layer
- * @property {string} name
- * @property {HTMLElement} figure
- * @property {HTMLCanvasElement} canvas
- * @property {HTMLElement} head
- * @property {{element: HTMLElement, low: HTMLElement, gradient: HTMLElement, high: HTMLElement}} bar
- * @property {HTMLElement} caption
- * @property {HTMLElement[]} lines
- * @property {HTMLCanvasElement} cells
- * @property {Shade} shade
- * @property {ColourMap} colourMap
- * @property {number[][]} borders
- *
  * @typedef {{maps: Maps, selection: Selection}} Pinned
  * @typedef {{maps: Maps, name: string, selection: Selection | null}} Reference of likelihood ratios; selection: null for the comparison run
  * @typedef {{trace: Trace, maps: Maps, layers: Layer[], title: string, options: MapOptions}} DisplayedMaps
@@ -116,7 +106,7 @@ export class MapPanel {
     const [maps, trace] = [this.#maps, this.#trace];
     if (!maps || !trace) return;
     this.#setPinned(this.#pinned ? null : { maps, selection: trace.selection });
-    const pin = this.#pinned ? pinText(trace.selection, maps.step, this.#store.state.angle) : '';
+    const pin = this.#pinned ? formatPin(trace.selection, maps.step, this.#store.state.angle) : '';
     this.#store.set({ pin });
   }
 
@@ -194,7 +184,7 @@ export class MapPanel {
       figure.colourMap = reference ? 'diverging' : /** @type {ColourMap} */ (colours);
       figure.borders = regions === 'shown' ? borders(maps, layer, REGION_SHARES) : [];
       paintCells(figure.cells, figure.shade, maps.size, figure.colourMap);
-      this.#showBar(figure);
+      updateColourBar(figure, this.#title());
     });
     this.#showTitle(reference);
     const pairs = html('#maps-pairs', this.#panel);
@@ -235,45 +225,21 @@ export class MapPanel {
   #build(layers) {
     this.#side = 0;
     for (const { figure } of this.#figures) figure.remove();
-    this.#figures = layers.map((name, layer) => this.#figure(name, layer, layers.length > 1));
+    this.#figures = layers.map((name) => createFigure(name, layers.length > 1));
+    this.#figures.forEach(({ canvas }, layer) => this.#bindCanvas(canvas, layer));
     this.#host.append(...this.#figures.map(({ figure }) => figure));
   }
 
   /**
-   * @param {string} name
+   * @param {HTMLCanvasElement} canvas
    * @param {number} layer
-   * @param {boolean} fuses
-   * @returns {Figure}
    */
-  #figure(name, layer, fuses) {
-    const label = fuses || name !== 'fused' ? name.replaceAll('+', ' + ') : 'estimate';
-    const [low, high] = [create('b'), create('b')];
-    const colours = create('i');
-    const bar = create('span', { className: 'colours' }, low, colours, high);
-    const head = create('div', { className: 'head' }, create('h3', { textContent: label }), bar);
-    const lines = [create('p'), create('p'), create('p')];
-    const caption = create('figcaption', {}, ...lines);
-    const canvas = create('canvas', { role: 'img', tabIndex: 0 });
+  #bindCanvas(canvas, layer) {
     canvas.addEventListener('pointermove', (event) => this.#point(event, layer));
     canvas.addEventListener('pointerleave', () => this.#setHover(null));
     canvas.addEventListener('pointerdown', (event) => event.preventDefault()); // keeps the focus
     canvas.addEventListener('keydown', (event) => this.#moveCrosshair(event));
     canvas.addEventListener('blur', () => this.#setHover(null));
-    const figure = create('figure', {}, head, canvas, caption);
-    figure.style.setProperty('--line', `var(${cssVariable(fuses ? name : 'fused')})`);
-    return {
-      name,
-      figure,
-      canvas,
-      head,
-      bar: { element: bar, low, gradient: colours, high },
-      caption,
-      lines,
-      cells: create('canvas'),
-      shade: { values: new Float32Array(), low: 0, high: 1, clipped: false },
-      colourMap: 'viridis',
-      borders: [],
-    };
   }
 
   /** Returns the side of a map's square that fits the panel, in px. */
@@ -345,15 +311,6 @@ export class MapPanel {
     figure.caption.title = description;
     const texts = this.#hover ? this.#values(maps, index, this.#hover) : lines;
     figure.lines.forEach((line, i) => (line.textContent = texts[i] ?? ''));
-  }
-
-  /** @param {Figure} figure */
-  #showBar({ bar, shade, colourMap }) {
-    const [low, high] = rangeLabels(shade, rangeDigits(shade));
-    [bar.low.textContent, bar.high.textContent] = [low, high];
-    bar.gradient.style.background = gradient(colourMap);
-    const [from, to] = rangeLabels(shade, 2);
-    bar.element.title = `Colour: ${this.#title()}, from ${from} to ${to}`;
   }
 
   /**
@@ -430,33 +387,4 @@ function fitsCloseUp({ half_width: half, peak, numbers }) {
     const radius = Math.sqrt((numbers.area95[layer] / Math.PI) * numbers.elongation[layer]);
     return Math.max(...offset.map(Math.abs)) + radius <= half / CLOSE_UP;
   });
-}
-
-/**
- * Writes a step of the page's task as URL parameters.
- * @param {Selection} selection
- * @param {number} step
- * @param {number | null} angle
- */
-function pinText({ filter, data, episode, faults }, step, angle) {
-  const query = new URLSearchParams({ filter, data, episode: String(episode), step: String(step) });
-  if (faults) query.set('faults', faults);
-  if (angle !== null) query.set('angle', angle.toFixed(4));
-  return String(query);
-}
-
-/**
- * Reads a step from URL parameters.
- * @param {string} pin
- * @param {string} task
- */
-function parsePin(pin, task) {
-  const query = new URLSearchParams(pin);
-  const [filter, data, faults] = ['filter', 'data', 'faults'].map((key) => query.get(key) ?? '');
-  const angle = query.get('angle');
-  return {
-    selection: { task, filter, data, episode: Number(query.get('episode')), faults },
-    step: Number(query.get('step')),
-    angle: angle === null ? null : Number(angle),
-  };
 }

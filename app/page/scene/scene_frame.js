@@ -1,7 +1,7 @@
 /** The frame of the 3D scene. */
 
 import { html } from '../core/dom.js';
-import { say } from '../widgets/panel_state.js';
+import { setPanelState } from '../widgets/panel_state.js';
 
 /**
  * Interface of viser_frame_throttle.js, in the frame.
@@ -26,7 +26,7 @@ export class SceneFrame {
         };
     });
     this.#frame.title = '3D scene: robot, true state and estimates';
-    say(host, 'loading', 'Starting the 3D scene …');
+    setPanelState(host, 'loading', 'Starting the 3D scene …');
   }
 
   /**
@@ -35,7 +35,7 @@ export class SceneFrame {
    * @param {Promise<unknown>} ready when loading may start: it delays other parts of the page
    */
   async open(url, ready) {
-    say(this.#host, 'loading', 'Starting the 3D scene …');
+    setPanelState(this.#host, 'loading', 'Starting the 3D scene …');
     await ready;
     if (this.#frame.isConnected) {
       this.#frame.contentWindow?.location.replace(url); // without a history entry
@@ -55,7 +55,7 @@ export class SceneFrame {
 
   /** Called when the scene shows the cursor. */
   drawn() {
-    if (this.#host.dataset.state !== 'ready') say(this.#host, 'ready');
+    if (this.#host.dataset.state !== 'ready') setPanelState(this.#host, 'ready');
   }
 
   get #throttle() {

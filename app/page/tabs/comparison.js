@@ -3,7 +3,7 @@
 import * as api from '../data/api.js';
 import { Edit } from './comparison_form.js';
 import { Figures } from '../widgets/figures.js';
-import { say } from '../widgets/panel_state.js';
+import { setPanelState } from '../widgets/panel_state.js';
 
 const NOTHING =
   'Nothing to compare with yet. Choose another filter, other sensors or an edit over some steps, and run it beside this one.';
@@ -25,7 +25,7 @@ export class Compare {
 
   /**
    * @param {HTMLElement} host @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
-   * @param {import('../widgets/fault_dialog.js').FaultSheet} sheet
+   * @param {import('../widgets/fault_dialog.js').FaultDialog} sheet
    * @param {(other: import('../data/trace.js').Trace | null, label: string) => void} overlay is told of the other run as it comes and goes
    */
   constructor(host, catalog, store, sheet, overlay) {
@@ -40,7 +40,7 @@ export class Compare {
     this.#form = new Edit(host.querySelector('form'), catalog, store, sheet, (against) =>
       api.checkSelection({ ...store.state, against }),
     );
-    say(this.#result, 'loading', 'Loading …');
+    setPanelState(this.#result, 'loading', 'Loading …');
     this.#showGain();
   }
 
@@ -83,8 +83,8 @@ export class Compare {
     const { signal } = (this.#loading = new AbortController());
     this.#draw(null, '');
     this.#show(null);
-    if (!against) return say(this.#result, 'empty', NOTHING);
-    const wait = (share) => say(this.#result, 'loading', 'Running the other one …', share);
+    if (!against) return setPanelState(this.#result, 'empty', NOTHING);
+    const wait = (share) => setPanelState(this.#result, 'loading', 'Running the other one …', share);
     wait(null);
     try {
       const task = this.#catalog.tasks.find((t) => t.name === name);
@@ -93,11 +93,11 @@ export class Compare {
       const found = await api.comparison(selection, signal);
       this.#draw(other, found.names[1], found.edit ? 'the edited run' : found.names[1]);
       this.#show(found);
-      say(this.#result, 'ready');
+      setPanelState(this.#result, 'ready');
     } catch (error) {
       if (error.name === 'AbortError') return;
       if (!(error instanceof api.ServerError)) console.error(error);
-      say(this.#result, 'error', error.message);
+      setPanelState(this.#result, 'error', error.message);
     }
   }
 

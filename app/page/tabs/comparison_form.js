@@ -42,7 +42,7 @@ export class Edit {
 
   /**
    * @param {HTMLFormElement} form @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
-   * @param {import('../widgets/fault_dialog.js').FaultSheet} sheet
+   * @param {import('../widgets/fault_dialog.js').FaultDialog} sheet
    * @param {(against: string) => Promise<unknown>} check raises what is wrong with an other run
    */
   constructor(form, catalog, store, sheet, check) {
@@ -174,7 +174,7 @@ export class Edit {
   }
 
   #tell(line) {
-    this.#form.querySelector('.wrong').textContent = line;
+    this.#form.querySelector('.error').textContent = line;
     return '';
   }
 

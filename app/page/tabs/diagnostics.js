@@ -2,8 +2,8 @@
 
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
-import { result, told, underWay } from '../widgets/jobs.js';
-import { say } from '../widgets/panel_state.js';
+import { pending, jobSummary, isActive } from '../widgets/jobs.js';
+import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
 import { sentence } from '../core/units.js';
 
@@ -15,7 +15,7 @@ const KEPT = 48; // results
 
 /**
  * @typedef {object} Result what is known of one diagnostic, with one choice of options, of one trace or of all held out
- * @property {'loading' | 'ready' | 'unasked' | 'working' | 'ended' | 'error'} state
+ * @property {'loading' | 'ready' | 'absent' | 'active' | 'ended' | 'error'} state
  * @property {api.DiagnosticResult} [found] @property {api.Job} [job] @property {string} [error]
  */
 
@@ -48,7 +48,7 @@ export class Diagnostics {
       .addEventListener('submit', (event) => (event.preventDefault(), this.#takeOptions()));
     host.querySelector('form').addEventListener('change', () => this.#takeOptions());
     jobs.listen((list) => this.#hear(list));
-    say(host, 'loading', 'Loading …');
+    setPanelState(host, 'loading', 'Loading …');
   }
 
   /** Whether the panel can be seen: nothing is asked for before. */
@@ -84,7 +84,7 @@ export class Diagnostics {
     this.#loading = new AbortController();
     const trace = this.#trace;
     if (trace.live?.state === 'running')
-      return say(
+      return setPanelState(
         this.#host,
         'empty',
         'The run goes on. Diagnostics are made of all its steps once it has ended, and show here by themselves.',
@@ -92,11 +92,11 @@ export class Diagnostics {
     try {
       this.#entries = await api.diagnostics(trace.selection, this.#loading.signal);
     } catch (error) {
-      if (error.name !== 'AbortError') say(this.#host, 'error', error.message);
+      if (error.name !== 'AbortError') setPanelState(this.#host, 'error', error.message);
       return;
     }
     this.#stale = false;
-    say(this.#host, this.#entries.length ? 'ready' : 'empty', 'There are no diagnostics.');
+    setPanelState(this.#host, this.#entries.length ? 'ready' : 'empty', 'There are no diagnostics.');
     this.#build();
     this.#showOpen();
     this.#ask();
@@ -125,7 +125,7 @@ export class Diagnostics {
         this.#query(entry),
         signal,
       );
-      this.#keep(key, result(body));
+      this.#keep(key, pending(body));
     } catch (error) {
       if (error.name === 'AbortError') return;
       this.#keep(key, { state: 'error', error: error.message });
@@ -138,7 +138,7 @@ export class Diagnostics {
     try {
       this.#keep(
         key,
-        result(await api.startDiagnostic(this.#trace.selection, entry.name, this.#query(entry))),
+        pending(await api.startDiagnostic(this.#trace.selection, entry.name, this.#query(entry))),
       );
     } catch (error) {
       this.#keep(key, { state: 'error', error: error.message });
@@ -156,7 +156,7 @@ export class Diagnostics {
       if (!job) continue;
       const now = byId.get(job.id);
       if (now?.state === 'done') [done] = [true, this.#results.delete(key)];
-      else this.#keep(key, result({ job: now ?? null }));
+      else this.#keep(key, pending({ job: now ?? null }));
     }
     for (const entry of this.#entries) this.#draw(entry);
     if (done && this.#open) this.#ask();
@@ -220,7 +220,9 @@ export class Diagnostics {
       const line = `The link asks for diagnostic “${state.diagnostic}”, which does not exist. Available: ${names}.`;
       this.#host.querySelector('.top h3').textContent = line;
     } else {
-      this.#host.querySelector('.top h3').textContent = open ? open.title : 'Diagnostics of this run';
+      this.#host.querySelector('.top h3').textContent = open
+        ? open.title
+        : 'Diagnostics of this run';
     }
     this.#host.querySelector('.list').hidden = Boolean(open);
     this.#host.querySelector('article').hidden = !open;
@@ -290,7 +292,7 @@ export class Diagnostics {
     if (entry !== this.#opened) return;
     const article = this.#host.querySelector('article');
     this.#tell(article, entry, known);
-    this.#figures.show(known.found ?? null, this.#trace);
+    this.#figures.show(known.result ?? null, this.#trace);
   }
 
   #tell(host, entry, known) {
@@ -299,12 +301,12 @@ export class Diagnostics {
     if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
     const before = host.dataset.state;
     host.dataset.state = known.state;
-    host.setAttribute('aria-busy', String(known.state === 'loading' || known.state === 'working'));
+    host.setAttribute('aria-busy', String(known.state === 'loading' || known.state === 'active'));
     const acts = { unasked: 'Compute', ended: 'Try again', working: 'Cancel' }[known.state];
     if (before !== known.state || (acts && !doing.firstChild)) {
       const focused = doing.contains(document.activeElement);
       doing.replaceChildren(...(acts ? [this.#button(acts, entry)] : []));
-      if (known.state === 'working') doing.prepend(document.createElement('progress'));
+      if (known.state === 'active') doing.prepend(document.createElement('progress'));
       if (focused)
         (
           doing.querySelector('button') ??
@@ -324,7 +326,7 @@ export class Diagnostics {
     button.setAttribute('aria-label', `${name}: ${entry.title}`);
     button.addEventListener('click', () => {
       const { job } = this.#results.get(this.#key(entry)) ?? {};
-      if (job && underWay(job)) this.#jobs.cancel(job.id);
+      if (job && isActive(job)) this.#jobs.cancel(job.id);
       else this.#compute(entry);
     });
     return button;
@@ -334,7 +336,7 @@ export class Diagnostics {
 function said(entry, { state, found, job, error }) {
   if (state === 'ready') return found.verdict;
   if (state === 'refused' || state === 'error') return sentence(error);
-  if (state === 'working' || state === 'ended') return told(job);
-  if (state === 'unasked') return 'Takes a while, so it is computed only when asked for.';
+  if (state === 'active' || state === 'ended') return jobSummary(job);
+  if (state === 'absent') return 'Takes a while, so it is computed only when asked for.';
   return 'Measuring …';
 }

@@ -1,6 +1,6 @@
 /** The episodes of the data set as a table that can be sorted: what each is, and how the filter did on it where that is known. */
 
-import { stopAt, walk } from '../widgets/row_navigation.js';
+import { setTabStop, navigateRows } from '../widgets/row_navigation.js';
 import { fixed, percent } from '../core/units.js';
 
 const HEIGHT = 20; // of a sparkline, in its own units
@@ -112,7 +112,7 @@ export class Episodes {
   /** @param {HTMLElement} host @param {import('../core/state.js').Store} store @param {import('../data/api.js').Catalog} catalog */
   constructor(host, store, catalog) {
     [this.#host, this.#store, this.#catalog] = [host, store, catalog];
-    walk(host.querySelector('tbody'));
+    navigateRows(host.querySelector('tbody'));
     store.listen((_, changed) => changed.has('episode') && this.#here());
   }
 
@@ -189,7 +189,7 @@ export class Episodes {
     this.#host.parentElement.scrollTop = 0;
     // A list by index begins where one is; any other with its first.
     const open = this.#rows.get(this.#store.state.episode);
-    if (open && this.#sort.name === 'index' && !this.#chosen) stopAt(open.row, false);
+    if (open && this.#sort.name === 'index' && !this.#chosen) setTabStop(open.row, false);
   }
 
   #heading({ name, title, help, words, surveyed }) {

@@ -3,9 +3,9 @@
 import * as api from '../data/api.js';
 import { copyText } from '../core/clipboard.js';
 import { Episodes } from './episodes.js';
-import { result, told, underWay } from '../widgets/jobs.js';
+import { pending, jobSummary, isActive } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
-import { stopAt, walk } from '../widgets/row_navigation.js';
+import { setTabStop, navigateRows } from '../widgets/row_navigation.js';
 import { DISPLAY_UNITS, fixed, percent, sentence, significant } from '../core/units.js';
 
 const LISTS = [
@@ -25,7 +25,7 @@ const KEPT = 8; // results
 
 /**
  * @typedef {object} Result what is known of one filter over one data set
- * @property {'loading' | 'ready' | 'unasked' | 'working' | 'ended' | 'error' | 'waits'} state `waits`: for the end of a live run
+ * @property {'loading' | 'ready' | 'absent' | 'active' | 'ended' | 'error' | 'waits'} state `waits`: for the end of a live run
  * @property {api.Failures} [found] @property {api.Job} [job] @property {string} [error]
  */
 
@@ -51,7 +51,7 @@ export class Failures {
   constructor(host, store, jobs, timeline, catalog) {
     [this.#host, this.#store, this.#jobs, this.#timeline] = [host, store, jobs, timeline];
     this.#episodes = new Episodes(this.#part('.episodes'), store, catalog);
-    walk(this.#part('.events tbody'));
+    navigateRows(this.#part('.events tbody'));
     jobs.listen((list) => this.#hear(list));
     this.load();
   }
@@ -92,7 +92,7 @@ export class Failures {
     this.draw();
     if (this.#results.get(key).state === 'ready') return;
     try {
-      this.#keep(key, result(await api.failures(this.#store.state, signal)));
+      this.#keep(key, pending(await api.failures(this.#store.state, signal)));
     } catch (error) {
       if (error.name === 'AbortError') return;
       this.#keep(key, { state: 'error', error: error.message });
@@ -109,7 +109,7 @@ export class Failures {
     this.#open(events[this.#last], inputTime);
     const table = this.#part('.events');
     if (table.checkVisibility())
-      stopAt(this.#rows[this.#last].row, table.contains(document.activeElement));
+      setTabStop(this.#rows[this.#last].row, table.contains(document.activeElement));
   }
 
   /** Goes to the worst failure of all as soon as it is known; has it looked for where nobody did. */
@@ -121,7 +121,7 @@ export class Failures {
   #seek() {
     if (this.#sought !== this.#key) return;
     const { state } = this.#known;
-    if (state === 'unasked') this.#look();
+    if (state === 'absent') this.#look();
     if (state !== 'ready') return;
     [this.#sought, this.#last] = ['', -1];
     this.go(1);
@@ -141,11 +141,11 @@ export class Failures {
     this.#host.dataset.state = known.state;
     this.#host.setAttribute(
       'aria-busy',
-      String(known.state === 'loading' || known.state === 'working'),
+      String(known.state === 'loading' || known.state === 'active'),
     );
     this.#doing(known);
     const score = this.#score;
-    this.#measures(known.found?.scores ?? []);
+    this.#measures(known.result?.scores ?? []);
     const line = score
       ? score.why_not
         ? `None by ${called(score)}: ${score.why_not}.`
@@ -155,7 +155,7 @@ export class Failures {
     if (verdict.textContent !== line) verdict.textContent = verdict.title = line;
     this.#phases(score);
     this.#list(score);
-    this.#episodes.show(known.found ?? null, score && !score.why_not ? score : null);
+    this.#episodes.show(known.result ?? null, score && !score.why_not ? score : null);
   }
 
   #part(selector) {
@@ -186,7 +186,7 @@ export class Failures {
 
   /** The chosen measure, or the first where the filter's task has no such. */
   get #score() {
-    const scores = this.#known.found?.scores;
+    const scores = this.#known.result?.scores;
     return scores?.find(({ name }) => name === this.#store.state.by) ?? scores?.[0];
   }
 
@@ -209,7 +209,7 @@ export class Failures {
   async #look() {
     const key = this.#key;
     try {
-      this.#keep(key, result(await api.startFailureSearch(this.#store.state)));
+      this.#keep(key, pending(await api.startFailureSearch(this.#store.state)));
     } catch (error) {
       this.#keep(key, { state: 'error', error: error.message });
     }
@@ -224,7 +224,7 @@ export class Failures {
       if (!job) continue;
       const now = byId.get(job.id);
       if (now?.state === 'done') this.#results.delete(key);
-      else this.#keep(key, result({ job: now ?? null }));
+      else this.#keep(key, pending({ job: now ?? null }));
     }
     if (this.#results.has(this.#key)) this.draw();
     else this.load();
@@ -242,11 +242,11 @@ export class Failures {
     if (doing.dataset.acts !== (acts ?? '')) {
       const focused = doing.contains(document.activeElement);
       doing.dataset.acts = acts ?? '';
-      doing.replaceChildren(...(state === 'working' ? [document.createElement('progress')] : []));
+      doing.replaceChildren(...(state === 'active' ? [document.createElement('progress')] : []));
       if (acts)
         doing.append(
           button(acts, 'text', () =>
-            underWay(this.#known.job ?? {}) ? this.#jobs.cancel(this.#known.job.id) : this.#look(),
+            isActive(this.#known.job) ? this.#jobs.cancel(this.#known.job.id) : this.#look(),
           ),
         );
       if (focused) (doing.querySelector('button') ?? this.#part('.scroll')).focus();
@@ -399,10 +399,10 @@ function drawn(by, trace) {
 
 function said({ state, job, error }) {
   if (state === 'error') return sentence(error);
-  if (state === 'working' || state === 'ended') return told(job);
+  if (state === 'active' || state === 'ended') return jobSummary(job);
   if (state === 'waits')
     return 'The run goes on. Its failures are looked for in all its steps once it has ended; that shows here by itself.';
-  if (state === 'unasked')
+  if (state === 'absent')
     return 'Nobody has looked yet. The filter has to run over all these episodes, so it is done only when asked for.';
   return 'Loading …';
 }

@@ -3,9 +3,9 @@
 import * as api from '../data/api.js';
 import { Descent } from './lineage.js';
 import { Figures } from '../widgets/figures.js';
-import { told, underWay } from '../widgets/jobs.js';
+import { jobSummary, isActive } from '../widgets/jobs.js';
 import { ModuleTree } from './module_tree.js';
-import { say } from '../widgets/panel_state.js';
+import { setPanelState } from '../widgets/panel_state.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { permalink } from '../core/state.js';
 import { fixed, sentence, displayName } from '../core/units.js';
@@ -48,7 +48,7 @@ const FORM = `
     <div class="row numbers"></div>
     <div class="row"><label title="Of the slice, only these steps are learned from: episodes, and steps of them. All training episodes where it is empty.">Only episodes, steps <input name="moments" placeholder="9, 31:20-60" autocomplete="off" spellcheck="false"></label></div>
     <div class="row"><button class="text start">Fine-tune</button> <label class="past" hidden>Runs so far <select name="past"></select></label></div>
-    <p class="wrong" role="alert"></p>
+    <p class="error" role="alert"></p>
     <section class="descent"></section>
   </form>
   <article hidden tabindex="-1">
@@ -82,7 +82,7 @@ export class Finetune {
 
   /**
    * @param {HTMLElement} host @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
-   * @param {import('../widgets/jobs.js').Jobs} jobs @param {import('../widgets/fault_dialog.js').FaultSheet} sheet
+   * @param {import('../widgets/jobs.js').Jobs} jobs @param {import('../widgets/fault_dialog.js').FaultDialog} sheet
    */
   constructor(host, catalog, store, jobs, sheet) {
     [this.#host, this.#catalog, this.#store, this.#jobs] = [host, catalog, store, jobs];
@@ -114,7 +114,7 @@ export class Finetune {
       () => (store.set({ run: '' }), store.flush(), this.#field('preset').focus()),
     );
     this.#part('.act').addEventListener('click', () =>
-      underWay(this.#run.job ?? {})
+      isActive(this.#run.job)
         ? jobs.cancel(this.#run.job.id)
         : this.#start(this.#run.settings, this.#run),
     );
@@ -145,7 +145,7 @@ export class Finetune {
     const { signal } = (this.#loading = new AbortController());
     try {
       if (key !== this.#loaded) {
-        say(this.#host, 'loading', 'Looking into the filter …');
+        setPanelState(this.#host, 'loading', 'Looking into the filter …');
         this.#offer = await api.finetuneOptions(this.#store.state, signal);
         this.#loaded = key;
         this.#showOffer();
@@ -153,7 +153,7 @@ export class Finetune {
       }
       this.#run = run ? await api.finetuneRun(run, signal) : null;
       this.#show();
-      say(
+      setPanelState(
         this.#host,
         this.#offer.why_not && !run ? 'empty' : 'ready',
         this.#offer.why_not && sentence(this.#offer.why_not),
@@ -161,7 +161,7 @@ export class Finetune {
     } catch (error) {
       if (error.name === 'AbortError') return;
       if (!(error instanceof api.ServerError)) console.error(error);
-      say(this.#host, 'error', error.message);
+      setPanelState(this.#host, 'error', error.message);
     }
   }
 
@@ -260,7 +260,7 @@ export class Finetune {
   }
 
   async #start(settings, of = this.#store.state) {
-    const wrong = this.#part('.wrong');
+    const wrong = this.#part('.error');
     wrong.textContent = '';
     if (!settings.train.length)
       return (wrong.textContent = 'Nothing is ticked: there is nothing to train.');
@@ -300,14 +300,14 @@ export class Finetune {
         : 'Its job is forgotten. It goes on where it stood.';
     this.#part('article').dataset.state = found
       ? 'ready'
-      : job && (underWay(job) || job.state === 'cancelled')
+      : job && (isActive(job) || job.state === 'cancelled')
         ? 'working'
         : 'ended';
     const [bar, act] = this.#part('.doing').children;
     this.#part('.doing').hidden = Boolean(found);
-    [bar.hidden, bar.value] = [!underWay(job ?? {}), job?.progress ?? 0];
-    act.textContent = underWay(job ?? {}) ? 'Pause' : 'Go on';
-    act.title = underWay(job ?? {})
+    [bar.hidden, bar.value] = [!isActive(job), job?.progress ?? 0];
+    act.textContent = isActive(job) ? 'Pause' : 'Go on';
+    act.title = isActive(job)
       ? 'It goes on from its last look at the validation episodes'
       : '';
     this.#decisions();
@@ -439,7 +439,7 @@ function curvesOf({ losses, validations }, task) {
 const said = (job) =>
   job.state === 'cancelled'
     ? 'Paused. It goes on from its last look at the validation episodes.'
-    : told(job);
+    : jobSummary(job);
 
 const learned = ({ settings }) =>
   settings.mix.map(({ slice }) => slice.name).join(' and ') || 'nominal data';

@@ -32,7 +32,7 @@ export function addLiveRuns(catalog, { runs, tasks }) {
 }
 
 /** What the state must become to show a run at its newest step. @param {import('../data/api.js').Catalog} catalog @param {Run} run */
-export function showing(catalog, { task: name, filter, data, episode, steps, state }, now) {
+export function liveRunState(catalog, { task: name, filter, data, episode, steps, state }, now) {
   const { map } = catalog.tasks.find((task) => task.name === name);
   const component = now.task === name ? now.component : map.x;
   const running = state === 'running';
@@ -67,7 +67,7 @@ export class Live {
    * @param {HTMLElement} root of the page @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
    * @param {{grown: (trace: import('../data/trace.js').Trace, fresh: boolean) => void, ended: (trace: import('../data/trace.js').Trace) => void, listed: () => void, say: (line: string) => void}} handlers
    *   are told that a trace has more steps (fresh: and columns), that its run has ended, that there are other runs, what is to be said
-   * @param {{runs: Run[], tasks: object[]}} first
+   * @param {import('../data/api.js').LiveList} first
    */
   constructor(root, catalog, store, handlers, first) {
     [this.#button, this.#list, this.#follow] = ['#live', '#live-runs', '#follow'].map((part) =>
@@ -230,7 +230,7 @@ export class Live {
     this.#list.hidePopover();
     const { state } = this.#store;
     if (run.data === state.data && this.#running) this.#store.set({ follow: true });
-    else this.#store.set(showing(this.#catalog, run, state));
+    else this.#store.set(liveRunState(this.#catalog, run, state));
   }
 
   #place() {

@@ -1,10 +1,10 @@
 /** What the workspace keeps: recordings, the user's own among them, and reports; opened, compared, named, tagged, deleted, had back. */
 
-import { Adding } from '../widgets/upload.js';
+import { Uploads } from '../widgets/upload.js';
 import * as api from '../data/api.js';
 import { FileTable } from '../widgets/file_table.js';
-import { told, underWay } from '../widgets/jobs.js';
-import { say } from '../widgets/panel_state.js';
+import { jobSummary, isActive } from '../widgets/jobs.js';
+import { setPanelState } from '../widgets/panel_state.js';
 import { formatBytes, sentence } from '../core/units.js';
 
 const AGAIN = 4000; // ms until the list is asked for again: another browser may have changed it
@@ -38,7 +38,7 @@ const words = (name, title, help, value = (file) => file[name] ?? null) => ({
   title,
   help,
   value,
-  shown: (file) => String(value(file) ?? '–'),
+  content: (file) => String(value(file) ?? '–'),
 });
 const OF_A_RUN = [
   words('task', 'task', 'What it is of'),
@@ -56,7 +56,7 @@ const size = {
   title: 'size',
   help: 'On the disk',
   value: (file) => file.bytes,
-  shown: (file) => formatBytes(file.bytes),
+  content: (file) => formatBytes(file.bytes),
   number: true,
 };
 const when = (name) => ({
@@ -64,7 +64,7 @@ const when = (name) => ({
   title: 'when',
   help: 'It was written',
   value: (file) => Date.parse(file[name]),
-  shown: (file) => moment(new Date(file[name])),
+  content: (file) => moment(new Date(file[name])),
   hint: (file) => new Date(file[name]).toLocaleString('en-GB'),
   number: true,
 });
@@ -110,27 +110,27 @@ export class Library {
       title: 'name',
       help: 'Of the file',
       value: (file) => file.name,
-      shown: (file) => this.#tags(file),
+      content: (file) => this.#tags(file),
       hint: (file) => (file.reading ? '' : file.problem),
     };
     this.#recordings = new FileTable(
       this.#part('.recordings'),
       [name, ...OF_A_RUN, data, size, when('modified')],
       {
-        acts: (file) => this.#acts(file),
+        actions: (file) => this.#acts(file),
         sort: { name: 'when', down: true },
-        picks: { has: (file) => this.#chosen.has(file), toggle: (file) => this.#choose(file) },
+        selection: { has: (file) => this.#chosen.has(file), toggle: (file) => this.#choose(file) },
       },
     );
     this.#reports = new FileTable(
       this.#part('.reports table'),
-      [{ ...name, shown: () => '', hint: ({ title }) => title }, ...OF_A_RUN, size, when('made')],
+      [{ ...name, content: () => '', hint: ({ title }) => title }, ...OF_A_RUN, size, when('made')],
       {
-        acts: (file) => this.#actsOfReport(file),
+        actions: (file) => this.#actsOfReport(file),
         sort: { name: 'when', down: true },
       },
     );
-    this.#adding = new Adding(this.#part('.adding'), (added) => this.#added(added));
+    this.#adding = new Uploads(this.#part('.adding'), (added) => this.#added(added));
     jobs.listen((list) => this.#hear(list));
     this.#take();
     this.#takeDrops();
@@ -153,7 +153,7 @@ export class Library {
   /** Asks what there is, now and again for as long as the panel can be seen. */
   async load() {
     clearTimeout(this.#timer);
-    if (!this.#kept) say(this.#host, 'loading', 'Loading …');
+    if (!this.#kept) setPanelState(this.#host, 'loading', 'Loading …');
     try {
       const [kept, made] = await Promise.all([api.recordings(), api.reports()]);
       const read = JSON.stringify([kept, made]);
@@ -171,9 +171,9 @@ export class Library {
         ];
         this.#draw();
       }
-      say(this.#host, 'ready');
+      setPanelState(this.#host, 'ready');
     } catch (error) {
-      if (!this.#kept) say(this.#host, 'error', error.message);
+      if (!this.#kept) setPanelState(this.#host, 'error', error.message);
       else this.#say(error.message);
     }
     clearTimeout(this.#timer);
@@ -282,39 +282,39 @@ export class Library {
         ? undefined
         : sentence(file.problem);
     return [
-      { name: 'Open in Rerun', key: 'Enter', act: () => this.#show([file]), why: unread },
+      { name: 'Open in Rerun', key: 'Enter', run: () => this.#show([file]), disabledReason: unread },
       { name: 'Open the run here', ...this.#run(file, unread) },
       ...(file.automatic
         ? [
             {
               name: 'Keep',
-              act: () => this.#keep(file),
-              why: this.#readOnly,
+              run: () => this.#keep(file),
+              disabledReason: this.#readOnly,
               hint: 'It was written for the Rerun tab, and goes when there are many.',
             },
           ]
         : []),
-      { name: 'Rename', key: 'F2', act: () => this.#rename(file), why: this.#readOnly },
-      { name: 'Tags', act: () => this.#tag(file), why: this.#readOnly },
+      { name: 'Rename', key: 'F2', run: () => this.#rename(file), disabledReason: this.#readOnly },
+      { name: 'Tags', run: () => this.#tag(file), disabledReason: this.#readOnly },
       { name: `Download, ${formatBytes(file.bytes)}`, href: file.url, download: file.name },
       {
         name: 'Delete',
         key: 'Delete',
-        act: () => this.#delete(file, 'recordings'),
-        why: this.#readOnly,
+        run: () => this.#delete(file, 'recordings'),
+        disabledReason: this.#readOnly,
       },
     ];
   }
 
   /** The run of a recording: this server's own, or read out of the file. */
   #run(file, unread) {
-    if (file.run) return { act: () => this.#store.set({ ...this.#selection(file), tab: 'scene' }) };
+    if (file.run) return { run: () => this.#store.set({ ...this.#selection(file), tab: 'scene' }) };
     const known = this.#catalog.tasks.some(({ name }) => name === file.task);
     if (unread || file.problem || !known)
-      return { why: unread ?? sentence(file.problem || `This server has no task ${file.task}`) };
+      return { disabledReason: unread ?? sentence(file.problem || `This server has no task ${file.task}`) };
     return {
-      act: () => this.#readRun(file),
-      why: this.#readOnly,
+      run: () => this.#readRun(file),
+      disabledReason: this.#readOnly,
       hint: `As it was recorded. ${file.why_not}`,
     };
   }
@@ -334,17 +334,17 @@ export class Library {
     const job = list.find(({ id }) => id === this.#awaited);
     if (job?.state === 'done')
       location.assign(`/${job.link}`); // its episode is new to this page
-    else if (job && !underWay(job)) [this.#awaited] = ['', this.#say(told(job), null, true)];
+    else if (job && !isActive(job)) [this.#awaited] = ['', this.#say(jobSummary(job), null, true)];
     if (this.#open) this.load();
   }
 
   #actsOfReport(file) {
     return [
-      { name: 'Open', key: 'Enter', href: `${file.url}?shown=true`, window: true },
+      { name: 'Open', key: 'Enter', href: `${file.url}?shown=true`, newWindow: true },
       {
         name: 'Open its run here',
-        act: () => this.#store.set({ ...this.#selection({ ...file, run: file }), tab: 'scene' }),
-        why: this.#lacking(file),
+        run: () => this.#store.set({ ...this.#selection({ ...file, run: file }), tab: 'scene' }),
+        disabledReason: this.#lacking(file),
       },
       { name: 'Download the page', href: file.url, download: `${file.name}.html` },
       ...(file.pdf
@@ -353,8 +353,8 @@ export class Library {
       {
         name: 'Delete',
         key: 'Delete',
-        act: () => this.#delete(file, 'reports'),
-        why: this.#readOnly,
+        run: () => this.#delete(file, 'reports'),
+        disabledReason: this.#readOnly,
       },
     ];
   }

@@ -2,8 +2,8 @@
  *  the page's run, or files in its place, which keep their own time. */
 
 import { recordingRequest } from '../data/api.js';
-import { say } from '../widgets/panel_state.js';
-import { written } from '../widgets/save_button.js';
+import { setPanelState } from '../widgets/panel_state.js';
+import { writeRecording } from '../widgets/save_button.js';
 
 const SETTLING = 30; // frames at most until a recording that is being opened keeps our time
 const ECHO_FRAMES = 4; // that the viewer may take to tell back a time that we set
@@ -78,13 +78,13 @@ export class Rerun {
     const shown = (this.#shown = files ?? trace);
     this.#settled = null;
     try {
-      say(this.#host, 'loading', files ? 'Starting Rerun …' : 'Writing the recording …');
+      setPanelState(this.#host, 'loading', files ? 'Starting Rerun …' : 'Writing the recording …');
       const [recordings] = await Promise.all([
         files ?? Promise.all([trace.stream ? this.#growing(trace) : this.#record(trace)]),
         this.#start(),
       ]);
       if (this.#shown !== shown) return;
-      say(this.#host, 'loading', 'Opening the recording …');
+      setPanelState(this.#host, 'loading', 'Opening the recording …');
       const { store_ids: kept } = await this.#viewer.open(
         recordings.map(({ url }) => new URL(url, location.href).href),
       );
@@ -95,7 +95,7 @@ export class Rerun {
         'blueprint',
         recordings.length > 1 ? 'expanded' : undefined,
       );
-      say(this.#host, 'ready');
+      setPanelState(this.#host, 'ready');
       // What follows takes a drawing or more for each answer: the recording can be looked at meanwhile.
       if (!files) await this.#settle(shown);
       if (this.#shown !== shown) return;
@@ -105,14 +105,14 @@ export class Rerun {
     } catch (error) {
       if (this.#shown !== shown) return;
       this.#shown = null;
-      say(this.#host, 'error', `Rerun cannot show this: ${error.message ?? error}`);
+      setPanelState(this.#host, 'error', `Rerun cannot show this: ${error.message ?? error}`);
     }
   }
 
   #record(trace) {
-    return written(recordingRequest(trace, true), this.#jobs, ({ progress, message }) => {
+    return writeRecording(recordingRequest(trace, true), this.#jobs, ({ progress, message }) => {
       if (this.#shown === trace)
-        say(this.#host, 'loading', `Writing the recording: ${message || 'starting'} …`, progress);
+        setPanelState(this.#host, 'loading', `Writing the recording: ${message || 'starting'} …`, progress);
     });
   }
 

@@ -1,9 +1,9 @@
 /** What studies found: every filter's error by share of black pictures, as bars and as a table, each a way to its worst moments. */
 
 import * as api from '../data/api.js';
-import { Bars, patch, roam } from '../widgets/bar_chart.js';
-import { told, underWay } from '../widgets/jobs.js';
-import { say } from '../widgets/panel_state.js';
+import { BarChart, legendSample, navigateLinks } from '../widgets/bar_chart.js';
+import { jobSummary, isActive } from '../widgets/jobs.js';
+import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
 import { permalink } from '../core/state.js';
 import { fixed, percent, sentence, significant, displayName } from '../core/units.js';
@@ -71,9 +71,9 @@ export class Study {
       jobs,
     ];
     host.innerHTML = BODY;
-    this.#bars = new Bars(this.#part('.chart'), (bar) => this.#tell(bar));
+    this.#bars = new BarChart(this.#part('.chart'), (bar) => this.#tell(bar));
     const body = this.#part('tbody');
-    roam(body);
+    navigateLinks(body);
     const look = ({ target }) => this.#bars.mark(target.closest('tr')?.dataset.filter ?? '');
     for (const kind of ['pointerover', 'focusin']) body.addEventListener(kind, look);
     for (const kind of ['pointerleave', 'focusout'])
@@ -97,13 +97,13 @@ export class Study {
   }
 
   async #load() {
-    if (!this.#studies) say(this.#host, 'loading', 'Loading …');
+    if (!this.#studies) setPanelState(this.#host, 'loading', 'Loading …');
     try {
       ({ studies: this.#studies, problems: this.#problems } = await api.studies());
       this.#heard = this.#how;
       this.#draw();
     } catch (error) {
-      say(this.#host, 'error', error.message);
+      setPanelState(this.#host, 'error', error.message);
     }
   }
 
@@ -148,7 +148,7 @@ export class Study {
     const found = study.tasks.find(({ name }) => name === state.task);
     if (!found) {
       const others = study.tasks.map(({ name }) => name).join(', ');
-      return say(
+      return setPanelState(
         this.#host,
         'empty',
         `This study has nothing on ${state.task}. It is of ${others}: choose another task${this.#studies.length > 1 ? ' or study' : ''}.`,
@@ -171,21 +171,21 @@ export class Study {
     this.#part('.about').textContent = about(view, rows);
     this.#chart(view, rows);
     this.#table(view, rows);
-    say(this.#host, 'ready');
+    setPanelState(this.#host, 'ready');
   }
 
   /** How many cells are left, and a button that has them trained; or how far that is, and one that ends it. */
   #cells() {
     const { unfinished, cells, why_not: whyNot } = this.#study;
-    const [box, runs] = [this.#part('.cells'), this.#job && underWay(this.#job)];
+    const [box, runs] = [this.#part('.cells'), this.#job && isActive(this.#job)];
     box.hidden = !unfinished && !runs;
     const [progress, text, button] = box.children;
     progress.hidden = !runs;
     progress.value = this.#job?.progress ?? 0;
-    const ended = this.#job && !runs && this.#job.state !== 'done' ? ` ${told(this.#job)}` : '';
+    const ended = this.#job && !runs && this.#job.state !== 'done' ? ` ${jobSummary(this.#job)}` : '';
     const rest = `${unfinished} of ${cells} cells ${unfinished === 1 ? 'is' : 'are'} not trained yet.`;
     text.textContent = runs
-      ? `Training cells: ${told(this.#job)}`
+      ? `Training cells: ${jobSummary(this.#job)}`
       : `${rest}${ended}${whyNot ? ` Not from here: ${sentence(whyNot)}` : ''}`;
     button.textContent = runs ? 'Cancel' : unfinished === 1 ? 'Train it' : 'Train them';
     button.hidden = !runs && Boolean(whyNot);
@@ -193,7 +193,7 @@ export class Study {
 
   /** Has what is left trained, or no longer. */
   async #run() {
-    if (this.#job && underWay(this.#job)) return this.#jobs.cancel(this.#job.id);
+    if (this.#job && isActive(this.#job)) return this.#jobs.cancel(this.#job.id);
     try {
       const { job } = await api.trainStudy(this.#study.name);
       this.#study.job = job.id;
@@ -475,7 +475,7 @@ function line(columns, row) {
   const made = document.createElement('tr');
   made.dataset.filter = row.name;
   const name = Object.assign(document.createElement('th'), { scope: 'row' });
-  name.append(patch(row.name), row.name);
+  name.append(legendSample(row.name), row.name);
   made.append(name);
   for (const { bar, shown, value } of columns.slice(1)) {
     const cell = made.insertCell();

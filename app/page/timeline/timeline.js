@@ -8,19 +8,17 @@
 /** @import { StepWindow } from './step_window.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { scaled } from '../core/palette.js';
 import { fixed } from '../core/units.js';
-import { intervals } from '../data/trace.js';
+import { intervals } from '../data/arrays.js';
 import { GUTTER, chart, chartData } from './chart.js';
 import { EventMarks } from './event_marks.js';
 import { Gestures } from './gestures.js';
+import { layoutKey, noteElement, trackHeights } from './layout.js';
 import { formatValue, legend, updateLegend } from './legend.js';
 import { fitWindow, formatWindow, parseWindow, zoomWindow } from './step_window.js';
 import { TRACKS, selectedError, tracks } from './tracks.js';
 
 const MIN_HEIGHT = 60; // px, below which there are no charts
-const NOTE_HEIGHT = scaled(26); // px of a note in place of a chart
-const LINE_HEIGHT = scaled(14); // px of a line of a legend
 const CURSOR_MARGIN = 0.25; // share of the visible steps before the cursor when it comes into view
 
 /** @typedef {{plot: uPlot, track: Track, top: number, height: number}} Chart top and height in px of the host */
@@ -133,7 +131,7 @@ export class Timeline {
     if (!trace) return;
     const grown = tracks(trace, this.#store.state, this.#activeComparison);
     if (!this.#store.state.window) this.#window = this.#allSteps;
-    if (!this.#charts.length || layout(grown) !== layout(this.#tracks)) {
+    if (!this.#charts.length || layoutKey(grown) !== layoutKey(this.#tracks)) {
       this.redraw();
       return;
     }
@@ -400,51 +398,9 @@ export class Timeline {
 }
 
 /**
- * Returns the properties of tracks that require new charts when they change.
- * @param {Track[]} tracks
- */
-const layout = (tracks) =>
-  JSON.stringify(
-    tracks.map(({ title, note, unit, series }) => [
-      title,
-      note,
-      unit,
-      series.map(({ name, sigma, comparison }) => [name, Boolean(sigma), comparison]),
-    ]),
-  );
-
-/**
- * Returns the height of each track in px: the height of its legend, and an equal share of the remaining height.
- * The lowest track always has a chart, because of the axis.
- * @param {Track[]} tracks
- * @param {number} height px
- */
-function trackHeights(tracks, height) {
-  const noteOnly = tracks.map(({ note }, i) => Boolean(note) && i < tracks.length - 1);
-  const minimum = tracks.map(({ series }, i) => {
-    if (noteOnly[i]) return NOTE_HEIGHT;
-    const names = new Set(series.map(({ name }) => name));
-    return 3 + LINE_HEIGHT * (1 + Math.max(names.size, 2));
-  });
-  const remaining = height - minimum.reduce((a, b) => a + b, 0);
-  const share = remaining / noteOnly.filter((value) => !value).length;
-  return minimum.map((value, i) => Math.floor(value + (noteOnly[i] ? 0 : share)));
-}
-
-/**
  * @param {HTMLElement} target
  * @param {number} x px
  */
 function place(target, x) {
   target.style.transform = `translateX(${x.toFixed(2)}px)`;
-}
-
-/**
- * @param {string} text
- * @param {number} height px
- */
-function noteElement(text, height) {
-  const note = create('p', { className: 'track-note', textContent: text });
-  note.style.height = `${height}px`;
-  return note;
 }

@@ -1,7 +1,8 @@
 /** The charts of the timeline for a trace and a state. */
 
 /** @import { State } from '../core/state.js' */
-/** @import { Series as Values, Trace } from '../data/trace.js' */
+/** @import { Series as Values } from '../data/arrays.js' */
+/** @import { Trace } from '../data/trace.js' */
 /** @import { Series, Track } from './chart.js' */
 
 import { displayName, fixed } from '../core/units.js';

@@ -1,11 +1,14 @@
-/** Grouped bars with whiskers and dots, drawn as SVG whose bars are links; the looks of filters, for the bars and their legend. */
+/** Grouped bars with error bars and dots as SVG, each bar a link; colours and textures of filters, also for legends. */
 
 import { scaled } from '../core/palette.js';
 import { fixed } from '../core/units.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
-/** As in the paper's figure (recordings/rerun_log/figures.py): a colour for what a filter fuses, a texture for how it filters. */
-const FAMILIES = {
+/**
+ * Colour by fusion rule, texture by estimator, as in the paper's figure (recordings/rerun_log/figures.py).
+ * @type {Record<string, string>}
+ */
+const COLOURS = {
   crossmodal: '--fused',
   unimodal: '--spare-2',
   feature: '--spare-1',
@@ -13,38 +16,61 @@ const FAMILIES = {
   image: '--image',
   haptics: '--haptics',
 };
+/** @type {Record<string, string>} */
 const TEXTURES = { pf: 'M-1 5 5-1M1 7 7 1', ukf: 'M1 2h2M4 5h2', lstm: 'M0 1.5h6M0 4.5h6' };
-const PATTERN = 6; // px, side of a texture's square
-const EDGE = { left: scaled(34), right: scaled(6), top: scaled(16), bottom: scaled(22) }; // px
-const TALLEST = 2.5; // times the bar in the middle: taller ones are cut off and say their value
-const SHARE = 0.86; // of a group that is bars
-const LINES = 5; // of the scale, about
+const TEXTURE_SIZE = 6; // px
+const MARGIN = { left: scaled(34), right: scaled(6), top: scaled(16), bottom: scaled(22) }; // px
+const MAX_HEIGHT = 2.5; // times the median bar: taller bars are cut off and show their value
+const BAR_SHARE = 0.86; // of the width of a group
+const TICKS = 5; // of the scale, about
 
 /**
  * @typedef {object} Bar
- * @property {string} filter @property {number | null} mean @property {number | null} spread
- * @property {{value: number, here: boolean}[]} dots one a seed; whether it is the one that a link opens
- * @property {string | null} href null where there is nothing to open @property {string} label all of it in words
+ * @property {string} filter
+ * @property {number | null} mean
+ * @property {number | null} spread
+ * @property {{value: number, here: boolean}[]} dots one per seed; here: whether the link opens this seed
+ * @property {string | null} href null if there is nothing to open
+ * @property {string} label complete description
+ *
  * @typedef {object} Chart
- * @property {string} label @property {string} unit of the scale @property {{name: string, bars: Bar[]}[]} groups
+ * @property {string} label
+ * @property {string} unit of the scale
+ * @property {{name: string, bars: Bar[]}[]} groups
  * @property {{name: string, value: number} | null} level a dashed line
+ *
+ * @typedef {object} Scale
+ * @property {number} top largest displayed value
+ * @property {(value: number) => number} y position in px
  */
 
-export class Bars {
+export class BarChart {
   #host;
+  #onPoint;
+  /** @type {Chart | null} */
   #chart = null;
-  #told;
+  /** @type {Map<Element, Bar>} */
+  #bars = new Map();
   #width = 0;
 
-  /** @param {HTMLElement} host @param {(bar: Bar | null) => void} told which bar is looked at */
-  constructor(host, told) {
-    [this.#host, this.#told] = [host, told];
-    new ResizeObserver(() => host.clientWidth !== this.#width && this.#draw()).observe(host);
-    roam(host);
-    const look = ({ target }) => this.#told(target.closest?.('a')?.bar ?? null);
-    for (const kind of ['pointerover', 'focusin']) host.addEventListener(kind, look);
+  /**
+   * @param {HTMLElement} host
+   * @param {(bar: Bar | null) => void} onPoint called with the bar under the pointer or with the focus
+   */
+  constructor(host, onPoint) {
+    this.#host = host;
+    this.#onPoint = onPoint;
+    const redraw = () => this.#host.clientWidth !== this.#width && this.#draw();
+    new ResizeObserver(redraw).observe(host);
+    navigateLinks(host);
+    /** @param {Event} event */
+    const point = ({ target }) => {
+      const link = target instanceof Element ? target.closest('a') : null;
+      this.#onPoint((link && this.#bars.get(link)) ?? null);
+    };
+    for (const kind of ['pointerover', 'focusin']) host.addEventListener(kind, point);
     for (const kind of ['pointerleave', 'focusout'])
-      host.addEventListener(kind, () => this.#told(null));
+      host.addEventListener(kind, () => this.#onPoint(null));
   }
 
   /** @param {Chart | null} chart */
@@ -53,251 +79,291 @@ export class Bars {
     this.#draw();
   }
 
-  /** Marks the bars of one filter; of none for an empty name. */
+  /**
+   * Highlights the bars of a filter; of none for an empty name.
+   * @param {string} filter
+   */
   mark(filter) {
-    for (const link of this.#host.querySelectorAll('a'))
-      link.classList.toggle('here', link.bar.filter === filter);
+    for (const [link, bar] of this.#bars) link.classList.toggle('here', bar.filter === filter);
   }
 
   #draw() {
     const [width, height] = [(this.#width = this.#host.clientWidth), this.#host.clientHeight];
-    const focused = [...this.#host.querySelectorAll('a')].indexOf(document.activeElement);
+    const focused = [...this.#bars.keys()].findIndex((link) => link === document.activeElement);
     this.#host.replaceChildren();
+    this.#bars.clear();
     if (!this.#chart || !width) return;
     const { label, unit, groups, level } = this.#chart;
     const bars = groups.flatMap((group) => group.bars);
-    const top = highest(bars, level);
-    const y = (value) =>
-      EDGE.top + (height - EDGE.top - EDGE.bottom) * (1 - Math.min(value, top) / top);
-    const across = (width - EDGE.left - EDGE.right) / groups.length;
-    const svg = element(
+    const top = scaleTop(bars, level);
+    const innerHeight = height - MARGIN.top - MARGIN.bottom;
+    /** @type {Scale} */
+    const scale = { top, y: (v) => MARGIN.top + innerHeight * (1 - Math.min(v, top) / top) };
+    const svg = svgElement(
       'svg',
       { viewBox: `0 0 ${width} ${height}`, width, height, role: 'group', 'aria-label': label },
-      textures(bars.map((bar) => bar.filter)),
+      textureDefinitions(bars.map((bar) => bar.filter)),
+      ...gridLines(scale, width),
+      svgElement('text', { x: 2, y: scaled(10) }, unit),
     );
-    const step = pleasing(top / LINES);
-    for (let value = 0; value <= top; value += step) {
+    const groupWidth = (width - MARGIN.left - MARGIN.right) / groups.length;
+    groups.forEach(({ name, bars: members }, g) => {
+      const left = MARGIN.left + (g + (1 - BAR_SHARE) / 2) * groupWidth;
+      const middle = left + (BAR_SHARE * groupWidth) / 2;
+      const barWidth = (BAR_SHARE * groupWidth) / members.length;
       svg.append(
-        element('path', {
-          class: value ? 'grid' : 'ground',
-          d: `M${EDGE.left} ${y(value)}H${width - EDGE.right}`,
-        }),
+        svgElement('text', { x: middle, y: height - scaled(7), 'text-anchor': 'middle' }, name),
+        ...members.map((bar, i) => this.#link(bar, left + i * barWidth, barWidth, scale)),
       );
-      svg.append(
-        element(
-          'text',
-          { x: EDGE.left - 5, y: y(value) + scaled(4), 'text-anchor': 'end' },
-          fixed(value, step < 0.1 ? 2 : step < 1 ? 1 : 0),
-        ),
-      );
-    }
-    svg.append(element('text', { x: 2, y: scaled(10) }, unit));
-    groups.forEach((group, g) => {
-      const left = EDGE.left + g * across + ((1 - SHARE) / 2) * across;
-      const each = (SHARE * across) / group.bars.length;
-      svg.append(
-        element(
-          'text',
-          { x: left + (SHARE * across) / 2, y: height - scaled(7), 'text-anchor': 'middle' },
-          group.name,
-        ),
-      );
-      group.bars.forEach((bar, i) => svg.append(this.#bar(bar, left + i * each, each, y, top)));
     });
-    if (level && level.value <= top) {
-      svg.append(
-        element('path', {
-          class: 'level',
-          d: `M${EDGE.left} ${y(level.value)}H${width - EDGE.right}`,
-        }),
-      );
-      svg.append(
-        element(
-          'text',
-          { x: width - EDGE.right, y: y(level.value) - 4, 'text-anchor': 'end' },
-          level.name,
-        ),
-      );
-    }
+    if (level && level.value <= top) svg.append(...levelLine(level, scale, width));
     this.#host.append(svg);
-    const links = [...svg.querySelectorAll('a')];
+    const links = svg.querySelectorAll('a');
     links.forEach((link, i) => (link.tabIndex = i === Math.max(0, focused) ? 0 : -1));
     if (focused >= 0) links[focused]?.focus();
   }
 
-  #bar(bar, left, each, y, top) {
-    const [x, wide, middle] = [left + 0.06 * each, 0.88 * each, left + each / 2];
-    const link = element('a', {
+  /**
+   * @param {Bar} bar
+   * @param {number} left px
+   * @param {number} width px
+   * @param {Scale} scale
+   */
+  #link(bar, left, width, scale) {
+    const link = svgElement('a', {
       class: 'bar-link',
       'aria-label': bar.label,
       ...(bar.href === null ? { role: 'img' } : { href: bar.href }),
     });
-    link.bar = bar;
+    this.#bars.set(link, bar);
+    const bottom = scale.y(0);
     link.append(
-      element('rect', {
+      svgElement('rect', {
         class: 'hit',
         x: left,
-        y: EDGE.top - 4,
-        width: each,
-        height: y(0) - EDGE.top + 4,
+        y: MARGIN.top - 4,
+        width,
+        height: bottom - MARGIN.top + 4,
       }),
+      ...(bar.mean === null
+        ? [missingMark(left + width / 2, bottom)]
+        : barShapes(bar, bar.mean, left, width, scale)),
     );
-    if (bar.mean === null) {
-      link.append(
-        element('path', { class: 'missing', d: `M${middle - 3} ${y(0) - 9}l6 6m0-6l-6 6` }),
-      );
-      return link;
-    }
-    link.append(
-      element('rect', {
-        ...face(bar.filter),
-        x,
-        y: y(bar.mean),
-        width: wide,
-        height: y(0) - y(bar.mean),
-      }),
-    );
-    if (bar.mean > top) {
-      link.append(
-        element('path', {
-          class: 'cut',
-          d: `M${x - 1} ${EDGE.top + 5}l${wide / 2 + 1}-4 ${wide / 2 + 1} 4`,
-        }),
-      );
-      const size = Math.min(scaled(11), each);
-      const text = {
-        class: 'over',
-        transform: `translate(${middle + 0.36 * size} ${EDGE.top + scaled(10)}) rotate(-90)`,
-        'text-anchor': 'end',
-      };
-      const told = element('text', text, fixed(bar.mean, 1));
-      told.style.fontSize = `${size}px`;
-      link.append(told);
-      return link;
-    }
-    if (bar.spread !== null) {
-      const [from, to] = [y(Math.max(0, bar.mean - bar.spread)), y(bar.mean + bar.spread)];
-      const cap = Math.min(3, each / 4);
-      link.append(
-        element('path', {
-          class: 'whisker',
-          d: `M${middle} ${from}V${to}M${middle - cap} ${from}h${2 * cap}M${middle - cap} ${to}h${2 * cap}`,
-        }),
-      );
-    }
-    const apart = wide / (bar.dots.length + 1);
-    bar.dots.forEach(({ value, here }, i) => {
-      const dot = {
-        class: here ? 'dot here' : 'dot',
-        cx: x + (i + 1) * apart,
-        cy: y(value),
-        r: Math.min(here ? scaled(3) : scaled(22) / 10, each / 5),
-      };
-      if (value <= top) link.append(element('circle', dot));
-    });
     return link;
   }
 }
 
-/** A piece of a filter's bar, for a legend. @param {string} filter */
-export function patch(filter) {
-  return element(
+/**
+ * @param {Scale} scale
+ * @param {number} width px
+ */
+function gridLines({ top, y }, width) {
+  const step = tickStep(top / TICKS);
+  const digits = step < 0.1 ? 2 : step < 1 ? 1 : 0;
+  const values = Array.from({ length: Math.floor(top / step) + 1 }, (_, i) => i * step);
+  return values.flatMap((value) => [
+    svgElement('path', {
+      class: value ? 'grid' : 'ground',
+      d: `M${MARGIN.left} ${y(value)}H${width - MARGIN.right}`,
+    }),
+    svgElement(
+      'text',
+      { x: MARGIN.left - 5, y: y(value) + scaled(4), 'text-anchor': 'end' },
+      fixed(value, digits),
+    ),
+  ]);
+}
+
+/**
+ * @param {{name: string, value: number}} level
+ * @param {Scale} scale
+ * @param {number} width px
+ */
+function levelLine({ name, value }, { y }, width) {
+  const right = width - MARGIN.right;
+  return [
+    svgElement('path', { class: 'level', d: `M${MARGIN.left} ${y(value)}H${right}` }),
+    svgElement('text', { x: right, y: y(value) - 4, 'text-anchor': 'end' }, name),
+  ];
+}
+
+/**
+ * @param {number} x px
+ * @param {number} bottom px
+ */
+const missingMark = (x, bottom) =>
+  svgElement('path', { class: 'missing', d: `M${x - 3} ${bottom - 9}l6 6m0-6l-6 6` });
+
+/**
+ * Returns the bar with its error bar and dots, or with its value if it is cut off.
+ * @param {Bar} bar
+ * @param {number} mean
+ * @param {number} left px
+ * @param {number} slot px, width for the bar and its gaps
+ * @param {Scale} scale
+ */
+function barShapes({ filter, spread, dots }, mean, left, slot, { top, y }) {
+  const [x, width, middle] = [left + 0.06 * slot, 0.88 * slot, left + slot / 2];
+  const shape = { ...appearance(filter), x, y: y(mean), width, height: y(0) - y(mean) };
+  /** @type {SVGElement[]} */
+  const shapes = [svgElement('rect', shape)];
+  if (mean > top) return [...shapes, ...cutMarks(mean, x, width, middle, slot)];
+  if (spread !== null) {
+    const [low, high] = [y(Math.max(0, mean - spread)), y(mean + spread)];
+    const cap = Math.min(3, slot / 4);
+    const caps = `M${middle - cap} ${low}h${2 * cap}M${middle - cap} ${high}h${2 * cap}`;
+    shapes.push(svgElement('path', { class: 'whisker', d: `M${middle} ${low}V${high}${caps}` }));
+  }
+  const spacing = width / (dots.length + 1);
+  dots.forEach(({ value, here }, i) => {
+    if (value > top) return;
+    const radius = Math.min(here ? scaled(3) : scaled(22) / 10, slot / 5);
+    const position = { cx: x + (i + 1) * spacing, cy: y(value), r: radius };
+    shapes.push(svgElement('circle', { class: here ? 'dot here' : 'dot', ...position }));
+  });
+  return shapes;
+}
+
+/**
+ * @param {number} mean
+ * @param {number} x px
+ * @param {number} width px
+ * @param {number} middle px
+ * @param {number} slot px
+ */
+function cutMarks(mean, x, width, middle, slot) {
+  const size = Math.min(scaled(11), slot);
+  const half = width / 2 + 1;
+  const place = `translate(${middle + 0.36 * size} ${MARGIN.top + scaled(10)}) rotate(-90)`;
+  const value = svgElement(
+    'text',
+    { class: 'over', transform: place, 'text-anchor': 'end' },
+    fixed(mean, 1),
+  );
+  value.style.fontSize = `${size}px`;
+  const d = `M${x - 1} ${MARGIN.top + 5}l${half}-4 ${half} 4`;
+  return [svgElement('path', { class: 'cut', d }), value];
+}
+
+/**
+ * Returns the colour and texture of a filter, for a legend.
+ * @param {string} filter
+ */
+export function legendSample(filter) {
+  return svgElement(
     'svg',
     { class: 'patch', viewBox: '0 0 14 10', 'aria-hidden': 'true' },
-    element('rect', { ...face(filter), x: 0.5, y: 0.5, width: 13, height: 9 }),
+    svgElement('rect', { ...appearance(filter), x: 0.5, y: 0.5, width: 13, height: 9 }),
   );
 }
 
 /**
- * Makes the links in a host one stop of the tab key: the arrows go from one to the next, up and down by rows of as many as
- * `data-row` of the host says.
+ * Makes the links in a host one tab stop; the arrow keys move between them, up and down by rows of `data-row` links.
  * @param {HTMLElement} host
  */
-export function roam(host) {
+export function navigateLinks(host) {
   host.addEventListener('keydown', (event) => {
     const links = [...host.querySelectorAll('a')];
-    const place = links.indexOf(event.target);
+    const place = links.findIndex((link) => link === event.target);
     const row = Number(host.dataset.row) || links.length;
-    const by = {
-      ArrowLeft: -1,
-      ArrowRight: 1,
-      ArrowUp: -row,
-      ArrowDown: row,
-      Home: -Infinity,
-      End: Infinity,
-    }[event.key];
-    if (by === undefined || place < 0) return;
+    /** @type {Record<string, number>} */
+    const targets = {
+      ArrowLeft: place - 1,
+      ArrowRight: place + 1,
+      ArrowUp: place - row,
+      ArrowDown: place + row,
+      Home: 0,
+      End: links.length - 1,
+    };
+    if (!(event.key in targets) || place < 0) return;
     event.preventDefault();
     event.stopPropagation();
-    const to = Number.isFinite(by) ? place + by : by < 0 ? 0 : links.length - 1;
-    if (!links[to]) return;
-    links.forEach((link, i) => (link.tabIndex = i === to ? 0 : -1));
-    links[to].focus();
+    const target = links[targets[event.key]];
+    if (!target) return;
+    for (const link of links) link.tabIndex = link === target ? 0 : -1;
+    target.focus();
   });
 }
 
-const family = (filter) => filter.replace(/-?(ekf|ukf|pf)$/, '');
+/** @param {string} filter */
+const fusionRule = (filter) => filter.replace(/-?(ekf|ukf|pf)$/, '');
+/** @param {string} filter */
 const texture = (filter) =>
   Object.keys(TEXTURES).find((kind) => `-${filter}`.endsWith(`-${kind}`)) ?? '';
-const hue = (filter) => FAMILIES[family(filter)] ?? '--ink';
+/** @param {string} filter */
+const colourOf = (filter) => COLOURS[fusionRule(filter)] ?? '--ink';
 
-function face(filter) {
+/**
+ * @param {string} filter
+ * @returns {Record<string, string>}
+ */
+function appearance(filter) {
   const kind = texture(filter);
   return {
     class: 'face',
-    style: `--line: var(${hue(filter)})`,
-    ...(kind ? { fill: `url(#bar${hue(filter)}-${kind})` } : {}),
+    style: `--line: var(${colourOf(filter)})`,
+    ...(kind ? { fill: `url(#bar${colourOf(filter)}-${kind})` } : {}),
   };
 }
 
-/** The textures of these filters, to be named by their bars. */
-function textures(filters) {
-  const kinds = new Map(
-    filters.filter(texture).map((filter) => [`bar${hue(filter)}-${texture(filter)}`, filter]),
-  );
-  const made = [...kinds].map(([id, filter]) =>
-    element(
+/**
+ * Returns the textures of filters, which their bars refer to.
+ * @param {string[]} filters
+ */
+function textureDefinitions(filters) {
+  const textured = filters.filter(texture);
+  const byId = new Map(textured.map((f) => [`bar${colourOf(f)}-${texture(f)}`, f]));
+  const patterns = [...byId].map(([id, filter]) =>
+    svgElement(
       'pattern',
       {
         id,
         class: 'texture',
-        style: `--line: var(${hue(filter)})`,
-        width: PATTERN,
-        height: PATTERN,
+        style: `--line: var(${colourOf(filter)})`,
+        width: TEXTURE_SIZE,
+        height: TEXTURE_SIZE,
         patternUnits: 'userSpaceOnUse',
       },
-      element('rect', { width: PATTERN, height: PATTERN }),
-      element('path', { d: TEXTURES[texture(filter)] }),
+      svgElement('rect', { width: TEXTURE_SIZE, height: TEXTURE_SIZE }),
+      svgElement('path', { d: TEXTURES[texture(filter)] }),
     ),
   );
-  return element('defs', {}, ...made);
+  return svgElement('defs', {}, ...patterns);
 }
 
-/** Where the scale ends. */
-function highest(bars, level) {
-  const means = bars
-    .map((bar) => bar.mean)
-    .filter((mean) => mean !== null)
-    .sort((a, b) => a - b);
-  const whole = Math.max(
-    0,
-    ...bars.filter((bar) => bar.mean !== null).map((bar) => bar.mean + (bar.spread ?? 0)),
-  );
-  const cut = TALLEST * (means[Math.floor(means.length / 2)] ?? 0);
-  const top = Math.min(whole, cut) || level?.value || 1;
+/**
+ * Returns the largest value of the scale.
+ * @param {Bar[]} bars
+ * @param {Chart['level']} level
+ */
+function scaleTop(bars, level) {
+  const ends = bars.flatMap(({ mean, spread }) => (mean === null ? [] : [mean + (spread ?? 0)]));
+  const means = bars.flatMap(({ mean }) => (mean === null ? [] : [mean])).sort((a, b) => a - b);
+  const limit = MAX_HEIGHT * (means[Math.floor(means.length / 2)] ?? 0);
+  const top = Math.min(Math.max(0, ...ends), limit) || level?.value || 1;
   return 1.04 * (level && level.value > top && level.value <= 1.3 * top ? level.value : top);
 }
 
-/** 1, 2 or 5 times a power of ten, no less than a value. */
-function pleasing(value) {
+/**
+ * Returns 1, 2 or 5 times a power of ten, no less than a value.
+ * @param {number} value
+ */
+function tickStep(value) {
   const power = 10 ** Math.floor(Math.log10(value));
-  return power * ([1, 2, 5].find((times) => times * power >= value) ?? 10);
+  return power * ([1, 2, 5].find((factor) => factor * power >= value) ?? 10);
 }
 
-function element(tag, attributes, ...children) {
-  const made = document.createElementNS(SVG, tag);
+/**
+ * @template {keyof SVGElementTagNameMap} K
+ * @param {K} tag
+ * @param {Record<string, string | number>} attributes
+ * @param {...(Node | string)} children
+ * @returns {SVGElementTagNameMap[K]}
+ */
+function svgElement(tag, attributes, ...children) {
+  const node = document.createElementNS(SVG, tag);
   for (const [name, value] of Object.entries(attributes))
-    made.setAttribute(name, typeof value === 'number' ? Number(value.toFixed(2)) : value);
-  made.append(...children);
-  return made;
+    node.setAttribute(name, typeof value === 'number' ? String(Number(value.toFixed(2))) : value);
+  node.append(...children);
+  return node;
 }

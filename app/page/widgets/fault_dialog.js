@@ -1,105 +1,127 @@
 /** Sensor faults: presets, and a dialog for any other fault injection as text (docs/data.md). */
 
+/** @import { Fault } from '../data/api.js' */
+
+import { create, element, html, messageOf } from '../core/dom.js';
+
 const OTHER = 'other';
 
-/** The sheet in which any faults can be written. A faults that the server refuses changes nothing but the sheet. */
-export class FaultSheet {
-  #sheet;
-  #text;
-  #wrong;
-  #asker = null;
+/**
+ * @typedef {object} FaultTarget
+ * @property {(faults: string) => Promise<unknown>} check throws the reason if the faults are invalid
+ * @property {(faults: string) => void} choose applies the faults
+ */
+/** @typedef {{name: string, faults: string}} FaultPreset */
 
-  /** @param {HTMLDialogElement} sheet @param {import('../data/api.js').Fault[]} faults */
-  constructor(sheet, faults) {
-    this.#sheet = sheet;
-    [this.#text, this.#wrong] = ['input', '.wrong'].map((part) => sheet.querySelector(part));
-    this.#text.addEventListener('input', () => this.#tell(''));
-    sheet.querySelector('tbody').replaceChildren(...faults.map((fault) => row(fault, this.#text)));
-    sheet.querySelector('form').addEventListener('submit', (event) => this.#take(event));
+/** Dialog to edit a fault injection. Invalid faults are reported in the dialog and change nothing else. */
+export class FaultDialog {
+  #dialog;
+  #input;
+  #error;
+  /** @type {FaultTarget | null} */
+  #target = null;
+
+  /**
+   * @param {HTMLDialogElement} dialog
+   * @param {Fault[]} faults
+   */
+  constructor(dialog, faults) {
+    this.#dialog = dialog;
+    this.#input = element('input', HTMLInputElement, dialog);
+    this.#error = html('.error', dialog);
+    this.#input.addEventListener('input', () => this.#setError(''));
+    html('tbody', dialog).replaceChildren(...faults.map((fault) => faultRow(fault, this.#input)));
+    html('form', dialog).addEventListener('submit', (event) => this.#submit(event));
   }
 
   /**
-   * @param {string} faults to begin with @param {(faults: string) => Promise<unknown>} check raises what is wrong with one
-   * @param {(faults: string) => void} choose is given the one that is applied
+   * Opens the dialog.
+   * @param {string} faults initial text
+   * @param {FaultTarget} target
    */
-  ask(faults, check, choose) {
-    this.#asker = { check, choose };
-    this.#text.value = faults;
-    this.#tell('');
-    this.#sheet.showModal();
-    this.#text.focus();
+  open(faults, target) {
+    this.#target = target;
+    this.#input.value = faults;
+    this.#setError('');
+    this.#dialog.showModal();
+    this.#input.focus();
   }
 
-  async #take(event) {
-    if (event.submitter?.value === 'cancel') return;
+  /** @param {SubmitEvent} event */
+  async #submit(event) {
+    if (event.submitter instanceof HTMLButtonElement && event.submitter.value === 'cancel') return;
     event.preventDefault();
-    const faults = this.#text.value.trim();
+    const faults = this.#input.value.trim();
     try {
-      await this.#asker.check(faults);
+      await this.#target?.check(faults);
     } catch (error) {
-      return this.#tell(error.message);
+      return this.#setError(messageOf(error));
     }
-    this.#asker.choose(faults);
-    this.#sheet.close();
+    this.#target?.choose(faults);
+    this.#dialog.close();
   }
 
-  #tell(line) {
-    this.#wrong.textContent = line;
+  /** @param {string} line */
+  #setError(line) {
+    this.#error.textContent = line;
   }
 }
 
 /**
- * Select element with the fault presets; its last entry opens the dialog.
- * @param {HTMLSelectElement} select @param {FaultSheet} sheet
- * @param {object} of @param {string} of.none what no faults is called @param {() => string} of.chosen
- * @param {(faults: string) => void} of.choose @param {(faults: string) => Promise<unknown>} of.check
- * @returns {(ready: {name: string, faults: string}[]) => void} shows those that are ready, and the chosen one
+ * Connects a select element with the fault presets; its last entry opens the dialog.
+ * @param {HTMLSelectElement} select
+ * @param {FaultDialog} dialog
+ * @param {FaultTarget & {none: string, selected: () => string}} options none: label of no faults
+ * @returns {(presets: FaultPreset[]) => void} shows the presets and the selected faults
  */
-export function faultPicker(select, sheet, { none, chosen, choose, check }) {
-  let ready = [];
+export function faultPicker(select, dialog, { none, selected, choose, check }) {
+  /** @type {FaultPreset[]} */
+  let presets = [];
   const show = () => {
-    const faults = chosen();
-    const own = faults && !ready.some((r) => r.faults === faults) ? [{ name: faults, faults }] : [];
-    const all = [{ name: none, faults: '' }, ...ready, ...own, { name: 'other …', faults: OTHER }];
-    select.replaceChildren(...all.map((r) => new Option(r.name, r.faults)));
-    [select.value, select.disabled, select.title] = [
-      faults,
-      false,
-      `How the sensors are broken${faults && `: ${faults}`}`,
+    const faults = selected();
+    const isPreset = !faults || presets.some((preset) => preset.faults === faults);
+    const options = [
+      { name: none, faults: '' },
+      ...presets,
+      ...(isPreset ? [] : [{ name: faults, faults }]),
+      { name: 'other …', faults: OTHER },
     ];
+    select.replaceChildren(...options.map((option) => new Option(option.name, option.faults)));
+    [select.value, select.disabled] = [faults, false];
+    select.title = `Sensor faults${faults && `: ${faults}`}`;
   };
-  const take = (faults) => (choose(faults), show());
+  /** @param {string} faults */
+  const apply = (faults) => (choose(faults), show());
   select.addEventListener('change', () => {
-    if (select.value !== OTHER) return take(select.value);
-    select.value = chosen();
-    sheet.ask(chosen(), check, take);
+    if (select.value !== OTHER) return apply(select.value);
+    select.value = selected();
+    dialog.open(selected(), { check, choose: apply });
   });
-  return (list) => ((ready = list), show());
+  return (list) => ((presets = list), show());
 }
 
-/** A fault in the sheet's list; its button adds it to the text. */
-function row({ fault, meaning, parameters }, text) {
-  const own = parameters.slice(0, -2); // all have the last two, from and to
-  const line = document.createElement('tr');
-  const button = document.createElement('button');
-  [button.type, button.className, button.textContent, button.title] = [
-    'button',
-    'text quiet',
-    fault,
-    'Add it',
-  ];
-  button.addEventListener('click', () => {
-    const first = parameters[0].default ?? '';
-    text.value = [text.value.trim(), `${fault}=${first}`].filter(Boolean).join(',');
-    text.dispatchEvent(new Event('input'));
-    text.focus();
+/**
+ * Creates the row of a fault in the dialog; its button adds the fault to the text.
+ * @param {Fault} fault
+ * @param {HTMLInputElement} input
+ */
+function faultRow({ fault, meaning, parameters }, input) {
+  const specific = parameters.slice(0, -2); // without `from` and `to`, which every fault has
+  const button = create('button', {
+    type: 'button',
+    className: 'text quiet',
+    textContent: fault,
+    title: 'Add this fault',
   });
-  const cells = [
-    button,
-    own.map((p) => (p.default === null ? p.name : `${p.name}=${p.default}`)).join(' '),
-    meaning,
-  ];
-  for (const cell of cells) line.insertCell().append(cell);
-  line.cells[1].title = own.map((p) => `${p.name}: ${p.meaning} (${p.unit})`).join('\n');
-  return line;
+  button.addEventListener('click', () => {
+    const value = parameters[0].default ?? '';
+    input.value = [input.value.trim(), `${fault}=${value}`].filter(Boolean).join(',');
+    input.dispatchEvent(new Event('input'));
+    input.focus();
+  });
+  const defaults = specific.map((p) => (p.default === null ? p.name : `${p.name}=${p.default}`));
+  const row = document.createElement('tr');
+  for (const cell of [button, defaults.join(' '), meaning]) row.insertCell().append(cell);
+  row.cells[1].title = specific.map((p) => `${p.name}: ${p.meaning} (${p.unit})`).join('\n');
+  return row;
 }

@@ -1,292 +1,386 @@
-/** A table of files that can be sorted: each has a name that opens it, a field to change what it is called, and a menu. */
+/** Sortable table of files: each name opens its file or becomes a text field, and each row has a menu of actions. */
 
-import { stopAt, walk } from './row_navigation.js';
+import { create, element, html, messageOf } from '../core/dom.js';
+import { navigateRows, setTabStop } from './row_navigation.js';
 
 /**
- * @typedef {{name: string}} File
- * @typedef {object} Column
- * @property {string} name @property {string} title @property {string} help
- * @property {(file: File) => string | number | null} value by which it is sorted; null where there is none
- * @property {(file: File) => string | Node} shown @property {(file: File) => string} [hint] @property {boolean} [number]
- * @typedef {object} Act what can be done with a file
- * @property {string} name @property {string} [key] of the keyboard that does it in its row
- * @property {() => void} [act] @property {string} [href] a link in its place, `download` a name to save it by, `window` whether in another one
- * @property {string} [why] it cannot be done @property {string} [hint] what there is to know
+ * Action on a file.
+ * @typedef {object} Action
+ * @property {string} name
+ * @property {string} [key] keyboard shortcut in the row
+ * @property {() => void} [run]
+ * @property {string} [href] a link in place of `run`
+ * @property {string} [download] name of the file that the link saves
+ * @property {boolean} [newWindow] whether the link opens a new window
+ * @property {string} [disabledReason] set if the action is not possible
+ * @property {string} [hint]
  */
 
+/**
+ * @template {{name: string}} F
+ * @typedef {object} Column
+ * @property {string} name
+ * @property {string} title
+ * @property {string} help
+ * @property {(file: F) => string | number | null} value sort key; null if there is none
+ * @property {(file: F) => string | Node} content
+ * @property {(file: F) => string} [hint]
+ * @property {boolean} [number]
+ */
+
+/**
+ * @template {{name: string}} F
+ * @typedef {object} FileTableOptions
+ * @property {(file: F) => Action[]} actions the first one is run by a click on the name
+ * @property {{name: string, down: boolean}} sort
+ * @property {{has: (name: string) => boolean, toggle: (name: string) => void}} [selection] gives each row a checkbox
+ */
+
+/** @template {{name: string}} F */
 export class FileTable {
   #table;
-  #menu = Object.assign(document.createElement('div'), { popover: 'auto', className: 'menu' });
+  #head;
+  #body;
+  #menu = create('div', { popover: 'auto', className: 'menu', role: 'menu' });
   #columns;
-  #acts;
-  #picks;
+  #actions;
+  #selection;
   #sort;
+  /** @type {F[]} */
   #files = [];
-  #rows = new Map(); // by name
+  /** Rows by file name. @type {Map<string, HTMLTableRowElement>} */
+  #rows = new Map();
   #editing = false;
-  #here = '';
+  #highlighted = '';
 
   /**
-   * @param {HTMLTableElement} table @param {Column[]} columns the first is the name's
-   * @param {{acts: (file: File) => Act[], sort: {name: string, down: boolean}, picks?: {has: (name: string) => boolean, toggle: (name: string) => void}}} ways
-   *   the first of a file's acts is what a click on its name does; `picks` gives each row a box to tick
+   * @param {HTMLTableElement} table
+   * @param {Column<F>[]} columns the first one has the name
+   * @param {FileTableOptions<F>} options
    */
-  constructor(table, columns, { acts, sort, picks = null }) {
-    [this.#table, this.#columns, this.#acts, this.#sort, this.#picks] = [
-      table,
-      columns,
-      acts,
-      sort,
-      picks,
-    ];
-    this.#menu.setAttribute('role', 'menu');
-    table.parentElement.append(this.#menu);
-    this.#menu.addEventListener('keydown', (event) => this.#roam(event));
-    walk(table.tBodies[0]);
-    table.tBodies[0].addEventListener('keydown', (event) => this.#press(event));
+  constructor(table, columns, { actions, sort, selection }) {
+    this.#table = table;
+    this.#columns = columns;
+    this.#actions = actions;
+    this.#sort = sort;
+    this.#selection = selection;
+    this.#head = element('thead', HTMLTableSectionElement, table);
+    this.#body = element('tbody', HTMLTableSectionElement, table);
+    table.after(this.#menu);
+    this.#menu.addEventListener('keydown', (event) => this.#navigateMenu(event));
+    navigateRows(this.#body);
+    this.#body.addEventListener('keydown', (event) => this.#runShortcut(event));
   }
 
-  /** @param {File[]} files What is being written in a field stays; the rest follows when that is done. */
+  /**
+   * Shows files. While a name is edited, the table is updated when editing ends.
+   * @param {F[]} files
+   */
   show(files) {
     this.#files = files;
     if (!this.#editing) this.#draw();
   }
 
-  /** Marks a file's row and brings it into sight. */
+  /**
+   * Highlights the row of a file and scrolls it into view.
+   * @param {string} name
+   */
   point(name) {
-    this.#here = name;
+    this.#highlighted = name;
     for (const [other, row] of this.#rows) row.classList.toggle('here', other === name);
-    if (this.#rows.has(name)) stopAt(this.#rows.get(name), true);
+    const row = this.#rows.get(name);
+    if (row) setTabStop(row, true);
   }
 
-  /** A field in place of a file's name. @param {(text: string) => Promise<void>} save says by an error what is wrong */
+  /**
+   * Replaces the name of a file by a text field.
+   * @param {F} file
+   * @param {string} label
+   * @param {string} text
+   * @param {(text: string) => Promise<void>} save throws the reason if the text is invalid
+   */
   edit(file, label, text, save) {
     const cell = this.#rows.get(file.name)?.querySelector('.name');
     if (!cell) return;
-    const form = document.createElement('form');
-    form.innerHTML =
-      '<input type="text" autocomplete="off" spellcheck="false"><p class="wrong" role="alert"></p>';
-    const [input, wrong] = form.children;
+    const input = create('input', { type: 'text', autocomplete: 'off', spellcheck: false });
+    const error = create('p', { className: 'error', role: 'alert' });
+    const form = create('form', {}, input, error);
     [input.value, input.ariaLabel] = [text, label];
     this.#editing = true;
     const end = () => {
       if (!this.#editing) return;
       this.#editing = false;
       this.#draw();
-      const row = this.#rows.get(file.name) ?? this.#rows.get(this.#here); // it may have another name by now
-      if (row) stopAt(row, true);
+      const row = this.#rows.get(file.name) ?? this.#rows.get(this.#highlighted); // after a renaming
+      if (row) setTabStop(row, true);
     };
-    const done = async () => {
+    const submit = async () => {
       if (input.value === text) return end();
       input.disabled = true;
       try {
         await save(input.value);
         end();
-      } catch (error) {
-        [input.disabled, wrong.textContent] = [false, error.message];
+      } catch (reason) {
+        [input.disabled, error.textContent] = [false, messageOf(reason)];
         input.setAttribute('aria-invalid', 'true');
         input.focus();
       }
     };
-    form.addEventListener('submit', (event) => (event.preventDefault(), done()));
+    form.addEventListener('submit', (event) => (event.preventDefault(), submit()));
     form.addEventListener('keydown', (event) => {
       event.stopPropagation();
       if (event.key === 'Escape') end();
     });
-    form.addEventListener('focusout', () => !input.disabled && !wrong.textContent && done());
+    form.addEventListener('focusout', () => !input.disabled && !error.textContent && submit());
     cell.replaceChildren(form);
     input.focus();
     input.select();
   }
 
-  get #ordered() {
-    const { value } = this.#columns.find(({ name }) => name === this.#sort.name);
+  get #sorted() {
+    const column = this.#columns.find(({ name }) => name === this.#sort.name) ?? this.#columns[0];
     const sign = this.#sort.down ? -1 : 1;
-    const order = (a, b) =>
-      typeof a === 'string' ? a.localeCompare(b, 'en', { numeric: true }) : a - b;
     return [...this.#files].sort((a, b) => {
-      const [one, other] = [value(a), value(b)];
-      return one === null || other === null
-        ? Number(one === null) - Number(other === null)
-        : sign * order(one, other);
+      const [left, right] = [column.value(a), column.value(b)];
+      if (left === null || right === null) return Number(left === null) - Number(right === null);
+      return sign * compare(left, right);
     });
   }
 
   #draw() {
-    const { activeElement: active } = document;
-    const [focused, part] = this.#table.contains(active)
-      ? [active.closest('tr')?.dataset.name, active.dataset.part]
-      : [];
-    const top = document.createElement('tr');
-    if (this.#picks) top.append(unseen('Chosen', 'pick'));
-    top.append(...this.#columns.map((column) => this.#heading(column)), unseen('Menu', 'menus'));
-    this.#table.tHead.replaceChildren(top);
-    const files = this.#ordered;
+    const { activeElement } = document;
+    const focused =
+      activeElement instanceof HTMLElement && this.#table.contains(activeElement)
+        ? activeElement
+        : null;
+    const [name, part] = [focused?.closest('tr')?.dataset.name, focused?.dataset.part];
+    const head = document.createElement('tr');
+    if (this.#selection) head.append(hiddenHeading('Selected', 'pick'));
+    head.append(
+      ...this.#columns.map((column) => this.#heading(column)),
+      hiddenHeading('Menu', 'menus'),
+    );
+    this.#head.replaceChildren(head);
+    const files = this.#sorted;
     this.#rows = new Map(files.map((file, i) => [file.name, this.#row(file, i)]));
-    this.#table.tBodies[0].replaceChildren(...this.#rows.values());
+    this.#body.replaceChildren(...this.#rows.values());
     this.#table.hidden = !files.length;
-    const again = focused !== undefined ? this.#rows.get(focused) : part && this.#table.tHead;
-    if (again && focused !== undefined) stopAt(again, false);
-    again?.querySelector?.(`[data-part="${part}"]`)?.focus({ preventScroll: true });
+    const row = name === undefined ? undefined : this.#rows.get(name);
+    if (row) setTabStop(row, false);
+    const place = name === undefined ? this.#head : row;
+    if (part) focusPart(place, part);
   }
 
+  /** @param {Column<F>} column */
   #heading({ name, title, help, number }) {
-    const cell = Object.assign(document.createElement('th'), {
-      scope: 'col',
-      className: `${number ? 'number ' : ''}of-${name}`,
-    });
-    const sorted = this.#sort.name === name;
-    cell.ariaSort = sorted ? (this.#sort.down ? 'descending' : 'ascending') : 'none';
-    const button = part('button', `sort ${name}`, {
-      type: 'button',
-      className: 'quiet sort',
-      title: `${help}. Sort by it`,
-      textContent: title,
-    });
+    const isSorted = this.#sort.name === name;
+    const button = namedPart(
+      create('button', {
+        type: 'button',
+        className: 'quiet sort',
+        title: `${help}. Click to sort`,
+        textContent: title,
+      }),
+      `sort ${name}`,
+    );
     button.addEventListener('click', () => {
-      this.#sort = { name, down: sorted ? !this.#sort.down : Boolean(number) };
+      this.#sort = { name, down: isSorted ? !this.#sort.down : Boolean(number) };
       this.#draw();
     });
-    cell.append(button);
+    const className = `${number ? 'number ' : ''}of-${name}`;
+    const cell = create('th', { scope: 'col', className }, button);
+    cell.ariaSort = isSorted ? (this.#sort.down ? 'descending' : 'ascending') : 'none';
     return cell;
   }
 
+  /**
+   * @param {F} file
+   * @param {number} i place in the table
+   */
   #row(file, i) {
     const row = document.createElement('tr');
     row.dataset.name = file.name;
-    row.classList.toggle('here', file.name === this.#here);
-    const acts = this.#acts(file);
-    if (this.#picks) {
-      const pick = part('input', 'pick', {
-        type: 'checkbox',
-        checked: this.#picks.has(file.name),
-        ariaLabel: `Choose ${file.name}`,
-      });
-      pick.addEventListener('change', () => this.#picks.toggle(file.name));
-      row.insertCell().append(pick);
-      row.cells[0].className = 'pick';
-    }
-    for (const [c, { name, shown, hint, number }] of this.#columns.entries()) {
+    row.classList.toggle('here', file.name === this.#highlighted);
+    const actions = this.#actions(file);
+    if (this.#selection) this.#addCheckbox(row, file, this.#selection);
+    for (const [c, { name, content, hint, number }] of this.#columns.entries()) {
       const cell = row.insertCell();
       cell.className = c ? `${number ? 'number ' : ''}of-${name}` : 'name';
       cell.title = hint?.(file) ?? '';
-      const place = c ? cell : cell.appendChild(document.createElement('div'));
-      if (!c) place.append(this.#opener(file, acts[0]));
-      place.append(shown(file));
+      if (c) cell.append(content(file));
+      else cell.append(create('div', {}, this.#nameButton(file, actions[0]), content(file)));
     }
-    const more = part('button', 'more', {
-      type: 'button',
-      className: 'quiet more',
-      textContent: '⋯',
-      ariaHasPopup: 'menu',
-      title: 'What can be done with it',
-    });
+    const more = namedPart(
+      create('button', {
+        type: 'button',
+        className: 'quiet more',
+        textContent: '⋯',
+        ariaHasPopup: 'menu',
+        title: 'Actions',
+      }),
+      'more',
+    );
     more.setAttribute('aria-label', `Menu of ${file.name}`);
-    more.addEventListener('click', () => this.#unfold(more, acts));
+    more.addEventListener('click', () => this.#openMenu(more, actions));
     row.insertCell().append(more);
-    for (const control of row.querySelectorAll('button, input')) control.tabIndex = i ? -1 : 0;
+    for (const control of row.querySelectorAll('button')) control.tabIndex = i ? -1 : 0;
+    for (const control of row.querySelectorAll('input')) control.tabIndex = i ? -1 : 0;
     return row;
   }
 
-  #opener(file, { name, why }) {
-    const button = part('button', 'open', {
-      type: 'button',
-      className: 'title',
-      textContent: file.name,
-    });
-    button.title = why ?? `${name}: ${file.name}`;
-    button.setAttribute('aria-disabled', String(Boolean(why)));
-    button.addEventListener('click', () => this.#do(file, ({ name: other }) => other === name));
+  /**
+   * @param {HTMLTableRowElement} row
+   * @param {F} file
+   * @param {NonNullable<FileTableOptions<F>['selection']>} selection
+   */
+  #addCheckbox(row, { name }, selection) {
+    const checkbox = namedPart(
+      create('input', {
+        type: 'checkbox',
+        checked: selection.has(name),
+        ariaLabel: `Select ${name}`,
+      }),
+      'pick',
+    );
+    checkbox.addEventListener('change', () => selection.toggle(name));
+    const cell = row.insertCell();
+    cell.className = 'pick';
+    cell.append(checkbox);
+  }
+
+  /**
+   * @param {F} file
+   * @param {Action} action
+   */
+  #nameButton(file, { name, disabledReason }) {
+    const button = namedPart(
+      create('button', { type: 'button', className: 'title', textContent: file.name }),
+      'open',
+    );
+    button.title = disabledReason ?? `${name}: ${file.name}`;
+    button.setAttribute('aria-disabled', String(Boolean(disabledReason)));
+    button.addEventListener('click', () => this.#run(file, (action) => action.name === name));
     return button;
   }
 
-  #do(file, which) {
-    const found = this.#acts(file).find(which);
-    if (!found || found.why) return;
-    if (found.href) link(found).click();
-    else found.act();
+  /**
+   * @param {F} file
+   * @param {(action: Action) => boolean} matches
+   */
+  #run(file, matches) {
+    const action = this.#actions(file).find(matches);
+    if (!action || action.disabledReason) return;
+    if (action.href) actionLink(action).click();
+    else action.run?.();
   }
 
-  #press(event) {
-    const file = this.#files.find(({ name }) => name === event.target.closest('tr')?.dataset.name);
-    if (!file || event.target.closest('form')) return;
-    if (event.key === 'Enter' || !this.#acts(file).some(({ key }) => key === event.key)) return; // its button has Enter
+  /** @param {KeyboardEvent} event */
+  #runShortcut(event) {
+    if (!(event.target instanceof Element) || event.target.closest('form')) return;
+    const row = event.target.closest('tr');
+    const file = this.#files.find(({ name }) => name === row?.dataset.name);
+    if (!file || event.key === 'Enter') return; // Enter clicks the button
+    if (!this.#actions(file).some(({ key }) => key === event.key)) return;
     event.preventDefault();
     event.stopPropagation();
-    this.#do(file, ({ key }) => key === event.key);
+    this.#run(file, ({ key }) => key === event.key);
   }
 
-  #unfold(button, acts) {
-    this.#menu.replaceChildren(...acts.map((act) => this.#item(act)));
+  /**
+   * @param {HTMLElement} button
+   * @param {Action[]} actions
+   */
+  #openMenu(button, actions) {
+    const items = actions.map((action) => this.#menuItem(action));
+    this.#menu.replaceChildren(...items);
     this.#menu.showPopover();
-    const [at, size] = [button.getBoundingClientRect(), this.#menu.getBoundingClientRect()];
-    this.#menu.style.left = `${Math.max(4, Math.min(at.right - size.width, innerWidth - size.width - 4))}px`;
-    this.#menu.style.top = `${at.bottom + size.height > innerHeight - 4 ? Math.max(4, at.top - size.height) : at.bottom}px`;
-    this.#menu.firstElementChild.focus();
+    const [anchor, size] = [button.getBoundingClientRect(), this.#menu.getBoundingClientRect()];
+    const left = Math.min(anchor.right - size.width, innerWidth - size.width - 4);
+    const fitsBelow = anchor.bottom + size.height <= innerHeight - 4;
+    this.#menu.style.left = `${Math.max(4, left)}px`;
+    this.#menu.style.top = `${fitsBelow ? anchor.bottom : Math.max(4, anchor.top - size.height)}px`;
+    items[0]?.focus();
   }
 
-  #item(act) {
+  /** @param {Action} action */
+  #menuItem(action) {
+    const { name, key, disabledReason, hint } = action;
     const item =
-      act.href && !act.why
-        ? link(act)
-        : Object.assign(document.createElement('button'), { type: 'button' });
+      action.href && !disabledReason ? actionLink(action) : create('button', { type: 'button' });
     item.setAttribute('role', 'menuitem');
-    item.setAttribute('aria-disabled', String(Boolean(act.why)));
+    item.setAttribute('aria-disabled', String(Boolean(disabledReason)));
     item.tabIndex = -1;
-    item.append(Object.assign(document.createElement('span'), { textContent: act.name }));
-    if (act.key)
-      item.append(
-        Object.assign(document.createElement('kbd'), {
-          textContent: { Delete: 'del' }[act.key] ?? act.key,
-        }),
-      );
-    if (act.why ?? act.hint)
-      item.append(
-        Object.assign(document.createElement('small'), { textContent: act.why ?? act.hint }),
-      );
+    item.append(create('span', { textContent: name }));
+    if (key) item.append(create('kbd', { textContent: key === 'Delete' ? 'del' : key }));
+    const note = disabledReason ?? hint;
+    if (note) item.append(create('small', { textContent: note }));
     item.addEventListener('click', () => {
-      if (act.why) return;
+      if (disabledReason) return;
       this.#menu.hidePopover();
-      act.act?.();
+      action.run?.();
     });
     return item;
   }
 
-  #roam(event) {
+  /** @param {KeyboardEvent} event */
+  #navigateMenu(event) {
     event.stopPropagation();
     const items = [...this.#menu.children];
-    const place = items.indexOf(document.activeElement);
-    const to = { ArrowDown: place + 1, ArrowUp: place - 1, Home: 0, End: -1 }[event.key];
+    const place = items.findIndex((item) => item === document.activeElement);
+    /** @type {Record<string, number>} */
+    const targets = { ArrowDown: place + 1, ArrowUp: place - 1, Home: 0, End: -1 };
     if (event.key === 'Tab') this.#menu.hidePopover();
-    if (to === undefined) return;
+    if (!(event.key in targets)) return;
     event.preventDefault();
-    items.at(to % items.length).focus();
+    const item = items.at(targets[event.key] % items.length);
+    if (item instanceof HTMLElement) item.focus();
   }
 }
 
-/** The heading of a column whose cells say by themselves what they are. */
-function unseen(text, className) {
-  const cell = Object.assign(document.createElement('th'), { scope: 'col', className });
-  cell.append(
-    Object.assign(document.createElement('span'), {
-      className: 'visually-hidden',
-      textContent: text,
-    }),
-  );
-  return cell;
+/**
+ * @param {string | number} left
+ * @param {string | number} right
+ */
+const compare = (left, right) =>
+  typeof left === 'string'
+    ? left.localeCompare(String(right), 'en', { numeric: true })
+    : left - Number(right);
+
+/**
+ * Creates a heading for screen readers only.
+ * @param {string} text
+ * @param {string} className
+ */
+function hiddenHeading(text, className) {
+  const label = create('span', { className: 'visually-hidden', textContent: text });
+  return create('th', { scope: 'col', className }, label);
 }
 
-function link({ href, download, window }) {
-  return Object.assign(document.createElement('a'), {
-    href,
-    ...(download !== undefined && { download }),
-    ...(window && { target: '_blank', rel: 'noopener' }),
-  });
+/** @param {Action} action */
+function actionLink({ href = '', download, newWindow }) {
+  const link = create('a', { href });
+  if (download !== undefined) link.download = download;
+  if (newWindow) [link.target, link.rel] = ['_blank', 'noopener'];
+  return link;
 }
 
-/** An element that is found again when its row is made anew. */
-function part(tag, name, properties) {
-  const made = Object.assign(document.createElement(tag), properties);
-  made.dataset.part = name;
-  return made;
+/**
+ * Names a control, so that it gets the focus back when its row is redrawn.
+ * @template {HTMLElement} T
+ * @param {T} node
+ * @param {string} name
+ * @returns {T}
+ */
+function namedPart(node, name) {
+  node.dataset.part = name;
+  return node;
+}
+
+/**
+ * @param {HTMLElement | undefined} parent
+ * @param {string} name
+ */
+function focusPart(parent, name) {
+  if (parent?.querySelector(`[data-part="${name}"]`))
+    html(`[data-part="${name}"]`, parent).focus({ preventScroll: true });
 }

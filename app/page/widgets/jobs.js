@@ -1,169 +1,219 @@
-/** Long work in the background: what runs, how far it is, what it says. It goes on when the page is closed. */
+/** Background jobs: their state, progress and log. Jobs continue when the page is closed. */
 
-import * as api from '../data/api.js';
+/** @import { Job, JobReply } from '../types/server.js' */
+
+import { element, html } from '../core/dom.js';
 import { percent, sentence } from '../core/units.js';
+import * as api from '../data/api.js';
 
-const AGAIN = 500; // ms until the server is asked again, while something is under way
+const POLL_INTERVAL = 500; // ms, while a job is active
 const STATES = {
-  waiting: 'waits',
-  running: 'runs',
+  waiting: 'waiting',
+  running: 'running',
   done: 'done',
   failed: 'failed',
   cancelled: 'cancelled',
   interrupted: 'interrupted',
 };
 
-/** @param {api.Job} job */
-export const underWay = (job) => job.state === 'waiting' || job.state === 'running';
+/**
+ * Returns whether a job is waiting or running.
+ * @param {Job | null | undefined} job
+ */
+export const isActive = (job) => job?.state === 'waiting' || job?.state === 'running';
 
 export class Jobs {
   #drawer;
   #button;
+  /** @type {Job[]} */
   #list = [];
+  /** @type {Set<(jobs: Job[]) => void>} */
   #listeners = new Set();
+  /** @type {Map<string, HTMLLIElement>} */
   #rows = new Map();
   #timer = 0;
 
-  /** @param {HTMLElement} drawer @param {HTMLButtonElement} button that opens it */
+  /**
+   * @param {HTMLElement} drawer
+   * @param {HTMLButtonElement} button opens the drawer
+   */
   constructor(drawer, button) {
-    [this.#drawer, this.#button] = [drawer, button];
+    this.#drawer = drawer;
+    this.#button = button;
     button.addEventListener('click', () => this.toggle());
-    drawer.querySelector('.bar button').addEventListener('click', () => this.toggle());
+    this.#closeButton.addEventListener('click', () => this.toggle());
     drawer.addEventListener('keydown', (event) => event.key === 'Escape' && this.toggle());
     this.refresh();
   }
 
-  /** @param {(jobs: api.Job[]) => void} listener called when any of them has changed. */
+  get #closeButton() {
+    return element('.bar button', HTMLButtonElement, this.#drawer);
+  }
+
+  /** @param {(jobs: Job[]) => void} listener called when a job has changed */
   listen(listener) {
     this.#listeners.add(listener);
   }
 
-  /** One as it was last heard of. @returns {api.Job | undefined} */
+  /**
+   * Returns the last known state of a job.
+   * @param {string | null | undefined} id
+   */
   find(id) {
     return this.#list.find((job) => job.id === id);
   }
 
-  /** Waits until one has ended. @param {(job: api.Job) => void} told of every change before @returns {Promise<api.Job | undefined>} undefined: forgotten */
-  async ended(id, told) {
+  /**
+   * Waits until a job has ended; returns undefined if it was removed.
+   * @param {string} id
+   * @param {(job: Job) => void} progress called at each change before
+   * @returns {Promise<Job | undefined>}
+   */
+  async ended(id, progress) {
     await this.refresh();
     return new Promise((resolve) => {
-      const hear = () => {
+      const listener = () => {
         const job = this.find(id);
-        if (job && underWay(job)) return told(job);
-        this.#listeners.delete(hear);
+        if (job && isActive(job)) return progress(job);
+        this.#listeners.delete(listener);
         resolve(job);
       };
-      this.#listeners.add(hear);
-      hear();
+      this.#listeners.add(listener);
+      listener();
     });
   }
 
   /** Opens or closes the drawer. */
   toggle() {
     const opens = this.#drawer.hidden;
+    const { activeElement } = document;
     this.#drawer.hidden = !opens;
     this.#button.setAttribute('aria-expanded', String(opens));
-    if (opens) this.#drawer.querySelector('.bar button').focus();
-    else if (
-      this.#drawer.contains(document.activeElement) ||
-      document.activeElement === document.body
-    )
+    if (opens) this.#closeButton.focus();
+    else if (this.#drawer.contains(activeElement) || activeElement === document.body)
       this.#button.focus();
     this.refresh();
   }
 
-  /** Asks how far they are, and again for as long as something is under way. */
+  /** Gets the jobs from the server, and again at intervals while one is active. */
   async refresh() {
     clearTimeout(this.#timer);
     const list = await api.jobs().catch(() => null);
-    if (list) this.#take(list);
+    if (list) this.#update(list);
     clearTimeout(this.#timer);
-    if (this.#list.some(underWay)) this.#timer = setTimeout(() => this.refresh(), AGAIN);
+    if (this.#list.some(isActive)) this.#timer = setTimeout(() => this.refresh(), POLL_INTERVAL);
   }
 
-  /** Cancels one that is under way, forgets one that has ended. */
+  /**
+   * Cancels an active job, or removes one that has ended.
+   * @param {string} id
+   */
   async cancel(id) {
-    await api.cancelJob(id).catch(() => {}); // one that is gone already
+    await api.cancelJob(id).catch(() => {}); // already removed
     await this.refresh();
   }
 
-  #take(list) {
+  /** @param {Job[]} list */
+  #update(list) {
     const changed = JSON.stringify(list) !== JSON.stringify(this.#list);
     this.#list = list;
-    const active = list.filter(underWay).length;
+    const active = list.filter(isActive).length;
     this.#button.textContent = active ? `Jobs (${active})` : 'Jobs';
     if (!this.#drawer.hidden) this.#show();
     if (changed) for (const listener of this.#listeners) listener(list);
   }
 
   #show() {
-    const host = this.#drawer.querySelector('ol');
+    const host = html('ol', this.#drawer);
     for (const [id, row] of this.#rows) {
       if (this.#list.some((job) => job.id === id)) continue;
-      if (row.contains(document.activeElement)) this.#drawer.querySelector('.bar button').focus();
+      if (row.contains(document.activeElement)) this.#closeButton.focus();
       row.remove();
       this.#rows.delete(id);
     }
     this.#list.forEach((job, i) => {
-      if (!this.#rows.has(job.id)) this.#rows.set(job.id, this.#row(job.id));
-      const row = this.#rows.get(job.id);
+      const row = this.#rows.get(job.id) ?? this.#row(job.id);
+      this.#rows.set(job.id, row);
       if (host.children[i] !== row) host.insertBefore(row, host.children[i] ?? null);
       this.#fill(row, job);
     });
-    this.#drawer.querySelector('.none').hidden = this.#list.length > 0;
+    html('.none', this.#drawer).hidden = this.#list.length > 0;
   }
 
+  /** @param {string} id */
   #row(id) {
     const row = document.createElement('li');
     row.innerHTML =
       '<h3></h3><button type="button" class="text quiet"></button><progress max="1"></progress><p class="state"></p>' +
       '<details><summary>Log</summary><pre tabindex="0"></pre></details>';
-    row.querySelector('button').addEventListener('click', () => this.cancel(id));
-    row.querySelector('details').addEventListener('toggle', () => this.#log(row, id));
+    html('button', row).addEventListener('click', () => this.cancel(id));
+    html('details', row).addEventListener('toggle', () => this.#showLog(row, id));
     return row;
   }
 
+  /**
+   * @param {HTMLLIElement} row
+   * @param {Job} job
+   */
   #fill(row, job) {
     row.dataset.state = job.state;
-    const [title, button, progress, state] = row.children;
+    const title = html('h3', row);
     if (job.link && job.state === 'done') {
-      if (!title.firstElementChild)
-        title.replaceChildren(
-          Object.assign(document.createElement('a'), {
-            href: `/${job.link}`,
-            textContent: job.title,
-          }),
-        );
+      const link = title.querySelector('a') ?? document.createElement('a');
+      [link.href, link.textContent] = [`/${job.link}`, job.title];
+      if (!link.isConnected) title.replaceChildren(link);
     } else title.textContent = job.title;
-    button.textContent = underWay(job) ? 'Cancel' : 'Forget';
+    const button = html('button', row);
+    button.textContent = isActive(job) ? 'Cancel' : 'Remove';
     button.setAttribute('aria-label', `${button.textContent}: ${job.title}`);
+    const progress = element('progress', HTMLProgressElement, row);
     progress.value = job.state === 'done' ? 1 : job.progress;
     progress.setAttribute('aria-label', `Progress of ${job.title}`);
-    state.textContent = told(job);
-    if (underWay(job)) this.#log(row, job.id);
+    html('.state', row).textContent = jobSummary(job);
+    if (isActive(job)) this.#showLog(row, job.id);
   }
 
-  async #log(row, id) {
-    const [details, text] = [row.querySelector('details'), row.querySelector('pre')];
-    if (!details.open) return;
+  /**
+   * @param {HTMLLIElement} row
+   * @param {string} id
+   */
+  async #showLog(row, id) {
+    if (!element('details', HTMLDetailsElement, row).open) return;
     const { log } = await api.job(id).catch(() => ({ log: '' }));
-    text.textContent = log || 'It has said nothing.';
+    html('pre', row).textContent = log || 'The log is empty.';
   }
 }
 
-/** A job's state in a line. @param {api.Job} job */
-export function told(job) {
+/**
+ * Returns the state of a job in one line.
+ * @param {Job} job
+ */
+export function jobSummary(job) {
   if (job.state === 'running') return `${percent(job.progress)}, ${job.message || 'starting'}`;
   if (job.error && job.error !== job.state)
     return sentence(job.state === 'failed' ? job.error : `${STATES[job.state]}: ${job.error}`);
-  if (job.state === 'done') return `Done in ${Math.max(1, Math.round(job.ended - job.started))} s.`;
+  if (job.state === 'done') {
+    const seconds = Number(job.ended) - Number(job.started);
+    return `Done in ${Math.max(1, Math.round(seconds))} s.`;
+  }
   return sentence(STATES[job.state]);
 }
 
-/** What the server answered where a job finds something: what it found, or how the job is. */
-export function result(body) {
-  if (!('job' in body)) return { state: 'ready', found: body };
+/**
+ * State of a result that a job may compute.
+ * @template T
+ * @typedef {{state: 'ready', result: T, job?: undefined} | {state: 'absent', job?: undefined} | {state: 'active' | 'ended', job: Job}} Pending
+ */
+
+/**
+ * Returns the result in a server's reply, or the state of the job that computes it.
+ * @template {object} T
+ * @param {T | JobReply} body
+ * @returns {Pending<T>}
+ */
+export function pending(body) {
+  if (!('job' in body)) return { state: 'ready', result: body };
   const { job } = body;
-  if (!job) return { state: 'unasked' };
-  return { state: underWay(job) ? 'working' : 'ended', job };
+  if (!job) return { state: 'absent' };
+  return { state: isActive(job) ? 'active' : 'ended', job };
 }

@@ -1,19 +1,24 @@
-/** What a panel says while it has nothing to show: loading, empty, or an error. Its place stays the same. */
+/** States of a panel without content, and the messages at the top of the page. */
+
+import { create, html } from '../core/dom.js';
 
 /**
- * @param {HTMLElement} body of a panel, with a `.note` inside
- * @param {'ready' | 'loading' | 'empty' | 'error'} state @param {string} [text] @param {number | null} [share] done, 0..1
+ * Shows whether a panel is loading, empty, failed or ready. Its size stays the same.
+ * @param {HTMLElement} body contains a `.note`
+ * @param {'ready' | 'loading' | 'empty' | 'error'} state
+ * @param {string} [text]
+ * @param {number | null} [share] progress from 0 to 1
  */
-export function say(body, state, text = '', share = null) {
+export function setPanelState(body, state, text = '', share = null) {
   body.dataset.state = state;
   body.setAttribute('aria-busy', String(state === 'loading'));
-  const note = body.querySelector('.note');
+  const note = html('.note', body);
   note.textContent = state === 'ready' ? '' : text;
   note.style.setProperty('--done', share === null ? '' : String(share));
   note.classList.toggle('measured', state === 'loading' && share !== null);
 }
 
-/** Lines across the top of the page: what went wrong, until it is put right or put away. */
+/** Messages at the top of the page, one per key; each stays until it is replaced, cleared or dismissed. */
 export class Messages {
   #host;
 
@@ -22,23 +27,28 @@ export class Messages {
     this.#host = host;
   }
 
-  /** @param {string} key what it is about: a newer line takes the place of the older; an empty one ends it. */
-  say(key, text) {
-    const before = this.#host.querySelector(`[data-key="${key}"]`);
-    if (!text) {
-      before?.remove();
-      return;
-    }
-    const line = before ?? document.createElement('p');
-    if (!before) {
-      line.dataset.key = key;
-      const close = document.createElement('button');
-      [close.type, close.textContent] = ['button', '×'];
-      close.setAttribute('aria-label', 'Dismiss');
-      close.addEventListener('click', () => line.remove());
-      line.append(document.createElement('span'), close);
-      this.#host.append(line);
-    }
-    if (line.firstChild.textContent !== text) line.firstChild.textContent = text;
+  /**
+   * Shows a message in place of the one with the same key; an empty text removes that one.
+   * @param {string} key
+   * @param {string} [text]
+   */
+  show(key, text = '') {
+    /** @type {HTMLElement | null} */
+    const line = this.#host.querySelector(`[data-key="${key}"]`);
+    if (!text) line?.remove();
+    else if (!line) this.#append(key, text);
+    else if (html('span', line).textContent !== text) html('span', line).textContent = text;
+  }
+
+  /**
+   * @param {string} key
+   * @param {string} text
+   */
+  #append(key, text) {
+    const close = create('button', { type: 'button', textContent: '×', ariaLabel: 'Dismiss' });
+    const line = create('p', {}, create('span', { textContent: text }), close);
+    line.dataset.key = key;
+    close.addEventListener('click', () => line.remove());
+    this.#host.append(line);
   }
 }

@@ -1,138 +1,189 @@
-/** What is shown: task, filter, episode, speed; and the small choices above the time line. */
+/** Pickers in the header: task, filter, data set, episode, faults and speed; and the radio groups of all panels. */
 
-import { checkSelection } from '../data/api.js';
-import { showing } from '../tabs/live_runs.js';
-import { faultPicker } from './fault_dialog.js';
+/** @import { State, Store } from '../core/state.js' */
+/** @import { Catalog, DataSet, EpisodeSummary, Task } from '../types/server.js' */
+/** @import { FaultDialog } from './fault_dialog.js' */
+
+import { create, element } from '../core/dom.js';
 import { SPEEDS } from '../core/state.js';
 import { percent } from '../core/units.js';
+import { checkSelection } from '../data/api.js';
+import { liveRunState } from '../tabs/live_runs.js';
+import { faultPicker } from './fault_dialog.js';
+
+/** @typedef {[value: string | number, label: string | number]} Option */
 
 /**
- * @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store @param {import('./fault_dialog.js').FaultSheet} sheet
+ * Connects the pickers of the header.
+ * @param {Catalog} catalog
+ * @param {Store} store
+ * @param {FaultDialog} dialog
  * @returns {() => void} to be called when the catalog has changed
  */
-export function pickers(catalog, store, sheet) {
-  const ids = ['task', 'filter', 'data', 'episode', 'speed'];
-  const [task, filter, data, episode, speed] = ids.map((id) => document.getElementById(id));
-  const named = (list, name) => list.find((one) => one.name === name);
-  const current = () => named(catalog.tasks, store.state.task);
-  const names = (list) => list.map(({ name }) => [name, name]);
-  /** The filters of this task that a data set can be shown with: one known by its live run alone, with no other. */
-  const usable = (set) => current().filters.filter(({ live }) => !live || live === set);
-  // Who chooses what this run is compared with sees the two change places.
-  const swapped = (key, value) =>
-    store.state.against === `${key}=${value}` ? { against: `${key}=${store.state[key]}` } : {};
-  const showFaults = faultPicker(document.getElementById('faults'), sheet, {
+export function connectPickers(catalog, store, dialog) {
+  const selects = {
+    task: element('#task', HTMLSelectElement),
+    filter: element('#filter', HTMLSelectElement),
+    data: element('#data', HTMLSelectElement),
+    episode: element('#episode', HTMLSelectElement),
+    speed: element('#speed', HTMLSelectElement),
+  };
+  const { task, filter, data, episode, speed } = selects;
+  const currentTask = () => byName(catalog.tasks, store.state.task) ?? catalog.tasks[0];
+  const showFaults = faultPicker(element('#faults', HTMLSelectElement), dialog, {
     none: 'as recorded',
-    chosen: () => store.state.faults,
-    choose: (faults) => store.set({ faults, ...swapped('faults', faults) }),
+    selected: () => store.state.faults,
+    choose: (faults) => store.set({ faults, ...swapped(store.state, 'faults', faults) }),
     check: (faults) => checkSelection({ ...store.state, faults, against: '' }),
   });
   fill(
     speed,
-    SPEEDS.map((s) => [s, `${s}×`]),
+    SPEEDS.map((factor) => [factor, `${factor}×`]),
   );
   const refill = () => {
     fill(task, names(catalog.tasks));
-    fill(filter, names(usable(store.state.data)));
-    fill(data, names(current().data));
+    fill(filter, names(filtersOf(currentTask(), store.state.data)));
+    fill(data, names(currentTask().data));
+    const episodes = byName(currentTask().data, store.state.data)?.episodes ?? [];
     fill(
       episode,
-      (named(current().data, store.state.data)?.episodes ?? []).map((e) => [e.index, described(e)]),
+      episodes.map((summary) => [summary.index, episodeLabel(summary)]),
     );
-    // A choice of one is none.
-    for (const select of [task, data]) select.parentElement.hidden = select.length < 2;
+    for (const select of [task, data])
+      if (select.parentElement) select.parentElement.hidden = select.length < 2;
   };
   task.addEventListener('change', () => {
-    const {
-      name,
-      filters,
-      data: [{ name: data, first }],
-      fault_presets,
-      map,
-    } = named(catalog.tasks, task.value);
-    const filter = (named(filters, store.state.filter) ?? filters[0]).name;
-    const faults = fault_presets.some((r) => r.faults === store.state.faults)
-      ? store.state.faults
-      : '';
-    store.set({
-      task: name,
-      filter,
-      data,
-      episode: first,
-      faults,
-      against: '',
-      step: 0,
-      angle: null,
-      component: map.x,
-      playing: false,
-    });
+    const selected = byName(catalog.tasks, task.value);
+    if (selected) store.set(firstRun(selected, store.state));
   });
   data.addEventListener('change', () => {
-    const { live, first } = named(current().data, data.value);
-    const { name } = named(usable(data.value), filter.value) ?? current().filters[0];
-    store.set(
-      live
-        ? showing(catalog, live, store.state)
-        : { data: data.value, filter: name, episode: first, step: 0, playing: false },
-    );
+    const set = byName(currentTask().data, data.value);
+    if (set) store.set(set.live ? liveRunState(catalog, set.live, store.state) : switchData(set));
   });
+  /** @param {DataSet} set */
+  const switchData = (set) => {
+    const filters = filtersOf(currentTask(), set.name);
+    const { name } = byName(filters, filter.value) ?? currentTask().filters[0];
+    return { data: set.name, filter: name, episode: set.first, step: 0, playing: false };
+  };
   filter.addEventListener('change', () =>
-    store.set({ filter: filter.value, ...swapped('filter', filter.value) }),
+    store.set({ filter: filter.value, ...swapped(store.state, 'filter', filter.value) }),
   );
   episode.addEventListener('change', () =>
     store.set({ episode: Number(episode.value), step: 0, playing: false }),
   );
   speed.addEventListener('change', () => store.set({ speed: Number(speed.value) }));
-  const show = (state, changed = new Set(['task'])) => {
+  const show = (/** @type {State} */ state, changed = new Set(['task'])) => {
     if (changed.has('task') || changed.has('data')) refill();
-    if (changed.has('task') || changed.has('faults')) showFaults(current().fault_presets);
-    for (const select of [task, filter, data, episode, speed]) select.value = state[select.id];
+    if (changed.has('task') || changed.has('faults')) showFaults(currentTask().fault_presets);
+    task.value = state.task;
+    filter.value = state.filter;
+    data.value = state.data;
+    episode.value = String(state.episode);
+    speed.value = String(state.speed);
   };
   show(store.state);
   store.listen(show);
   return () => show(store.state);
 }
 
-function described({ index, policy, split, steps, contact_fraction, label }) {
-  return (
-    label ??
-    [index, policy, split, `${steps} steps`, `contact ${percent(contact_fraction)}`]
-      .filter((part) => part !== '')
-      .join(' · ')
-  );
+/**
+ * @template {{name: string}} T
+ * @param {T[]} list
+ * @param {string} name
+ */
+const byName = (list, name) => list.find((entry) => entry.name === name);
+
+/**
+ * @param {{name: string}[]} list
+ * @returns {Option[]}
+ */
+const names = (list) => list.map(({ name }) => [name, name]);
+
+/**
+ * Returns the filters of a task for a data set. A filter that is known only from a live run has only that run's data.
+ * @param {Task} task
+ * @param {string} data
+ */
+const filtersOf = (task, data) => task.filters.filter(({ live }) => !live || live === data);
+
+/**
+ * Swaps the run and the comparison run if the comparison run is chosen.
+ * @param {State} state
+ * @param {'filter' | 'faults'} key
+ * @param {string} value
+ */
+const swapped = (state, key, value) =>
+  state.against === `${key}=${value}` ? { against: `${key}=${state[key]}` } : {};
+
+/**
+ * Returns the changes of the state that select the first run of a task.
+ * @param {Task} task
+ * @param {State} state
+ */
+function firstRun(task, state) {
+  const [{ name: data, first }] = task.data;
+  const hasFaults = task.fault_presets.some(({ faults }) => faults === state.faults);
+  return {
+    task: task.name,
+    filter: (byName(task.filters, state.filter) ?? task.filters[0]).name,
+    data,
+    episode: first,
+    faults: hasFaults ? state.faults : '',
+    against: '',
+    step: 0,
+    angle: null,
+    component: task.map.x,
+    playing: false,
+  };
 }
 
-function fill(select, options) {
-  select.replaceChildren(...options.map(([value, text]) => new Option(text, value)));
-  select.disabled = false;
+/** @param {EpisodeSummary} episode */
+function episodeLabel({ index, policy, split, steps, contact_fraction, label }) {
+  if (label) return label;
+  const parts = [index, policy, split, `${steps} steps`, `contact ${percent(contact_fraction)}`];
+  return parts.filter((part) => part !== '').join(' · ');
 }
 
 /**
- * One choice of a few, as radio buttons in a row. They are made anew only where the options are others: the focus stays.
- * @param {HTMLElement} host @param {[string, string][]} options values and what they are called
- * @param {string} chosen @param {(value: string) => void} choose
+ * @param {HTMLSelectElement} select
+ * @param {Option[]} options
  */
-export function choice(host, options, chosen, choose) {
-  host.hidden = options.length < 2;
-  choosing.set(host, choose);
-  const shown = JSON.stringify(options);
-  if (host.dataset.options !== shown) {
-    host.dataset.options = shown;
-    host.replaceChildren(...options.map(([value, text]) => option(host, value, text)));
-  }
-  for (const input of host.querySelectorAll('input')) input.checked = input.value === chosen;
+function fill(select, options) {
+  select.replaceChildren(
+    ...options.map(([value, label]) => new Option(String(label), String(value))),
+  );
+  select.disabled = false;
 }
 
-const choosing = new WeakMap(); // host -> what is to be done with a choice
+/** Handlers of the radio groups. @type {WeakMap<HTMLElement, (value: string) => void>} */
+const handlers = new WeakMap();
 
-function option(host, value, text) {
-  const label = document.createElement('label');
-  const input = Object.assign(document.createElement('input'), {
-    type: 'radio',
-    name: host.id,
-    value,
-  });
-  input.addEventListener('change', () => choosing.get(host)(value));
-  label.append(input, text);
-  return label;
+/**
+ * Shows a radio group. Its buttons are replaced only where the options have changed, so that the focus stays.
+ * @param {HTMLElement} host hidden if there are fewer than two options
+ * @param {[value: string, label: string][]} options
+ * @param {string} selected
+ * @param {(value: string) => void} choose
+ */
+export function choice(host, options, selected, choose) {
+  host.hidden = options.length < 2;
+  handlers.set(host, choose);
+  const key = JSON.stringify(options);
+  if (host.dataset.options !== key) {
+    host.dataset.options = key;
+    host.replaceChildren(...options.map(([value, label]) => radioButton(host, value, label)));
+  }
+  for (const input of host.querySelectorAll('input')) input.checked = input.value === selected;
+}
+
+/**
+ * @param {HTMLElement} host
+ * @param {string} value
+ * @param {string} label
+ */
+function radioButton(host, value, label) {
+  const input = create('input', { type: 'radio', name: host.id, value });
+  input.addEventListener('change', () => handlers.get(host)?.(value));
+  return create('label', {}, input, label);
 }

@@ -1,134 +1,155 @@
-/** "Report": a sheet of what a report of the shown run is to hold; Enter has it made as it is. */
+/** Dialog with the options of a report of the current run; Enter accepts the defaults. */
 
-const WHOLE = /^\d+$/;
+/** @import { ReportOptions, Selection } from '../data/api.js' */
+/** @import { Trace } from '../data/trace.js' */
+
+import { create, element, html, messageOf } from '../core/dom.js';
+
+const STEP = /^\d+$/;
 const BODY = `
   <form aria-label="Report" novalidate>
     <h2>Report of this run</h2>
-    <p class="about">One page that opens offline, with its figures, tables and numbers beside it.</p>
+    <p class="about">A page that opens offline, with its figures, tables and data files.</p>
     <fieldset>
-      <legend>Moments shown with scene, picture, maps and numbers</legend>
+      <legend>Steps shown with scene, image, maps and values</legend>
       <label><input type="radio" name="which" value="worst" checked> the three with the largest position error</label>
       <label><input type="radio" name="which" value="these"> these steps <input type="text" name="steps" aria-label="Steps" placeholder="12, 40" autocomplete="off"></label>
       <p class="offered"></p>
     </fieldset>
-    <label><input type="checkbox" name="every"> <span>slow diagnostics as well: likelihood maps, saliency, Shapley values</span></label>
-    <label><input type="checkbox" name="pdf"> <span>print it as PDF as well</span></label>
+    <label><input type="checkbox" name="every"> <span>Include slow diagnostics: likelihood maps, saliency, Shapley values</span></label>
+    <label><input type="checkbox" name="pdf"> <span>Also write a PDF</span></label>
     <label class="title">Title <input type="text" name="title" maxlength="200" autocomplete="off"></label>
-    <p class="wrong" role="alert"></p>
-    <button class="text make" autofocus>Make the report</button>
+    <p class="error" role="alert"></p>
+    <button class="text make" autofocus>Create report</button>
   </form>`;
 
-export class ReportSheet {
-  #sheet = Object.assign(document.createElement('div'), {
-    id: 'report-sheet',
-    popover: 'auto',
-    innerHTML: BODY,
-  });
+/** @typedef {{step: number, pinned: {maps: {step: number}, selection: Selection} | null}} StepOffer */
+
+export class ReportDialog {
+  #dialog = create('div', { id: 'report-sheet', popover: 'auto', innerHTML: BODY });
   #form;
-  #make;
+  #which;
+  #steps;
+  #title;
+  #create;
+  /** @type {Trace | null} */
   #trace = null;
 
   /**
-   * @param {HTMLButtonElement} button that opens it @param {() => {step: number, pinned: {maps: {step: number}, selection: object} | null}} now the moments to offer
-   * @param {(trace: import('../data/trace.js').Trace, wanted: import('../data/api.js').ReportOptions) => Promise<void>} make has it made; rejects with what is wrong
+   * @param {HTMLButtonElement} button opens the dialog
+   * @param {() => StepOffer} stepOffer returns the current step and the pinned step
+   * @param {(trace: Trace, options: ReportOptions) => Promise<void>} createReport throws the reason if it fails
    */
-  constructor(button, now, make) {
-    this.#make = make;
-    this.#form = this.#sheet.querySelector('form');
-    this.#sheet.setAttribute('role', 'dialog');
-    this.#sheet.setAttribute('aria-label', 'Report of this run');
-    button.after(this.#sheet);
-    button.popoverTargetElement = this.#sheet;
+  constructor(button, stepOffer, createReport) {
+    this.#create = createReport;
+    this.#form = element('form', HTMLFormElement, this.#dialog);
+    this.#which = [...this.#form.querySelectorAll('input')].filter(({ name }) => name === 'which');
+    this.#steps = this.#input('steps');
+    this.#title = this.#input('title');
+    this.#dialog.setAttribute('role', 'dialog');
+    this.#dialog.setAttribute('aria-label', 'Report of this run');
+    button.after(this.#dialog);
+    button.popoverTargetElement = this.#dialog;
     button.setAttribute('aria-haspopup', 'dialog');
-    const { steps, which } = this.#form.elements;
-    steps.addEventListener('input', () => (which.value = steps.value.trim() ? 'these' : 'worst'));
-    // Who chose with the mouse makes it with Enter, too.
-    this.#form.addEventListener(
-      'change',
-      ({ target }) => target.matches(':focus-visible') || this.#form.querySelector('.make').focus(),
+    this.#steps.addEventListener('input', () =>
+      this.#select(this.#steps.value.trim() ? 'these' : 'worst'),
     );
+    // After a choice with the mouse, Enter creates the report as well.
+    this.#form.addEventListener('change', ({ target }) => {
+      if (target instanceof Element && !target.matches(':focus-visible'))
+        html('.make', this.#form).focus();
+    });
     this.#form.addEventListener('submit', (event) => (event.preventDefault(), this.#submit()));
-    this.#sheet.addEventListener('beforetoggle', ({ newState }) => {
-      if (newState !== 'open') return;
+    this.#dialog.addEventListener('beforetoggle', (event) => {
+      if (event.newState !== 'open') return;
       const { bottom, right } = button.getBoundingClientRect();
-      [this.#sheet.style.top, this.#sheet.style.right] = [
-        `${bottom + 5}px`,
-        `${Math.max(6, innerWidth - right - 60)}px`,
-      ];
-      this.#say('');
-      this.#offer(now());
+      this.#dialog.style.top = `${bottom + 5}px`;
+      this.#dialog.style.right = `${Math.max(6, innerWidth - right - 60)}px`;
+      this.#setError('');
+      this.#offer(stepOffer());
     });
   }
 
-  /** @param {import('../data/trace.js').Trace} trace another run: steps that were chosen are of the one before */
+  /** @param {string} name */
+  #input(name) {
+    return element(`input[name=${name}]`, HTMLInputElement, this.#form);
+  }
+
+  /** @param {'worst' | 'these'} value */
+  #select(value) {
+    for (const input of this.#which) input.checked = input.value === value;
+  }
+
+  /**
+   * Sets the run; the steps of the previous run are cleared.
+   * @param {Trace} trace
+   */
   show(trace) {
     this.#trace = trace;
-    const { steps, which, title } = this.#form.elements;
-    [steps.value, which.value] = ['', 'worst'];
-    title.placeholder = `${trace.header.filter} on ${trace.selection.task}`;
+    this.#steps.value = '';
+    this.#select('worst');
+    this.#title.placeholder = `${trace.header.filter} on ${trace.selection.task}`;
   }
 
-  /** Buttons that put this moment, or the pinned one, among the steps. */
+  /**
+   * Shows buttons that add the current step and the pinned step.
+   * @param {StepOffer} offer
+   */
   #offer({ step, pinned }) {
-    const same =
+    const selection = Object.entries(this.#trace?.selection ?? {});
+    const isPinned =
       pinned &&
-      Object.entries(this.#trace?.selection ?? {}).every(
-        ([key, value]) => pinned.selection[key] === value,
-      );
-    const offered = [
-      [`this one, ${step}`, step],
-      ...(same && pinned.maps.step !== step
-        ? [[`the pinned one, ${pinned.maps.step}`, pinned.maps.step]]
-        : []),
-    ];
-    this.#form.querySelector('.offered').replaceChildren(
-      'Add ',
-      ...offered.map(([textContent, one]) => {
-        const button = Object.assign(document.createElement('button'), {
-          type: 'button',
-          className: 'text quiet',
-          textContent,
-        });
-        button.addEventListener('click', () => this.#add(one));
-        return button;
-      }),
-    );
+      pinned.maps.step !== step &&
+      selection.every(([key, value]) => Object(pinned.selection)[key] === value);
+    /** @type {[string, number][]} */
+    const steps = [[`current step ${step}`, step]];
+    if (isPinned) steps.push([`pinned step ${pinned.maps.step}`, pinned.maps.step]);
+    const buttons = steps.map(([textContent, value]) => {
+      const button = create('button', { type: 'button', className: 'text quiet', textContent });
+      button.addEventListener('click', () => this.#add(value));
+      return button;
+    });
+    html('.offered', this.#form).replaceChildren('Add ', ...buttons);
   }
 
+  /** @param {number} step */
   #add(step) {
-    const { steps, which } = this.#form.elements;
-    const there = parts(steps.value);
-    if (!there.includes(String(step))) steps.value = [...there, step].join(', ');
-    which.value = 'these';
+    const steps = split(this.#steps.value);
+    if (!steps.includes(String(step))) this.#steps.value = [...steps, step].join(', ');
+    this.#select('these');
   }
 
   async #submit() {
-    const { which, steps, every, pdf, title } = this.#form.elements;
-    const asked = which.value === 'these' ? parts(steps.value) : [];
-    const last = (this.#trace?.steps ?? 0) - 1;
-    const wrong = asked.find((step) => !WHOLE.test(step) || Number(step) > last);
-    if (!this.#trace) return this.#say('The run is not there yet.');
-    if (wrong !== undefined)
-      return this.#say(`${wrong} is no step of this run: it has steps 0 to ${last}.`);
-    if (which.value === 'these' && !asked.length)
-      return this.#say('Give one step or more, such as 12, 40.');
+    const listed = this.#which.some(({ checked, value }) => checked && value === 'these');
+    const steps = listed ? split(this.#steps.value) : [];
+    if (!this.#trace) return this.#setError('The run is still loading.');
+    const last = this.#trace.steps - 1;
+    const invalid = steps.find((step) => !STEP.test(step) || Number(step) > last);
+    if (invalid !== undefined)
+      return this.#setError(`Step ${invalid} does not exist. The steps are 0 to ${last}.`);
+    if (listed && !steps.length)
+      return this.#setError('Enter one or more steps, for example 12, 40.');
     try {
-      await this.#make(this.#trace, {
-        events: asked.map(Number),
-        slow: every.checked,
-        pdf: pdf.checked,
-        title: title.value.trim(),
+      await this.#create(this.#trace, {
+        events: steps.map(Number),
+        slow: this.#input('every').checked,
+        pdf: this.#input('pdf').checked,
+        title: this.#title.value.trim(),
       });
-      this.#sheet.hidePopover();
+      this.#dialog.hidePopover();
     } catch (error) {
-      this.#say(error.message);
+      this.#setError(messageOf(error));
     }
   }
 
-  #say(problem) {
-    this.#form.querySelector('.wrong').textContent = problem;
+  /** @param {string} message */
+  #setError(message) {
+    html('.error', this.#form).textContent = message;
   }
 }
 
-/** What stands between commas or spaces. */
-const parts = (text) => text.split(/[\s,]+/).filter(Boolean);
+/**
+ * Splits a text at commas and spaces.
+ * @param {string} text
+ */
+const split = (text) => text.split(/[\s,]+/).filter(Boolean);

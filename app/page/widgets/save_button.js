@@ -1,90 +1,103 @@
-/** "Save .rrd": has a recording written, says how far it is, and saves it once it is there, also after a reload. */
+/** "Save .rrd": writes a recording, shows the progress and downloads the file; resumes after a reload. */
 
+/** @import { Job, Recording } from '../data/api.js' */
+/** @import { RecordingRequest } from '../data/api.js' */
+/** @import { Jobs } from './jobs.js' */
+
+import { create, messageOf } from '../core/dom.js';
+import { fixed, formatBytes, percent } from '../core/units.js';
 import * as api from '../data/api.js';
-import { told } from './jobs.js';
-import { formatBytes, fixed, percent } from '../core/units.js';
+import { jobSummary } from './jobs.js';
 
-const WAITED_FOR = 'recording'; // in this tab's storage: what was asked for, until it is there
+const PENDING_REQUEST = 'recording'; // key in the session storage
 
 /**
- * Has a recording written and waits until it is there. Raises ServerError.
- * @param {object} asked see `api.recordingRequest` @param {import('./jobs.js').Jobs} jobs one of which makes the maps
- * @param {(job: api.Job) => void} say how far it is
- * @returns {Promise<api.Recording>}
+ * Has a recording written and waits until it is complete. Throws ServerError.
+ * @param {RecordingRequest} request
+ * @param {Jobs} jobs one of them computes the maps
+ * @param {(job: Job) => void} progress
+ * @returns {Promise<Recording>}
  */
-export async function written(asked, jobs, say) {
-  const made = await api.createRecording(asked);
-  if (!made.job) return made;
-  say(made.job);
-  const job = await jobs.ended(made.job.id, say);
-  if (job?.state !== 'done') throw new api.ServerError(job ? told(job) : 'Its job was forgotten.');
-  const there = await api.createRecording(asked);
-  if (there.job) throw new api.ServerError('It was deleted as soon as it was there.');
-  return { ...there, seconds: job.ended - job.started };
+export async function writeRecording(request, jobs, progress) {
+  const reply = await api.createRecording(request);
+  if (!('job' in reply)) return reply;
+  progress(reply.job);
+  const job = await jobs.ended(reply.job.id, progress);
+  if (job?.state !== 'done')
+    throw new api.ServerError(job ? jobSummary(job) : 'The job was removed.');
+  const recording = await api.createRecording(request);
+  if ('job' in recording) throw new api.ServerError('The recording was deleted.');
+  return { ...recording, seconds: Number(job.ended) - Number(job.started) };
 }
 
 /**
- * @param {HTMLButtonElement} button @param {HTMLElement} host where the result is told @param {import('./jobs.js').Jobs} jobs
- * @param {() => object | null} wanted see `api.recordingRequest`; null while there is no run
- * @param {() => void} open shows the run in the Rerun tab @param {(name: string) => void} keep shows where the file is among the others
- * @returns {() => Promise<void>} what the button does
+ * Connects the button.
+ * @param {HTMLButtonElement} button
+ * @param {HTMLElement} host of the result
+ * @param {Jobs} jobs
+ * @param {object} actions
+ * @param {() => RecordingRequest | null} actions.request null while there is no run
+ * @param {() => void} actions.openRerun shows the run in the Rerun tab
+ * @param {(name: string) => void} actions.openRecordings shows the file in the Recordings tab
+ * @returns {() => Promise<void>} saves the run
  */
-export function saving(button, host, jobs, wanted, open, keep) {
-  const tell = (...children) => {
-    const close = act('×', () => host.replaceChildren(), '');
-    close.setAttribute('aria-label', 'Dismiss');
-    const line = document.createElement('p');
-    line.append(...children, close);
-    host.replaceChildren(line);
+export function connectSaveButton(button, host, jobs, { request, openRerun, openRecordings }) {
+  /** @param {...(Node | string)} children */
+  const show = (...children) => {
+    const close = action('×', () => host.replaceChildren(), '');
+    close.ariaLabel = 'Dismiss';
+    host.replaceChildren(create('p', {}, ...children, close));
   };
-  const save = async (asked) => {
-    if (button.disabled || !asked) return;
-    sessionStorage.setItem(WAITED_FOR, JSON.stringify(asked));
+  /** @param {RecordingRequest | null} body */
+  const save = async (body) => {
+    if (button.disabled || !body) return;
+    sessionStorage.setItem(PENDING_REQUEST, JSON.stringify(body));
     [button.disabled, button.textContent] = [true, 'Writing …'];
-    const progress = Object.assign(document.createElement('progress'), {
-      ariaLabel: 'Progress of the recording',
-      hidden: true,
-    });
-    const cancel = act('Cancel', () => jobs.cancel(cancel.value));
+    const progress = create('progress', { ariaLabel: 'Progress of the recording', hidden: true });
+    const cancel = action('Cancel', () => jobs.cancel(cancel.value));
     cancel.hidden = true;
-    tell('Writing the recording …', progress, cancel);
+    show('Writing the recording …', progress, cancel);
     try {
-      const recording = await written(asked, jobs, ({ id, progress: share }) => {
+      const recording = await writeRecording(body, jobs, ({ id, progress: share }) => {
         [progress.value, cancel.value, button.textContent] = [share, id, percent(share)];
         progress.hidden = cancel.hidden = false;
       });
-      const link = Object.assign(document.createElement('a'), {
-        href: recording.url,
-        download: recording.name,
-        textContent: recording.name,
-      });
-      const again = [
-        ['Open in Rerun tab', open],
-        ['Recordings', () => keep(recording.name)],
-      ].map(([text, then]) => act(text, () => (host.replaceChildren(), then())));
-      const when =
-        recording.seconds === null ? 'written before' : `written in ${fixed(recording.seconds)} s`;
-      tell(link, ` ${formatBytes(recording.bytes)}, ${when} `, ...again);
+      const { name, url, bytes, seconds } = recording;
+      const link = create('a', { href: url, download: name, textContent: name });
+      const duration = seconds === null ? 'written earlier' : `written in ${fixed(seconds)} s`;
+      /** @param {() => void} open */
+      const leave = (open) => () => (host.replaceChildren(), open());
+      show(
+        link,
+        ` ${formatBytes(bytes)}, ${duration} `,
+        action('Open in Rerun tab', leave(openRerun)),
+        action(
+          'Recordings',
+          leave(() => openRecordings(name)),
+        ),
+      );
       link.click();
     } catch (error) {
-      tell(`The recording was not written: ${error.message}`);
+      show(`The recording was not written: ${messageOf(error)}`);
     } finally {
-      sessionStorage.removeItem(WAITED_FOR);
+      sessionStorage.removeItem(PENDING_REQUEST);
       [button.disabled, button.textContent] = [false, 'Save .rrd'];
     }
   };
-  button.addEventListener('click', () => save(wanted()));
-  const before = sessionStorage.getItem(WAITED_FOR);
-  if (before) save(JSON.parse(before));
-  return () => save(wanted());
+  button.addEventListener('click', () => save(request()));
+  const unfinished = sessionStorage.getItem(PENDING_REQUEST);
+  if (unfinished) save(JSON.parse(unfinished));
+  return () => save(request());
 }
 
-function act(textContent, then, className = 'text') {
-  const button = Object.assign(document.createElement('button'), {
-    type: 'button',
-    className,
-    textContent,
-  });
-  button.addEventListener('click', then);
+/**
+ * Creates a button.
+ * @param {string} textContent
+ * @param {() => void} handler
+ * @param {string} [className]
+ */
+function action(textContent, handler, className = 'text') {
+  const button = create('button', { type: 'button', className, textContent });
+  button.addEventListener('click', handler);
   return button;
 }

@@ -1,56 +1,84 @@
-/** Files that are being added: sent one after the other, each with how far it is, a way to stop it, and what went wrong. */
+/** Uploads of recordings, one after the other, each with progress, cancellation and its error. */
 
+/** @import { RecordingEntry } from '../types/server.js' */
+
+import { create, messageOf } from '../core/dom.js';
 import { formatBytes, percent, sentence } from '../core/units.js';
 
-export class Adding {
+export class Uploads {
   #host;
   #done;
   #last = Promise.resolve();
 
-  /** @param {HTMLElement} host a list @param {(added: object) => void} done called with each recording that was added */
+  /**
+   * @param {HTMLElement} host a list
+   * @param {(recording: RecordingEntry) => void} done called for each uploaded recording
+   */
   constructor(host, done) {
-    [this.#host, this.#done] = [host, done];
+    this.#host = host;
+    this.#done = done;
   }
 
-  /** @param {File[]} files @param {(name: string) => string} free a name like this one that nobody has @param {number} largest bytes */
-  add(files, free, largest) {
-    for (const file of files) this.#last = this.#one(file, free, largest, this.#last);
+  /**
+   * @param {File[]} files
+   * @param {(name: string) => string} unusedName returns a similar name that is not in use
+   * @param {number} limit bytes
+   */
+  add(files, unusedName, limit) {
+    for (const file of files) this.#last = this.#upload(file, unusedName, limit, this.#last);
   }
 
-  async #one(file, free, largest, before) {
-    const line = document.createElement('li');
-    line.innerHTML =
-      '<span></span><progress max="1" value="0"></progress><button type="button" class="text quiet">Cancel</button>';
-    const [text, bar, button] = line.children;
-    bar.ariaLabel = `Progress of ${file.name}`;
-    text.textContent = `${file.name}, ${formatBytes(file.size)}: waits`;
+  /**
+   * @param {File} file
+   * @param {(name: string) => string} unusedName
+   * @param {number} limit
+   * @param {Promise<void>} previous upload
+   */
+  async #upload(file, unusedName, limit, previous) {
+    const text = create('span', {
+      textContent: `${file.name}, ${formatBytes(file.size)}: waiting`,
+    });
+    const bar = create('progress', { max: 1, value: 0, ariaLabel: `Progress of ${file.name}` });
+    const button = create('button', { type: 'button', className: 'text quiet' }, 'Cancel');
+    const line = create('li', {}, text, bar, button);
     this.#host.append(line);
     const request = new XMLHttpRequest();
-    let stopped = false;
-    button.addEventListener('click', () => ((stopped = true), request.abort(), line.remove()));
-    await before;
-    if (stopped) return;
+    let cancelled = false;
+    button.addEventListener('click', () => {
+      cancelled = true;
+      request.abort();
+      line.remove();
+    });
+    await previous;
+    if (cancelled) return;
     try {
-      if (file.size > largest)
-        throw new Error(
-          `it has ${formatBytes(file.size)}, and no more than ${formatBytes(largest)} are taken here`,
-        );
-      const added = await send(request, file, free(file.name), (share) => {
+      if (file.size > limit) {
+        const [size, maximum] = [formatBytes(file.size), formatBytes(limit)];
+        throw new Error(`it has ${size}; the limit is ${maximum}`);
+      }
+      const recording = await send(request, file, unusedName(file.name), (share) => {
         bar.value = share;
-        text.textContent = `${file.name}: ${share < 1 ? percent(share) : 'is looked into'}`;
+        text.textContent = `${file.name}: ${share < 1 ? percent(share) : 'checking'}`;
       });
       line.remove();
-      this.#done(added);
+      this.#done(recording);
     } catch (error) {
       line.dataset.state = 'error';
-      text.textContent = `${file.name} was not added: ${sentence(error.message)}`;
+      text.textContent = `${file.name} was not added: ${sentence(messageOf(error))}`;
       bar.remove();
       [button.textContent, button.ariaLabel] = ['×', 'Dismiss'];
     }
   }
 }
 
-/** Sends a file; only an XMLHttpRequest tells how much of it has gone. */
+/**
+ * Uploads a file. An XMLHttpRequest, because fetch reports no upload progress.
+ * @param {XMLHttpRequest} request
+ * @param {File} file
+ * @param {string} name
+ * @param {(share: number) => void} progress
+ * @returns {Promise<RecordingEntry>}
+ */
 function send(request, file, name, progress) {
   return new Promise((resolve, reject) => {
     request.open('PUT', `/api/recordings/${encodeURIComponent(name)}`);
@@ -60,9 +88,9 @@ function send(request, file, name, progress) {
     );
     request.addEventListener('load', () => {
       if (request.status === 201) resolve(request.response);
-      else reject(new Error(request.response?.error ?? `the server answered ${request.status}`));
+      else reject(new Error(request.response?.error ?? `the server responded ${request.status}`));
     });
-    request.addEventListener('error', () => reject(new Error('the server does not answer')));
+    request.addEventListener('error', () => reject(new Error('the server does not respond')));
     request.send(file);
   });
 }

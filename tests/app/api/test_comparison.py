@@ -16,7 +16,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.app.views.scene import Scene
-from beliefscope.app.views.scene_belief import OUTLINES
+from beliefscope.app.views.scene_belief import OUTLINE_EDGES
 from beliefscope.app.views.scene_comparison import dashed
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.traces.replay import Edit
@@ -144,17 +144,17 @@ def test_selection_of_comparison_run() -> None:
     assert len({selection, edited, selection.comparison("from=40&to=60&faults=blackout&weights=image=0.6")}) == 3
 
 
-@pytest.mark.parametrize("shape", OUTLINES)
-def test_dashes_lie_on_their_edges_and_cover_about_half(shape: str) -> None:
-    edges = np.asarray(OUTLINES[shape])  # of size 1 m: a box has long edges alone
+@pytest.mark.parametrize("shape", OUTLINE_EDGES)
+def test_dashes_cover_half_of_their_edges(shape: str) -> None:
+    edges = np.asarray(OUTLINE_EDGES[shape])  # of size 1 m
     dashes = dashed(edges)
     lengths = [np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1) for lines in (edges, dashes)]
     assert 0.4 < lengths[1].sum() / lengths[0].sum() < 0.7
     ends = dashes.reshape(-1, 1, 3)
     along = (edges[:, 1] - edges[:, 0]) / lengths[0][:, None]
-    away = ends - edges[None, :, 0]
-    on = np.clip((away * along).sum(-1, keepdims=True), 0.0, lengths[0][:, None])
-    assert np.linalg.norm(away - on * along, axis=-1).min(axis=1).max() < 1e-6
+    offset = ends - edges[None, :, 0]
+    distance = np.clip((offset * along).sum(-1, keepdims=True), 0.0, lengths[0][:, None])
+    assert np.linalg.norm(offset - distance * along, axis=-1).min(axis=1).max() < 1e-6
 
 
 def test_scene_shows_comparison_run(server: TestClient) -> None:

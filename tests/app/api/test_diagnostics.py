@@ -211,9 +211,7 @@ def test_settings_json_round_trip(tmp_path: Path, root: Path) -> None:
     with pytest.raises(BadInput, match="task 'nope'"):
         Settings.from_json(settings.to_json() | {"tasks": ["nope"]})
     source = f"{root / 'examples' / '04_own_filter.py'}:build"
-    external = Settings.from_json(
-        settings.to_json() | {"checkpoints": {"own": {"source": source, "task": "door"}}}
-    )
+    external = Settings.from_json(settings.to_json() | {"checkpoints": {"own": {"source": source, "task": "door"}}})
     again = Settings.from_json(external.to_json())
     assert again.checkpoints["own"].hash == external.checkpoints["own"].hash  # type: ignore[union-attr]
 

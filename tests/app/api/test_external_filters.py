@@ -1,4 +1,4 @@
-"""Filters from outside in the commands and on the server; and that only the command line can name one."""
+"""External filters in commands and on the server; only the command line can name code."""
 
 from __future__ import annotations
 
@@ -45,27 +45,27 @@ def result(*arguments: object) -> Any:
     return json.loads(out)
 
 
-def test_example_is_short_and_knows_how_sure_it_is() -> None:
+def test_example_is_short_and_calibrated() -> None:
     assert len(EXAMPLE.read_text().splitlines()) < 60
-    measured = result("evaluate", "door", "--filter", SPEC)
-    assert measured["filter"] == "04_own_filter-build"
-    assert 0.5 < measured["nees"] < 2.0
-    assert measured["coverage95"] > 0.85
-    assert measured["particles"] is None
+    metrics = result("evaluate", "door", "--filter", SPEC)
+    assert metrics["filter"] == "04_own_filter-build"
+    assert 0.5 < metrics["nees"] < 2.0
+    assert metrics["coverage95"] > 0.85
+    assert metrics["particles"] is None
 
 
-def test_trace_and_recording_are_of_one_run(tmp_path: Path) -> None:
-    made = result("trace", "door", "--filter", SPEC, "-o", tmp_path / "own.trace")
+def test_trace_and_recording_are_equal(tmp_path: Path) -> None:
+    summary = result("trace", "door", "--filter", SPEC, "-o", tmp_path / "own.trace")
     result("record", "door", "--filter", SPEC, "--maps", 50, "-o", tmp_path / "own.rrd")
     traced, recorded = load_trace(tmp_path / "own.trace"), read_recording(tmp_path / "own.rrd")
-    assert traced.checkpoint_hash == recorded.checkpoint_hash == made["checkpoint_hash"]
+    assert traced.checkpoint_hash == recorded.checkpoint_hash == summary["checkpoint_hash"]
     assert (traced.kind, traced.modalities) == (recorded.kind, recorded.modalities) == ("external", ())
     for name in ("estimate_mean", "estimate_covariance", "modality_mean"):
         np.testing.assert_array_equal(getattr(recorded, name), getattr(traced, name))
 
 
 @pytest.mark.parametrize("command", ["trace", "record", "evaluate"])
-def test_a_failure_is_one_line_and_leaves_no_file(command: str, tmp_path: Path) -> None:
+def test_error_is_one_line_and_leaves_no_file(command: str, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(FAILS)
     output = () if command == "evaluate" else ("-o", tmp_path / "new")
     code, out, err = run(command, "door", "--filter", f"{tmp_path}/own.py:Fails", *output)
@@ -74,14 +74,14 @@ def test_a_failure_is_one_line_and_leaves_no_file(command: str, tmp_path: Path) 
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["own.py"]
 
 
-def test_a_module_is_found_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_module_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_own_filters.py").write_text(EXAMPLE.read_text())
     monkeypatch.chdir(tmp_path)
     assert result("evaluate", "door", "--filter", "my_own_filters:build")["filter"] == "my_own_filters-build"
     sys.modules.pop("my_own_filters")
 
 
-def test_a_server_must_know_the_task(tmp_path: Path) -> None:
+def test_server_needs_the_task(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(FAILS)
     code, _, err = run("serve", "--filter", f"{tmp_path}/own.py:Fails", "--workspace", tmp_path / "w")
     assert code == 2
@@ -94,20 +94,22 @@ def client(base_settings: Settings, tmp_path: Path, open_client: Callable[..., T
     return open_client(Settings(tmp_path / "workspace", base_settings.data, {own.name: own}))
 
 
-def test_the_page_has_what_it_says(client: TestClient) -> None:
+def test_page_shows_available_values(client: TestClient) -> None:
     with client:
-        listed = client.get("/api/catalog").json()["tasks"][0]["filters"][0]
-        assert (listed["name"], listed["kind"]) == ("04_own_filter-build", "external")
+        entry = client.get("/api/catalog").json()["tasks"][0]["filters"][0]
+        assert (entry["name"], entry["kind"]) == ("04_own_filter-build", "external")
         while (answer := client.get("/api/trace/door/04_own_filter-build/0")).status_code == 202:
             pass
-        found = answer.json()
-        columns = {column["name"] for column in found["columns"]}
+        header = answer.json()
+        columns = {column["name"] for column in header["columns"]}
         assert {"estimate_mean", "estimate_sigma"} <= columns
-        assert not {"modality_mean", "modality_sigma", "weights", "effective_weights", "effective_sample_size"} & columns
-        assert found["no_maps"] is None
+        assert (
+            not {"modality_mean", "modality_sigma", "weights", "effective_weights", "effective_sample_size"} & columns
+        )
+        assert header["no_maps"] is None
 
 
-def test_the_page_cannot_name_code(client: TestClient, tmp_path: Path) -> None:
+def test_page_cannot_name_code(client: TestClient, tmp_path: Path) -> None:
     trap = tmp_path / "trap.py"
     trap.write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\n" + EXAMPLE.read_text())
     with client:

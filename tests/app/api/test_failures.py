@@ -12,8 +12,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.jobs.failures import MAX_EVENTS, failure_document
-from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.failures.events import survey_of
 

@@ -13,8 +13,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.jobs.finetune import ProgressLog
-from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.filters.checkpoint import load_checkpoint
 
 TIMEOUT = 120.0  # s, including the import of PyTorch by a job
@@ -53,9 +53,7 @@ def test_options(client: TestClient) -> None:
 
 
 @pytest.mark.long
-def test_run_is_compared_with_its_base_and_saved(
-    settings: Settings, open_client: Callable[..., TestClient]
-) -> None:
+def test_run_is_compared_with_its_base_and_saved(settings: Settings, open_client: Callable[..., TestClient]) -> None:
     base = load_checkpoint(settings.checkpoints["crossmodal-ekf"])  # type: ignore[arg-type]
     with open_client(settings) as client:
         before = filters(client)
@@ -93,7 +91,7 @@ def test_run_is_compared_with_its_base_and_saved(
         assert client.post(f"/api/tuned/{run}/discard").json()["saved_as"] is None
         assert filters(client) == before
         assert path.is_file()
-        client.delete(f"/api/jobs/{shown['job']['id']}")
+        client.delete(f"/api/jobs/{details['job']['id']}")
         again = client.get(f"/api/tuned/{run}").json()
         assert (again["job"], again["result"]) == (None, result), "the result outlasts its job"
     assert load_checkpoint(settings.checkpoints["crossmodal-ekf"]).hash == base.hash  # type: ignore[arg-type]

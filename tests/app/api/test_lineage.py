@@ -14,8 +14,8 @@ from starlette.testclient import TestClient
 
 from beliefscope.app.api.finetune import _options
 from beliefscope.app.runs.saved_filters import SavedFilter, save_filter
-from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 
 MIX = [{"slice": {"name": "haptics only"}, "share": 1.0}]

@@ -1,4 +1,4 @@
-"""Live runs over HTTP: every page gets every step, at its own speed; a dead or damaged run is told."""
+"""Live runs over HTTP: blocks of steps, states, and use as data sets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 
-from beliefscope.app.api.live import PATIENCE
+from beliefscope.app.api.live import TIMEOUT
 from beliefscope.app.protocol.trace_format import camera_images, columns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
@@ -28,12 +28,14 @@ from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter
 from beliefscope.recordings.read import read_recording
 
 STEPS = 24
-SHOWN = "/api/trace/door/{}/9?data=live:run"
+TRACE = "/api/trace/door/{}/9?data=live:run"
 
 
-def cut(whole: Trace, first: int, last: int) -> Trace:
+def part(run: Trace, first: int, last: int) -> Trace:
     static = ("start_mean", "start_covariance")
-    return trace_from_arrays(header_of(whole), {n: a if n in static else a[first:last] for n, a in arrays_of(whole).items()})
+    return trace_from_arrays(
+        header_of(run), {n: a if n in static else a[first:last] for n, a in arrays_of(run).items()}
+    )
 
 
 @pytest.fixture(scope="module", params=["crossmodal-ekf", "crossmodal-pf"])
@@ -41,32 +43,32 @@ def whole(request: pytest.FixtureRequest) -> Trace:
     checkpoint = load_checkpoint(shipped("door", request.param))
     with open_dataset(sample_path("door")) as data:
         episode = data[9]
-    short = {one: getattr(episode, one)[:STEPS] for one in ("states", "controls", "contact", "qpos")}
-    seen = {key: array[:STEPS] for key, array in episode.observations.items()}
-    return trace(checkpoint, replace(episode, **short, observations=seen), 9, seed=0, particles=40)
+    fields = {name: getattr(episode, name)[:STEPS] for name in ("states", "controls", "contact", "qpos")}
+    observations = {key: array[:STEPS] for key, array in episode.observations.items()}
+    return trace(checkpoint, replace(episode, **fields, observations=observations), 9, seed=0, particles=40)
 
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    """What ships."""
+    """Built-in filters and data."""
     return Settings(tmp_path / "workspace")
 
 
 @pytest.fixture
 def folder(settings: Any) -> Path:
-    made: Path = settings.workspace / "live"
-    made.mkdir(parents=True)
-    return made
+    path: Path = settings.workspace / "live"
+    path.mkdir(parents=True)
+    return path
 
 
 @pytest.fixture
 def writer(folder: Path, whole: Trace) -> Iterator[LiveFileWriter]:
-    made = LiveFileWriter(folder / "run.live", whole, expected=STEPS)
-    yield made
-    made.close()
+    writer = LiveFileWriter(folder / "run.live", whole, expected=STEPS)
+    yield writer
+    writer.close()
 
 
-def ask(socket: WebSocketTestSession, first: int, state: str = "running") -> tuple[dict[str, Any], bytes]:
+def request_block(socket: WebSocketTestSession, first: int, state: str = "running") -> tuple[dict[str, Any], bytes]:
     socket.send_text(json.dumps({"from": first, "state": state}))
     message = socket.receive_bytes()
     length = int.from_bytes(message[:4], "little")
@@ -74,49 +76,49 @@ def ask(socket: WebSocketTestSession, first: int, state: str = "running") -> tup
 
 
 def values(head: dict[str, Any], buffer: bytes) -> dict[str, np.ndarray[Any, Any]]:
-    found = {}
+    arrays = {}
     for column in head["columns"]:
         count = int(np.prod(column["shape"]))
-        found[column["name"]] = np.frombuffer(buffer, "<f4", count, column["offset"]).reshape(column["shape"])
-    seen = np.frombuffer(buffer[len(buffer) - head["pictures"] :], np.uint8)
-    return found | {"pictures": seen.reshape(head["steps"], 32, 32)}
+        arrays[column["name"]] = np.frombuffer(buffer, "<f4", count, column["offset"]).reshape(column["shape"])
+    images = np.frombuffer(buffer[len(buffer) - head["pictures"] :], np.uint8)
+    return arrays | {"pictures": images.reshape(head["steps"], 32, 32)}
 
 
 def expected(whole: Trace) -> dict[str, np.ndarray[Any, Any]]:
-    said, buffer = columns(whole)
-    shown = camera_images(whole)
-    assert shown is not None
-    return values({"columns": said, "pictures": shown.nbytes, "steps": len(whole)}, buffer + shown.tobytes())
+    descriptions, buffer = columns(whole)
+    images = camera_images(whole)
+    assert images is not None
+    head = {"columns": descriptions, "pictures": images.nbytes, "steps": len(whole)}
+    return values(head, buffer + images.tobytes())
 
 
-def same(one: dict[str, Any], other: dict[str, Any]) -> None:
-    assert one.keys() == other.keys()
-    for name in one:
-        np.testing.assert_allclose(one[name], other[name], rtol=1e-5, atol=1e-7, err_msg=name)
+def assert_equal(actual: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert actual.keys() == expected.keys()
+    for name in actual:
+        np.testing.assert_allclose(actual[name], expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
 
 
-def test_pages_of_different_speeds_both_get_everything(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    """One asks after each step that is written, the other once in a while: its blocks are larger, nothing is lost."""
-    got: dict[str, list[Any]] = {"fast": [], "slow": []}
+def test_fast_and_slow_clients_receive_all_steps(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
+    """The slow client receives larger blocks."""
+    blocks: dict[str, list[Any]] = {"fast": [], "slow": []}
     with client.websocket_connect("/api/live/run") as fast, client.websocket_connect("/api/live/run") as slow:
         for step in range(STEPS):
-            writer.append(cut(whole, step, step + 1))
-            head, buffer = ask(fast, step)
+            writer.append(part(whole, step, step + 1))
+            head, buffer = request_block(fast, step)
             assert (head["first"], head["steps"], head["total"], head["state"]) == (step, 1, step + 1, "running")
-            got["fast"].append(values(head, buffer))
+            blocks["fast"].append(values(head, buffer))
             if step % 8 == 7:
-                head, buffer = ask(slow, step - 7)
+                head, buffer = request_block(slow, step - 7)
                 assert head["steps"] == 8
-                got["slow"].append(values(head, buffer))
+                blocks["slow"].append(values(head, buffer))
         writer.finish()
-        head, _ = ask(fast, STEPS)
+        head, _ = request_block(fast, STEPS)
         assert (head["steps"], head["state"], head["message"]) == (0, "ended", "")
-    for blocks in got.values():
-        same({name: np.concatenate([b[name] for b in blocks]) for name in blocks[0]}, expected(whole))
+    for parts in blocks.values():
+        assert_equal({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, expected(whole))
 
 
-def test_a_page_that_does_not_ask_costs_nothing(address: str, settings: Any, whole: Trace) -> None:
-    """The server sends only what is asked for: nothing waits in it for a page that has stalled."""
+def test_nothing_is_sent_without_a_request(address: str, settings: Any, whole: Trace) -> None:
     from websockets.sync.client import connect
 
     folder = settings.workspace / "live"
@@ -135,84 +137,84 @@ def test_a_page_that_does_not_ask_costs_nothing(address: str, settings: Any, who
     writer.close()
 
 
-def test_one_message_is_bounded(client: TestClient, writer: LiveFileWriter, whole: Trace, monkeypatch: Any) -> None:
-    """However long the run: the page asks again for the rest."""
+def test_size_of_a_message_is_limited(
+    client: TestClient, writer: LiveFileWriter, whole: Trace, monkeypatch: Any
+) -> None:
     writer.append(whole)
-    monkeypatch.setattr("beliefscope.app.api.live.BLOCK", 5 * writer_row(writer))
+    monkeypatch.setattr("beliefscope.app.api.live.MAX_BLOCK", 5 * bytes_per_step(writer))
     first, parts = 0, []
     with client.websocket_connect("/api/live/run") as socket:
         while first < STEPS:
-            head, buffer = ask(socket, first)
+            head, buffer = request_block(socket, first)
             assert 0 < head["steps"] <= 5
             parts.append(values(head, buffer))
             first += head["steps"]
-    same({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, expected(whole))
+    assert_equal({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, expected(whole))
 
 
-def writer_row(writer: LiveFileWriter) -> int:
+def bytes_per_step(writer: LiveFileWriter) -> int:
     reader = LiveFileReader(writer.path)
     reader.close()
     return reader.bytes_per_step
 
 
-def test_a_page_waits_until_a_step_comes(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    writer.append(cut(whole, 0, 1))
+def test_response_waits_for_the_next_step(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
+    writer.append(part(whole, 0, 1))
     with client.websocket_connect("/api/live/run") as socket:
-        late = threading.Timer(0.3, writer.append, [cut(whole, 1, 2)])
-        late.start()
-        head, _ = ask(socket, 1)
+        timer = threading.Timer(0.3, writer.append, [part(whole, 1, 2)])
+        timer.start()
+        head, _ = request_block(socket, 1)
         assert head["steps"] == 1
-        late.join()
+        timer.join()
         started = time.monotonic()
-        head, _ = ask(socket, 2)
+        head, _ = request_block(socket, 2)
         assert head["steps"] == 0
-        assert time.monotonic() - started >= PATIENCE - 0.1
+        assert time.monotonic() - started >= TIMEOUT - 0.1
 
 
-def test_a_growing_run_is_shown_as_far_as_it_is(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    url = SHOWN.format(whole.filter)
-    assert client.get(url).status_code == 202  # there is no step yet
-    writer.append(cut(whole, 0, 10))
+def test_header_of_a_growing_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
+    url = TRACE.format(whole.filter)
+    assert client.get(url).status_code == 202  # no step yet
+    writer.append(part(whole, 0, 10))
     header = client.get(url).json()
     assert (header["steps"], header["live"]["state"], header["live"]["expected"]) == (10, "running", STEPS)
     assert header["no_maps"] is None
     assert header["modalities"] == list(whole.modalities)
-    writer.append(cut(whole, 10, STEPS))
+    writer.append(part(whole, 10, STEPS))
     writer.finish()
     header = client.get(url).json()
     assert header["steps"] == STEPS
-    assert "live" not in header  # an ordinary run from now on
+    assert "live" not in header
     content = client.get(f"/api/trace/door/{whole.filter}/9/columns?data=live:run").content
-    same(
+    assert_equal(
         values({"columns": header["columns"], "pictures": 0, "steps": 0}, content),
         {**expected(whole), "pictures": np.zeros((0, 32, 32))},
     )
 
 
-def test_maps_of_a_growing_run_are_those_of_the_whole(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    """Made of one step alone, as the newest must be; the same once it has ended."""
-    writer.append(cut(whole, 0, 12))
+def test_maps_of_growing_and_ended_runs_are_equal(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
+    writer.append(part(whole, 0, 12))
     store = client.app.state.store  # type: ignore[attr-defined]
-    asked = Selection("door", whole.filter, 9, data="live:run")
-    growing = store.request(asked)
+    selection = Selection("door", whole.filter, 9, data="live:run")
+    growing = store.request(selection)
     assert growing.growing
     maps = [growing.map(step, None, 41) for step in (0, 11)]
-    writer.append(cut(whole, 12, STEPS))
+    writer.append(part(whole, 12, STEPS))
     writer.finish()
-    ended = store.request(asked)
+    ended = store.request(selection)
     assert not ended.growing
-    for one in maps:
+    for likelihood_map in maps:
         np.testing.assert_allclose(
-            one.log_likelihood, ended.map(one.step, None, 41).log_likelihood, rtol=1e-4, atol=1e-3
+            likelihood_map.log_likelihood, ended.map(likelihood_map.step, None, 41).log_likelihood, rtol=1e-4, atol=1e-3
         )
 
 
-def test_the_list_tells_how_each_run_is(client: TestClient, writer: LiveFileWriter, whole: Trace, folder: Path) -> None:
-    """One goes on, one was killed at its step 4, one is no run at all; none keeps the others from being listed."""
-    writer.append(cut(whole, 0, 3))
-    dead = LiveFileWriter(folder / "dead.live", whole)
-    dead.append(cut(whole, 0, 5))
-    dead.close()
+def test_states_of_runs(client: TestClient, writer: LiveFileWriter, whole: Trace, folder: Path) -> None:
+    """A running one, one killed at step 4, and a damaged file."""
+    writer.append(part(whole, 0, 3))
+    killed = LiveFileWriter(folder / "dead.live", whole)
+    killed.append(part(whole, 0, 5))
+    killed.close()
     (folder / "torn.live").write_bytes(b"BsL\nnot a run")
     for age, name in enumerate(("run", "dead", "torn")):
         os.utime(folder / f"{name}.live", (1e9 - age, 1e9 - age))
@@ -225,34 +227,32 @@ def test_the_list_tells_how_each_run_is(client: TestClient, writer: LiveFileWrit
     assert (listed[0]["filter"], listed[0]["steps"], listed[0]["available"]) == (whole.filter, 3, True)
     assert listed[1]["message"] == "Live run 'dead' stopped at step 4: its process has exited without closing the file."
     assert "torn.live" in listed[2]["message"]
-    assert client.get(SHOWN.format(whole.filter).replace("run", "dead")).json()["steps"] == 5
+    assert client.get(TRACE.format(whole.filter).replace("run", "dead")).json()["steps"] == 5
 
 
-def test_a_filter_that_is_not_here_is_shown_without_its_networks(
-    client: TestClient, folder: Path, whole: Trace
-) -> None:
-    """Another hash: its Gaussians are drawn; a particle filter's networks cannot be asked."""
+def test_run_of_an_unavailable_filter(client: TestClient, folder: Path, whole: Trace) -> None:
+    """Gaussians have maps; a particle filter's maps need its networks."""
     other = replace(whole, checkpoint_hash="f" * 64)
     writer = LiveFileWriter(folder / "run.live", other)
     writer.append(other)
     run = client.get("/api/live").json()["runs"][0]
     assert (run["filter"], run["available"]) == (f"{whole.filter} (live)", False)
-    header = client.get(SHOWN.format(run["filter"])).json()
+    header = client.get(TRACE.format(run["filter"])).json()
     assert (header["no_maps"] is None) == (whole.kind == "ekf")
     writer.finish()
-    assert client.get(SHOWN.format(run["filter"])).json()["no_maps"] == header["no_maps"]
+    assert client.get(TRACE.format(run["filter"])).json()["no_maps"] == header["no_maps"]
     writer.close()
 
 
-def test_a_run_whose_truth_is_not_known(client: TestClient, folder: Path, whole: Trace) -> None:
-    """Numbers of the truth are NaN and maps lie around the estimate; nothing fails."""
-    blind = replace(whole, episode=replace(whole.episode, states=np.full_like(whole.episode.states, np.nan)))
-    writer = LiveFileWriter(folder / "run.live", blind)
-    writer.append(blind)
+def test_run_without_true_states(client: TestClient, folder: Path, whole: Trace) -> None:
+    """Values that need the truth are NaN, and maps are centered on the estimate."""
+    run = replace(whole, episode=replace(whole.episode, states=np.full_like(whole.episode.states, np.nan)))
+    writer = LiveFileWriter(folder / "run.live", run)
+    writer.append(run)
     with client.websocket_connect("/api/live/run") as socket:
-        found = values(*ask(socket, 0))
-    assert np.isnan(found["truth"]).all()
-    assert np.isnan(found["nees"]).all()
+        arrays = values(*request_block(socket, 0))
+    assert np.isnan(arrays["truth"]).all()
+    assert np.isnan(arrays["nees"]).all()
     view = client.post("/api/views", json={}).json()
     with client.websocket_connect(view["socket"]) as socket:
         for serial, finish in enumerate((False, True)):
@@ -267,13 +267,13 @@ def test_a_run_whose_truth_is_not_known(client: TestClient, folder: Path, whole:
             np.testing.assert_allclose(head["centre"], whole.estimate_mean[-1, :2], rtol=1e-5)
             assert socket.receive_json() == {"type": "drawn", "serial": serial, "step": STEPS - 1}
     writer.close()
-    found = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
-    assert [score["total"] for score in found["scores"] if score["name"] == "error"] == [0]
+    failures = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
+    assert [score["total"] for score in failures["scores"] if score["name"] == "error"] == [0]
 
 
-def test_what_cannot_be_asked_of_a_live_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    writer.append(cut(whole, 0, 6))
-    for url, said in {
+def test_invalid_requests_for_a_live_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
+    writer.append(part(whole, 0, 6))
+    for url, message in {
         "/api/trace/door/image-ekf/9?data=live:run": "live run 'run' goes on",
         "/api/trace/push/crossmodal-ekf/9?data=live:run": "is of task 'door', episode 9",
         "/api/trace/door/crossmodal-ekf/9?data=live:none": "live run 'none' does not exist",
@@ -281,13 +281,13 @@ def test_what_cannot_be_asked_of_a_live_run(client: TestClient, writer: LiveFile
         "/api/failures/door/crossmodal-ekf?data=live:run": "live run 'run' goes on",
     }.items():
         answer = client.get(url)
-        assert (answer.status_code, said in answer.json()["error"]) == (400, True), answer.text
+        assert (answer.status_code, message in answer.json()["error"]) == (400, True), answer.text
     with client.websocket_connect("/api/live/run") as socket:
         socket.send_text('{"from": -1}')
         assert socket.receive()["code"] == 4000
 
 
-def test_another_filter_runs_over_a_run_that_has_ended(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
+def test_another_filter_on_an_ended_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     writer.append(whole)
     writer.finish()
     url = "/api/trace/door/image-ekf/9?data=live:run"
@@ -297,56 +297,53 @@ def test_another_filter_runs_over_a_run_that_has_ended(client: TestClient, write
     assert answer.json()["steps"] == STEPS
 
 
-def test_failures_of_a_run_that_has_ended_are_those_of_its_episode(
-    client: TestClient, writer: LiveFileWriter, whole: Trace
-) -> None:
+def test_failures_of_an_ended_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
     writer.append(whole)
     writer.finish()
-    found = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
-    assert (found["data"], found["steps"], found["faults"]) == ("live:run", STEPS, "")
-    by_error = next(score for score in found["scores"] if score["name"] == "error")
-    expected = failures_of(Survey.from_traces([whole]), "error").events
-    assert [(m["step"], m["value"]) for m in by_error["events"]] == [(m.step, m.score) for m in expected]
-    assert {m["episode"] for m in by_error["events"]} == {9}
+    failures = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
+    assert (failures["data"], failures["steps"], failures["faults"]) == ("live:run", STEPS, "")
+    by_error = next(score for score in failures["scores"] if score["name"] == "error")
+    events = failures_of(Survey.from_traces([whole]), "error").events
+    assert [(e["step"], e["value"]) for e in by_error["events"]] == [(e.step, e.score) for e in events]
+    assert {e["episode"] for e in by_error["events"]} == {9}
     assert "data=live%3Arun" in by_error["events"][0]["link"]
-    asked = client.post(f"/api/failures/door/{whole.filter}?data=live:run")
-    assert "a single episode, not a data set" in asked.json()["error"]
+    refused = client.post(f"/api/failures/door/{whole.filter}?data=live:run")
+    assert "a single episode, not a data set" in refused.json()["error"]
 
 
-def until(client: TestClient, url: str) -> dict[str, Any]:
+def poll(client: TestClient, url: str) -> dict[str, Any]:
     deadline = time.monotonic() + 60.0
     while (answer := client.get(url)).status_code == 202:
         assert time.monotonic() < deadline
     assert answer.status_code == 200, answer.text
-    found: dict[str, Any] = answer.json()
-    return found
+    result: dict[str, Any] = answer.json()
+    return result
 
 
-def test_recorded_compared_and_diagnosed_as_any_run(
+def test_recording_comparison_and_diagnostics(
     client: TestClient, writer: LiveFileWriter, whole: Trace, settings: Any
 ) -> None:
-    """A recording is of what there is by then; what needs the whole episode comes with its end."""
-    asked = {"task": "door", "filter": whole.filter, "episode": 9, "data": "live:run", "maps": 4}
+    """A recording contains the steps so far; the others need the end of the run."""
+    body = {"task": "door", "filter": whole.filter, "episode": 9, "data": "live:run", "maps": 4}
     written = []
     for first, last in ((0, 10), (10, STEPS)):
-        writer.append(cut(whole, first, last))
-        answer = client.post("/api/recordings", json=asked)
+        writer.append(part(whole, first, last))
+        answer = client.post("/api/recordings", json=body)
         assert answer.status_code == 201, answer.text
         written.append(read_recording(settings.workspace / "recordings" / answer.json()["name"]))
-    assert [len(one) for one in written] == [10, STEPS]
+    assert [len(run) for run in written] == [10, STEPS]
     np.testing.assert_array_equal(written[1].estimate_mean, whole.estimate_mean)
     writer.finish()
     path = f"door/{whole.filter}/9"
-    found = until(client, f"/api/compare/{path}?data=live:run&against=filter%3Dimage-ekf")
-    assert found["names"] == [whole.filter, "image-ekf"]
+    comparison = poll(client, f"/api/compare/{path}?data=live:run&against=filter%3Dimage-ekf")
+    assert comparison["names"] == [whole.filter, "image-ekf"]
     entries = {entry["name"]: entry for entry in client.get(f"/api/diagnostics/{path}?data=live:run").json()}
     name = next(name for name, entry in entries.items() if not entry["slow"] and not entry["why_not"])
-    assert until(client, f"/api/diagnostics/{name}/{path}?data=live:run")["trajectories"] == 1
+    assert poll(client, f"/api/diagnostics/{name}/{path}?data=live:run")["trajectories"] == 1
 
 
-def test_its_recording_is_sent_as_it_grows(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    """Whole, though it grows while it is read; until the run has ended, not until the file has."""
-    writer.append(cut(whole, 0, 1))
+def test_growing_recording_is_streamed(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
+    writer.append(part(whole, 0, 1))
     recording = writer.path.with_suffix(".rrd")
     parts = [bytes([i]) * 300_000 for i in range(3)]
 

@@ -1,4 +1,4 @@
-"""The store of recordings over HTTP: written, added, named, tagged, deleted and had back."""
+"""Recordings over HTTP: write, upload, rename, tag, delete and restore."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from beliefscope.recordings.rerun_log.metadata import describe
 from beliefscope.recordings.write import write_recording
 
 URL = "/api/recordings"
-PATIENCE = 60.0  # s: a file is read by a process that imports Rerun first
+TIMEOUT = 60.0  # s, including the import of Rerun by the reader
 
 
 @pytest.fixture(scope="session")
 def own(base_settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A recording of the first filter's run over the second given episode, made elsewhere."""
+    """A recording of the first filter's run over the second episode."""
     checkpoint = load_checkpoint(Path(str(base_settings.checkpoints["crossmodal-ekf"])))
     with open_dataset(base_settings.data["mine"], DOOR) as data:
         run = trace(checkpoint, data[1], episode_index=1, seed=0, particles=base_settings.particles)
@@ -43,9 +43,9 @@ def own(base_settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> by
 
 
 @pytest.fixture(scope="session")
-def strange(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def foreign(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Another application's recording."""
-    path = tmp_path_factory.mktemp("strange") / "strange.rrd"
+    path = tmp_path_factory.mktemp("foreign") / "foreign.rrd"
     with rr.RecordingStream("their_app") as stream:
         stream.save(path)
         stream.log("world/points", rr.Points3D([[0, 0, 0]]))
@@ -56,15 +56,15 @@ def strange(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture
 def folder(settings: Settings) -> Path:
-    """Where the recordings of the server lie, and those that a user copies there."""
-    made = settings.workspace / "recordings"
-    made.mkdir(parents=True)
-    return made
+    """The server's folder of recordings."""
+    path = settings.workspace / "recordings"
+    path.mkdir(parents=True)
+    return path
 
 
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files are read by the same function in this process, which has imported Rerun already."""
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read files in this process, which has imported Rerun, instead of a subprocess."""
 
     def read(self: RecordingProbe, path: Path) -> RecordingInfo:
         try:
@@ -75,54 +75,54 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RecordingProbe, "__call__", read)
 
 
-HERE = pytest.mark.usefixtures("here")
+IN_PROCESS = pytest.mark.usefixtures("in_process")
 
 
 def listed(client: TestClient) -> dict[str, dict[str, Any]]:
-    """The recordings by name, once all of them are known."""
-    end = time.monotonic() + PATIENCE
+    """The recordings by name, once all have been read."""
+    end = time.monotonic() + TIMEOUT
     while True:
-        found = client.get(URL).json()["recordings"]
-        if not any(one["reading"] for one in found):
-            return {one["name"]: one for one in found}
+        recordings = client.get(URL).json()["recordings"]
+        if not any(r["reading"] for r in recordings):
+            return {r["name"]: r for r in recordings}
         assert time.monotonic() < end
         time.sleep(0.05)
 
 
-def test_a_recording_is_written_listed_and_read(client: TestClient, trace_url: str, settings: Settings) -> None:
-    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "faults": ""}
-    answer = client.post("/api/recordings", json=wanted)
+def test_write_list_and_download(client: TestClient, trace_url: str, settings: Settings) -> None:
+    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "faults": ""}
+    answer = client.post("/api/recordings", json=body)
     assert answer.status_code == 201, answer.text
-    made = answer.json()
-    assert made["name"].startswith("door-crossmodal-pf-episode1-")
-    (listed,) = client.get("/api/recordings").json()["recordings"]
-    assert (listed["name"], listed["bytes"]) == (made["name"], made["bytes"])
-    assert (listed["task"], listed["filter"], listed["episode"]) == ("door", "crossmodal-pf", 1)
-    content = client.get(made["url"]).content
-    assert content == (settings.workspace / "recordings" / made["name"]).read_bytes()
-    part = client.get(made["url"], headers={"Range": "bytes=4-11"})
+    written = answer.json()
+    assert written["name"].startswith("door-crossmodal-pf-episode1-")
+    (entry,) = client.get("/api/recordings").json()["recordings"]
+    assert (entry["name"], entry["bytes"]) == (written["name"], written["bytes"])
+    assert (entry["task"], entry["filter"], entry["episode"]) == ("door", "crossmodal-pf", 1)
+    content = client.get(written["url"]).content
+    assert content == (settings.workspace / "recordings" / written["name"]).read_bytes()
+    part = client.get(written["url"], headers={"Range": "bytes=4-11"})
     assert (part.status_code, part.content) == (206, content[4:12])
-    run = read_recording(settings.workspace / "recordings" / made["name"])
+    run = read_recording(settings.workspace / "recordings" / written["name"])
     (offset,) = (c["offset"] for c in client.get(trace_url).json()["columns"] if c["name"] == "estimate_mean")
-    shown = np.frombuffer(client.get(f"{trace_url}/columns").content, "<f4", run.estimate_mean.size, offset)
-    np.testing.assert_array_equal(run.estimate_mean.ravel(), shown)
+    estimate = np.frombuffer(client.get(f"{trace_url}/columns").content, "<f4", run.estimate_mean.size, offset)
+    np.testing.assert_array_equal(run.estimate_mean.ravel(), estimate)
 
 
-def test_nothing_of_it_is_left_when_the_server_has_ended(settings: Settings, open_client: Callable[..., Any]) -> None:
+def test_threads_end_with_the_server(settings: Settings, open_client: Callable[..., Any]) -> None:
     with open_client(settings) as client:
         assert client.post(URL, json={"task": "door", "filter": "crossmodal-pf", "episode": 1}).status_code == 201
-    assert not [one for one in threading.enumerate() if "recordings" in one.name]
+    assert not [thread for thread in threading.enumerate() if "recordings" in thread.name]
 
 
-def test_a_recording_that_is_there_is_not_written_again(client: TestClient, trace_url: str, settings: Settings) -> None:
-    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
-    first = client.post("/api/recordings", json=wanted).json()
+def test_existing_recording_is_not_written_again(client: TestClient, trace_url: str, settings: Settings) -> None:
+    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
+    first = client.post("/api/recordings", json=body).json()
     path = settings.workspace / "recordings" / first["name"]
     before = path.stat().st_mtime_ns
-    again = client.post("/api/recordings", json=wanted)
+    again = client.post("/api/recordings", json=body)
     assert (again.status_code, again.json()) == (200, first | {"seconds": None})
     assert path.stat().st_mtime_ns == before
-    other = client.post("/api/recordings", json=wanted | {"faults": "blackout=0.5"})
+    other = client.post("/api/recordings", json=body | {"faults": "blackout=0.5"})
     assert other.status_code == 201
     assert other.json()["name"] != first["name"]
 
@@ -130,7 +130,7 @@ def test_a_recording_that_is_there_is_not_written_again(client: TestClient, trac
 @pytest.mark.parametrize(
     "name", ["../traces/x", "..%2ftraces%2fx", "..%5cx", "%2fetc%2fpasswd", ".hidden", "door-crossmodal-pf-episode1-zz"]
 )
-def test_a_recordings_name_leads_nowhere_else(client: TestClient, settings: Settings, name: str) -> None:
+def test_names_do_not_leave_the_folder(client: TestClient, settings: Settings, name: str) -> None:
     (settings.workspace / "traces").mkdir(parents=True)
     (settings.workspace / "traces" / "x.rrd").write_bytes(b"secret")
     answer = client.get(f"/api/recordings/{name}.rrd")
@@ -139,7 +139,7 @@ def test_a_recordings_name_leads_nowhere_else(client: TestClient, settings: Sett
 
 
 @pytest.mark.parametrize(
-    ("body", "status", "said"),
+    ("body", "status", "message"),
     [
         (b"not json", 422, "JSON"),
         (b"{}", 422, "Field required"),
@@ -148,23 +148,23 @@ def test_a_recordings_name_leads_nowhere_else(client: TestClient, settings: Sett
         (b'{"task": "door", "filter": "none", "episode": 1}', 400, "filter 'none' does not exist"),
     ],
 )
-def test_a_bad_request_for_a_recording_writes_nothing(
-    client: TestClient, settings: Settings, body: bytes, status: int, said: str
+def test_invalid_requests_write_nothing(
+    client: TestClient, settings: Settings, body: bytes, status: int, message: str
 ) -> None:
     answer = client.post("/api/recordings", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == status
-    assert said in answer.json()["error"]
+    assert message in answer.json()["error"]
     assert not (settings.workspace / "recordings").exists()
 
 
-def test_a_file_of_ours_is_added_with_all_that_it_says(client: TestClient, own: bytes, folder: Path) -> None:
+def test_upload_reads_metadata(client: TestClient, own: bytes, folder: Path) -> None:
     answer = client.put(f"{URL}/theirs%20(1).rrd", content=own)
     assert answer.status_code == 201, answer.text
     assert (folder / "theirs (1).rrd").read_bytes() == own
-    (found,) = listed(client).values()
-    assert answer.json() == found
-    said = {key: found[key] for key in ("name", "task", "filter", "episode", "steps", "faults", "problem", "why_not")}
-    assert said == {
+    (entry,) = listed(client).values()
+    assert answer.json() == entry
+    values = {key: entry[key] for key in ("name", "task", "filter", "episode", "steps", "faults", "problem", "why_not")}
+    assert values == {
         "name": "theirs (1).rrd",
         "task": "door",
         "filter": "crossmodal-ekf",
@@ -174,117 +174,111 @@ def test_a_file_of_ours_is_added_with_all_that_it_says(client: TestClient, own: 
         "problem": "",
         "why_not": "",
     }
-    assert found["run"] == {"filter": "crossmodal-ekf", "data": "mine"}
-    assert client.get(found["url"]).content == own
+    assert entry["run"] == {"filter": "crossmodal-ekf", "data": "mine"}
+    assert client.get(entry["url"]).content == own
     assert not [path for path in folder.iterdir() if path.name.endswith(".part")]
 
 
-@HERE
-def test_a_strangers_file_is_listed_and_says_why_it_is_no_run(client: TestClient, strange: bytes) -> None:
-    found = client.put(f"{URL}/strange.rrd", content=strange).json()
-    assert (found["application"], found["task"], found["run"]) == ("their_app", None, None)
-    assert "written by 'their_app', not by beliefscope" in found["problem"]
-    assert found["entities"] >= 1
+@IN_PROCESS
+def test_recording_of_another_application(client: TestClient, foreign: bytes) -> None:
+    entry = client.put(f"{URL}/foreign.rrd", content=foreign).json()
+    assert (entry["application"], entry["task"], entry["run"]) == ("their_app", None, None)
+    assert "written by 'their_app', not by beliefscope" in entry["problem"]
+    assert entry["entities"] >= 1
 
 
-@HERE
-def test_what_the_server_has_not_is_said(
+@IN_PROCESS
+def test_reason_why_a_run_is_not_in_the_catalog(
     settings: Settings, open_client: Callable[..., TestClient], own: bytes, folder: Path
 ) -> None:
     (folder / "run.rrd").write_bytes(own)
-    for other, why in (
-        ({"checkpoints": {}}, "Its filter, crossmodal-ekf of door with checkpoint"),
-        ({"data": {}}, "No data set of this server has its episode 1"),
-        ({"seed": 3}, "seed 0; this server runs filters with seed 3"),
+    for changes, reason in (
+        ({"checkpoints": {}}, "Filter crossmodal-ekf of door with checkpoint"),
+        ({"data": {}}, "No data set of this server contains its episode 1"),
+        ({"seed": 3}, "seed 0; this server uses seed 3"),
     ):
-        with open_client(replace(settings, **other)) as client:
-            (found,) = listed(client).values()
-        assert found["run"] is None
-        assert why in found["why_not"]
+        with open_client(replace(settings, **changes)) as client:
+            (entry,) = listed(client).values()
+        assert entry["run"] is None
+        assert reason in entry["why_not"]
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (b"", "not a whole Rerun recording"),
-        (b"\x89PNG\r\n", "begins with RRF"),
+        (b"\x89PNG\r\n", "begin with RRF"),
         (b"RRF2" + bytes(8), "not a whole Rerun recording"),
         (b"RRF2\x00\x29\x00\x00\x01\x02\x00\x00" + bytes(range(256)) * 40, "not a whole Rerun recording"),
         (None, "not a whole Rerun recording"),
     ],
-    ids=["empty", "picture", "nothing", "junk", "cut"],
+    ids=["empty", "image", "zeros", "junk", "truncated"],
 )
-def test_what_is_no_recording_is_not_added(
-    client: TestClient, own: bytes, folder: Path, content: bytes | None, said: str
+def test_invalid_files_are_refused(
+    client: TestClient, own: bytes, folder: Path, content: bytes | None, message: str
 ) -> None:
     answer = client.put(f"{URL}/x.rrd", content=own[: len(own) // 2] if content is None else content)
     assert answer.status_code == 400
-    assert said in answer.json()["error"]
+    assert message in answer.json()["error"]
     assert str(folder) not in answer.json()["error"]
     assert not list(folder.iterdir())
     assert not listed(client)
 
 
-@HERE
-def test_a_file_that_is_too_large_is_refused_before_and_while_it_comes(
-    client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recordings, "LARGEST", 10_000)
-    blocks = (own[start : start + 4000] for start in range(0, len(own), 4000))  # without a length said before
-    for content in (own, blocks):
+@IN_PROCESS
+def test_upload_size_is_limited(client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recordings, "MAX_UPLOAD", 10_000)
+    chunks = (own[start : start + 4000] for start in range(0, len(own), 4000))  # without content-length
+    for content in (own, chunks):
         answer = client.put(f"{URL}/x.rrd", content=content)
         assert answer.status_code == 413
-        assert "more than 0 MB" in answer.json()["error"]
+        assert "larger than 0 MB" in answer.json()["error"]
     assert client.get(URL).json()["largest"] == 10_000
     assert not list(folder.iterdir())
 
 
-def test_a_file_made_to_do_harm_ends_its_reader_only(
-    client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On one changed bit of ``abort.rrd`` Rerun 0.41 ends its process; one that always does stands for such readers."""
+def test_crash_of_the_reader(client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rerun 0.41 aborts on ``abort.rrd``, which has one flipped bit; ``/bin/false`` stands for any crash."""
     (folder / "bad.rrd").write_bytes((Path(__file__).parent / "abort.rrd").read_bytes())
-    (found,) = listed(client).values()
-    assert found["problem"]
-    assert (found["application"], found["run"]) == ("", None)
+    (entry,) = listed(client).values()
+    assert entry["problem"]
+    assert (entry["application"], entry["run"]) == ("", None)
     monkeypatch.setattr("sys.executable", "/bin/false")
     (folder / "bad.rrd").write_bytes(own)
-    (found,) = listed(client).values()
-    assert "Reading the file failed" in found["problem"]
+    (entry,) = listed(client).values()
+    assert "Reading the file failed" in entry["problem"]
     answer = client.put(f"{URL}/x.rrd", content=own)
     assert answer.status_code == 400
     assert "Reading the file failed" in answer.json()["error"]
 
 
-@HERE
-def test_names_and_tags_change_and_outlive_the_server(
-    settings: Settings, open_client: Callable[..., TestClient], own: bytes
-) -> None:
+@IN_PROCESS
+def test_names_and_tags_are_stored(settings: Settings, open_client: Callable[..., TestClient], own: bytes) -> None:
     with open_client(settings) as client:
         client.put(f"{URL}/a.rrd", content=own)
         client.put(f"{URL}/b.rrd", content=own)
         answer = client.patch(f"{URL}/a.rrd", json={"tags": ["paper", "Fig  3", "PAPER"]})
         assert answer.json()["tags"] == ["paper", "Fig 3"]
-        taken = client.patch(f"{URL}/a.rrd", json={"name": "b"})
-        assert (taken.status_code, "'b.rrd' already exists" in taken.json()["error"]) == (409, True)
+        conflict = client.patch(f"{URL}/a.rrd", json={"name": "b"})
+        assert (conflict.status_code, "'b.rrd' already exists" in conflict.json()["error"]) == (409, True)
         assert client.put(f"{URL}/b.rrd", content=own).status_code == 409
         renamed = client.patch(f"{URL}/a.rrd", json={"name": "Tür (neu)"}).json()
         assert (renamed["name"], renamed["tags"]) == ("Tür (neu).rrd", ["paper", "Fig 3"])
         assert client.get(renamed["url"]).content == own
         assert client.get(f"{URL}/a.rrd").status_code == 404
     with open_client(settings) as client:
-        assert {name: one["tags"] for name, one in listed(client).items()} == {
+        assert {name: r["tags"] for name, r in listed(client).items()} == {
             "Tür (neu).rrd": ["paper", "Fig 3"],
             "b.rrd": [],
         }
 
 
-@HERE
-def test_what_cannot_be_a_name_or_tag_changes_nothing(client: TestClient, own: bytes) -> None:
+@IN_PROCESS
+def test_invalid_names_and_tags_are_refused(client: TestClient, own: bytes) -> None:
     before = client.put(f"{URL}/a.rrd", content=own).json()
     names = ("", "..", "../x", "a\\b", ".hidden", "a" * 300)
     tags = ([""], ["a,b"], ["x" * 41], [f"{i}" for i in range(30)], "x")
-    for body in (*({"name": name} for name in names), *({"tags": some} for some in tags), {"tag": 1}, [], None):
+    for body in (*({"name": name} for name in names), *({"tags": value} for value in tags), {"tag": 1}, [], None):
         answer = client.patch(f"{URL}/a.rrd", json=body)
         assert answer.status_code in (400, 422), body
         assert "\n" not in answer.json()["error"]
@@ -292,19 +286,19 @@ def test_what_cannot_be_a_name_or_tag_changes_nothing(client: TestClient, own: b
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a\0b", "a\nb", " a", "a ", "a.", "x" * 201, "ü" * 101, "a:b"])
-def test_no_name_leads_out_of_its_folder(name: str) -> None:
+def test_invalid_file_names(name: str) -> None:
     with pytest.raises(BadInput, match="Name"):
         checked(name)
 
 
-@HERE
-def test_what_was_deleted_is_had_back(client: TestClient, own: bytes, folder: Path) -> None:
+@IN_PROCESS
+def test_delete_and_restore(client: TestClient, own: bytes, folder: Path) -> None:
     client.put(f"{URL}/a.rrd", content=own)
-    before = client.patch(f"{URL}/a.rrd", json={"tags": ["kept"]}).json()
+    before = client.patch(f"{URL}/a.rrd", json={"tags": ["paper"]}).json()
     id = client.delete(f"{URL}/a.rrd").json()["deleted"]
-    now = client.get(URL).json()
-    assert now["recordings"] == []
-    assert [(one["id"], one["name"], one["bytes"]) for one in now["deleted"]] == [(id, "a.rrd", len(own))]
+    lists = client.get(URL).json()
+    assert lists["recordings"] == []
+    assert [(d["id"], d["name"], d["bytes"]) for d in lists["deleted"]] == [(id, "a.rrd", len(own))]
     client.put(f"{URL}/a.rrd", content=own)
     assert client.post(f"{URL}/deleted/{id}").status_code == 409
     client.patch(f"{URL}/a.rrd", json={"name": "other"})
@@ -316,10 +310,8 @@ def test_what_was_deleted_is_had_back(client: TestClient, own: bytes, folder: Pa
     assert not list((folder / ".deleted").iterdir())
 
 
-@HERE
-def test_the_trash_lets_go_after_its_days(
-    client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@IN_PROCESS
+def test_deleted_files_expire(client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "a.rrd").write_bytes(own)
     client.delete(f"{URL}/a.rrd")
     assert len(client.get(URL).json()["deleted"]) == 1
@@ -329,12 +321,12 @@ def test_the_trash_lets_go_after_its_days(
     assert not list((folder / ".deleted").iterdir())
 
 
-@HERE
-def test_a_list_is_told_again_only_when_it_has_changed(client: TestClient, own: bytes, folder: Path) -> None:
+@IN_PROCESS
+def test_list_has_an_etag(client: TestClient, own: bytes, folder: Path) -> None:
     client.put(f"{URL}/a.rrd", content=own)
     tag = client.get(URL).headers["etag"]
     assert client.get(URL, headers={"If-None-Match": tag}).status_code == 304
-    (folder / "a.rrd").unlink()  # under the server
+    (folder / "a.rrd").unlink()
     assert client.get(URL, headers={"If-None-Match": tag}).json()["recordings"] == []
     for answer in (
         client.get(f"{URL}/a.rrd"),
@@ -345,25 +337,25 @@ def test_a_list_is_told_again_only_when_it_has_changed(client: TestClient, own: 
         assert "does not exist" in answer.json()["error"]
 
 
-@HERE
-def test_a_file_is_read_once_and_again_when_it_is_another(
-    client: TestClient, own: bytes, strange: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
+@IN_PROCESS
+def test_metadata_are_read_again_after_a_change(
+    client: TestClient, own: bytes, foreign: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "a.rrd").write_bytes(own)
     client.patch(f"{URL}/a.rrd", json={"tags": ["x"]})
     assert listed(client)["a.rrd"]["task"] == "door"
-    lines = folder / ".about" / "a.rrd.json"
-    written = lines.stat().st_mtime_ns
+    metadata = folder / ".about" / "a.rrd.json"
+    written = metadata.stat().st_mtime_ns
     assert listed(client)["a.rrd"]["task"] == "door"
-    assert lines.stat().st_mtime_ns == written
-    (folder / "a.rrd").write_bytes(strange)
-    found = listed(client)["a.rrd"]
-    assert (found["application"], found["tags"]) == ("their_app", ["x"])
-    lines.write_text("{broken")
+    assert metadata.stat().st_mtime_ns == written
+    (folder / "a.rrd").write_bytes(foreign)
+    entry = listed(client)["a.rrd"]
+    assert (entry["application"], entry["tags"]) == ("their_app", ["x"])
+    metadata.write_text("{broken")
     assert listed(client)["a.rrd"]["application"] == "their_app"
 
 
-def test_links_and_files_under_way_are_no_recordings(
+def test_links_and_partial_files_are_not_listed(
     settings: Settings, open_client: Callable[..., TestClient], folder: Path, tmp_path: Path
 ) -> None:
     secret = tmp_path / "secret"
@@ -380,18 +372,20 @@ def test_links_and_files_under_way_are_no_recordings(
     assert secret.read_bytes() == b"secret"
 
 
-@HERE
-def test_a_renamed_recording_is_not_written_again_and_a_namesake_is_not_taken_for_it(
+@IN_PROCESS
+def test_renamed_recording_is_recognised_by_content(
     client: TestClient, trace_url: str, own: bytes, folder: Path
 ) -> None:
-    wanted = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
-    made = client.post(URL, json=wanted).json()
-    client.patch(f"{URL}/{made['name']}", json={"name": "mine"})
-    again = client.post(URL, json=wanted)
+    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
+    written = client.post(URL, json=body).json()
+    client.patch(f"{URL}/{written['name']}", json={"name": "mine"})
+    again = client.post(URL, json=body)
     assert (again.status_code, again.json()["name"]) == (200, "mine.rrd")
     client.delete(f"{URL}/mine.rrd")
-    client.put(f"{URL}/{made['name']}", content=own)  # under the name that the page would give
-    other = client.post(URL, json=wanted)
-    assert (other.status_code, other.json()["name"]) == (201, made["name"].replace(".rrd", "-2.rrd"))
+    client.put(f"{URL}/{written['name']}", content=own)  # same name, other content
+    other = client.post(URL, json=body)
+    assert (other.status_code, other.json()["name"]) == (201, written["name"].replace(".rrd", "-2.rrd"))
     assert read_recording(folder / other.json()["name"]).filter == "crossmodal-pf"
-    assert json.loads((folder / ".about" / f"{other.json()['name']}.json").read_text())["original_name"] == made["name"]
+    assert (
+        json.loads((folder / ".about" / f"{other.json()['name']}.json").read_text())["original_name"] == written["name"]
+    )

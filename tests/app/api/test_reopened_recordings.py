@@ -1,4 +1,4 @@
-"""A recording's run, opened on a page that could not run it again."""
+"""Opening the run of a recording on a server without its filter."""
 
 from __future__ import annotations
 
@@ -18,12 +18,10 @@ from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.write import write_recording
 
-PATIENCE = 120.0  # s: a job imports PyTorch first
+TIMEOUT = 120.0  # s, including the import of PyTorch by a job
 
 
-def test_the_run_in_a_recording_is_shown_as_it_was_recorded(
-    settings: Settings, open_client: Callable[..., TestClient]
-) -> None:
+def test_run_equals_the_recorded_one(settings: Settings, open_client: Callable[..., TestClient]) -> None:
     checkpoint = load_checkpoint(Path(str(settings.checkpoints["crossmodal-pf"])))
     with open_dataset(settings.data["mine"], DOOR) as data:
         run = trace(checkpoint, data[1], episode_index=1, seed=5, particles=20)
@@ -33,8 +31,8 @@ def test_the_run_in_a_recording_is_shown_as_it_was_recorded(
     (folder / "no run.rrd").write_bytes(b"RRF2")
     url = "/api/recordings/best%20run%20(1).rrd/run"
     with open_client(replace(settings, checkpoints={}, data={})) as client:
-        end = time.monotonic() + PATIENCE
-        while any(one["reading"] for one in client.get("/api/recordings").json()["recordings"]):
+        end = time.monotonic() + TIMEOUT
+        while any(r["reading"] for r in client.get("/api/recordings").json()["recordings"]):
             assert time.monotonic() < end
             time.sleep(0.1)
         job = client.post(url).json()["job"]
@@ -42,15 +40,15 @@ def test_the_run_in_a_recording_is_shown_as_it_was_recorded(
             assert time.monotonic() < end
             time.sleep(0.1)
         assert job["state"] == "done", job["error"]
-        asked = {key: value for key, (value,) in parse_qs(job["link"].removeprefix("?")).items()}
-        path = f"/api/trace/{asked['task']}/{asked['filter']}/{asked['episode']}"
-        header = client.get(path, params={"data": asked["data"]}).json()
+        query = {key: value for key, (value,) in parse_qs(job["link"].removeprefix("?")).items()}
+        path = f"/api/trace/{query['task']}/{query['filter']}/{query['episode']}"
+        header = client.get(path, params={"data": query["data"]}).json()
         assert (header["steps"], header["seed"], header["checkpoint_hash"]) == (len(run), 5, checkpoint.hash)
-        columns = client.get(f"{path}/columns", params={"data": asked["data"]}).content
-        (offset,) = (one["offset"] for one in header["columns"] if one["name"] == "estimate_mean")
-        shown = np.frombuffer(columns, "<f4", run.estimate_mean.size, offset)
-        np.testing.assert_array_equal(shown, run.estimate_mean.ravel())
-        assert client.post(url).json()["job"]["state"] == "done", "what was read is not read again"
+        columns = client.get(f"{path}/columns", params={"data": query["data"]}).content
+        (offset,) = (c["offset"] for c in header["columns"] if c["name"] == "estimate_mean")
+        estimate = np.frombuffer(columns, "<f4", run.estimate_mean.size, offset)
+        np.testing.assert_array_equal(estimate, run.estimate_mean.ravel())
+        assert client.post(url).json()["job"]["state"] == "done", "the recording is read once"
         refused = client.post("/api/recordings/no%20run.rrd/run")
         assert (refused.status_code, "not a whole Rerun recording" in refused.json()["error"]) == (400, True)
         assert client.post("/api/recordings/none.rrd/run").status_code == 404

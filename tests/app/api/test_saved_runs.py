@@ -46,7 +46,7 @@ def test_recording_with_maps_is_a_job(client: TestClient, trace_url: str) -> Non
 def test_oldest_automatic_recordings_are_deleted(
     client: TestClient, trace_url: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording_files, "AUTOMATIC", 2)
+    monkeypatch.setattr(recording_files, "MAX_AUTOMATIC", 2)
     body = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
 
     def record(noise: int, automatic: bool = True) -> str:

@@ -14,14 +14,14 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.api.studies import all_studies
-from beliefscope.app.workspace.studies import FILE, SHIPPED, Study
 from beliefscope.app.cli.commands.study import _cells
-from beliefscope.recordings.study_figures import write_study
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.workspace.studies import FILE, SHIPPED, Study
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.training.study import run_cell
+from beliefscope.recordings.study_figures import write_study
 
 FILTER = "crossmodal-ekf"
 
@@ -58,9 +58,7 @@ def find_study(client: TestClient, name: str) -> dict[str, Any]:
     return study
 
 
-def test_built_in_study(
-    settings: Settings, open_client: Callable[..., TestClient]
-) -> None:
+def test_built_in_study(settings: Settings, open_client: Callable[..., TestClient]) -> None:
     with open_client(replace(settings, checkpoints={}, data={})) as client:
         study = find_study(client, SHIPPED)
     assert [task["name"] for task in study["tasks"]] == ["door", "push"]
@@ -105,9 +103,7 @@ def test_checkpoint_with_another_hash_is_refused(
     assert "is not the checkpoint that study 'mine' evaluated" in answer.json()["error"]
 
 
-def test_order_of_studies(
-    settings: Settings, folder: Path, open_client: Callable[..., TestClient]
-) -> None:
+def test_order_of_studies(settings: Settings, folder: Path, open_client: Callable[..., TestClient]) -> None:
     workspace = settings.workspace
     shutil.copytree(folder, workspace / "later")
     (workspace / "broken").mkdir()
@@ -175,7 +171,10 @@ def test_reason_why_cells_cannot_be_trained(
         assert reason(preset="huge").startswith("preset 'huge' does not exist")
         hash_ = open_dataset(settings.data["mine"]).hash
         tasks = {"tasks": {"door": {"data": "door.h5", "data_hash": hash_}}}
-        assert reason(**tasks, cells={"push/lstm/seed0": "missing"}) == "study 'mine' does not name the training data of push"
+        assert (
+            reason(**tasks, cells={"push/lstm/seed0": "missing"})
+            == "study 'mine' does not name the training data of push"
+        )
         assert client.post("/api/studies/shipped/cells").status_code == 400
         assert client.post("/api/studies/none/cells").status_code == 404
         (folder / FILE).write_text(json.dumps(results("", cells={"../../door/seed0": "missing"})))

@@ -1,4 +1,4 @@
-"""The page's interface over HTTP, as docs/api.md promises it."""
+"""Catalog and traces over HTTP."""
 
 from __future__ import annotations
 
@@ -21,61 +21,59 @@ OpenClient = Callable[..., TestClient]
 
 
 def columns(client: TestClient, url: str) -> dict[str, np.ndarray[Any, Any]]:
-    described = client.get(url).json()["columns"]
+    descriptions = client.get(url).json()["columns"]
     buffer = client.get(f"{url}/columns").content
     return {
         c["name"]: np.frombuffer(buffer, "<f4", count=int(np.prod(c["shape"])), offset=c["offset"]).reshape(c["shape"])
-        for c in described
+        for c in descriptions
     }
 
 
-def test_the_catalog_says_what_there_is(client: TestClient, steps: int) -> None:
+def test_catalog(client: TestClient, steps: int) -> None:
     catalog = client.get("/api/catalog").json()
     assert catalog["version"] == __version__
     assert catalog["problems"] == []
     door = catalog["tasks"][0]
     assert [c["name"] for c in door["components"]] == ["hinge_x", "hinge_y", "angle"]
     assert door["map"] == {"x": "hinge_x", "y": "hinge_y", "half_width": 0.135}
-    given = [(f["name"], f["kind"], f["metrics"]) for f in door["filters"][:2]]
-    assert given == [(f"crossmodal-{kind}", kind, {"position_cm": 1.5}) for kind in ("ekf", "pf")]
+    filters = [(f["name"], f["kind"], f["metrics"]) for f in door["filters"][:2]]
+    assert filters == [(f"crossmodal-{kind}", kind, {"position_cm": 1.5}) for kind in ("ekf", "pf")]
     mine, sample = door["data"]
     assert (mine["name"], mine["first"], sample["name"]) == ("mine", 1, "sample")
     assert [(e["index"], e["steps"], e["split"]) for e in mine["episodes"]] == [(0, steps, "train"), (1, steps, "test")]
     assert sample["episodes"][sample["first"]]["split"] == "test"
 
 
-def test_a_trace_comes_as_its_own_numbers(client: TestClient, trace_url: str, settings: Settings, steps: int) -> None:
+def test_columns_equal_the_trace(client: TestClient, trace_url: str, settings: Settings, steps: int) -> None:
     header = client.get(trace_url).json()
     (file,) = (settings.workspace / "traces").iterdir()
     trace = load_trace(file)
     assert header["steps"] == len(trace) == steps
     assert header["checkpoint_hash"] == trace.checkpoint_hash
     assert header["modalities"] == ["image", "haptics"]
-    got = columns(client, trace_url)
-    np.testing.assert_array_equal(got["truth"], trace.episode.states)
-    np.testing.assert_array_equal(got["estimate_mean"], trace.estimate_mean)
-    np.testing.assert_array_equal(got["effective_weights"], trace.effective_weights)
-    np.testing.assert_array_equal(got["contact"], trace.episode.contact)
-    np.testing.assert_array_equal(got["force"], trace.episode.observations["force"])
-    np.testing.assert_allclose(got["estimate_sigma"][:, 0] ** 2, trace.estimate_covariance[:, 0, 0], rtol=1e-5)
+    values = columns(client, trace_url)
+    np.testing.assert_array_equal(values["truth"], trace.episode.states)
+    np.testing.assert_array_equal(values["estimate_mean"], trace.estimate_mean)
+    np.testing.assert_array_equal(values["effective_weights"], trace.effective_weights)
+    np.testing.assert_array_equal(values["contact"], trace.episode.contact)
+    np.testing.assert_array_equal(values["force"], trace.episode.observations["force"])
+    np.testing.assert_allclose(values["estimate_sigma"][:, 0] ** 2, trace.estimate_covariance[:, 0, 0], rtol=1e-5)
     assert trace.log_weights is not None
     np.testing.assert_allclose(
-        got["effective_sample_size"], 1.0 / np.square(np.exp(trace.log_weights)).sum(axis=1), rtol=1e-4
+        values["effective_sample_size"], 1.0 / np.square(np.exp(trace.log_weights)).sum(axis=1), rtol=1e-4
     )
-    pictures = np.frombuffer(client.get(f"{trace_url}/images").content, np.uint8).reshape(steps, 32, 32)
-    np.testing.assert_array_equal(pictures, trace.episode.observations["image"])
+    images = np.frombuffer(client.get(f"{trace_url}/images").content, np.uint8).reshape(steps, 32, 32)
+    np.testing.assert_array_equal(images, trace.episode.observations["image"])
 
 
-def test_a_filter_without_particles_has_no_sample_size(client: TestClient) -> None:
+def test_ekf_has_no_effective_sample_size(client: TestClient) -> None:
     url = "/api/trace/door/crossmodal-ekf/0"
     while client.get(url).status_code == 202:
         pass
     assert "effective_sample_size" not in columns(client, url)
 
 
-def test_a_trace_outlives_the_server(
-    client: TestClient, trace_url: str, settings: Settings, open_client: OpenClient
-) -> None:
+def test_trace_file_is_reused(client: TestClient, trace_url: str, settings: Settings, open_client: OpenClient) -> None:
     (file,) = (settings.workspace / "traces").iterdir()
     written = file.stat().st_mtime_ns
     with open_client(settings) as again:
@@ -85,37 +83,37 @@ def test_a_trace_outlives_the_server(
     assert file.stat().st_mtime_ns == written
 
 
-def test_a_damaged_trace_file_is_computed_again(trace_url: str, settings: Settings, open_client: OpenClient) -> None:
+def test_damaged_trace_file_is_replaced(trace_url: str, settings: Settings, open_client: OpenClient) -> None:
     (file,) = (settings.workspace / "traces").iterdir()
-    whole = file.read_bytes()
-    file.write_bytes(whole[: len(whole) // 2])
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2])
     with open_client(settings) as again:
         while (answer := again.get(trace_url)).status_code == 202:
             pass
         assert answer.status_code == 200
-    assert len(file.read_bytes()) == len(whole)
+    assert len(file.read_bytes()) == len(content)
 
 
-def test_the_catalog_has_faults_that_can_be_asked_for(client: TestClient, trace_url: str) -> None:
+def test_faults_change_the_images(client: TestClient, trace_url: str) -> None:
     tasks = {t["name"]: t for t in client.get("/api/catalog").json()["tasks"]}
     fault_sets = {r["name"]: r["faults"] for r in tasks["door"]["fault_presets"]}
     assert fault_sets["40 % image blackout"] == "blackout=0.4"
     assert {"force axis stuck", "end-effector offset 2 cm", "haptics dropped"} <= fault_sets.keys()
-    whole = client.get(f"{trace_url}/images").content
+    clean = client.get(f"{trace_url}/images").content
     for faults in ("blackout=0.8", '[{"fault": "image_frozen", "from": 20}]'):
         query = {"faults": faults}
         while (answer := client.get(trace_url, params=query)).status_code == 202:
             pass
         assert answer.json()["faults"] == str(Faults.parse(faults))
-        broken = client.get(f"{trace_url}/images", params=query).content
-        assert len(broken) == len(whole)
-        assert broken != whole
+        images = client.get(f"{trace_url}/images", params=query).content
+        assert len(images) == len(clean)
+        assert images != clean
     assert client.get(trace_url).json()["faults"] == ""
-    assert client.get(f"{trace_url}/images").content == whole
+    assert client.get(f"{trace_url}/images").content == clean
 
 
 @pytest.mark.parametrize(
-    ("faults", "said"),
+    ("faults", "message"),
     [
         ("blakout", "fault 'blakout' does not exist. Available: blackout,"),
         ("blackout=2", "blackout's 'probability' is 2, not a number from 0 to 1"),
@@ -124,17 +122,17 @@ def test_the_catalog_has_faults_that_can_be_asked_for(client: TestClient, trace_
         ("secret.json", "fault 'secret.json' does not exist"),
     ],
 )
-def test_a_bad_faults_is_one_readable_line(client: TestClient, trace_url: str, faults: str, said: str) -> None:
+def test_invalid_faults_are_refused(client: TestClient, trace_url: str, faults: str, message: str) -> None:
     body = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "faults": faults}
     answers = [client.get(trace_url + part, params={"faults": faults}) for part in ("", "/columns", "/images")]
     for answer in (*answers, client.post("/api/recordings", json=body)):
         assert answer.status_code == 400
-        assert said in answer.json()["error"]
+        assert message in answer.json()["error"]
 
 
 @pytest.mark.parametrize("part", ["", "/columns", "/images"])
 @pytest.mark.parametrize(
-    ("path", "said"),
+    ("path", "message"),
     [
         ("nothing/crossmodal-pf/0", "task 'nothing' does not exist. Available: door"),
         ("door/crosmodal-pf/0", "filter 'crosmodal-pf' does not exist. Available: crossmodal-ekf, crossmodal-pf"),
@@ -142,29 +140,29 @@ def test_a_bad_faults_is_one_readable_line(client: TestClient, trace_url: str, f
         ("door/crossmodal-pf/-1", "episode -1 does not exist."),
     ],
 )
-def test_unknown_names_get_one_readable_line(client: TestClient, path: str, part: str, said: str) -> None:
+def test_unknown_names_are_refused(client: TestClient, path: str, part: str, message: str) -> None:
     answer = client.get(f"/api/trace/{path}{part}")
     assert answer.status_code == 400
-    assert said in answer.json()["error"]
+    assert message in answer.json()["error"]
     assert "\n" not in answer.json()["error"]
 
 
 @pytest.mark.parametrize(
     "path", ["/nowhere", "/scene/none/", "/static/none.js", "/static/0/none.js", "/api/recordings/x.rrd"]
 )
-def test_what_is_not_there_is_said_in_json(client: TestClient, path: str) -> None:
+def test_404_is_json(client: TestClient, path: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 404
     assert answer.json()["error"]
 
 
-def test_a_trace_is_fetched_once(client: TestClient, trace_url: str) -> None:
+def test_columns_have_an_etag(client: TestClient, trace_url: str) -> None:
     first = client.get(f"{trace_url}/columns")
     again = client.get(f"{trace_url}/columns", headers={"If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_data_sets_are_told_apart(client: TestClient, trace_url: str) -> None:
+def test_data_sets_with_equal_episode_indices(client: TestClient, trace_url: str) -> None:
     mine = columns(client, trace_url)["truth"]
     url = "/api/trace/door/crossmodal-pf/1?data="
     while (answer := client.get(f"{url}sample")).status_code == 202:
@@ -177,26 +175,24 @@ def test_data_sets_are_told_apart(client: TestClient, trace_url: str) -> None:
     assert answer.json()["error"] == "data 'yours' does not exist. Available: mine, sample."
 
 
-@pytest.mark.parametrize("broken", ["data", "checkpoint"])
-def test_a_corrupt_file_is_told_and_the_server_goes_on(
-    settings: Settings, tmp_path: Path, open_client: OpenClient, broken: str
-) -> None:
+@pytest.mark.parametrize("kind", ["data", "checkpoint"])
+def test_damaged_input_file_is_reported(settings: Settings, tmp_path: Path, open_client: OpenClient, kind: str) -> None:
     bad = tmp_path / "bad"
-    bad.write_bytes(b"not what it should be")
-    if broken == "data":
+    bad.write_bytes(b"damaged")
+    if kind == "data":
         settings = replace(settings, data=settings.data | {"bad": bad})
     else:
         settings = replace(settings, checkpoints={**settings.checkpoints, "bad": bad})
     with open_client(settings, warm=True) as client:
         (problem,) = client.get("/api/catalog").json()["problems"]
         assert str(bad) in problem
-        answer = client.get("/api/trace/door/crossmodal-pf/0?data=bad" if broken == "data" else "/api/trace/door/bad/0")
+        answer = client.get("/api/trace/door/crossmodal-pf/0?data=bad" if kind == "data" else "/api/trace/door/bad/0")
         assert answer.status_code == 400
         assert "'bad' does not exist. Available: " in answer.json()["error"]
         assert client.get("/api/trace/door/crossmodal-pf/0").status_code in (200, 202)
 
 
-def test_the_first_trace_is_ready_before_it_is_asked_for(settings: Settings, open_client: OpenClient) -> None:
+def test_first_trace_is_computed_at_startup(settings: Settings, open_client: OpenClient) -> None:
     with open_client(settings, warm=True):
         deadline = time.monotonic() + 30.0
         while not list((settings.workspace / "traces").glob("door-crossmodal-ekf-episode1-*.trace")):

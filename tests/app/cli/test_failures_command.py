@@ -1,4 +1,4 @@
-"""The command ``failures`` and the links it gives."""
+"""The command ``failures`` and its permalinks."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 
 @pytest.fixture
 def line(base_settings: Settings) -> list[object]:
-    """The command over the small data set."""
+    """The command on the small dataset."""
     checkpoint, data = base_settings.checkpoints["crossmodal-pf"], base_settings.data["mine"]
     return ["failures", "door", "--filter", checkpoint, "--data", data, "--particles", 30]
 
 
-def test_a_document_with_links(run: Run, line: list[object], base_settings: Settings) -> None:
+def test_json_document_with_permalinks(run: Run, line: list[object], base_settings: Settings) -> None:
     folder = base_settings.checkpoints["crossmodal-pf"].parent.name
     code, out, _ = run(*line, "--all", "--by", "angle", "--faults", "blackout=0.4", "--top", 2, "--json", "-")
     assert code == 0
@@ -43,10 +43,10 @@ def test_a_document_with_links(run: Run, line: list[object], base_settings: Sett
     assert document["episodes"] == 2
     assert 1 <= len(document["events"]) <= 2
     event = document["events"][0]
-    asked = {key: value for key, (value,) in parse_qs(event["link"].removeprefix("?")).items()}
-    assert asked == {
+    query = {key: value for key, (value,) in parse_qs(event["link"].removeprefix("?")).items()}
+    assert query == {
         "task": "door",
-        "filter": f"{folder}-crossmodal-pf",  # the bare name is that of the filter that ships
+        "filter": f"{folder}-crossmodal-pf",  # the bare name is the built-in filter
         "data": "door",
         "episode": str(event["episode"]),
         "step": str(event["step"]),
@@ -60,20 +60,20 @@ def test_a_document_with_links(run: Run, line: list[object], base_settings: Sett
     assert "--data" in document["serve"]
 
 
-def test_tables_and_whole_links(run: Run, line: list[object]) -> None:
+def test_tables_and_full_permalinks(run: Run, line: list[object]) -> None:
     code, out, err = run(*line, "--url", "http://127.0.0.1:9000/", "--by", "ess")
     assert code == 0
     assert "What was happening: particles to effective ones (x)" in out
     assert "http://127.0.0.1:9000/?task=door&" in out
     assert "track=particles" in out
-    assert "the page filters with 300 particles" in err
+    assert "the dashboard uses 300 particles" in err
 
 
-def test_only_one_group(run: Run, line: list[object]) -> None:
-    every = json.loads(run(*line, "--all", "--by", "ess", "--json", "-")[1])["events"]
-    name = every[-1]["phase"]
-    kept = json.loads(run(*line, "--all", "--by", "ess", "--phase", name, "--json", "-")[1])["events"]
-    assert kept == [event for event in every if event["phase"] == name]
+def test_events_of_one_phase(run: Run, line: list[object]) -> None:
+    events = json.loads(run(*line, "--all", "--by", "ess", "--json", "-")[1])["events"]
+    name = events[-1]["phase"]
+    selection = json.loads(run(*line, "--all", "--by", "ess", "--phase", name, "--json", "-")[1])["events"]
+    assert selection == [event for event in events if event["phase"] == name]
 
 
 @pytest.mark.parametrize(
@@ -81,18 +81,18 @@ def test_only_one_group(run: Run, line: list[object]) -> None:
     [
         (["--by", "eror"], "score of task 'door' 'eror' does not exist. Available: error, angle, nees, ess"),
         (["--phase", "contact"], "phase 'contact' does not exist. Available: contact made"),
-        (["--top", "0"], "'0' is not a whole number of at least 1"),
+        (["--top", "0"], "'0' is not an integer of at least 1"),
     ],
 )
-def test_what_is_wrong_is_said(run: Run, line: list[object], options: list[str], message: str) -> None:
+def test_invalid_options(run: Run, line: list[object], options: list[str], message: str) -> None:
     code, out, err = run(*line, *options)
     assert (code, out) == (2, "")
     assert message in " ".join(err.split())
 
 
-def test_a_link_keeps_any_name() -> None:
+def test_permalink_escapes_names() -> None:
     link = permalink(DOOR, "my filter*~", "a&b=ü", 3, 4, "blackout=1:from=2,delay=image:steps=3", "regret")
-    asked = {key: value for key, (value,) in parse_qs(link.removeprefix("?")).items()}
-    assert (asked["filter"], asked["data"]) == ("my filter*~", "a&b=ü")
-    assert asked["faults"] == "blackout=1:from=2,delay=image:steps=3"
-    assert asked["weights"] == "effective"
+    query = {key: value for key, (value,) in parse_qs(link.removeprefix("?")).items()}
+    assert (query["filter"], query["data"]) == ("my filter*~", "a&b=ü")
+    assert query["faults"] == "blackout=1:from=2,delay=image:steps=3"
+    assert query["weights"] == "effective"

@@ -1,4 +1,4 @@
-"""The command ``serve`` as a process of its own: what it prints, makes, logs, and how it ends."""
+"""The command ``serve`` as a process: output, files, logs, and shutdown."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
 
-from beliefscope.app.cli.commands.serve import _opening
+from beliefscope.app.cli.commands.serve import _browser_opener
 from beliefscope.app.jobs.queue import Jobs
-from beliefscope.app.server import timeouts
 from beliefscope.app.runs.settings import Settings
+from beliefscope.app.server import timeouts
 from beliefscope.app.server.main import create_app
 from beliefscope.app.server.timeouts import HTTPProtocol
 
-PATIENCE = 60.0  # s
+TIMEOUT = 60.0  # s
 
 
 @contextlib.contextmanager
 def served(workspace: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The process and its address."""
+    """Yields a server process and its address."""
     command = [sys.executable, "-m", "beliefscope", "serve", "--port", "0", "--workspace", str(workspace), *options]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
@@ -47,40 +47,40 @@ def served(workspace: Path, *options: str) -> Iterator[tuple[subprocess.Popen[st
         server.communicate()
 
 
-def asked(url: str, body: Any = None) -> Any:
+def request_json(url: str, body: Any = None) -> Any:
     data = None if body is None else json.dumps(body).encode()
     request = urllib.request.Request(
         url, data, {"content-type": "application/json", "origin": url[: url.index("/", 8)]}
     )
-    with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
+    with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
         return json.load(answer)
 
 
-def test_a_stop_saves_the_jobs_and_the_log_tells(tmp_path: Path) -> None:
+def test_sigterm_saves_jobs_and_is_logged(tmp_path: Path) -> None:
     workspace = tmp_path / "workspace"
     with served(workspace, "--log-level", "info", "--log-format", "json") as (server, address):
-        assert asked(f"{address}/healthz")["status"] == "ok"
-        asked(f"{address}/api/finetune/push/crossmodal-ekf", {"train": ["haptics-only"], "steps": 20000})
-        end = time.monotonic() + PATIENCE
-        while asked(f"{address}/api/jobs")[0]["state"] != "running":
+        assert request_json(f"{address}/healthz")["status"] == "ok"
+        request_json(f"{address}/api/finetune/push/crossmodal-ekf", {"train": ["haptics-only"], "steps": 20000})
+        end = time.monotonic() + TIMEOUT
+        while request_json(f"{address}/api/jobs")[0]["state"] != "running":
             assert time.monotonic() < end
         server.send_signal(signal.SIGTERM)
-        _, errors = server.communicate(timeout=PATIENCE)
+        _, errors = server.communicate(timeout=TIMEOUT)
         assert server.returncode == 0, errors
-    said = [json.loads(line) for line in errors.splitlines()]
-    assert [line["event"] for line in said] == ["started", "job began", "job ended", "stopped"]
-    assert said[0]["url"].startswith(address)
-    assert said[2]["state"] == "interrupted"
+    lines = [json.loads(line) for line in errors.splitlines()]
+    assert [line["event"] for line in lines] == ["started", "job began", "job ended", "stopped"]
+    assert lines[0]["url"].startswith(address)
+    assert lines[2]["state"] == "interrupted"
     (job,) = Jobs(workspace / "jobs").all()
     assert (job.state, job.error) == ("interrupted", "the server stopped")
 
 
-def test_whatever_ends_it_ends_its_jobs(tmp_path: Path) -> None:
+def test_other_signals_end_the_jobs(tmp_path: Path) -> None:
     """A closed terminal, and Ctrl-C again and again, after which uvicorn would leave out what ends the jobs."""
     workspace = tmp_path / "workspace"
     with served(workspace) as (server, address):
-        asked(f"{address}/api/finetune/push/crossmodal-ekf", {"train": ["haptics-only"], "steps": 20000})
-        end = time.monotonic() + PATIENCE / 2
+        request_json(f"{address}/api/finetune/push/crossmodal-ekf", {"train": ["haptics-only"], "steps": 20000})
+        end = time.monotonic() + TIMEOUT / 2
         while server.poll() is None and time.monotonic() < end:
             server.send_signal(signal.SIGHUP)
             server.send_signal(signal.SIGINT)
@@ -91,38 +91,38 @@ def test_whatever_ends_it_ends_its_jobs(tmp_path: Path) -> None:
     assert (job["state"], job["error"]) == ("interrupted", "the server stopped")
 
 
-def test_the_workspace_is_for_its_user_alone(settings: Settings) -> None:
+def test_workspace_is_private(settings: Settings) -> None:
     create_app(settings, warm=False)
     assert stat.S_IMODE(settings.workspace.stat().st_mode) == 0o700
 
 
-def test_the_browser_is_given_the_link_in_a_file_of_ours_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_token_is_passed_to_the_browser_in_a_private_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", opened.append)
-    link = "http://lab:8000/?token=of-this-server-alone"
-    with _opening(tmp_path, secret=True) as open_in_browser:
+    link = "http://lab:8000/?token=secret"
+    with _browser_opener(tmp_path, secret=True) as open_in_browser:
         open_in_browser(link)
         (page,) = tmp_path.iterdir()
-        assert opened == [page.as_uri()], "other users see what a browser is started with"
+        assert opened == [page.as_uri()], "other users can see the browser's command line"
         assert stat.S_IMODE(page.stat().st_mode) == 0o600
         assert link in page.read_text()
     assert not list(tmp_path.iterdir())
-    with _opening(tmp_path, secret=False) as open_in_browser:
+    with _browser_opener(tmp_path, secret=False) as open_in_browser:
         open_in_browser("http://127.0.0.1:8000/")
     assert opened[1:] == ["http://127.0.0.1:8000/"]
 
 
-async def _says_yes(scope: Scope, receive: Receive, send: Send) -> None:
+async def _respond(scope: Scope, receive: Receive, send: Send) -> None:
     assert scope["type"] == "http"
     await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"3")]})
     await send({"type": "http.response.body", "body": b"yes"})
 
 
 @pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
-    """Address of a server that waits half a second for the head of a request."""
+def server_address(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
+    """Address of a server with a header timeout of half a second."""
     monkeypatch.setattr(timeouts, "HEAD_TIMEOUT", 0.5)
-    config = uvicorn.Config(_says_yes, port=0, log_level="error", http=HTTPProtocol, lifespan="off")
+    config = uvicorn.Config(_respond, port=0, log_level="error", http=HTTPProtocol, lifespan="off")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
     thread.start()
@@ -136,40 +136,39 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
 REQUEST = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
-def answered(by: socket.socket) -> None:
-    """Reads one answer."""
-    said = b""
-    while not said.endswith(b"yes"):
-        part = by.recv(4096)
+def read_response(connection: socket.socket) -> None:
+    response = b""
+    while not response.endswith(b"yes"):
+        part = connection.recv(4096)
         assert part
-        said += part
+        response += part
 
 
-@pytest.mark.parametrize("before", [b"", REQUEST], ids=["at once", "after another"])
-@pytest.mark.parametrize("part", [b"GET / HTTP/1.1\r\nX: y", b""], ids=["half a head", "nothing"])
-def test_a_head_that_never_ends_is_given_up(patient: tuple[str, int], before: bytes, part: bytes) -> None:
-    with socket.create_connection(patient, timeout=10.0) as slow:
+@pytest.mark.parametrize("before", [b"", REQUEST], ids=["first request", "second request"])
+@pytest.mark.parametrize("part", [b"GET / HTTP/1.1\r\nX: y", b""], ids=["partial header", "no data"])
+def test_incomplete_header_times_out(server_address: tuple[str, int], before: bytes, part: bytes) -> None:
+    with socket.create_connection(server_address, timeout=10.0) as slow:
         if before:
             slow.sendall(before)
-            answered(slow)
+            read_response(slow)
         slow.sendall(part)
         started = time.monotonic()
         if part:
-            with contextlib.suppress(OSError):  # closed while it is written to
+            with contextlib.suppress(OSError):  # closed during a write
                 for _ in range(100):
                     slow.sendall(b"y")
                     slow.settimeout(0.1)
                     with contextlib.suppress(TimeoutError):
                         if not slow.recv(1):
                             break
-        elif not before:  # between two requests, uvicorn's own patience of 5 s holds
+        elif not before:  # between requests, uvicorn's keep-alive timeout of 5 s applies
             assert slow.recv(1) == b""
         assert time.monotonic() - started < 5.0
 
 
-def test_who_asks_in_time_is_answered_again_and_again(patient: tuple[str, int]) -> None:
-    with socket.create_connection(patient, timeout=10.0) as quick:
+def test_fast_requests_keep_the_connection(server_address: tuple[str, int]) -> None:
+    with socket.create_connection(server_address, timeout=10.0) as quick:
         for _ in range(5):
             quick.sendall(REQUEST)
-            answered(quick)
+            read_response(quick)
             time.sleep(0.2)

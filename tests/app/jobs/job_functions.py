@@ -1,4 +1,4 @@
-"""What the tests' jobs do, each in a process of its own (``test_jobs.py``)."""
+"""Functions of the tests' jobs."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from beliefscope.datasets.errors import BadInput
 
 def add(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
     print("adding")
-    report(0.5, "half of it")
+    report(0.5, "half done")
     return {"sum": sum(arguments["numbers"]), "threads": os.environ["OMP_NUM_THREADS"]}
 
 
 def wait(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
-    """Until a file is there; starts a process of its own, which is to end with it."""
+    """Wait for a file; the subprocess must end with the job."""
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     Path(arguments["started"]).write_text(f"{os.getpid()} {child.pid}")
     while not Path(arguments["until"]).exists():
@@ -38,7 +38,7 @@ def crash(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
 
 
 def vanish(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
-    print("leaving without a word")
+    print("exiting without an error")
     sys.stdout.flush()
     os._exit(3)
 
@@ -47,12 +47,12 @@ def refuse(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
     raise BadInput("particles must be at least 1, not 0")
 
 
-def hopeless(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
+def not_json(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
     return {"value": float("nan")}
 
 
-def hungry(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
-    """Takes more memory than it may."""
-    most = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + (64 << 20)
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+def exhaust_memory(arguments: dict[str, Any], report: Report) -> dict[str, Any]:
+    """Allocate more memory than the limit."""
+    limit = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + (64 << 20)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     return {"bytes": len(bytearray(1 << 30))}

@@ -1,10 +1,12 @@
-"""Long work in processes of its own: real ones, cancelled, killed, crashed, and found again."""
+"""Job queue: results, progress, cancellation, crashes and restarts."""
 
 from __future__ import annotations
 
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,13 +16,15 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from beliefscope.app.jobs.queue import Job, Jobs, QueueFull, routes
+from beliefscope.app.api.jobs import routes
+from beliefscope.app.jobs.queue import KINDS, Job, Jobs
+from beliefscope.app.runs.errors import QueueFull
 from beliefscope.datasets.errors import BadInput
 
-KINDS = {name: f"job_functions:{name}" for name in ("add", "wait", "crash", "vanish", "refuse", "hopeless")}
-PATIENCE = 60.0  # s: a process of Python with torch takes seconds to start on a busy machine
+TEST_KINDS = {name: f"job_functions:{name}" for name in ("add", "wait", "crash", "vanish", "refuse", "not_json")}
+TIMEOUT = 60.0  # s
 
-Open = Callable[..., Jobs]
+OpenJobs = Callable[..., Jobs]
 
 
 @pytest.fixture
@@ -29,35 +33,35 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def opened(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Open]:
-    """Opens the folder as a server that starts does."""
+def open_jobs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[OpenJobs]:
+    """Opens the folder like a starting server."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
-    all_: list[Jobs] = []
+    opened: list[Jobs] = []
 
     def open_(**limits: int) -> Jobs:
-        all_.append(Jobs(folder, KINDS, **limits))
-        return all_[-1]
+        opened.append(Jobs(folder, TEST_KINDS, **limits))
+        return opened[-1]
 
     yield open_
-    for jobs in all_:
+    for jobs in opened:
         jobs.close()
 
 
-def until(condition: Callable[[], Any]) -> Any:
-    end = time.monotonic() + PATIENCE
-    while not (found := condition()):
+def wait_until(condition: Callable[[], Any]) -> Any:
+    end = time.monotonic() + TIMEOUT
+    while not (value := condition()):
         assert time.monotonic() < end
         time.sleep(0.01)
-    return found
+    return value
 
 
-def ended(jobs: Jobs, id: str) -> Job:
-    until(lambda: jobs[id].ended)
+def wait_for(jobs: Jobs, id: str) -> Job:
+    wait_until(lambda: jobs[id].ended)
     return jobs[id]
 
 
-def alive(pid: int) -> bool:
-    """Whether a process is there and no corpse that nobody has buried yet."""
+def is_alive(pid: int) -> bool:
+    """Whether a process exists and is not a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
@@ -65,7 +69,7 @@ def alive(pid: int) -> bool:
 
 
 class Waiting:
-    """A job that runs until it is let go."""
+    """A job that runs until a file exists."""
 
     def __init__(self, jobs: Jobs, folder: Path, name: str) -> None:
         self.started, self.until = folder / f"{name}.started", folder / f"{name}.until"
@@ -74,55 +78,55 @@ class Waiting:
 
     @property
     def pids(self) -> list[int]:
-        until(lambda: self.started.exists() and self.started.read_text().count(" "))
+        wait_until(lambda: self.started.exists() and self.started.read_text().count(" "))
         return [int(pid) for pid in self.started.read_text().split()]
 
 
-def test_a_job_gives_its_result_and_is_not_done_twice(opened: Open) -> None:
-    jobs = opened()
+def test_result_is_stored_and_reused(open_jobs: OpenJobs) -> None:
+    jobs = open_jobs()
     job = jobs.submit("add", "Add", {"numbers": [1, 2, 3]}, "one to three")
-    done = ended(jobs, job.id)
+    done = wait_for(jobs, job.id)
     assert (done.state, done.progress, done.error) == ("done", 1.0, "")
     result = jobs.result(job.id)
     assert result
     assert json.loads(result.read_bytes()) == {"sum": 6, "threads": "1"}
     assert jobs.log(job.id) == "adding\n"
-    assert done.asked <= done.started <= done.ended
+    assert done.submitted <= done.started <= done.ended
     assert jobs.submit("add", "Add", {"numbers": [1, 2, 3]}, "one to three") == done
     assert jobs.find("add", "one to three") == done
     assert jobs.find("add", "one to four") is None
     assert jobs.submit("add", "Add", {"numbers": [4]}, "one to four").id != job.id
 
 
-def test_progress_is_told_and_cancelling_ends_all_its_processes(opened: Open, tmp_path: Path) -> None:
-    jobs = opened()
+def test_progress_and_cancellation(open_jobs: OpenJobs, tmp_path: Path) -> None:
+    jobs = open_jobs()
     job = Waiting(jobs, tmp_path, "a")
     pids = job.pids
-    until(lambda: jobs[job.id].message == "waiting for the file")
+    wait_until(lambda: jobs[job.id].message == "waiting for the file")
     assert (jobs[job.id].state, jobs[job.id].progress) == ("running", 0.25)
     jobs.cancel(job.id)
-    assert ended(jobs, job.id).state == "cancelled"
-    until(lambda: not any(map(alive, pids)))
-    jobs.cancel(job.id)  # one that has ended is forgotten
+    assert wait_for(jobs, job.id).state == "cancelled"
+    wait_until(lambda: not any(map(is_alive, pids)))
+    jobs.cancel(job.id)  # deletes an ended job
     assert jobs.all() == []
     assert not (tmp_path / "jobs" / job.id).exists()
 
 
 @pytest.mark.parametrize(
-    ("kind", "why", "log"),
+    ("kind", "error", "log"),
     [
         ("crash", "ZeroDivisionError: division by zero", "Traceback"),
-        ("vanish", "its process ended with exit code 3; it said last: leaving without a word", "leaving"),
+        ("vanish", "its process ended with exit code 3; last output: exiting without an error", "exiting"),
         ("refuse", "particles must be at least 1, not 0", ""),
-        ("hopeless", "ValueError: Out of range float values are not JSON compliant", "hopeless|json"),
+        ("not_json", "ValueError: Out of range float values are not JSON compliant", "not_json|json"),
     ],
 )
-def test_a_crash_says_why_and_can_be_tried_again(opened: Open, kind: str, why: str, log: str) -> None:
-    jobs = opened()
+def test_error_is_reported_and_job_can_be_repeated(open_jobs: OpenJobs, kind: str, error: str, log: str) -> None:
+    jobs = open_jobs()
     first = jobs.submit(kind, kind, {"numbers": []}, "")
-    failed = ended(jobs, first.id)
+    failed = wait_for(jobs, first.id)
     assert failed.state == "failed"
-    assert failed.error.startswith(why)
+    assert failed.error.startswith(error)
     assert any(part in jobs.log(first.id) for part in log.split("|"))
     assert not jobs.result(first.id)
     again = jobs.submit(kind, kind, {"numbers": []}, "")
@@ -130,33 +134,33 @@ def test_a_crash_says_why_and_can_be_tried_again(opened: Open, kind: str, why: s
     assert again.state in ("waiting", "running")
 
 
-def test_a_killed_process_leaves_the_others_alone(opened: Open, tmp_path: Path) -> None:
-    jobs = opened(at_once=2)
+def test_killed_process_does_not_affect_others(open_jobs: OpenJobs, tmp_path: Path) -> None:
+    jobs = open_jobs(max_running=2)
     killed, other = Waiting(jobs, tmp_path, "a"), Waiting(jobs, tmp_path, "b")
     pid, child = killed.pids
-    other.pids  # noqa: B018 - wait until it runs
+    other.pids  # noqa: B018 - waits until it runs
     os.kill(pid, signal.SIGKILL)
-    failed = ended(jobs, killed.id)
+    failed = wait_for(jobs, killed.id)
     assert failed.state == "failed"
-    assert "signal 9 (SIGKILL), perhaps for want of memory" in failed.error
-    until(lambda: not alive(child))
+    assert "signal 9 (SIGKILL), possibly out of memory" in failed.error
+    wait_until(lambda: not is_alive(child))
     assert jobs[other.id].state == "running"
     other.until.touch()
-    assert ended(jobs, other.id).state == "done"
+    assert wait_for(jobs, other.id).state == "done"
 
 
-def test_one_runs_the_rest_wait_and_too_many_are_refused(opened: Open, tmp_path: Path) -> None:
-    jobs = opened(at_once=1, waiting=2)
+def test_limits_of_running_and_waiting_jobs(open_jobs: OpenJobs, tmp_path: Path) -> None:
+    jobs = open_jobs(max_running=1, max_waiting=2)
     first, second, third = (Waiting(jobs, tmp_path, name) for name in "abc")
     assert [jobs[job.id].state for job in (first, second, third)] == ["running", "waiting", "waiting"]
-    with pytest.raises(QueueFull, match="2 jobs wait already"):
+    with pytest.raises(QueueFull, match="2 jobs are already waiting"):
         Waiting(jobs, tmp_path, "d")
-    assert jobs.submit("wait", "", {}, "b").id == second.id  # asked for again: the same one
+    assert jobs.submit("wait", "", {}, "b").id == second.id
     assert jobs.cancel(second.id).state == "cancelled"
     first.until.touch()
-    assert ended(jobs, first.id).state == "done"
+    assert wait_for(jobs, first.id).state == "done"
     third.until.touch()
-    assert ended(jobs, third.id).state == "done"
+    assert wait_for(jobs, third.id).state == "done"
     assert jobs[second.id].started is None
     assert not second.started.exists()
     assert [job.title[-1] for job in jobs.all()] == ["c", "b", "a"]
@@ -164,16 +168,16 @@ def test_one_runs_the_rest_wait_and_too_many_are_refused(opened: Open, tmp_path:
         jobs.submit("dig", "", {}, "")
 
 
-def test_results_outlive_the_server_and_what_was_under_way_is_interrupted(opened: Open, tmp_path: Path) -> None:
-    jobs = opened(at_once=1)
-    done = ended(jobs, jobs.submit("add", "Add", {"numbers": [2, 3]}, "").id)
+def test_restart_keeps_results_and_interrupts_active_jobs(open_jobs: OpenJobs, tmp_path: Path) -> None:
+    jobs = open_jobs(max_running=1)
+    done = wait_for(jobs, jobs.submit("add", "Add", {"numbers": [2, 3]}, "").id)
     running, waiting = Waiting(jobs, tmp_path, "a"), Waiting(jobs, tmp_path, "b")
     pids = running.pids
-    while_it_runs = opened()  # as after a server that was killed: its process id is this one's
-    assert [job.state for job in while_it_runs.all()] == ["interrupted", "interrupted", "done"]
+    concurrent = open_jobs()  # as after the server was killed: same process id
+    assert [job.state for job in concurrent.all()] == ["interrupted", "interrupted", "done"]
     jobs.close()
-    until(lambda: not any(map(alive, pids)))
-    again = opened()
+    wait_until(lambda: not any(map(is_alive, pids)))
+    again = open_jobs()
     assert again.all()[-1] == done
     result = again.result(done.id)
     assert result
@@ -185,36 +189,36 @@ def test_results_outlive_the_server_and_what_was_under_way_is_interrupted(opened
         jobs.submit("add", "Add", {"numbers": []}, "late")
 
 
-def test_another_servers_jobs_and_damaged_files_are_left_alone(opened: Open, folder: Path) -> None:
-    jobs = opened()
-    done = ended(jobs, jobs.submit("add", "Add", {"numbers": []}, "").id)
+def test_jobs_of_other_servers_and_damaged_files_are_ignored(open_jobs: OpenJobs, folder: Path) -> None:
+    jobs = open_jobs()
+    done = wait_for(jobs, jobs.submit("add", "Add", {"numbers": []}, "").id)
     other = folder / "other"
     other.mkdir()
-    theirs = json.dumps(vars(done) | {"id": "other", "state": "running", "server": os.getppid()})
-    (other / "job.json").write_text(theirs)
+    record = json.dumps(vars(done) | {"id": "other", "state": "running", "server": os.getppid()})
+    (other / "job.json").write_text(record)
     (folder / "half").mkdir()
     (folder / "half" / "job.json").write_text('{"id": "ha')
-    assert opened().all() == [done]
-    assert (other / "job.json").read_text() == theirs
+    assert open_jobs().all() == [done]
+    assert (other / "job.json").read_text() == record
 
 
-def test_a_job_ends_when_its_server_is_gone(opened: Open, tmp_path: Path) -> None:
-    jobs = opened()
+def test_job_ends_with_its_server(open_jobs: OpenJobs, tmp_path: Path) -> None:
+    jobs = open_jobs()
     job = Waiting(jobs, tmp_path, "a")
     pid, _ = job.pids
     stdin = jobs._processes[job.id].stdin
     assert stdin is not None
-    stdin.close()  # as the system does for a server that was killed
-    until(lambda: not alive(pid))
+    stdin.close()  # as at the end of the server's process
+    wait_until(lambda: not is_alive(pid))
 
 
-def test_over_http(opened: Open, tmp_path: Path) -> None:
-    jobs = opened()
+def test_routes(open_jobs: OpenJobs, tmp_path: Path) -> None:
+    jobs = open_jobs()
     app = FastAPI()
     app.include_router(routes(jobs))
     with TestClient(app) as client:
         assert client.get("/api/jobs").json() == []
-        done = ended(jobs, jobs.submit("add", "Add up", {"numbers": [1]}, "").id)
+        done = wait_for(jobs, jobs.submit("add", "Add up", {"numbers": [1]}, "").id)
         waiting = Waiting(jobs, tmp_path, "a")
         assert [(job["title"], job["state"]) for job in client.get("/api/jobs").json()] == [
             ("Wait for a", "running"),
@@ -225,8 +229,28 @@ def test_over_http(opened: Open, tmp_path: Path) -> None:
         answer = client.get(f"/api/jobs/{waiting.id}/result")
         assert (answer.status_code, "it is running" in answer.text) == (404, True)
         assert client.delete(f"/api/jobs/{waiting.id}").status_code == 200
-        assert ended(jobs, waiting.id).state == "cancelled"
+        assert wait_for(jobs, waiting.id).state == "cancelled"
         for method in ("GET", "DELETE"):
             assert client.request(method, "/api/jobs/nope").status_code == 404
         assert client.delete(f"/api/jobs/{done.id}").json()["state"] == "done"
         assert [job["title"] for job in client.get("/api/jobs").json()] == ["Wait for a"]
+
+
+def test_jobs_import_no_web_framework() -> None:
+    """The functions of all kinds exist and their modules do not import FastAPI."""
+    code = (
+        "import importlib, sys\n"
+        f"for kind in {list(KINDS.values())!r}:\n"
+        "    module, _, name = kind.partition(':')\n"
+        "    getattr(importlib.import_module(module), name)\n"
+        "print(*sorted({'fastapi', 'starlette', 'uvicorn'} & sys.modules.keys()))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == ""
+
+
+def test_record_of_an_earlier_version(folder: Path, open_jobs: OpenJobs) -> None:
+    (folder / "a").mkdir(parents=True)
+    record = {"id": "a", "kind": "add", "title": "Add", "state": "done", "asked": 5.0}
+    (folder / "a" / "job.json").write_text(json.dumps(record))
+    assert open_jobs()["a"].submitted == 5.0

@@ -89,11 +89,13 @@ def test_errors_are_reported_and_close_ends_a_run(store: TraceStore, worker: Tra
         run.result(TIMEOUT)
 
 
-def test_requests_survive_json(store: TraceStore) -> None:
+def test_requests_survive_json(settings: Settings) -> None:
+    store = TraceStore(settings)
     for selection in (SELECTION, SELECTION.comparison("from=5&to=10&faults=blackout&weights=image=0.5")):
         assert Selection.from_json(selection.to_json()) == selection
         original = replace(request(store, selection), user_tasks=())
         assert RunRequest.from_json(original.to_json() | {"user_tasks": ()}) == original
+    store.close()
 
 
 def test_the_worker_imports_no_web_or_viewer_packages() -> None:

@@ -1,4 +1,4 @@
-"""Many at once, and for long: work by its due time, traces that nobody shows let go, browsers that do not read."""
+"""Load: memory of traces, queue limits, scheduling, slow clients."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from websockets.typing import Origin
 
 from beliefscope.app.api import recordings
 from beliefscope.app.runs import trace_store, traced_run
-from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.trace_store import TRACES_IN_MEMORY, TraceStore
 from beliefscope.app.runs.settings import Settings
-from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
+from beliefscope.app.runs.trace_store import TRACES_IN_MEMORY, TraceStore
+from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
+from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
 from beliefscope.app.views.view import PREFETCH_STEPS
 from beliefscope.app.workspace.recording_probe import RecordingInfo, RecordingProbe
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 
-PATIENCE = 30.0  # s
+TIMEOUT = 30.0  # s
 
 
 @pytest.fixture
@@ -44,76 +44,78 @@ def store(settings: Settings) -> Iterator[TraceStore]:
     store.close()
 
 
-def broken(number: int, filter_: str = "crossmodal-ekf") -> Selection:
-    """One of many runs of the same episode."""
+def faulty_run(number: int, filter_: str = "crossmodal-ekf") -> Selection:
+    """One of many runs of an episode."""
     return Selection("door", filter_, 1, Faults.parse(f"blackout=0.{number:02d}"))
 
 
-def opened(store: TraceStore, count: int) -> list[weakref.ref[TracedRun]]:
-    found = []
+def request_runs(store: TraceStore, count: int) -> list[weakref.ref[TracedRun]]:
+    refs = []
     for number in range(1, count + 1):
-        traced = store.request(broken(number))
-        traced.result(PATIENCE)
-        found.append(weakref.ref(traced))
-    return found
+        run = store.request(faulty_run(number))
+        run.result(TIMEOUT)
+        refs.append(weakref.ref(run))
+    return refs
 
 
-def living(refs: list[weakref.ref[Any]]) -> int:
+def count_alive(refs: list[weakref.ref[Any]]) -> int:
     gc.collect()
     return sum(ref() is not None for ref in refs)
 
 
-def test_memory_holds_the_newest_traces_not_all_that_were_opened(store: TraceStore) -> None:
-    refs = opened(store, TRACES_IN_MEMORY + 4)
-    # The thread that traced the last one may not have let go of it yet.
-    assert TRACES_IN_MEMORY <= living(refs) <= TRACES_IN_MEMORY + 1
+def test_memory_holds_the_newest_traces_not_all_that_were_request_runs(store: TraceStore) -> None:
+    refs = request_runs(store, TRACES_IN_MEMORY + 4)
+    # The worker thread may still hold the last one.
+    assert TRACES_IN_MEMORY <= count_alive(refs) <= TRACES_IN_MEMORY + 1
     assert refs[-1]() is not None
     assert refs[0]() is None
 
 
-def test_large_traces_count_by_their_bytes(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_traces_is_limited(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trace_store, "BYTES_IN_MEMORY", 1)
-    assert living(opened(store, 4)) <= 2
-    assert store.cached(broken(4)) is not None
+    assert count_alive(request_runs(store, 4)) <= 2
+    assert store.cached(faulty_run(4)) is not None
 
 
-def test_a_trace_that_somebody_shows_stays_and_is_the_others_too(store: TraceStore) -> None:
-    shown = store.request(broken(90))
-    shown.result(PATIENCE)
-    opened(store, TRACES_IN_MEMORY + 1)
-    assert store.request(broken(90)) is shown
+def test_trace_in_use_is_kept_and_shared(store: TraceStore) -> None:
+    run = store.request(faulty_run(90))
+    run.result(TIMEOUT)
+    request_runs(store, TRACES_IN_MEMORY + 1)
+    assert store.request(faulty_run(90)) is run
 
 
-def test_names_of_what_was_opened_are_forgotten(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_cached_keys_is_limited(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trace_store, "MAX_KEYS", 3)
-    keys = [store.key(broken(number)) for number in range(1, 8)]
+    keys = [store.key(faulty_run(number)) for number in range(1, 8)]
     assert len(store._keys) == 3
-    assert [store.key(broken(number)) for number in range(1, 8)] == keys
+    assert [store.key(faulty_run(number)) for number in range(1, 8)] == keys
 
 
-def test_so_many_runs_wait_and_no_more(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_waiting_runs_is_limited(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trace_store, "MAX_WAITING", 3)
-    served: TraceStore = client.app.state.store  # type: ignore[attr-defined]
-    go_on = threading.Event()
-    served._executor.submit(go_on.wait, PATIENCE)
-    asked = [client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": f"blackout=0.{i}"}) for i in range(1, 6)]
-    assert [answer.status_code for answer in asked] == [202, 202, 202, 429, 429]
-    assert "3 filter runs are waiting already" in asked[-1].json()["error"]
+    store: TraceStore = client.app.state.store  # type: ignore[attr-defined]
+    proceed = threading.Event()
+    store._executor.submit(proceed.wait, TIMEOUT)
+    responses = [
+        client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": f"blackout=0.{i}"}) for i in range(1, 6)
+    ]
+    assert [answer.status_code for answer in responses] == [202, 202, 202, 429, 429]
+    assert "3 filter runs are waiting already" in responses[-1].json()["error"]
     assert client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": "blackout=0.3"}).status_code == 202
     assert client.get("/api/trace/door/crossmodal-ekf/1/columns", params={"faults": "blackout=0.3"}).status_code == 202
-    go_on.set()
-    served.request(broken(30)).result(PATIENCE)
+    proceed.set()
+    store.request(faulty_run(30)).result(TIMEOUT)
     assert client.get("/api/trace/door/crossmodal-ekf/1", params={"faults": "blackout=0.5"}).status_code in (200, 202)
 
 
-def test_recordings_that_are_read_for_long_hold_up_nobody_else(
+def test_slow_reader_of_recordings_does_not_block_others(
     address: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    go_on = threading.Event()
+    proceed = threading.Event()
 
     def slow(_: RecordingProbe, path: Path) -> RecordingInfo:
-        go_on.wait(PATIENCE)
-        return RecordingInfo(problem="read at last")
+        proceed.wait(TIMEOUT)
+        return RecordingInfo(problem="unreadable")
 
     monkeypatch.setattr(RecordingProbe, "__call__", slow)
     headers = {"Origin": f"http://{address}"}
@@ -121,67 +123,67 @@ def test_recordings_that_are_read_for_long_hold_up_nobody_else(
     def put(number: int) -> int:
         url = f"http://{address}/api/recordings/{number}.rrd"
         try:
-            with urlopen(Request(url, b"RRF2", headers, method="PUT"), timeout=PATIENCE) as answer:
+            with urlopen(Request(url, b"RRF2", headers, method="PUT"), timeout=TIMEOUT) as answer:
                 return int(answer.status)
         except HTTPError as error:
             return error.code
 
-    count = (os.cpu_count() or 2) + 6  # more than asyncio has threads for all that waits
-    with ThreadPoolExecutor(count) as browsers:
-        added = browsers.map(put, range(count))
-        until = time.monotonic() + PATIENCE
+    count = (os.cpu_count() or 2) + 6  # more than asyncio's threads
+    with ThreadPoolExecutor(count) as clients:
+        statuses = clients.map(put, range(count))
+        deadline = time.monotonic() + TIMEOUT
         while len(list((settings.workspace / "recordings").glob(".*.part"))) < count:
-            assert time.monotonic() < until
+            assert time.monotonic() < deadline
             time.sleep(0.01)
         try:
             with urlopen(Request(f"http://{address}/api/views", b"", headers), timeout=10.0) as answer:
                 assert answer.status == 201
         finally:
-            go_on.set()
-        assert set(added) == {400}
+            proceed.set()
+        assert set(statuses) == {400}
     assert not list((settings.workspace / "recordings").glob(".*"))
 
 
-def test_what_others_add_meanwhile_leaves_no_room(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    free = iter([recordings.SPARED + 10**9, *[recordings.SPARED - 1] * 10])
-    monkeypatch.setattr(recordings, "disk", lambda _: next(free))
-    monkeypatch.setattr(recordings, "LOOK", 1000)
+def test_disk_fills_during_upload(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = iter([recordings.RESERVED_SPACE + 10**9, *[recordings.RESERVED_SPACE - 1] * 10])
+    monkeypatch.setattr(recordings, "free_space", lambda _: next(free))
+    monkeypatch.setattr(recordings, "CHECK_INTERVAL", 1000)
     folder = client.app.state.store.settings.workspace / "recordings"  # type: ignore[attr-defined]
     answer = client.put("/api/recordings/x.rrd", content=(b"RRF2" + bytes(596) for _ in range(10)))
     assert answer.status_code == 413
     assert not list(folder.iterdir())
 
 
-def test_maps_are_made_once_for_all_who_look(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    traced = store.request(broken(1, "crossmodal-pf"))
-    traced.result(PATIENCE)
-    one = traced.encoded_maps(3, None, 41)
-    assert traced.encoded_maps(3, None, 41) is one
-    assert traced.encoded_maps(3, 0.1, 41) is not one
-    assert one.message(5)[4:].startswith(b'{"type": "maps", "serial": 5, "other": false, "step": 3')
-    monkeypatch.setattr(traced_run, "MAP_CACHE_BYTES", 3 * one.nbytes)
+def test_maps_are_cached(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = store.request(faulty_run(1, "crossmodal-pf"))
+    run.result(TIMEOUT)
+    maps = run.encoded_maps(3, None, 41)
+    assert run.encoded_maps(3, None, 41) is maps
+    assert run.encoded_maps(3, 0.1, 41) is not maps
+    assert maps.message(5)[4:].startswith(b'{"type": "maps", "serial": 5, "other": false, "step": 3')
+    monkeypatch.setattr(traced_run, "MAP_CACHE_BYTES", 3 * maps.nbytes)
     for step in range(10):
-        traced.encoded_maps(step, None, 41)
-    assert len(traced._kept) == 3
-    assert traced._kept_bytes == sum(kept.nbytes for kept in traced._kept.values())
+        run.encoded_maps(step, None, 41)
+    assert len(run._cache) == 3
+    assert run._cache_bytes == sum(maps.nbytes for maps in run._cache.values())
 
 
-def test_while_a_hand_rests_the_maps_about_it_are_made(client: TestClient) -> None:
+def test_neighbouring_maps_are_prefetched(client: TestClient) -> None:
     view = client.post("/api/views").json()
-    chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1}
-    served: TraceStore = client.app.state.store  # type: ignore[attr-defined]
+    selection = {"task": "door", "filter": "crossmodal-ekf", "episode": 1}
+    store: TraceStore = client.app.state.store  # type: ignore[attr-defined]
     with client.websocket_connect(view["socket"]) as socket:
-        socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **chosen})
+        socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **selection})
         assert len(socket.receive_bytes()) > 0
-        traced = served.request(Selection("door", "crossmodal-ekf", 1))
-        assert traced.missing_maps(3, 0.1, 4) == [3, 2, 4, 1]
-        until = time.monotonic() + PATIENCE
-        while traced.missing_maps(3, None, PREFETCH_STEPS):
-            assert time.monotonic() < until
+        run = store.request(Selection("door", "crossmodal-ekf", 1))
+        assert run.missing_maps(3, 0.1, 4) == [3, 2, 4, 1]
+        deadline = time.monotonic() + TIMEOUT
+        while run.missing_maps(3, None, PREFETCH_STEPS):
+            assert time.monotonic() < deadline
             time.sleep(0.01)
 
 
-def test_a_closed_view_leaves_nothing_behind(open_client: Callable[..., TestClient], settings: Settings) -> None:
+def test_closed_views_are_released(open_client: Callable[..., TestClient], settings: Settings) -> None:
     with open_client(settings) as client:
         views: Views = client.app.state.views  # type: ignore[attr-defined]
         views._patience = 0.0
@@ -189,131 +191,129 @@ def test_a_closed_view_leaves_nothing_behind(open_client: Callable[..., TestClie
         before = threading.active_count()
         for number in range(1, 4):
             view = client.post("/api/views").json()
-            chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "faults": f"blackout=0.{number:02d}"}
+            selection = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "faults": f"blackout=0.{number:02d}"}
             with client.websocket_connect(view["socket"]) as socket:
-                socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **chosen})
+                socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **selection})
                 assert len(socket.receive_bytes()) > 0
                 assert socket.receive_json()["type"] == "drawn"
-            open_ = views[view["view"]]
-            refs += [weakref.ref(each) for each in (open_, open_.scene, open_.scene.viser.server)]
-            del open_
+            current = views[view["view"]]
+            refs += [weakref.ref(part) for part in (current, current.scene, current.scene.viser.server)]
+            del current
             client.portal.call(views._close_idle, 0)  # type: ignore[union-attr]
         assert len(views) == 0
-        assert living(refs) == 0
-        # The desk's, and those in which the event loop waits for what blocks; each is there once.
+        assert count_alive(refs) == 0
+        # Threads of the executor and of the event loop are shared by all views.
         assert threading.active_count() <= before + 14
 
 
-def test_one_page_too_many_is_told_how_many_there_may_be(settings: Settings) -> None:
+def test_number_of_views_is_limited(settings: Settings) -> None:
     async def scenario() -> str:
         views = Views(TraceStore(settings), limit=1)
-        (await views.open(False)).idle_since = None  # its page is there
-        with pytest.raises(BadInput) as told:
+        (await views.open(False)).idle_since = None  # in use
+        with pytest.raises(BadInput) as error:
             await views.open(False)
         await views.close()
-        return str(told.value)
+        return str(error.value)
 
     assert asyncio.run(scenario()).startswith("The maximum number of pages is open, 1.")
 
 
-def test_the_desk_takes_what_is_due_first_and_never_two_that_need_the_same() -> None:
+def test_executor_runs_earliest_deadline_first_and_resources_exclusively() -> None:
     async def scenario() -> tuple[list[str], int]:
-        desk, go_on = DeadlineExecutor(threads=1), threading.Event()
+        executor, proceed = DeadlineExecutor(threads=1), threading.Event()
         order: list[str] = []
-        first = asyncio.ensure_future(desk.run(lambda: go_on.wait(PATIENCE), 0.0))
-        await asyncio.sleep(0)  # it is taken up, and the others queue
+        first = asyncio.ensure_future(executor.run(lambda: proceed.wait(TIMEOUT), 0.0))
+        await asyncio.sleep(0)  # it starts, and the others wait
         others = [
-            asyncio.ensure_future(desk.run(lambda name=name: order.append(name), within))  # type: ignore[misc]
+            asyncio.ensure_future(executor.run(lambda name=name: order.append(name), within))  # type: ignore[misc]
             for name, within in (("fine", 3.0), ("scene", 2.0), ("coarse", 1.0), ("late scene", 2.5))
         ]
         await asyncio.sleep(0)
-        others[3].cancel()  # whose page has gone meanwhile
+        others[3].cancel()
         await asyncio.sleep(0.01)
-        assert 0.01 <= desk.overdue() < PATIENCE, "of the first, which was due at once"
-        go_on.set()
+        assert 0.01 <= executor.overdue() < TIMEOUT, "the first task was due immediately"
+        proceed.set()
         await asyncio.gather(first, *others[:3])
-        assert desk.overdue() == 0.0
-        desk.close()
+        assert executor.overdue() == 0.0
+        executor.close()
 
-        desk, inside, most = DeadlineExecutor(threads=4), [0], [0]
+        executor, inside, maximum = DeadlineExecutor(threads=4), [0], [0]
 
-        def alone() -> None:
+        def exclusive() -> None:
             inside[0] += 1
-            most[0] = max(most[0], inside[0])
+            maximum[0] = max(maximum[0], inside[0])
             threading.Event().wait(0.002)
             inside[0] -= 1
 
-        await asyncio.gather(*(desk.run(alone, 0.0, frozenset({"engine"})) for _ in range(20)))
-        desk.close()
-        return order, most[0]
+        await asyncio.gather(*(executor.run(exclusive, 0.0, frozenset({"engine"})) for _ in range(20)))
+        executor.close()
+        return order, maximum[0]
 
     assert asyncio.run(scenario()) == (["coarse", "scene", "fine"], 1)
 
 
-def test_one_after_the_other_has_its_turn_and_a_rest_follows_each_even_a_failed_one() -> None:
+def test_fair_lock_pauses_after_each_holder() -> None:
     async def scenario() -> list[tuple[str, float]]:
-        turns, told = FairLock(pause=2.0), []
+        lock, events = FairLock(pause=2.0), []
 
-        async def one(name: str) -> None:
-            async with turns:
-                told.append((name, time.monotonic()))
+        async def hold(name: str) -> None:
+            async with lock:
+                events.append((name, time.monotonic()))
                 await asyncio.sleep(0.02)
-                told.append((name, time.monotonic()))
+                events.append((name, time.monotonic()))
                 if name == "second":
                     raise ValueError(name)
 
-        await asyncio.gather(*(one(name) for name in ("first", "second", "third")), return_exceptions=True)
-        return told
+        await asyncio.gather(*(hold(name) for name in ("first", "second", "third")), return_exceptions=True)
+        return events
 
-    told = asyncio.run(scenario())
-    assert [name for name, _ in told] == ["first", "first", "second", "second", "third", "third"]
-    times = [at for _, at in told]
+    events = asyncio.run(scenario())
+    assert [name for name, _ in events] == ["first", "first", "second", "second", "third", "third"]
+    times = [at for _, at in events]
     for i in (0, 2):
-        # A turn that took t is followed by 2 t of rest; clocks and the loop's timers may differ by their resolution.
+        # The pause is twice as long as the lock was held, within the resolution of the timers.
         assert times[i + 2] - times[i + 1] >= 2.0 * (times[i + 1] - times[i]) - 0.002
 
 
-def test_the_desk_gives_back_errors_and_refuses_when_it_is_closed() -> None:
+def test_executor_propagates_errors_and_refuses_tasks_after_close() -> None:
     async def scenario() -> None:
-        desk = DeadlineExecutor(threads=1)
+        executor = DeadlineExecutor(threads=1)
         with pytest.raises(ZeroDivisionError):
-            await desk.run(lambda: 1 / 0, 0.0)
-        assert await desk.run(lambda: 3, 0.0) == 3
-        desk.close()
+            await executor.run(lambda: 1 / 0, 0.0)
+        assert await executor.run(lambda: 3, 0.0) == 3
+        executor.close()
         with pytest.raises(RuntimeError, match="stopping"):
-            await desk.run(lambda: 3, 0.0)
+            await executor.run(lambda: 3, 0.0)
 
     asyncio.run(scenario())
 
 
-def test_a_browser_that_never_reads_costs_no_more_than_what_is_on_its_way(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[int] = []
-    real = TracedRun.encoded_maps
+def test_client_that_does_not_read_is_not_buffered(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[int] = []
+    original = TracedRun.encoded_maps
 
     def counted(self: TracedRun, step: int, angle: float | None, size: int) -> Any:
-        made.append(step)
-        return real(self, step, angle, size)
+        steps.append(step)
+        return original(self, step, angle, size)
 
     monkeypatch.setattr(TracedRun, "encoded_maps", counted)
     origin = Origin(f"http://{address}")
 
     def view() -> str:
-        asked = Request(f"http://{address}/api/views", method="POST", headers={"Origin": str(origin)})
-        with urlopen(asked) as answer:
+        request = Request(f"http://{address}/api/views", method="POST", headers={"Origin": str(origin)})
+        with urlopen(request) as answer:
             return f"ws://{address}{json.load(answer)['socket']}"
 
     def cursor(serial: int) -> str:
-        chosen = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "size": 135, "scene": False}
-        return json.dumps({"type": "cursor", "serial": serial, "step": serial % 40, "angle": None, **chosen})
+        selection = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "size": 135, "scene": False}
+        return json.dumps({"type": "cursor", "serial": serial, "step": serial % 40, "angle": None, **selection})
 
-    # Beyond so many messages this client takes nothing more from its socket.
-    with connect(view(), origin=origin, max_queue=1, proxy=None) as deaf:
+    # With a full queue the client stops reading from its socket.
+    with connect(view(), origin=origin, max_queue=1, proxy=None) as stalled:
         for serial in range(1500):
-            deaf.send(cursor(serial))
+            stalled.send(cursor(serial))
         with connect(view(), origin=origin, max_size=None, proxy=None) as other:
             other.send(cursor(1))
-            assert isinstance(other.recv(timeout=PATIENCE), bytes)
-        # 130 KB each: what fits the system's buffers of one connection. The other 1400 cursors were overtaken.
-        assert len(made) < 100
+            assert isinstance(other.recv(timeout=TIMEOUT), bytes)
+        # Maps of 130 KB each fill the system's buffers; the other cursors were replaced by newer ones.
+        assert len(steps) < 100

@@ -1,4 +1,4 @@
-"""The server's log: one line an event, as text and as JSON, that nobody else can write into or fill."""
+"""The server's log: formats, escaping and limits."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ log = logging.getLogger("beliefscope.app")
 
 
 @pytest.fixture
-def written(request: pytest.FixtureRequest) -> Iterator[io.StringIO]:
-    """What is logged, in the form that the test names."""
+def log_text(request: pytest.FixtureRequest) -> Iterator[io.StringIO]:
+    """The log, in the format given as parameter."""
     names = ("beliefscope", "uvicorn.error")
     before = [(logger.handlers, logger.level) for logger in map(logging.getLogger, names)]
     stream = io.StringIO()
@@ -32,74 +32,74 @@ def written(request: pytest.FixtureRequest) -> Iterator[io.StringIO]:
         logging.getLogger(name).setLevel(level)
 
 
-@pytest.mark.parametrize("written", ["json"], indirect=True)
-def test_json_is_an_object_a_line(written: io.StringIO) -> None:
+@pytest.mark.parametrize("log_text", ["json"], indirect=True)
+def test_json_format(log_text: io.StringIO) -> None:
     log.info("job ended", extra={"event": {"job": "0123", "seconds": 1.5}})
     log.debug("not at this level")
     try:
         raise ValueError("of three\nlines\nof text")
     except ValueError:
         log.exception("failed")
-    ended, failed = map(json.loads, written.getvalue().splitlines())
+    ended, failed = map(json.loads, log_text.getvalue().splitlines())
     assert ended.pop("time").endswith("Z")
     assert ended == {"level": "info", "event": "job ended", "job": "0123", "seconds": 1.5}
     assert failed["traceback"].splitlines()[0].startswith("Traceback")
 
 
-@pytest.mark.parametrize("written", ["text"], indirect=True)
-def test_text_has_the_same(written: io.StringIO) -> None:
+@pytest.mark.parametrize("log_text", ["text"], indirect=True)
+def test_text_format(log_text: io.StringIO) -> None:
     log.warning("job ended", extra={"event": {"job": "0123", "error": "no room"}})
-    (line,) = written.getvalue().splitlines()
+    (line,) = log_text.getvalue().splitlines()
     assert line.split(" ", 1)[1] == 'warning: job ended job="0123" error="no room"'
 
 
-@pytest.mark.parametrize("written", logs.FORMATS, indirect=True)
-def test_a_log_line_cannot_be_forged(written: io.StringIO, client: TestClient) -> None:
-    forged = "x\r\n2026-01-01T00:00:00.000Z error: all is lost\u2028\x1b[2J\x9b2J"
+@pytest.mark.parametrize("log_text", logs.FORMATS, indirect=True)
+def test_log_lines_cannot_be_forged(log_text: io.StringIO, client: TestClient) -> None:
+    forged = "x\r\n2026-01-01T00:00:00.000Z error: injected line\u2028\x1b[2J\x9b2J"
     client.get("/api/jobs", headers={"Host": forged.encode()})  # type: ignore[dict-item]
-    client.get("/api/%0a2026-01-01 error: all is lost", headers={"Host": "evil.example"})
+    client.get("/api/%0a2026-01-01 error: injected line", headers={"Host": "evil.example"})
     client.post("/api/views", headers={"Origin": forged.encode("latin-1", errors="ignore")})  # type: ignore[dict-item]
     log.warning("%s", forged, extra={"event": {"name": forged}})
-    lines = written.getvalue().splitlines()
+    lines = log_text.getvalue().splitlines()
     assert len(lines) == 4
     try:
         raise ValueError(forged)
     except ValueError:
         log.exception("failed")
-    lines = written.getvalue().splitlines()
+    lines = log_text.getvalue().splitlines()
     assert not [line for line in lines if line.startswith("2026-01-01")]
-    assert all(line.isprintable() for line in lines), "a terminal obeys none of it"
+    assert all(line.isprintable() for line in lines), "control characters are escaped"
 
 
-@pytest.mark.parametrize("written", ["json"], indirect=True)
-def test_what_is_refused_is_told_with_its_reason(written: io.StringIO, client: TestClient) -> None:
+@pytest.mark.parametrize("log_text", ["json"], indirect=True)
+def test_refusal_is_logged_with_reason(log_text: io.StringIO, client: TestClient) -> None:
     client.get("/api/catalog?task=secret", headers={"Host": "evil.example"})
     client.get("/api/jobs/missing")
-    (line,) = map(json.loads, written.getvalue().splitlines())
+    (line,) = map(json.loads, log_text.getvalue().splitlines())
     assert line["level"] == "warning"
     assert line["event"].startswith("refused: Host 'evil.example'")
     assert (line["status"], line["path"]) == (403, "/api/catalog")
 
 
-def test_refusals_do_not_fill_the_log() -> None:
+def test_number_of_logged_refusals_is_limited() -> None:
     now = [0.0]
-    enough = RefusalLimit(clock=lambda: now[0])
+    limit = RefusalLimit(clock=lambda: now[0])
 
     def record(text: str) -> logging.LogRecord:
         return logging.LogRecord("beliefscope.app", logging.WARNING, "", 0, text, None, None)
 
     lines = ("refused: no", "Invalid HTTP request received.")  # the second is uvicorn's
-    assert sum(enough.filter(record(lines[i % 2])) for i in range(10 * MAX_REFUSALS)) == MAX_REFUSALS
-    assert enough.filter(record("job ended"))
+    assert sum(limit.filter(record(lines[i % 2])) for i in range(10 * MAX_REFUSALS)) == MAX_REFUSALS
+    assert limit.filter(record("job ended"))
     now[0] = 61.0
     after = record("refused: no")
-    assert enough.filter(after)
-    assert after.event["left_out_before"] == 9 * MAX_REFUSALS  # type: ignore[attr-defined]
+    assert limit.filter(after)
+    assert after.event["omitted_before"] == 9 * MAX_REFUSALS  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("written", ["json"], indirect=True)
-def test_a_job_is_told_of_when_it_begins_and_ends(
-    written: io.StringIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("log_text", ["json"], indirect=True)
+def test_start_and_end_of_jobs_are_logged(
+    log_text: io.StringIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "jobs"))
     jobs = Jobs(tmp_path / "jobs", {"crash": "job_functions:crash"})
@@ -109,8 +109,8 @@ def test_a_job_is_told_of_when_it_begins_and_ends(
         assert time.monotonic() < end
         time.sleep(0.05)
     jobs.close()
-    began, ended = map(json.loads, written.getvalue().splitlines())
-    assert (began["event"], began["job"], began["title"]) == ("job began", job.id, "Dividing")
+    started, ended = map(json.loads, log_text.getvalue().splitlines())
+    assert (started["event"], started["job"], started["title"]) == ("job started", job.id, "Dividing")
     assert (ended["event"], ended["job"], ended["level"]) == ("job ended", job.id, "warning")
     assert "ZeroDivisionError" in ended["error"]
     assert ended["seconds"] >= 0.0

@@ -1,7 +1,4 @@
-"""What befalls a server that runs for days: no room, no right, files that go, networks that are broken, a wrong clock.
-
-Each is made to happen to the real thing. What is asked for then is refused in one clear line, and the rest goes on.
-"""
+"""Environment faults: full disk, missing permissions, deleted files, clock changes, lost connections."""
 
 from __future__ import annotations
 
@@ -38,12 +35,12 @@ from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shi
 from beliefscope.inspect.trace import Trace, save_trace, trace
 from beliefscope.recordings.write import write_recording
 
-PATIENCE = 60.0  # s
+TIMEOUT = 60.0  # s
 
 
 @contextmanager
-def room_for(size: int) -> Iterator[None]:
-    """No file of this process may grow beyond so many bytes, as on a disk that is full."""
+def file_size_limit(size: int) -> Iterator[None]:
+    """Limit the size of files, as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -52,17 +49,17 @@ def room_for(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def until(condition: Callable[[], Any]) -> Any:
-    end = time.monotonic() + PATIENCE
-    while not (found := condition()):
+def wait_until(condition: Callable[[], Any]) -> Any:
+    end = time.monotonic() + TIMEOUT
+    while not (value := condition()):
         assert time.monotonic() < end
         time.sleep(0.02)
-    return found
+    return value
 
 
-def answer(client: TestClient, url: str) -> Any:
-    """The answer of a route that computes, once it has."""
-    return until(lambda: (got := client.get(url)).status_code != 202 and got)
+def poll(client: TestClient, url: str) -> Any:
+    """The response of a route once it is not 202."""
+    return wait_until(lambda: (response := client.get(url)).status_code != 202 and response)
 
 
 @pytest.fixture(scope="module")
@@ -81,65 +78,65 @@ WRITERS: dict[str, Callable[[Trace, Path], object]] = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(name: str, run: Trace, tmp_path: Path) -> None:
-    path = tmp_path / "kept"
+def test_full_disk_keeps_existing_file(name: str, run: Trace, tmp_path: Path) -> None:
+    path = tmp_path / "file"
     WRITERS[name](run, path)
     before = path.read_bytes()
 
     def write() -> None:
-        with room_for(10_000):
+        with file_size_limit(10_000):
             WRITERS[name](run, path)
 
-    (line,) = apart(write)
+    (line,) = errors_in_fork(write)
     assert str(path) in line
     assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path], "nothing half-written is left"
+    assert list(tmp_path.iterdir()) == [path], "no partial file is left"
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a disk")
+@pytest.mark.skipif(os.geteuid() != 0, reason="mount needs root")
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_disk_without_room_is_told_with_what_is_free(name: str, run: Trace, tmp_path: Path) -> None:
+def test_full_disk_is_reported_with_free_space(name: str, run: Trace, tmp_path: Path) -> None:
     place = tmp_path / "disk"
     place.mkdir()
-    mounted = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(place)]
-    if subprocess.run(mounted, capture_output=True, check=False).returncode:
-        pytest.skip("no disk can be mounted here")
+    command = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(place)]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("mount is not permitted")
     try:
         (place / "other").write_bytes(bytes(40_000))
-        (line,) = apart(partial(WRITERS[name], run, place / "wanted"))
-        # 16 pages of 4 KiB, of which the other file has ten: six are left, once what was half written is gone.
+        (line,) = errors_in_fork(partial(WRITERS[name], run, place / "new"))
+        # Six of 16 pages of 4 KiB are free after the partial file is deleted.
         assert line == f"cannot write {str(place / 'wanted')!r}: No space left on device, 0.0 MB are free there"
         assert [path.name for path in place.iterdir()] == ["other"]
     finally:
         subprocess.run(["umount", str(place)], check=True)
 
 
-@pytest.mark.long  # in a process that wrote other recordings before, Rerun may wait for ever
-def test_a_recording_on_a_full_disk_is_one_line_too(run: Trace, tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"  # not in a fork, for which Rerun is not made
-    with room_for(10_000), pytest.raises(BadInput, match=r"cannot write .*run\.rrd': .* MB are free there"):
+@pytest.mark.long  # Rerun may block in a process that wrote other recordings
+def test_recording_on_a_full_disk(run: Trace, tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"  # Rerun does not support forks
+    with file_size_limit(10_000), pytest.raises(BadInput, match=r"cannot write .*run\.rrd': .* MB are free there"):
         write_recording(run, path)
     assert not list(tmp_path.iterdir())
     assert write_recording(run, path).is_file()
 
 
-def apart(*works: Callable[[], object], user: int | None = None) -> list[str]:
-    """What BadInput says of each, in lines, in a fork of this process, which may be another user's."""
+def errors_in_fork(*functions: Callable[[], object], user: int | None = None) -> list[str]:
+    """Messages of BadInput raised by the functions in a fork of this process, optionally as another user."""
     reading, writing = os.pipe()
     pid = os.fork()
     if not pid:
         try:
             if user is not None:
                 os.setuid(user)
-            for work in works:
+            for function in functions:
                 try:
-                    work()
-                    said = "nothing"
+                    function()
+                    message = "no error"
                 except BadInput as error:
-                    said = str(error)
+                    message = str(error)
                 except BaseException as error:
-                    said = f"{type(error).__name__}, not BadInput: {error}"
-                os.write(writing, f"{said}\n".encode())
+                    message = f"{type(error).__name__}, not BadInput: {error}"
+                os.write(writing, f"{message}\n".encode())
         finally:
             os._exit(0)
     os.close(writing)
@@ -149,8 +146,8 @@ def apart(*works: Callable[[], object], user: int | None = None) -> list[str]:
     return lines
 
 
-def test_a_server_with_a_full_disk_says_so_and_goes_on(client: TestClient, trace_url: str, settings: Settings) -> None:
-    with room_for(100):
+def test_server_with_a_full_disk(client: TestClient, trace_url: str, settings: Settings) -> None:
+    with file_size_limit(100):
         refused = client.post("/api/failures/door/crossmodal-pf")
         assert refused.status_code == 400
         assert "cannot write" in refused.json()["error"]
@@ -161,42 +158,40 @@ def test_a_server_with_a_full_disk_says_so_and_goes_on(client: TestClient, trace
     client.delete(f"/api/jobs/{job['id']}")
 
 
-def test_a_job_whose_folder_is_gone_ends_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with working(tmp_path, monkeypatch) as jobs:
+def test_job_without_its_folder_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_jobs(tmp_path, monkeypatch) as jobs:
         waiting = jobs.submit("wait", "Wait", {"started": str(tmp_path / "a"), "until": str(tmp_path / "b")}, "1")
-        until((tmp_path / "a").exists)
+        wait_until((tmp_path / "a").exists)
         shutil.rmtree(tmp_path / "jobs")
         (tmp_path / "b").touch()
-        assert until(lambda: jobs[waiting.id].ended and jobs[waiting.id]).state == "failed"
-        assert done(jobs, "2").state == "done", "others go on"
+        assert wait_until(lambda: jobs[waiting.id].ended and jobs[waiting.id]).state == "failed"
+        assert run_job(jobs, "2").state == "done", "other jobs are unaffected"
 
 
-def test_a_job_that_cannot_be_started_does_not_hold_up_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its folder is gone by the time that it is its turn, as where somebody clears the workspace."""
-    with working(tmp_path, monkeypatch, at_once=1) as jobs:
+def test_job_that_cannot_start_does_not_block_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its folder was deleted while it was waiting."""
+    with open_jobs(tmp_path, monkeypatch, max_running=1) as jobs:
         first = jobs.submit("wait", "Wait", {"started": str(tmp_path / "a"), "until": str(tmp_path / "b")}, "1")
-        gone, last = (jobs.submit("add", "Add", {"numbers": [1, 2]}, key) for key in ("2", "3"))
-        until((tmp_path / "a").exists)
-        shutil.rmtree(tmp_path / "jobs" / gone.id)
+        deleted, last = (jobs.submit("add", "Add", {"numbers": [1, 2]}, key) for key in ("2", "3"))
+        wait_until((tmp_path / "a").exists)
+        shutil.rmtree(tmp_path / "jobs" / deleted.id)
         (tmp_path / "b").touch()
-        assert until(lambda: jobs[last.id].ended and jobs[last.id]).state == "done"
+        assert wait_until(lambda: jobs[last.id].ended and jobs[last.id]).state == "done"
         assert jobs[first.id].state == "done"
-        assert (jobs[gone.id].state, jobs[gone.id].error) == (
+        assert (jobs[deleted.id].state, jobs[deleted.id].error) == (
             "failed",
             "it could not be started: No such file or directory",
         )
 
 
-def test_a_folder_that_cannot_be_written_is_one_line(run: Trace) -> None:
-    """As nobody, where the tests are run by root, who may write everywhere."""
+def test_folder_without_write_permission(run: Trace) -> None:
+    """As user ``nobody`` if the tests run as root."""
     checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
     writers = WRITERS | {"checkpoint": lambda run, path: save_checkpoint(checkpoint.filter, "f", {}, path)}
     with tempfile.TemporaryDirectory() as place:
         Path(place).chmod(0o555)
-        works = [partial(write, run, Path(place) / name) for name, write in writers.items()]
-        lines = apart(*works, user=None if os.geteuid() else 65534)
+        functions = [partial(write, run, Path(place) / name) for name, write in writers.items()]
+        lines = errors_in_fork(*functions, user=None if os.geteuid() else 65534)
         assert len(lines) == len(writers)
         for line in lines:
             assert "annot write" in line
@@ -204,130 +199,124 @@ def test_a_folder_that_cannot_be_written_is_one_line(run: Trace) -> None:
         assert not list(Path(place).iterdir())
 
 
-def test_files_deleted_under_a_server(client: TestClient, trace_url: str, settings: Settings, tmp_path: Path) -> None:
-    asked = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
-    said = client.post("/api/recordings", json=asked)
-    assert said.status_code == 201, said.text
-    made = said.json()
+def test_deleted_workspace(client: TestClient, trace_url: str, settings: Settings, tmp_path: Path) -> None:
+    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
+    response = client.post("/api/recordings", json=body)
+    assert response.status_code == 201, response.text
+    recording = response.json()
     shutil.rmtree(settings.workspace)
     assert client.get(trace_url).status_code == 200
-    gone = client.get(made["url"])
-    assert gone.status_code == 404
-    assert made["name"] in gone.json()["error"]
-    assert answer(client, trace_url.replace("/1", "/0")).status_code == 200, "the workspace is made again"
+    missing = client.get(recording["url"])
+    assert missing.status_code == 404
+    assert recording["name"] in missing.json()["error"]
+    assert poll(client, trace_url.replace("/1", "/0")).status_code == 200, "the workspace is created again"
 
 
-def test_given_files_that_are_gone_are_named_and_the_rest_is_shown(
+def test_missing_input_files_are_reported(
     settings: Settings, open_client: Callable[..., TestClient], tmp_path: Path
 ) -> None:
-    data = {**settings.data, "gone": tmp_path / "gone.h5"}
+    data = {**settings.data, "missing": tmp_path / "missing.h5"}
     with open_client(replace(settings, data=data)) as client:
         catalog = client.get("/api/catalog").json()
-    assert [line for line in catalog["problems"] if "gone.h5 does not exist" in line]
-    assert "mine" in [one["name"] for one in catalog["tasks"][0]["data"]]
+    assert [line for line in catalog["problems"] if "missing.h5 does not exist" in line]
+    assert "mine" in [entry["name"] for entry in catalog["tasks"][0]["data"]]
 
 
-def broken(settings: Settings, path: Path, value: float) -> Settings:
-    """The settings with a filter whose weights have gone wrong."""
+def add_scaled_filter(settings: Settings, path: Path, value: float) -> Settings:
+    """The settings with a filter whose weights are multiplied by ``value``."""
     checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
     with torch.no_grad():
         for parameter in checkpoint.filter.parameters():
             parameter.mul_(value)
-    save_checkpoint(checkpoint.filter, "broken", {}, path)
-    return replace(settings, checkpoints={**settings.checkpoints, "broken": path})
+    save_checkpoint(checkpoint.filter, "scaled", {}, path)
+    return replace(settings, checkpoints={**settings.checkpoints, "scaled": path})
 
 
-def test_a_network_of_nan_is_refused_and_the_others_are_shown(
+def test_filter_with_nan_weights_is_refused(
     settings: Settings, open_client: Callable[..., TestClient], tmp_path: Path
 ) -> None:
-    with open_client(broken(settings, tmp_path / "nan.safetensors", float("nan"))) as client:
+    with open_client(add_scaled_filter(settings, tmp_path / "nan.safetensors", float("nan"))) as client:
         catalog = client.get("/api/catalog").json()
         assert [line for line in catalog["problems"] if "no finite numbers" in line]
-        assert "crossmodal-pf" in [one["name"] for one in catalog["tasks"][0]["filters"]]
+        assert "crossmodal-pf" in [entry["name"] for entry in catalog["tasks"][0]["filters"]]
 
 
-def test_a_network_that_overflows_shows_what_there_is(
-    settings: Settings, open_client: Callable[..., TestClient], tmp_path: Path
-) -> None:
-    """Its estimates are NaN. That is what the page is to show, not an error of the server."""
-    with open_client(broken(settings, tmp_path / "inf.safetensors", 1e18)) as client:
-        url = "/api/trace/door/broken/1"
-        assert answer(client, url).status_code < 500
+def test_filter_that_overflows(settings: Settings, open_client: Callable[..., TestClient], tmp_path: Path) -> None:
+    """NaN estimates are displayed and cause no server error."""
+    with open_client(add_scaled_filter(settings, tmp_path / "inf.safetensors", 1e18)) as client:
+        url = "/api/trace/door/scaled/1"
+        assert poll(client, url).status_code < 500
         for part in ("columns", "images"):
             assert client.get(f"{url}/{part}").status_code < 500
         for entry in client.get("/api/diagnostics").json():
             if not entry["slow"]:
-                got = client.get(f"/api/diagnostics/{entry['name']}/door/broken/1")
-                assert got.status_code < 500, got.text
+                response = client.get(f"/api/diagnostics/{entry['name']}/door/scaled/1")
+                assert response.status_code < 500, response.text
         view = client.post("/api/views").json()
-        cursor = {"type": "cursor", "serial": 1, "task": "door", "filter": "broken", "episode": 1, "step": 3}
+        cursor = {"type": "cursor", "serial": 1, "task": "door", "filter": "scaled", "episode": 1, "step": 3}
         with client.websocket_connect(view["socket"]) as page:
             page.send_json(cursor | {"scene": True})
-            said = page.receive()
-            assert "The server failed" not in str(said.get("text"))
-        assert answer(client, "/api/trace/door/crossmodal-pf/1").status_code == 200
+            message = page.receive()
+            assert "The server failed" not in str(message.get("text"))
+        assert poll(client, "/api/trace/door/crossmodal-pf/1").status_code == 200
 
 
 @contextmanager
-def working(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int = 2) -> Iterator[Jobs]:
+def open_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, max_running: int = 2) -> Iterator[Jobs]:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "jobs"))
-    kinds = {name: f"job_functions:{name}" for name in ("add", "wait", "hungry")}
-    jobs = Jobs(tmp_path / "jobs", kinds, at_once)
+    kinds = {name: f"job_functions:{name}" for name in ("add", "wait", "exhaust_memory")}
+    jobs = Jobs(tmp_path / "jobs", kinds, max_running)
     try:
         yield jobs
     finally:
         jobs.close()
 
 
-def done(jobs: Jobs, key: str, kind: str = "add") -> Job:
+def run_job(jobs: Jobs, key: str, kind: str = "add") -> Job:
     id = jobs.submit(kind, kind, {"numbers": [1, 2]}, key).id
-    return until(lambda: jobs[id].ended and jobs[id])
+    return wait_until(lambda: jobs[id].ended and jobs[id])
 
 
-def test_a_job_out_of_memory_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with working(tmp_path, monkeypatch) as jobs:
-        hungry = done(jobs, "1", "hungry")
-        assert (hungry.state, hungry.error.partition(":")[0]) == ("failed", "it ran out of memory")
-        assert done(jobs, "2").state == "done"
+def test_job_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_jobs(tmp_path, monkeypatch) as jobs:
+        job = run_job(jobs, "1", "exhaust_memory")
+        assert (job.state, job.error.partition(":")[0]) == ("failed", "it ran out of memory")
+        assert run_job(jobs, "2").state == "done"
 
 
-def test_a_clock_that_jumps_back_neither_loses_nor_reorders_jobs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(jobs_module, "KEPT", 2)
+def test_order_of_jobs_after_clock_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jobs_module, "MAX_ENDED", 2)
     now = time.time()
-    with working(tmp_path, monkeypatch) as jobs:
+    with open_jobs(tmp_path, monkeypatch) as jobs:
         for key in ("1", "2", "3"):
             monkeypatch.setattr(jobs_module.time, "time", lambda now=now: now)
-            last = done(jobs, key)
+            last = run_job(jobs, key)
             assert last.state == "done"
             assert last.started is not None
             assert last.ended is not None
-            assert last.asked <= last.started <= last.ended
+            assert last.submitted <= last.started <= last.ended
             now -= 86400.0
-        assert jobs.all()[0] == last, "the newest comes first, and is not what is forgotten"
+        assert jobs.all()[0] == last, "the newest is first and is not deleted"
 
 
-def test_a_browser_that_vanishes_leaves_nothing_open(settings: Settings, address: str) -> None:
-    """Its connection is cut without a word, as when a machine sleeps or a cable is pulled and the router answers."""
+def test_reset_connection(settings: Settings, address: str) -> None:
+    """The connection is reset, as by a router after a machine was suspended."""
     origin = f"http://{address}"
-    client = httpx.Client(base_url=origin, headers={"Origin": origin}, timeout=PATIENCE)
+    client = httpx.Client(base_url=origin, headers={"Origin": origin}, timeout=TIMEOUT)
     views = [client.post("/api/views").json() for _ in range(2)]
-    sockets = [connect(f"ws://{address}{view['socket']}", origin=origin, open_timeout=PATIENCE) for view in views]  # type: ignore[arg-type]
-    vanishing, staying = sockets
-    vanishing.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-    vanishing.send(
-        '{"type": "cursor", "serial": 1, "task": "door", "filter": "crossmodal-pf", "episode": 1, "step": 1}'
-    )
-    vanishing.socket.close()
-    staying.send('{"type": "nothing", "serial": 7}')
-    assert '"serial":7' in str(staying.recv(timeout=PATIENCE)).replace(" ", "")
-    staying.close()
+    sockets = [connect(f"ws://{address}{view['socket']}", origin=origin, open_timeout=TIMEOUT) for view in views]  # type: ignore[arg-type]
+    reset, other = sockets
+    reset.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    reset.send('{"type": "cursor", "serial": 1, "task": "door", "filter": "crossmodal-pf", "episode": 1, "step": 1}')
+    reset.socket.close()
+    other.send('{"type": "unknown", "serial": 7}')
+    assert '"serial":7' in str(other.recv(timeout=TIMEOUT)).replace(" ", "")
+    other.close()
     client.close()
 
 
 @pytest.mark.anyio
-async def test_a_view_whose_page_has_gone_is_closed_after_a_while(settings: Settings) -> None:
+async def test_idle_view_is_closed(settings: Settings) -> None:
     application = create_app(settings, warm=False)
     views = Views(application.state.store, timeout=0.0)
     view = await views.open(dark=False)

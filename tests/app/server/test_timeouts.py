@@ -1,4 +1,4 @@
-"""Connections that take no part in HTTP or in a WebSocket: how many there may be, and when they end."""
+"""Limits of connections and WebSockets."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ SOCKET = f"GET / HTTP/1.1\r\n{UPGRADE}\r\n"
 TEXT, PART, PING, LAST = 1, 0, 9, 0x80
 
 
-async def _listens(scope: Scope, receive: Receive, send: Send) -> None:
-    """A socket that is listened to; whoever asks over HTTP is sent more than he can be without reading."""
+async def _application(scope: Scope, receive: Receive, send: Send) -> None:
+    """Reads all WebSocket messages; HTTP responses exceed the buffers of a client that does not read."""
     if scope["type"] == "websocket":
         await send({"type": "websocket.accept"})
         while (await receive())["type"] != "websocket.disconnect":
@@ -37,42 +37,42 @@ async def _listens(scope: Scope, receive: Receive, send: Send) -> None:
 
 
 @pytest.fixture
-def running(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
-    """Listens as ``serve`` does, with few buffers, and gives up half a second after nothing is taken any more."""
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
+    """A server like that of ``serve``, with small buffers and a short timeout for unread data."""
     monkeypatch.setattr(main, "UNREAD_TIMEOUT", 500)
-    config = uvicorn.Config(_listens, log_level="critical", http=HTTPProtocol, ws=WebSocketProtocol, lifespan="off")
+    config = uvicorn.Config(_application, log_level="critical", http=HTTPProtocol, ws=WebSocketProtocol, lifespan="off")
     with main._listen("127.0.0.1", 0) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 14)
-        running = uvicorn.Server(config)
-        thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
-        while not running.started:
+        while not server.started:
             time.sleep(0.01)
-        yield running
-        running.should_exit = True
+        yield server
+        server.should_exit = True
         thread.join(SECONDS)
 
 
-def called(running: uvicorn.Server, head: str) -> socket.socket:
-    """A connection that has said so much."""
-    caller = socket.socket()
-    caller.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 12)
-    caller.settimeout(SECONDS)
-    caller.connect(running.servers[0].sockets[0].getsockname())
-    caller.sendall(head.encode())
-    return caller
+def connect(server: uvicorn.Server, head: str) -> socket.socket:
+    """A connection that has sent ``head``."""
+    client = socket.socket()
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 12)
+    client.settimeout(SECONDS)
+    client.connect(server.servers[0].sockets[0].getsockname())
+    client.sendall(head.encode())
+    return client
 
 
 def frame(kind: int, content: bytes = b"") -> bytes:
-    """Of fewer than 126 bytes, masked with zeros."""
+    """A frame of fewer than 126 bytes, masked with zeros."""
     return bytes([kind, 0x80 | len(content), 0, 0, 0, 0]) + content
 
 
-def soon(true: Callable[[], bool]) -> bool:
+def becomes_true(condition: Callable[[], bool]) -> bool:
     end = time.monotonic() + SECONDS
-    while not true() and time.monotonic() < end:
+    while not condition() and time.monotonic() < end:
         time.sleep(0.01)
-    return true()
+    return condition()
 
 
 @pytest.mark.parametrize(
@@ -85,55 +85,54 @@ def soon(true: Callable[[], bool]) -> bool:
     ],
     ids=["another method", "with a body", "a long line", "many lines"],
 )
-def test_what_is_no_websocket_is_closed(running: uvicorn.Server, head: str) -> None:
-    with called(running, head) as caller:
-        assert caller.recv(100).startswith(b"HTTP/1.1 400 ")
-        assert soon(lambda: not running.server_state.connections)
+def test_failed_handshakes_are_closed(server: uvicorn.Server, head: str) -> None:
+    with connect(server, head) as client:
+        assert client.recv(100).startswith(b"HTTP/1.1 400 ")
+        assert becomes_true(lambda: not server.server_state.connections)
 
 
-def test_there_are_so_many_connections_sockets_among_them(
-    running: uvicorn.Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_number_of_connections_is_limited(server: uvicorn.Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timeouts, "MAX_CONNECTIONS", 2)
-    first, second = called(running, SOCKET), called(running, SOCKET)
+    first, second = connect(server, SOCKET), connect(server, SOCKET)
     assert first.recv(12) == second.recv(12) == b"HTTP/1.1 101"
-    with called(running, "") as third:
+    with connect(server, "") as third:
         assert third.recv(12) == b"HTTP/1.1 503"
     first.close()
-    assert soon(lambda: len(running.server_state.connections) == 1)
-    with called(running, SOCKET) as fourth:
+    assert becomes_true(lambda: len(server.server_state.connections) == 1)
+    with connect(server, SOCKET) as fourth:
         assert fourth.recv(12) == b"HTTP/1.1 101"
     second.close()
 
 
-def test_pongs_do_not_pile_up_for_who_does_not_read(running: uvicorn.Server) -> None:
-    with called(running, SOCKET) as caller:
-        assert caller.recv(12) == b"HTTP/1.1 101"
-        caller.settimeout(0.1)
-        pings, most, end = frame(PING | LAST, b"x" * 125) * 1000, 0, time.monotonic() + 1.5
-        while time.monotonic() < end and running.server_state.connections:
-            with contextlib.suppress(OSError):  # it is not read any more, or let go
-                caller.sendall(pings)
-            most = max([most, *(one.transport.get_write_buffer_size() for one in running.server_state.connections)])
-        # 64 KB after which asyncio calls it full, and the pongs to what it reads at once, 256 KB.
-        assert most < 400_000
+def test_pongs_do_not_accumulate(server: uvicorn.Server) -> None:
+    with connect(server, SOCKET) as client:
+        assert client.recv(12) == b"HTTP/1.1 101"
+        client.settimeout(0.1)
+        pings, maximum, end = frame(PING | LAST, b"x" * 125) * 1000, 0, time.monotonic() + 1.5
+        while time.monotonic() < end and server.server_state.connections:
+            with contextlib.suppress(OSError):  # not read, or closed
+                client.sendall(pings)
+            sizes = (c.transport.get_write_buffer_size() for c in server.server_state.connections)
+            maximum = max([maximum, *sizes])
+        # asyncio's high-water mark of 64 KB, and the pongs to one read of 256 KB.
+        assert maximum < 400_000
 
 
-def test_a_message_has_so_many_parts_at_most(running: uvicorn.Server) -> None:
-    with called(running, SOCKET) as caller:
-        while not caller.recv(4096).endswith(b"\r\n\r\n"):
+def test_number_of_frames_is_limited(server: uvicorn.Server) -> None:
+    with connect(server, SOCKET) as client:
+        while not client.recv(4096).endswith(b"\r\n\r\n"):
             pass
-        caller.sendall(
+        client.sendall(
             frame(TEXT, b"a") + frame(PART) * (MAX_FRAMES - 2) + frame(PART | LAST) + frame(PING | LAST, b"still")
         )
-        assert caller.recv(100).endswith(b"still")
-        caller.sendall(frame(TEXT, b"a") + frame(PART) * 2 * MAX_FRAMES)
-        said = caller.recv(100)
-        assert (said[0], said[2:4]) == (0x88, (1009).to_bytes(2))
+        assert client.recv(100).endswith(b"still")
+        client.sendall(frame(TEXT, b"a") + frame(PART) * 2 * MAX_FRAMES)
+        reply = client.recv(100)
+        assert (reply[0], reply[2:4]) == (0x88, (1009).to_bytes(2))
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="the system has no such limit")
-def test_who_takes_nothing_is_let_go(running: uvicorn.Server) -> None:
-    with called(running, "GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"):
-        assert soon(lambda: len(running.server_state.connections) == 1)
-        assert soon(lambda: not running.server_state.connections)
+def test_clients_that_do_not_read_are_disconnected(server: uvicorn.Server) -> None:
+    with connect(server, "GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"):
+        assert becomes_true(lambda: len(server.server_state.connections) == 1)
+        assert becomes_true(lambda: not server.server_state.connections)

@@ -120,15 +120,15 @@ def test_outdated_cursors_are_skipped(
     socket.send_text("not JSON")  # messages are processed in order
     assert socket.receive_json()["type"] == "error"
     resume.set()
-    answered, drawn = [], []
-    while 8 not in answered or 8 not in drawn:
+    answered, scene_serials = [], []
+    while 8 not in answered or 8 not in scene_serials:
         message = socket.receive()
         if "bytes" in message:
             answered.append(read(message["bytes"])[0]["serial"])
         else:
-            drawn.append(json.loads(message["text"])["serial"])
+            scene_serials.append(json.loads(message["text"])["serial"])
     assert answered == [1, 8]
-    assert drawn in ([8], [1, 8])  # the first may be replaced while it waits for the scene
+    assert scene_serials in ([8], [1, 8])  # the first may be replaced while it waits for the scene
 
 
 @pytest.mark.parametrize(

@@ -91,8 +91,8 @@ def test_hash_depends_on_weights_code_and_adapter(tmp_path: Path) -> None:
         hashes.append(load_external(f"{tmp_path}/own.py:build").hash)
     sys.modules.pop("helper")
     assert hashes[0] == hashes[1] != hashes[2]
-    one, other = Adapter(nn.Linear(2, 2), std=(1, 1, 1)), Adapter(nn.Linear(2, 2), std=(1, 1, 2))
-    assert ExternalFilter(one, DOOR, "a").hash != ExternalFilter(other, DOOR, "a").hash
+    first, second = Adapter(nn.Linear(2, 2), std=(1, 1, 1)), Adapter(nn.Linear(2, 2), std=(1, 1, 2))
+    assert ExternalFilter(first, DOOR, "a").hash != ExternalFilter(second, DOOR, "a").hash
 
 
 @pytest.mark.parametrize(

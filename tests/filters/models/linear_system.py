@@ -1,4 +1,4 @@
-"""A linear-Gaussian system in the filters' own interfaces, and the Kalman filter in NumPy to judge them by."""
+"""A linear-Gaussian system with the filters' interfaces, and a reference Kalman filter in NumPy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ START = 0.1 * np.eye(3)
 
 
 class LinearDynamics(nn.Module):
-    """``x' = A x + u`` with the interface of ``Dynamics``; the control part is u itself."""
+    """``x' = A x + u`` with the interface of ``Dynamics``; the control part is u."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class LinearDynamics(nn.Module):
 
 
 class GaussianLikelihood(ParticleFilter):
-    """A particle filter whose one measurement model is the system's own Gaussian."""
+    """A particle filter whose only measurement model is the system's Gaussian likelihood."""
 
     def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
         white = (evidence.observation[:, 0, None] - states) / torch.from_numpy(R_STD)
@@ -39,7 +39,7 @@ class GaussianLikelihood(ParticleFilter):
 
 
 def simulate(steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Controls u (T, 3) and observations z (T, 3) of one run that starts at the origin."""
+    """Controls u (T, 3) and observations z (T, 3) of one run from the origin."""
     rng = np.random.default_rng(seed)
     controls = rng.normal(size=(steps, 3))
     state, observations = np.zeros(3), []

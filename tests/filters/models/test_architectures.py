@@ -1,4 +1,4 @@
-"""Every filter of the catalog, for any task, and every option: laws that hold whatever the weights are."""
+"""Properties of every filter and option that hold for any weights."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def run(filter_: Filter, batch: Batch, evidence: Evidence | None = None, keep: b
     return rollout(filter_, evidence, start, torch.Generator().manual_seed(0), particles=20, keep=keep)
 
 
-def lively(filter_: Filter) -> Filter:
-    """Fresh weights, with outputs large enough to be seen."""
+def randomise(filter_: Filter) -> Filter:
+    """Initial weights with larger outputs of the dynamics and weight models."""
     torch.manual_seed(1)
     for name, module in filter_.named_modules():
         if isinstance(module, nn.Linear) and name in ("dynamics.output", "weight_model.output"):
@@ -47,17 +47,17 @@ def lively(filter_: Filter) -> Filter:
 # The catalog.
 
 
-def test_names_are_those_of_the_paper_and_a_ukf() -> None:
+def test_catalog_has_the_filters_of_the_paper_and_a_ukf() -> None:
     fused = {f"{how}-{kind}" for how in ("feature", "unimodal", "crossmodal") for kind in ("ekf", "pf")}
-    alone = {f"{modality}-{kind}" for modality in ("image", "haptics") for kind in ("ekf", "pf")}
-    assert set(NAMES) == fused | alone | {"lstm", "crossmodal-ukf"}
+    single = {f"{modality}-{kind}" for modality in ("image", "haptics") for kind in ("ekf", "pf")}
+    assert set(NAMES) == fused | single | {"lstm", "crossmodal-ukf"}
 
 
 @pytest.fixture
-def foreign(monkeypatch: pytest.MonkeyPatch) -> Task:
-    """A task of one's own: two components and three modalities with names of their own, no picture."""
+def custom_task(monkeypatch: pytest.MonkeyPatch) -> Task:
+    """A custom task with two state components and three modalities, without images."""
     task = Task(
-        name="foreign",
+        name="custom",
         components=(Component("x", "m"), Component("y", "m")),
         observations={"depth": (4,), "sound": (2,), "skin": (3,), "heat": (1,)},
         modalities={"sight": ("depth",), "hearing": ("sound",), "touch": ("skin", "heat")},
@@ -70,8 +70,8 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> Task:
     return task
 
 
-def test_a_foreign_task_has_them_all_over_its_own_modalities(foreign: Task) -> None:
-    filters = filters_of(foreign)
+def test_custom_task_has_all_filters_over_its_modalities(custom_task: Task) -> None:
+    filters = filters_of(custom_task)
     assert {"sight-ekf", "hearing-pf", "touch-ekf"} <= filters.keys()
     assert "image-ekf" not in filters
     assert filters["crossmodal-pf"].models == ("sight", "hearing", "touch")
@@ -81,16 +81,16 @@ def test_a_foreign_task_has_them_all_over_its_own_modalities(foreign: Task) -> N
     states = torch.randn(5, 2, 2)
     batch = Batch(observations, torch.randn(5, 2, 2), states, torch.zeros(5, 2, dtype=torch.bool), states[0])
     for name in filters:
-        result = run(build(architecture("foreign", name)), batch, keep=True)
+        result = run(build(architecture("custom", name)), batch, keep=True)
         assert torch.isfinite(result.estimate.mean).all(), name
         if name.startswith("crossmodal"):
             modality = result.steps[0].modality
             assert modality is None or modality.mean.shape == (2, 3, 2)
 
 
-def test_unknown_names_are_refused_with_those_there_are(foreign: Task) -> None:
+def test_unknown_names_are_rejected_with_the_available_ones(custom_task: Task) -> None:
     with pytest.raises(BadInput, match=r"filter 'image-ekf' does not exist\. Available: .*sight-ekf.*lstm"):
-        architecture("foreign", "image-ekf")
+        architecture("custom", "image-ekf")
     with pytest.raises(BadInput, match=r"task 'dor' does not exist\. Available: door"):
         architecture("dor", "lstm")
 
@@ -99,14 +99,14 @@ def test_unknown_names_are_refused_with_those_there_are(foreign: Task) -> None:
 
 
 def test_architectures_survive_json() -> None:
-    odd = Architecture(
+    unusual = Architecture(
         "door", "pf", "unimodal", ("image",), 32, 1, "mean", "moments", True, "raw", "soft", soft_share=0.25
     )
-    for one in (*filters_of(DOOR).values(), odd):
-        assert Architecture.from_json(one.to_json()) == one
+    for each in (*filters_of(DOOR).values(), unusual):
+        assert Architecture.from_json(each.to_json()) == each
 
 
-def test_what_an_older_checkpoint_does_not_say_takes_its_default() -> None:
+def test_missing_keys_of_older_checkpoints_take_their_default() -> None:
     older = {"task": "door", "kind": "pf", "fusion": "crossmodal", "models": ["image", "haptics"], "units": 64}
     assert Architecture.from_json(older) == Architecture("door", "pf")
 
@@ -123,12 +123,12 @@ def test_what_an_older_checkpoint_does_not_say_takes_its_default() -> None:
         ({"models": ["smell"]}, r"Modality 'smell' is not in task 'door'\. Available: image, haptics\."),
     ],
 )
-def test_bad_architectures(change: dict, message: str) -> None:
+def test_invalid_architectures_are_rejected(change: dict, message: str) -> None:
     with pytest.raises(BadInput, match=message):
         build(Architecture.from_json(Architecture("door", "ekf").to_json() | change))
 
 
-# Laws of all filters.
+# Properties of all filters.
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -146,11 +146,11 @@ def test_gradients_flow_through_16_steps_to_every_weight(name: str, window: Make
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name.startswith(("crossmodal", "unimodal"))])
-def test_the_order_of_modalities_does_not_matter(name: str, window: MakeWindow) -> None:
-    filter_, batch = lively(build(architecture("door", name))), window(8, 3)
-    turned = build(replace(filter_.architecture, models=filter_.names[::-1]))
+def test_order_of_modalities_does_not_matter(name: str, window: MakeWindow) -> None:
+    filter_, batch = randomise(build(architecture("door", name))), window(8, 3)
+    reversed_ = build(replace(filter_.architecture, models=filter_.names[::-1]))
     state = {key: value for key, value in filter_.state_dict().items() if not key.startswith("weight_model.")}
-    turned.load_state_dict(state, strict=False)
+    reversed_.load_state_dict(state, strict=False)
     with torch.no_grad():
         evidence = filter_.encode(batch)
         flip = {"control": evidence.control, "observation": evidence.observation.flip(2)}
@@ -160,24 +160,22 @@ def test_the_order_of_modalities_does_not_matter(name: str, window: MakeWindow) 
             noise=None if noise is None else noise.flip(2),
             log_weights=None if weights is None else weights.flip(2),
         )
-        here, there = run(filter_, batch, evidence).estimate, run(turned, batch, flipped).estimate
-    # Sums are taken in another order; a particle's ancestor may change where a pointer lies on an edge, not here.
-    torch.testing.assert_close(there.mean, here.mean, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(there.covariance, here.covariance, rtol=1e-4, atol=1e-5)
+        original, swapped = run(filter_, batch, evidence).estimate, run(reversed_, batch, flipped).estimate
+    # Sums are taken in another order; this could change an ancestor, but does not for this seed.
+    torch.testing.assert_close(swapped.mean, original.mean, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(swapped.covariance, original.covariance, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("k", [0, 1])
 @pytest.mark.parametrize("name", FUSED)
-def test_one_hot_beta_is_the_filter_on_that_modality_alone(
-    name: str, k: int, feedback: bool, window: MakeWindow
-) -> None:
-    filter_ = lively(build(replace(architecture("door", name), feedback=feedback)))
-    alone = build(replace(filter_.architecture, fusion="none", models=(filter_.names[k],)))
-    alone.load_state_dict({key: filter_.state_dict()[key] for key in alone.state_dict()})
+def test_one_hot_beta_equals_the_unimodal_filter(name: str, k: int, feedback: bool, window: MakeWindow) -> None:
+    filter_ = randomise(build(replace(architecture("door", name), feedback=feedback)))
+    unimodal = build(replace(filter_.architecture, fusion="none", models=(filter_.names[k],)))
+    unimodal.load_state_dict({key: filter_.state_dict()[key] for key in unimodal.state_dict()})
     batch = window(8, 3)
     with torch.no_grad():
-        fused, single = run(filter_, batch, filter_.encode(batch).only(k)).estimate, run(alone, batch).estimate
+        fused, single = run(filter_, batch, filter_.encode(batch).only(k)).estimate, run(unimodal, batch).estimate
     torch.testing.assert_close(fused.mean, single.mean, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(fused.covariance, single.covariance, rtol=1e-4, atol=1e-5)
 
@@ -185,7 +183,7 @@ def test_one_hot_beta_is_the_filter_on_that_modality_alone(
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "lstm"])
 def test_covariances_are_positive_definite(name: str, window: MakeWindow) -> None:
     with torch.no_grad():
-        covariance = run(lively(build(architecture("door", name))), window(12, 4)).estimate.covariance
+        covariance = run(randomise(build(architecture("door", name))), window(12, 4)).estimate.covariance
     torch.testing.assert_close(covariance, covariance.transpose(-1, -2))
     assert torch.linalg.eigvalsh(covariance.double()).min() > 0
 
@@ -194,8 +192,8 @@ def test_covariances_are_positive_definite(name: str, window: MakeWindow) -> Non
 
 
 def banks(feedback: bool, window: MakeWindow) -> tuple[Gaussian, Gaussian]:
-    """The bank that goes on after one step, and the fused belief."""
-    filter_ = lively(build(replace(architecture("door", "crossmodal-ekf"), feedback=feedback)))
+    """The bank after one step, and the fused belief."""
+    filter_ = randomise(build(replace(architecture("door", "crossmodal-ekf"), feedback=feedback)))
     assert isinstance(filter_, ExtendedKalmanFilter)
     batch = window(1, 3)
     with torch.no_grad():
@@ -204,7 +202,7 @@ def banks(feedback: bool, window: MakeWindow) -> tuple[Gaussian, Gaussian]:
     return bank, trace.estimate
 
 
-def test_feedback_hands_every_filter_the_fused_belief(window: MakeWindow) -> None:
+def test_feedback_replaces_every_belief_by_the_fused_one(window: MakeWindow) -> None:
     bank, fused = banks(True, window)
     for k in range(2):
         assert torch.equal(bank.mean[:, k], fused.mean)
@@ -214,7 +212,7 @@ def test_feedback_hands_every_filter_the_fused_belief(window: MakeWindow) -> Non
 
 
 def posterior(likelihoods: str, offset: float, window: MakeWindow) -> Tensor:
-    """Log-weights after a step whose haptics log-likelihood is higher by a constant."""
+    """Log-weights after a step with a constant added to the haptics log-likelihood."""
 
     class Shifted(ParticleFilter):
         def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
@@ -229,7 +227,7 @@ def posterior(likelihoods: str, offset: float, window: MakeWindow) -> Tensor:
     return step.log_weights
 
 
-def test_normalised_likelihoods_do_not_depend_on_their_scale_and_raw_ones_do(window: MakeWindow) -> None:
+def test_only_raw_likelihoods_depend_on_their_scale(window: MakeWindow) -> None:
     torch.testing.assert_close(
         posterior("normalised", 9.0, window), posterior("normalised", 0.0, window), rtol=1e-4, atol=1e-4
     )
@@ -238,7 +236,7 @@ def test_normalised_likelihoods_do_not_depend_on_their_scale_and_raw_ones_do(win
 
 @pytest.mark.parametrize("stride", [1, 2])
 @pytest.mark.parametrize("pooling", ["flatten", "spatial-softmax", "mean"])
-def test_encoders_of_every_pooling_learn(pooling: str, stride: int) -> None:
+def test_encoders_of_every_pooling_have_gradients(pooling: str, stride: int) -> None:
     encoder = ImageEncoder((32, 32), 16, stride, pooling)  # type: ignore[arg-type]
     features = encoder(torch.randn(3, 32, 32))
     assert features.shape == (3, 16)
@@ -246,7 +244,7 @@ def test_encoders_of_every_pooling_learn(pooling: str, stride: int) -> None:
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in encoder.parameters())
 
 
-def test_the_spatial_softmax_says_where_a_channel_is_active() -> None:
+def test_spatial_softmax_returns_the_position_of_activation() -> None:
     channels = torch.zeros(1, 2, 5, 9)
     channels[0, 0, 1, 6] = 100.0  # row 1 of 0..4 is y = -0.5, column 6 of 0..8 is x = 0.5
     torch.testing.assert_close(SpatialSoftmax()(channels), torch.tensor([[0.5, 0.0, -0.5, 0.0]]))
@@ -255,15 +253,15 @@ def test_the_spatial_softmax_says_where_a_channel_is_active() -> None:
 # The unscented transform.
 
 
-def test_sigma_points_have_the_moments_they_were_made_from() -> None:
+def test_sigma_points_have_the_moments_of_the_belief() -> None:
     root = torch.randn(4, 3, 3, dtype=torch.float64)
     belief = Gaussian(torch.randn(4, 3, dtype=torch.float64), root @ root.transpose(-1, -2))
-    again = unscented(sigma_points(belief))
-    torch.testing.assert_close(again.mean, belief.mean)
-    torch.testing.assert_close(again.covariance, belief.covariance)
+    result = unscented(sigma_points(belief))
+    torch.testing.assert_close(result.mean, belief.mean)
+    torch.testing.assert_close(result.covariance, belief.covariance)
 
 
-def test_the_square_of_a_gaussian_by_hand() -> None:
+def test_unscented_square_of_a_gaussian() -> None:
     # x ~ N(m, s^2): x^2 has mean m^2 + s^2 and variance 4 m^2 s^2 + 2 s^4; here m = 3, s = 2: 13 and 176.
     belief = Gaussian(torch.tensor([[3.0]]), torch.tensor([[[4.0]]]))
     squared = unscented(sigma_points(belief).square())
@@ -281,7 +279,7 @@ def lstm() -> Lstm:
     return filter_.requires_grad_(False)
 
 
-def test_the_lstm_is_pytorchs_own(lstm: Lstm, window: MakeWindow) -> None:
+def test_lstm_equals_pytorchs(lstm: Lstm, window: MakeWindow) -> None:
     reference = nn.LSTM(64, 512, 2).requires_grad_(False)
     for i, cell in enumerate(lstm.layers):
         getattr(reference, f"weight_ih_l{i}").copy_(cell.weight_x.T)
@@ -296,21 +294,21 @@ def test_the_lstm_is_pytorchs_own(lstm: Lstm, window: MakeWindow) -> None:
     torch.testing.assert_close(run(lstm, batch, evidence).estimate.mean, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_the_lstm_takes_the_same_steps_one_by_one(lstm: Lstm, window: MakeWindow) -> None:
+def test_lstm_steps_equal_the_batched_ones(lstm: Lstm, window: MakeWindow) -> None:
     batch, generator = window(10, 3), torch.Generator()
     evidence = lstm.encode(batch)
     belief = lstm.start(start_at_truth(lstm, batch), 0, generator)
-    at_once = list(lstm.steps(belief, evidence, generator))
-    for t, trace in enumerate(at_once):
+    batched = list(lstm.steps(belief, evidence, generator))
+    for t, trace in enumerate(batched):
         assert trace.predicted.hidden.equal(belief.hidden)  # type: ignore[union-attr]
         belief, step = lstm.step(belief, evidence[t], generator)
         assert step.estimate.mean.equal(trace.estimate.mean)
         assert step.posterior.hidden.equal(trace.posterior.hidden)  # type: ignore[union-attr]
 
 
-def test_the_lstm_starts_at_the_first_belief_and_knows_no_covariance(lstm: Lstm, window: MakeWindow) -> None:
+def test_lstm_depends_on_the_first_belief_and_has_no_covariance(lstm: Lstm, window: MakeWindow) -> None:
     batch = window(3, 2)
-    elsewhere = run(lstm, replace(batch, previous=batch.previous + 1.0)).estimate
-    assert (elsewhere.mean[0] - run(lstm, batch).estimate.mean[0]).abs().max() > 1e-4
-    assert elsewhere.covariance.shape == (3, 2, 3, 3)
-    assert torch.isnan(elsewhere.covariance).all()
+    shifted = run(lstm, replace(batch, previous=batch.previous + 1.0)).estimate
+    assert (shifted.mean[0] - run(lstm, batch).estimate.mean[0]).abs().max() > 1e-4
+    assert shifted.covariance.shape == (3, 2, 3, 3)
+    assert torch.isnan(shifted.covariance).all()

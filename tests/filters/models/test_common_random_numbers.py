@@ -1,4 +1,4 @@
-"""Common random numbers, and evidence without some of its models: what subsets of the modalities are run with."""
+"""Common random numbers, and evidence of subsets of the models."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ SUBSETS = torch.tensor([[False, False], [True, False], [False, True], [True, Tru
 KINDS = ("crossmodal-ekf", "crossmodal-ukf", "unimodal-ekf", "crossmodal-pf", "unimodal-pf", "feature-pf")
 
 
-@pytest.mark.parametrize("draw", [normal, uniform])
-def test_common_numbers_are_those_of_one_trajectory(draw: Callable[..., Tensor]) -> None:
+@pytest.mark.parametrize("sample", [normal, uniform])
+def test_common_numbers_equal_those_of_one_trajectory(sample: Callable[..., Tensor]) -> None:
     common, plain = Common().manual_seed(3), torch.Generator().manual_seed(3)
-    for _ in range(2):  # and it goes on as that of one would
-        drawn, alone = draw((4, 5, 2), common), draw((1, 5, 2), plain)
-        assert torch.equal(drawn, alone.expand(4, -1, -1))
+    for _ in range(2):
+        numbers, single = sample((4, 5, 2), common), sample((1, 5, 2), plain)
+        assert torch.equal(numbers, single.expand(4, -1, -1))
     assert torch.equal(common.get_state(), plain.get_state())
-    apart = draw((4, 5, 2), plain)
-    assert not torch.equal(apart[0], apart[1])
+    independent = sample((4, 5, 2), plain)
+    assert not torch.equal(independent[0], independent[1])
 
 
-def made(name: str, window: Callable[..., Batch]) -> tuple[Filter, Evidence, Gaussian]:
-    """An untrained filter, one trajectory's evidence, and its start."""
+def setup(name: str, window: Callable[..., Batch]) -> tuple[Filter, Evidence, Gaussian]:
+    """An untrained filter, one trajectory's evidence, and its first belief."""
     filter_ = build(architecture("door", name)).eval().requires_grad_(False)
     batch = window(STEPS, 1)
     return filter_, filter_.encode(batch), start_at_truth(filter_, batch)
@@ -54,41 +54,41 @@ def subsets(evidence: Evidence) -> Tensor:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_subsets_side_by_side(name: str, window: Callable[..., Batch]) -> None:
-    filter_, evidence, start = made(name, window)
+def test_batched_subsets_equal_single_ones(name: str, window: Callable[..., Batch]) -> None:
+    filter_, evidence, start = setup(name, window)
     present = subsets(evidence)
-    both = run(filter_, evidence.select_models(present), start)
-    # All that there is changes nothing; rounding alone differs between batches of one and of four.
-    torch.testing.assert_close(both[:, -1:], run(filter_, evidence, start), rtol=0, atol=1e-5)
+    batched = run(filter_, evidence.select_models(present), start)
+    # The full set equals no selection, up to rounding, which depends on the batch size.
+    torch.testing.assert_close(batched[:, -1:], run(filter_, evidence, start), rtol=0, atol=1e-5)
     for i in range(present.shape[1]):
-        alone = run(filter_, evidence.select_models(present[:, i : i + 1]), start)
-        torch.testing.assert_close(both[:, i : i + 1], alone, rtol=0, atol=1e-5)
+        single = run(filter_, evidence.select_models(present[:, i : i + 1]), start)
+        torch.testing.assert_close(batched[:, i : i + 1], single, rtol=0, atol=1e-5)
     if evidence.log_weights is not None:
         for k in range(2):
             only = run(filter_, evidence.only(k), start)
-            torch.testing.assert_close(both[:, 1 + k : 2 + k], only, rtol=0, atol=1e-5)
+            torch.testing.assert_close(batched[:, 1 + k : 2 + k], only, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_without_any_model_observations_do_not_matter(name: str, window: Callable[..., Batch]) -> None:
-    filter_, evidence, start = made(name, window)
+def test_observations_of_absent_models_have_no_effect(name: str, window: Callable[..., Batch]) -> None:
+    filter_, evidence, start = setup(name, window)
     other = replace(evidence, observation=evidence.observation + 1.0)
     present = subsets(evidence)
-    runs = [run(filter_, one.select_models(present), start) for one in (evidence, other)]
+    runs = [run(filter_, e.select_models(present), start) for e in (evidence, other)]
     assert torch.equal(runs[0][:, 0], runs[1][:, 0])
     assert not torch.equal(runs[0][:, -1], runs[1][:, -1])
 
 
-def test_without_any_model_a_kalman_filter_only_predicts(window: Callable[..., Batch]) -> None:
-    filter_, evidence, start = made("crossmodal-ekf", window)
+def test_kalman_filter_without_models_only_predicts(window: Callable[..., Batch]) -> None:
+    filter_, evidence, start = setup("crossmodal-ekf", window)
     mean = start.mean
     for t, estimate in enumerate(run(filter_, evidence.select_models(subsets(evidence)), start)[:, 0]):
         mean = filter_.dynamics(mean, evidence.control[t])
         torch.testing.assert_close(estimate, mean[0], rtol=0, atol=1e-5)
 
 
-def test_without_any_model_particles_keep_their_weights(window: Callable[..., Batch]) -> None:
-    filter_, evidence, start = made("crossmodal-pf", window)
+def test_particle_weights_without_models_are_unchanged(window: Callable[..., Batch]) -> None:
+    filter_, evidence, start = setup("crossmodal-pf", window)
     belief = filter_.start(start, PARTICLES, torch.Generator().manual_seed(0))
     none = evidence.select_models(subsets(evidence)[:, :1])
     _, step = filter_.step(belief, none[0], torch.Generator().manual_seed(0))
@@ -97,29 +97,29 @@ def test_without_any_model_particles_keep_their_weights(window: Callable[..., Ba
 
 
 def three(log_weights: Tensor) -> Evidence:
-    """One step of three models with log beta (3, W), and nothing else of interest."""
-    nothing = torch.zeros(1, 1, 3, 1)
-    return Evidence(torch.zeros(1, 1, 1), nothing, nothing, log_weights[None, None])
+    """One step of three models with log beta (3, W) and zero observations."""
+    zeros = torch.zeros(1, 1, 3, 1)
+    return Evidence(torch.zeros(1, 1, 1), zeros, zeros, log_weights[None, None])
 
 
-def test_beta_of_those_left_keeps_its_proportions() -> None:
+def test_beta_of_present_models_keeps_its_proportions() -> None:
     beta = torch.tensor([[0.5, 0.2], [0.3, 0.2], [0.2, 0.6]])
-    left = three(beta.log()).select_models(torch.tensor([[[True, False, True], [False, False, False]]]))
-    assert left.log_weights is not None
-    assert left.present is not None
-    shares = torch.softmax(left.log_weights[0], dim=-2)
+    selected = three(beta.log()).select_models(torch.tensor([[[True, False, True], [False, False, False]]]))
+    assert selected.log_weights is not None
+    assert selected.present is not None
+    shares = torch.softmax(selected.log_weights[0], dim=-2)
     torch.testing.assert_close(shares[0], torch.tensor([[5 / 7, 0.25], [0.0, 0.0], [2 / 7, 0.75]]))
-    torch.testing.assert_close(shares[1], beta)  # of nothing there is: as it was
-    assert left[0].present is not None
-    assert torch.equal(left[0].present, left.present[0])
-    assert left[:1].control.shape == (1, 2, 1)
+    torch.testing.assert_close(shares[1], beta)  # without any model: unchanged
+    assert selected[0].present is not None
+    assert torch.equal(selected[0].present, selected.present[0])
+    assert selected[:1].control.shape == (1, 2, 1)
 
 
 def test_beta_zero_is_not_present() -> None:
     beta = torch.tensor([[0.6], [0.4], [0.0]])
-    asked = torch.tensor([[[True, True, True], [False, False, True]]])
-    left = three(beta.log()).select_models(asked)
-    assert left.present is not None
-    assert left.present[0].tolist() == [[True, True, False], [False, False, False]]
-    assert left.log_weights is not None
-    torch.testing.assert_close(torch.softmax(left.log_weights[0], dim=-2), beta.expand(2, 3, 1))
+    present = torch.tensor([[[True, True, True], [False, False, True]]])
+    selected = three(beta.log()).select_models(present)
+    assert selected.present is not None
+    assert selected.present[0].tolist() == [[True, True, False], [False, False, False]]
+    assert selected.log_weights is not None
+    torch.testing.assert_close(torch.softmax(selected.log_weights[0], dim=-2), beta.expand(2, 3, 1))

@@ -1,4 +1,4 @@
-"""Step by step against FilterPy, which shares no line with this project."""
+"""Comparison with FilterPy, an independent implementation, step by step."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ R = np.diag(linear.R_STD**2)
 
 @pytest.fixture
 def dynamics() -> Dynamics:
-    """A network that bends: its fresh output layer would be almost zero."""
+    """A nonlinear dynamics model; with initial weights the output layer would be almost zero."""
     torch.manual_seed(7)
     model = Dynamics(n=3, control_size=3, units=16).double()
     torch.nn.init.normal_(model.output.weight, std=0.6)
@@ -42,7 +42,7 @@ def dynamics() -> Dynamics:
 
 
 class Extended(kalman.ExtendedKalmanFilter):  # type: ignore[misc, name-defined]
-    """FilterPy's, whose Jacobian comes from reverse-mode differentiation."""
+    """FilterPy's EKF with a Jacobian from reverse-mode differentiation."""
 
     def __init__(self, dynamics: Dynamics) -> None:
         super().__init__(dim_x=3, dim_z=3)

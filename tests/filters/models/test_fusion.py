@@ -1,4 +1,4 @@
-"""Fusion rules against hand-worked Gaussians, one-hot weights and permutations."""
+"""Fusion rules: Gaussians calculated by hand, one-hot weights and permutations."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_product_of_two_experts_by_hand() -> None:
 
 
 def test_weighted_average_by_hand() -> None:
-    # beta 1/4 and 3/4 in one dimension: B is beta squared, so variances 1 and 2 weigh 1/16 and 9/16: 19/10.
+    # beta 1/4 and 3/4 in one dimension: B is beta squared, so variances 1 and 2 have weights 1/16 and 9/16: 19/10.
     two = Gaussian(torch.tensor([[[0.0], [4.0]]]), torch.tensor([[[[1.0]], [[2.0]]]]))
     weights = torch.tensor([[[0.25], [0.75]]]).log()
     paper = weighted_average(two, weights, "paper")
@@ -44,7 +44,7 @@ def test_weighted_average_by_hand() -> None:
 
 
 @pytest.mark.parametrize("rule", ["paper", "moments"])
-def test_weighted_average_laws(rule: str) -> None:
+def test_weighted_average_is_definite_and_symmetric_in_the_modalities(rule: str) -> None:
     both, weights = bank(), log_beta((64, 2, 3))
     fused = weighted_average(both, weights, rule)  # type: ignore[arg-type]
     torch.testing.assert_close(fused.covariance, fused.covariance.transpose(-1, -2))
@@ -66,22 +66,22 @@ def test_one_hot_weights_give_the_unimodal_belief(rule: str, k: int) -> None:
     weights[:, k] = 0.0
     fused = weighted_average(both, weights, rule)  # type: ignore[arg-type]
     torch.testing.assert_close(fused.mean, both.mean[:, k])
-    # The paper's ratio keeps exp(-80) of the other modality.
+    # The paper's ratio retains exp(-80) of the other modality.
     torch.testing.assert_close(fused.covariance, both.covariance[:, k], rtol=1e-12, atol=1e-12)
 
 
-def test_weights_that_point_different_ways_per_component_stay_finite_and_definite() -> None:
+def test_opposite_one_hot_weights_per_component_give_a_definite_covariance() -> None:
     covariance = torch.tensor([[[[1.0, 0.99], [0.99, 1.0]], [[100.0, 99.0], [99.0, 100.0]]]])
     weights = torch.tensor([[[0.0, -torch.inf], [-torch.inf, 0.0]]])
     fused = weighted_average(Gaussian(torch.zeros(1, 2, 2), covariance), weights, "paper")
-    # Taken literally, sqrt(1 * 100) = 10 bounds the off-diagonal entry, but the formula gives about 50.
+    # The off-diagonal entry must be below sqrt(1 * 100) = 10, but the literal formula gives about 50.
     assert torch.linalg.eigvalsh(fused.covariance).min() > 0
     torch.testing.assert_close(fused.covariance.diagonal(dim1=-2, dim2=-1), torch.tensor([[1.0, 100.0]]))
 
 
-def test_definite_matrices_are_left_alone() -> None:
-    good = bank().covariance
-    assert positive_definite(good) is good
+def test_definite_matrices_are_unchanged() -> None:
+    covariance = bank().covariance
+    assert positive_definite(covariance) is covariance
 
 
 def test_mixture_is_the_log_of_the_weighted_sum() -> None:

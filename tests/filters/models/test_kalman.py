@@ -1,4 +1,4 @@
-"""On a linear-Gaussian system every filter with equations must find what the Kalman filter finds."""
+"""On a linear-Gaussian system all model-based filters must agree with the Kalman filter."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def single(kind: str, **options: object) -> Architecture:
 
 
 @pytest.mark.parametrize("kind", ["ekf", "ukf"])
-def test_it_is_the_kalman_filter_on_a_linear_system(kind: str) -> None:
+def test_equals_the_kalman_filter_on_a_linear_system(kind: str) -> None:
     controls, observations = linear.simulate(50, seed=1)
     means, covariances = linear.kalman(controls, observations)
     filter_ = KINDS[kind](single(kind))  # type: ignore[index]
@@ -55,15 +55,15 @@ def particle_error(particles: int, runs: int, resampling: Resampling = "systemat
     return float(np.sqrt(np.mean(squares)))
 
 
-def test_pf_approaches_the_kalman_filter_as_one_over_root_m() -> None:
+def test_pf_error_decreases_with_the_square_root_of_the_particles() -> None:
     few, many = particle_error(100, 48), particle_error(10_000, 8)
-    # The posterior's deviation is about 0.3; 10^4 particles should do 0.3 / 100, and thrice that allows for resampling.
+    # The posterior standard deviation is about 0.3: with 10^4 particles 0.3 / 100, times three for resampling.
     assert many < 0.01
-    # 100 times the particles: a tenth of the error. 8 runs of 20 steps leave the ratio some 10 % uncertain.
+    # 100 times the particles: a tenth of the error. The ratio over 8 runs of 20 steps has some 10 % uncertainty.
     assert few / many == pytest.approx(10.0, rel=0.35)
 
 
 @pytest.mark.parametrize("resampling", ["hard", "soft"])
-def test_other_resampling_finds_it_too(resampling: Resampling) -> None:
-    # Soft resampling whose weights did not follow the particles would be off by a share of the posterior's 0.3.
+def test_other_resampling_rules_agree_with_the_kalman_filter(resampling: Resampling) -> None:
+    # Soft resampling with wrong weights would have an error of the order of the posterior's 0.3.
     assert particle_error(10_000, 4, resampling) < 0.015

@@ -1,4 +1,4 @@
-"""Derivatives by dual numbers, and resampling."""
+"""Derivatives with dual numbers, and resampling."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beliefscope.filters.models.resampling import effective_sample_size, multino
 def test_jacobian_agrees_with_finite_differences() -> None:
     torch.manual_seed(3)
     dynamics = Dynamics(n=3, control_size=7, units=16).double()
-    # The fresh output layer is almost zero: make the change large enough to be seen.
+    # The initial output layer is almost zero: make the change large enough to test.
     torch.nn.init.normal_(dynamics.output.weight, std=1.0)
     states = torch.randn(5, 3, dtype=torch.float64)
     part = dynamics.control_part(torch.randn(5, 7, dtype=torch.float64))
@@ -22,7 +22,7 @@ def test_jacobian_agrees_with_finite_differences() -> None:
         shift = torch.zeros(3, dtype=torch.float64)
         shift[i] = step
         column = (dynamics(states + shift, part) - dynamics(states - shift, part)) / (2 * step)
-        # Central differences err by step^2 and by rounding / step: about 1e-9 here, unless a ReLU kink is crossed.
+        # Error of central differences: step^2 plus rounding / step, about 1e-9, unless a ReLU kink is crossed.
         torch.testing.assert_close(jacobian[..., i], column, rtol=1e-6, atol=1e-8)
 
 
@@ -38,13 +38,13 @@ def test_gradients_flow_through_the_jacobian() -> None:
         assert gradient.abs().sum() > 0, name
 
 
-def test_systematic_resampling_draws_each_particle_floor_or_ceil_of_its_share() -> None:
+def test_systematic_resampling_counts_are_floor_or_ceil_of_the_expectation() -> None:
     generator = torch.Generator().manual_seed(5)
     log_weights = torch.log_softmax(2.0 * torch.randn(200, 50, generator=generator), dim=-1)
     ancestors = systematic(log_weights, generator)
     counts = torch.zeros(200, 50).scatter_add_(1, ancestors, torch.ones(200, 50))
     share = 50 * log_weights.exp()
-    # Float32 sums of 50 weights are right to about 1e-5.
+    # Float32 sums of 50 weights are accurate to about 1e-5.
     assert bool((counts >= (share - 1e-4).floor()).all())
     assert bool((counts <= (share + 1e-4).ceil()).all())
 
@@ -54,16 +54,16 @@ def test_systematic_resampling_is_unbiased() -> None:
     log_weights = torch.log_softmax(torch.randn(1, 8, generator=generator), dim=-1).expand(20_000, 8)
     ancestors = systematic(log_weights, generator)
     mean_count = torch.stack([(ancestors == i).float().sum(-1).mean() for i in range(8)])
-    # Counts differ from their mean by less than 1, so 20,000 runs give it to 1 / sqrt(20000) = 0.007; four of those.
+    # Counts deviate by less than 1, so the mean of 20,000 runs has an error of 1 / sqrt(20000) = 0.007; allow four.
     torch.testing.assert_close(mean_count, 8 * log_weights[0].exp(), rtol=0, atol=0.03)
 
 
-def test_multinomial_resampling_draws_each_particle_with_its_weight() -> None:
+def test_multinomial_resampling_has_binomial_counts() -> None:
     generator = torch.Generator().manual_seed(7)
     log_weights = torch.log_softmax(torch.randn(1, 8, generator=generator), dim=-1).expand(20_000, 8)
     counts = torch.nn.functional.one_hot(multinomial(log_weights, generator), 8).float().sum(1)
     share = log_weights[0].exp()
-    # Binomial: mean 8 w and variance 8 w (1 - w); 20,000 runs give the mean to 0.01 and the variance to 1-2 %.
+    # Binomial: mean 8 w and variance 8 w (1 - w); 20,000 runs determine the mean to 0.01, the variance to 1-2 %.
     torch.testing.assert_close(counts.mean(0), 8 * share, rtol=0, atol=0.05)
     torch.testing.assert_close(counts.var(0), 8 * share * (1 - share), rtol=0.1, atol=0.01)
 
@@ -75,23 +75,23 @@ def test_soft_resampling_is_unbiased() -> None:
     before = (log_weights[0].exp() * values).sum()
     ancestors, corrected = soft(log_weights, 0.5, generator)
     after = (corrected.exp() * values[ancestors]).sum(-1)
-    # One draw is off by about 0.2, the mean of 20,000 by 0.0015. Unweighted, the particles are off by far more.
+    # The error of one run is about 0.2, of the mean of 20,000 0.0015. Without weights it is much larger.
     assert (after.mean() - before).abs() < 0.006
     assert (values[ancestors].mean() - before).abs() > 0.05
     torch.testing.assert_close(corrected.exp().sum(-1).mean(), torch.tensor(1.0), rtol=0, atol=0.01)
 
 
-def test_soft_resampling_weighs_by_what_was_not_drawn_from() -> None:
+def test_soft_resampling_corrects_by_importance_weights() -> None:
     # w = (0.9, 0.1): q = (0.7, 0.3) with share 0.5, so a copy weighs w / (2 q) = 9/14 or 1/6.
     log_weights = torch.tensor([[0.9, 0.1]]).log()
     ancestors, corrected = soft(log_weights, 0.5, torch.Generator().manual_seed(0))
     torch.testing.assert_close(corrected.exp(), torch.tensor([9 / 14, 1 / 6])[ancestors])
-    # Drawn from the weights alone, all copies weigh the same.
+    # With share 1, particles are sampled from the weights, and all copies have equal weight.
     _, equal = soft(log_weights, 1.0, torch.Generator().manual_seed(0))
     torch.testing.assert_close(equal.exp(), torch.full((1, 2), 0.5))
 
 
-def test_only_soft_resampling_lets_gradients_pass_and_all_weights_are_normalised() -> None:
+def test_only_soft_resampling_has_gradients_and_all_weights_are_normalised() -> None:
     for rule in ("systematic", "hard", "soft"):
         logits = torch.randn(3, 10, requires_grad=True)
         _, weights = resample(torch.log_softmax(logits, dim=-1), rule, 0.5, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
@@ -102,9 +102,9 @@ def test_only_soft_resampling_lets_gradients_pass_and_all_weights_are_normalised
     assert logits.grad.abs().sum() > 0
 
 
-def test_effective_sample_size_of_uniform_and_of_one() -> None:
+def test_effective_sample_size_of_uniform_and_one_hot_weights() -> None:
     uniform = torch.log_softmax(torch.zeros(3, 40), dim=-1)
-    one = torch.full((1, 40), -torch.inf)
-    one[0, 7] = 0.0
+    one_hot = torch.full((1, 40), -torch.inf)
+    one_hot[0, 7] = 0.0
     torch.testing.assert_close(effective_sample_size(uniform), torch.full((3,), 40.0))
-    assert effective_sample_size(one).item() == 1.0
+    assert effective_sample_size(one_hot).item() == 1.0

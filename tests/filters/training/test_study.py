@@ -109,6 +109,13 @@ def document(folder: Path, name: str) -> dict[str, Any]:
     return json.loads((folder / "cells" / f"{name}.json").read_text())
 
 
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Skips drawing the figures in this process."""
+    monkeypatch.setattr("beliefscope.recordings.study_figures.write_results", lambda rows, folder: [])
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_killed_study_resumes_to_the_same_results(data: Path, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "study"
     first = folder / "cells" / f"{NAMES[0]}.json"
@@ -206,9 +213,9 @@ def test_figure_has_bars_error_bars_and_missing_filters() -> None:
     assert not [line for line in axis.lines if line.get_linestyle() == "--"]
 
 
-def test_filters_look_different() -> None:
-    found = bar_styles(list(filters_of(find_task("door"))))
-    assert len({(one["facecolor"], one["hatch"]) for one in found.values()}) == len(found) == 12
+def test_bar_styles_of_filters_differ() -> None:
+    styles = bar_styles(list(filters_of(find_task("door")))).values()
+    assert len({(style["facecolor"], style["hatch"]) for style in styles}) == len(styles) == 12
 
 
 def cell(data: Path, name: str = "haptics-ekf", **changes: Any) -> Cell:
@@ -234,6 +241,7 @@ def test_cell_with_a_changed_checkpoint_is_not_finished(data: Path, finished: Pa
     assert first.finished(folder) is None
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_failed_cell_is_reported_and_the_others_run(
     data: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -278,7 +286,7 @@ def test_cell_locked_by_another_process_is_skipped(data: Path, tmp_path: Path) -
         ("--engine slurm", "engine 'slurm' does not exist. Available: local, ray"),
         ("--task dor", "task 'dor' does not exist"),
         ("--task door --filter lstmm", "filter 'lstmm' does not exist. Available: crossmodal-ekf"),
-        ("--seeds 0", "'0' is not a whole number of at least 1"),
+        ("--seeds 0", "'0' is not an integer of at least 1"),
         ("--data door.h5", "--data 'door.h5' is not TASK=FILE"),
         ("--task door --data push=a.h5", "--data 'push=a.h5' is for task 'push', but the study is of door"),
         ("--data door=none.h5", "none.h5 does not exist"),

@@ -1,4 +1,4 @@
-"""Editing a run in time: nothing edited gives the same bits, and what an edit does is what a faults does."""
+"""Counterfactuals: edits without effect are bit-identical, and edits with faults equal runs with faults."""
 
 from __future__ import annotations
 
@@ -22,12 +22,14 @@ def replay(request: pytest.FixtureRequest) -> Replay:
         return Replay(checkpoint, trace(checkpoint, data[9], 9, seed=3, particles=100))
 
 
-def different(one: Trace, other: Trace) -> list[str]:
-    return [n for n in ARRAYS if getattr(one, n) is not None and not np.array_equal(getattr(one, n), getattr(other, n))]
+def different(run: Trace, other_run: Trace) -> list[str]:
+    return [
+        n for n in ARRAYS if getattr(run, n) is not None and not np.array_equal(getattr(run, n), getattr(other_run, n))
+    ]
 
 
 @pytest.mark.parametrize("first", [0, 40, 99])
-def test_an_edit_of_nothing_changes_no_bit(replay: Replay, first: int) -> None:
+def test_empty_edit_is_bit_identical(replay: Replay, first: int) -> None:
     assert replay.exact
     edit = Edit(first, 100)
     again = replay.edited(edit)
@@ -35,12 +37,12 @@ def test_an_edit_of_nothing_changes_no_bit(replay: Replay, first: int) -> None:
     assert compare(replay.original, again, edit).verdict.endswith("changed nothing.")
 
 
-def test_an_edit_is_the_faults_over_its_span(replay: Replay) -> None:
+def test_edit_equals_faults_over_its_steps(replay: Replay) -> None:
     edit = Edit(40, 60, Faults.parse("blackout"))
     edited, original = replay.edited(edit), replay.original
     faults = Faults.parse("blackout:from=40:to=60")
-    whole = trace(replay.checkpoint, original.episode, 9, seed=3, particles=100, faults=faults)
-    assert not different(whole, edited)
+    faulty = trace(replay.checkpoint, original.episode, 9, seed=3, particles=100, faults=faults)
+    assert not different(faulty, edited)
     assert edited.faults == faults
     result = compare(original, edited, edit)
     assert not result.distance[:40].any()
@@ -48,7 +50,7 @@ def test_an_edit_is_the_faults_over_its_span(replay: Replay) -> None:
     assert result.carrier == "haptics"
 
 
-def test_beta_by_hand(replay: Replay) -> None:
+def test_edited_beta(replay: Replay) -> None:
     edited = replay.edited(Edit(40, 60, weights={"image": 0.25}))
     assert edited.weights is not None
     np.testing.assert_allclose(edited.weights[40:60, 0], 0.25, atol=1e-6)
@@ -56,26 +58,26 @@ def test_beta_by_hand(replay: Replay) -> None:
     assert Replay(replay.checkpoint, edited).exact
 
 
-def test_bad_edits(replay: Replay) -> None:
+def test_invalid_edits(replay: Replay) -> None:
     with pytest.raises(BadInput, match="has no steps"):
         Edit(60, 40)
-    with pytest.raises(BadInput, match="span of its own"):
+    with pytest.raises(BadInput, match="has its own steps"):
         Edit(40, 60, Faults.parse("blackout:from=3"))
-    with pytest.raises(BadInput, match="so is their sum"):
+    with pytest.raises(BadInput, match="must be between 0 and 1"):
         Edit(40, 60, weights={"image": 1.5})
-    with pytest.raises(BadInput, match="beyond this trace"):
+    with pytest.raises(BadInput, match="after the last step of this trace"):
         replay.edited(Edit(40, 101))
     with pytest.raises(BadInput, match="'touch' does not exist"):
         replay.edited(Edit(40, 60, weights={"touch": 0.5}))
 
 
-@pytest.mark.parametrize("replay", ["crossmodal-pf"], indirect=True)  # an EKF's maps are its posteriors
-def test_maps_are_fused_with_the_beta_that_was_set_by_hand(replay: Replay) -> None:
+@pytest.mark.parametrize("replay", ["crossmodal-pf"], indirect=True)  # the maps of an EKF are its posteriors
+def test_maps_use_edited_beta(replay: Replay) -> None:
     edited = replay.edited(Edit(20, 40, weights={"image": 1.0}))
     step, size = 25, 21
     image, haptics, fused = MapEngine(replay.checkpoint, edited).map(step, size=size).log_likelihood
-    # The mixture subtracts one number from each model's map; with all weight on one nothing else remains.
+    # The mixture subtracts a constant from each map; a one-hot beta leaves a single map.
     np.testing.assert_allclose(fused - fused.max(), image - image.max(), atol=1e-4)  # float32 of log-likelihoods
     assert np.abs((fused - fused.max()) - (haptics - haptics.max())).max() > 1.0
-    same = (MapEngine(replay.checkpoint, one).map(step - 10, size=size) for one in (edited, replay.original))
-    np.testing.assert_array_equal(*(one.log_likelihood for one in same))
+    same = (MapEngine(replay.checkpoint, run).map(step - 10, size=size) for run in (edited, replay.original))
+    np.testing.assert_array_equal(*(run.log_likelihood for run in same))

@@ -1,4 +1,4 @@
-"""Lineage: trees from headers, and a copy that another machine can use; the two commands on it."""
+"""Lineage: trees from headers, export, and the commands ``lineage`` and ``change``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import pytest
 import torch
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 from beliefscope.inspect.compare.lineage import export, lineage_of
 
@@ -18,104 +20,109 @@ Run = Callable[[str], tuple[int, str, str]]
 ROOT = shipped("door", "crossmodal-ekf")
 
 
-def born(parent: Path, path: Path, nudge: float, **record: object) -> str:
-    """A child of a checkpoint, its dynamics a little off; its hash."""
-    of = load_checkpoint(parent)
+def finetune(base_path: Path, path: Path, nudge: float, **record: object) -> str:
+    """Save a checkpoint with modified dynamics as fine-tuned from another; returns its hash."""
+    base = load_checkpoint(base_path)
     with torch.no_grad():
-        of.filter.get_parameter("dynamics.log_noise").add_(nudge)
+        base.filter.get_parameter("dynamics.log_noise").add_(nudge)
     settings = {"train": ["dynamics.log_noise"]}
-    return save_checkpoint(of.filter, of.name, {"parent": {"hash": of.hash, "settings": settings}, **record}, path)
+    return save_checkpoint(base.filter, base.name, {"base": {"hash": base.hash, "settings": settings}, **record}, path)
 
 
 @pytest.fixture
 def family(tmp_path: Path) -> Path:
-    """A child of what ships, its two children, and one whose parent is lost."""
-    place = tmp_path / "runs"
-    (place / "deep").mkdir(parents=True)
+    """Fine-tuned checkpoints in two generations, and one whose base is missing."""
+    folder = tmp_path / "runs"
+    (folder / "deep").mkdir(parents=True)
     metrics = {"0": {"fused": {"rmse": {"position_cm": 0.5, "angle_deg": 1.25}}}}
-    born(ROOT, place / "z-child.safetensors", 0.1, command="beliefscope finetune door", metrics=metrics)
-    born(place / "z-child.safetensors", place / "deep" / "first.safetensors", 0.1)
-    born(place / "z-child.safetensors", place / "deep" / "second.safetensors", 0.2)
-    born(place / "deep" / "second.safetensors", place / "lost.safetensors", 0.1)
-    born(place / "lost.safetensors", place / "orphan.safetensors", 0.1)
-    (place / "lost.safetensors").unlink()
-    (place / "cut.safetensors").write_bytes(ROOT.read_bytes()[:1000])
-    return place
+    finetune(ROOT, folder / "finetuned.safetensors", 0.1, command="beliefscope finetune door", metrics=metrics)
+    finetune(folder / "finetuned.safetensors", folder / "deep" / "first.safetensors", 0.1)
+    finetune(folder / "finetuned.safetensors", folder / "deep" / "second.safetensors", 0.2)
+    finetune(folder / "deep" / "second.safetensors", folder / "lost.safetensors", 0.1)
+    finetune(folder / "lost.safetensors", folder / "orphan.safetensors", 0.1)
+    (folder / "lost.safetensors").unlink()
+    (folder / "cut.safetensors").write_bytes(ROOT.read_bytes()[:1000])
+    return folder
 
 
-def test_the_tree_is_what_the_headers_say(family: Path) -> None:
-    found = lineage_of([family])
-    names = {hash: one.path.name for hash, one in found.members.items()}
+def test_tree_matches_the_headers(family: Path) -> None:
+    lineage = lineage_of([family])
+    names = {hash: member.path.name for hash, member in lineage.members.items()}
     assert sorted(names.values()) == sorted(
-        [ROOT.name, "z-child.safetensors", "first.safetensors", "second.safetensors", "orphan.safetensors"]
+        [ROOT.name, "finetuned.safetensors", "first.safetensors", "second.safetensors", "orphan.safetensors"]
     )
-    assert [one.path.name for one in found.roots] == [ROOT.name, "orphan.safetensors"]
-    child = found.find("z-child.safetensors")
-    assert {one.path.name for one in found.children(child.hash)} == {"first.safetensors", "second.safetensors"}
-    second = found.find("second.safetensors")
-    assert [one.path.name for one in found.line(second.hash)] == [
+    assert [member.path.name for member in lineage.roots] == [ROOT.name, "orphan.safetensors"]
+    finetuned = lineage.find("finetuned.safetensors")
+    assert {member.path.name for member in lineage.finetuned(finetuned.hash)} == {
+        "first.safetensors",
+        "second.safetensors",
+    }
+    second = lineage.find("second.safetensors")
+    assert [member.path.name for member in lineage.line(second.hash)] == [
         ROOT.name,
-        "z-child.safetensors",
+        "finetuned.safetensors",
         "second.safetensors",
     ]
-    assert child.rmse == {"position_cm": 0.5, "angle_deg": 1.25}
-    order = list(found.members)
+    assert finetuned.rmse == {"position_cm": 0.5, "angle_deg": 1.25}
+    order = list(lineage.members)
     assert all(
-        order.index(str(one.parent)) < order.index(hash) for hash, one in found.members.items() if one.parent in order
+        order.index(str(member.base)) < order.index(hash)
+        for hash, member in lineage.members.items()
+        if member.base in order
     )
-    assert len(found.left_out) == 1
-    assert "cut.safetensors" in found.left_out[0]
+    assert len(lineage.left_out) == 1
+    assert "cut.safetensors" in lineage.left_out[0]
 
 
-def test_a_checkpoint_is_named_by_file_or_hash(family: Path) -> None:
-    found = lineage_of([family])
-    child = found.find("z-child.safetensors")
-    assert found.find(child.hash[:8]) == found.find(str(child.path)) == child
-    with pytest.raises(BadInput, match=r"Available: .*z-child\.safetensors"):
-        found.find("nothing")
-    with pytest.raises(BadInput, match="no checkpoint is in"):
+def test_find_by_file_or_hash(family: Path) -> None:
+    lineage = lineage_of([family])
+    finetuned = lineage.find("finetuned.safetensors")
+    assert lineage.find(finetuned.hash[:8]) == lineage.find(str(finetuned.path)) == finetuned
+    with pytest.raises(BadInput, match=r"Available: .*finetuned\.safetensors"):
+        lineage.find("nothing")
+    with pytest.raises(BadInput, match="no checkpoint in"):
         lineage_of([family / "cut.safetensors"])
     with pytest.raises(BadInput, match="does not exist"):
         lineage_of([family / "nowhere"])
 
 
-def test_an_export_is_whole_and_loads(family: Path, tmp_path: Path) -> None:
-    found = lineage_of([family])
-    one = found.find("second.safetensors")
-    files = export(found, one.hash, tmp_path / "copy", "1.2.3")
+def test_export_is_complete(family: Path, tmp_path: Path) -> None:
+    lineage = lineage_of([family])
+    member = lineage.find("second.safetensors")
+    files = export(lineage, member.hash, tmp_path / "copy", "1.2.3")
     manifest = json.loads((tmp_path / "copy" / "lineage.json").read_text())
     assert len(manifest["members"]) == 3
     assert {p.name for p in files} == {m["file"] for m in manifest["members"]} | {"README.md", "lineage.json"}
-    for member in manifest["members"]:
-        path = tmp_path / "copy" / member["file"]
-        assert hashlib.sha256(path.read_bytes()).hexdigest() == member["hash"] == load_checkpoint(path).hash
+    for entry in manifest["members"]:
+        path = tmp_path / "copy" / entry["file"]
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == entry["hash"] == load_checkpoint(path).hash
     readme = (tmp_path / "copy" / "README.md").read_text()
     assert manifest["checkpoint"] in readme
-    assert "the 2 checkpoints that it was made from" in readme
+    assert "with its 2 ancestors" in readme
     again = lineage_of([tmp_path / "copy"], shipped=tmp_path)
     assert set(again.members) == {m["hash"] for m in manifest["members"]}
-    with pytest.raises(BadInput, match="is there already"):
-        export(found, one.hash, tmp_path / "copy", "1.2.3")
+    with pytest.raises(BadInput, match="exists; give the name of a new folder"):
+        export(lineage, member.hash, tmp_path / "copy", "1.2.3")
 
 
-def test_a_file_that_changed_meanwhile_is_not_handed_on(family: Path, tmp_path: Path) -> None:
-    found = lineage_of([family])
-    one = found.find("first.safetensors")
-    one.path.write_bytes(b"other")
+def test_modified_file_is_not_exported(family: Path, tmp_path: Path) -> None:
+    lineage = lineage_of([family])
+    member = lineage.find("first.safetensors")
+    member.path.write_bytes(b"other")
     with pytest.raises(BadInput, match="has changed"):
-        export(found, one.hash, tmp_path / "copy", "1.2.3")
+        export(lineage, member.hash, tmp_path / "copy", "1.2.3")
     assert not [path for path in tmp_path.iterdir() if "copy" in path.name]
 
 
-def test_the_command_draws_the_tree_and_exports(run: Run, family: Path, tmp_path: Path) -> None:
+def test_lineage_command(run: Run, family: Path, tmp_path: Path) -> None:
     code, out, err = run(f"lineage {family}")
     assert code == 0
-    assert "left out" in err
+    assert "cut.safetensors" in err
     lines = out.splitlines()
     assert "door crossmodal-ekf" in lines[0]
-    assert next(line for line in lines if "z-child" in line).startswith("└── ")
+    assert next(line for line in lines if "finetuned" in line).startswith("└── ")
     assert "RMSE position cm 0.5, angle deg 1.25" in out
-    assert "which is not here" in out
+    assert "which is not in these folders" in out
     code, out, _ = run(f"lineage {family} --json -")
     document = json.loads(out)
     assert (code, len(document["members"]), len(document["roots"])) == (0, 5, 2)
@@ -125,23 +132,35 @@ def test_the_command_draws_the_tree_and_exports(run: Run, family: Path, tmp_path
     assert run(f"lineage {family} --export first.safetensors")[0] == 2
 
 
-def test_the_change_command_reports_and_links(run: Run, family: Path, tmp_path: Path) -> None:
-    child = family / "z-child.safetensors"
-    report = tmp_path / "report"
-    code, out, err = run(f"change crossmodal-ekf {child} --slice late:faults=delay=image:steps=5 -o {report} --json -")
+def test_change_command(run: Run, family: Path, tmp_path: Path) -> None:
+    finetuned = family / "finetuned.safetensors"
+    report, data = tmp_path / "report", tmp_path / "small.h5"
+    with open_dataset(sample_path("door")) as episodes:
+        write_dataset(data, DOOR, [episodes[index] for index in episodes.held_out()[:5]])
+    code, out, err = run(
+        f"change crossmodal-ekf {finetuned} --slice late:faults=delay=image:steps=5 --data {data} -o {report} --json -"
+    )
     assert code == 0, err
     document = json.loads(out)
-    assert document["child"]
+    assert document["finetuned"]
     assert set(document["frozen"]) >= {"virtual_sensors", "weight_model", "statistics"}
     assert "late" in {d["slice"] for d in document["differences"]}
-    assert all(m["link"].startswith("?task=door&filter=z-child&data=sample") for m in document["moments"])
+    assert all(m["link"].startswith("?task=door&filter=finetuned&data=small") for m in document["events"])
     assert json.loads((report / "change.json").read_text()) == document
     assert document["verdict"] in (report / "change.md").read_text()
     assert (report / "change.svg").read_text().startswith("<?xml")
     for line in (
         "change crossmodal-ekf crossmodal-pf",
-        f"change crossmodal-ekf {child} -o {report}",
-        f"change crossmodal-ekf {child} --slice nosuch",
-        f"change {child} missing.safetensors",
+        f"change crossmodal-ekf {finetuned} -o {report}",
+        f"change crossmodal-ekf {finetuned} --slice nosuch",
+        f"change {finetuned} missing.safetensors",
     ):
         assert run(line)[0] == 2
+
+
+def test_record_of_an_earlier_version(tmp_path: Path) -> None:
+    checkpoint = load_checkpoint(ROOT)
+    path = tmp_path / "old.safetensors"
+    save_checkpoint(checkpoint.filter, "old", {"parent": {"hash": checkpoint.hash, "settings": {}}}, path)
+    lineage = lineage_of([path])
+    assert lineage.find("old.safetensors").base == checkpoint.hash

@@ -65,8 +65,8 @@ def test_json_is_complete_without_nan(results: tuple[Diagnostic, Diagnostic, Tra
         numbers = json.loads(json.dumps(result.to_dict(), allow_nan=False))
         assert numbers["verdict"] == result.verdict
         assert numbers["filter"] == results[2].filter
-        shown = json.loads(json.dumps(result.views(), allow_nan=False))
-        assert [table["title"] for table in shown["tables"]] == [table.title for table in result.tables()]
+        views = json.loads(json.dumps(result.views(), allow_nan=False))
+        assert [table["title"] for table in views["tables"]] == [table.title for table in result.tables()]
 
 
 def test_non_finite_numbers_become_none() -> None:

@@ -34,9 +34,9 @@ def test_effective_sample_size_of_equal_weights_is_their_number(count: int) -> N
     assert result.steps is not None
     np.testing.assert_allclose(result.steps.effective, count, rtol=1e-5)
     np.testing.assert_allclose(result.steps.largest, 1.0 / count, rtol=1e-5)
-    whole = result.phases[0]
-    assert (whole.phase, whole.steps) == ("all", 30)
-    assert whole.degenerate == float(count < 0.1 * M)
+    total = result.phases[0]
+    assert (total.phase, total.steps) == ("all", 30)
+    assert total.degenerate == float(count < 0.1 * M)
     assert ("never below 10% of 100 particles" in result.verdict) == (count >= 10)
 
 

@@ -84,12 +84,12 @@ def test_ties_are_resolved_towards_the_effective_weights() -> None:
 def test_regret_of_a_worked_example() -> None:
     """Errors of 2 cm and -1 cm with equal weights give 0.5 cm; an image weight of one third gives zero."""
     result = audit([erring((0.02, 0.0, 0.0), (-0.01, 0.0, 0.0), 0.5)])
-    whole = result.phases[0]
-    np.testing.assert_allclose(whole.oracle[:, 0], [1 / 3, 2 / 3], atol=1e-4)
-    np.testing.assert_allclose(whole.fused[:2], 0.005, rtol=1e-4)
-    np.testing.assert_allclose(whole.hindsight, 0.0, atol=1e-6)
-    np.testing.assert_allclose(whole.regret[:2], 0.005, rtol=1e-3)
-    np.testing.assert_allclose(whole.unimodal[:, 0], [0.02, 0.01], rtol=1e-4)
+    total = result.phases[0]
+    np.testing.assert_allclose(total.oracle[:, 0], [1 / 3, 2 / 3], atol=1e-4)
+    np.testing.assert_allclose(total.fused[:2], 0.005, rtol=1e-4)
+    np.testing.assert_allclose(total.hindsight, 0.0, atol=1e-6)
+    np.testing.assert_allclose(total.regret[:2], 0.005, rtol=1e-3)
+    np.testing.assert_allclose(total.unimodal[:, 0], [0.02, 0.01], rtol=1e-4)
     np.testing.assert_allclose(result.regret[:, 0], 0.005, rtol=1e-3)
     assert "Regret 0.500 cm: position RMSE 0.500 cm, 0.000 cm with the oracle's weights" in result.verdict
     assert "1.000 cm with haptics only. Better weights would reduce the error." in result.verdict
@@ -123,11 +123,11 @@ def test_real_filters(name: str) -> None:
     assert (result.regret >= 0.0).all()
     assert (result.oracle >= 0.0).all()
     np.testing.assert_allclose(result.oracle.sum(1), 1.0, rtol=1e-9)
-    whole = result.phases[0]
+    total = result.phases[0]
     # One-hot weights are among the oracle's choices.
-    assert whole.hindsight[0] <= whole.unimodal[:, 0].min() + 1e-9
+    assert total.hindsight[0] <= total.unimodal[:, 0].min() + 1e-9
     if name == "crossmodal-ekf":  # its mean is a convex combination by component; float32 in a trace
-        assert (whole.hindsight <= whole.fused + 1e-6).all()
+        assert (total.hindsight <= total.fused + 1e-6).all()
 
 
 def test_scalar_oracle_weight_minimises_the_position_error() -> None:

@@ -1,4 +1,4 @@
-"""A moment drawn from above: outlines are where the bodies are, contours hold what they claim."""
+"""Top view: footprints, contours, maps and reproducible files."""
 
 from __future__ import annotations
 
@@ -35,27 +35,27 @@ def map_(run: Trace) -> LikelihoodMap:
 
 
 def inside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether points (N, 2) lie in a convex outline (P, 2), counter-clockwise."""
+    """Whether points (N, 2) are inside of a convex outline (P, 2), counter-clockwise."""
     edges = np.roll(corners, -1, axis=0) - corners
-    off = points[:, None] - corners
-    return (edges[:, 0] * off[..., 1] - edges[:, 1] * off[..., 0] >= -1e-9).all(axis=1)
+    offset = points[:, None] - corners
+    return (edges[:, 0] * offset[..., 1] - edges[:, 1] * offset[..., 0] >= -1e-9).all(axis=1)
 
 
-def test_an_outline_holds_its_points() -> None:
+def test_outline_contains_its_points() -> None:
     points = np.random.default_rng(0).normal(size=(200, 2))
     assert inside(outline(points), points).all()
     np.testing.assert_array_equal(outline(points).max(axis=0), points.max(axis=0))
 
 
-def test_the_hand_is_drawn_where_it_was_felt(run: Trace) -> None:
-    around = scene_footprints(run, DOOR, STEP)
+def test_end_effector_is_drawn_at_its_observed_position(run: Trace) -> None:
+    footprints = scene_footprints(run, DOOR, STEP)
     effector = 100.0 * run.episode.observations["effector_position"][STEP, :2]
-    assert any(np.linalg.norm(one.outline.mean(axis=0) - effector) < 5.0 for one in around)
-    assert [one.top for one in around] == sorted(one.top for one in around)
+    assert any(np.linalg.norm(shape.outline.mean(axis=0) - effector) < 5.0 for shape in footprints)
+    assert [shape.top for shape in footprints] == sorted(shape.top for shape in footprints)
 
 
 @pytest.mark.parametrize("name", ["door", "push"])
-def test_a_footprint_is_the_objects_own(name: str) -> None:
+def test_footprint_matches_the_object(name: str) -> None:
     task = TASKS[name]
     with open_dataset(sample_path(name)) as data:
         episode = data[9]
@@ -64,37 +64,39 @@ def test_a_footprint_is_the_objects_own(name: str) -> None:
     corners = footprint(task.outline(episode.states[STEP]))
     x, y = corners.T
     area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-    drawn = [one.outline for one in scene_footprints(run, task, STEP)]
-    nearest = min(drawn, key=lambda one: np.abs(one.max(axis=0) - corners.max(axis=0)).max())
-    # The puck's rim has 24 corners in one and 48 in the other: a hundredth of its radius.
+    points = [shape.outline for shape in scene_footprints(run, task, STEP)]
+    nearest = min(points, key=lambda shape: np.abs(shape.max(axis=0) - corners.max(axis=0)).max())
+    # The puck has 24 and 48 corners; the difference is 1 % of its radius.
     np.testing.assert_allclose(nearest.max(axis=0), corners.max(axis=0), atol=0.06)
     np.testing.assert_allclose(nearest.min(axis=0), corners.min(axis=0), atol=0.06)
     assert area == pytest.approx(200.0 if name == "door" else np.pi * 25.0, rel=0.01)
 
 
-def test_an_ellipse_has_the_covariance_that_it_is_drawn_for() -> None:
+def test_contour_has_the_covariance() -> None:
     root = np.random.default_rng(2).normal(size=(50, 2, 2))
     covariance = root @ root.swapaxes(1, 2)
-    half, turn = contours(covariance)
-    axes = np.stack([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]).transpose(2, 1, 0) * half[:, None]
+    half, angle = contours(covariance)
+    axes = (
+        np.stack([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]).transpose(2, 1, 0) * half[:, None]
+    )
     np.testing.assert_allclose(axes @ axes.swapaxes(1, 2), covariance, atol=1e-12)
     assert (half[:, 0] <= half[:, 1]).all()
     flat = np.array([0.1, 0.3])
     np.testing.assert_allclose(contours(np.outer(flat, flat))[0], [0.0, np.hypot(*flat)], atol=1e-8)
 
 
-def test_contours_hold_86_percent_of_their_gaussian(run: Trace) -> None:
+def test_contours_contain_86_percent_of_the_gaussian(run: Trace) -> None:
     belief = draw_step(run, STEP).axes[1]
     ellipses = [patch for patch in belief.patches if isinstance(patch, Ellipse)]
     assert len(ellipses) == 3
     covariance = run.estimate_covariance[STEP][:2, :2].astype(float)
-    drawn = np.random.default_rng(1).multivariate_normal(run.estimate_mean[STEP, :2], covariance, 4000)
-    held = ellipses[-1].contains_points(ellipses[-1].axes.transData.transform(100.0 * drawn))
-    # 1 - exp(-2), with 4000 draws good to half a percent (one sigma)
-    assert held.mean() == pytest.approx(0.865, abs=0.02)
+    points = np.random.default_rng(1).multivariate_normal(run.estimate_mean[STEP, :2], covariance, 4000)
+    contained = ellipses[-1].contains_points(ellipses[-1].axes.transData.transform(100.0 * points))
+    # 1 - exp(-2); standard error of half a percent with 4000 samples
+    assert contained.mean() == pytest.approx(0.865, abs=0.02)
 
 
-def test_the_map_lies_about_the_truth_and_stays_white_where_nothing_is(run: Trace, map_: LikelihoodMap) -> None:
+def test_map_is_centred_on_the_true_position_and_transparent_at_low_likelihood(run: Trace, map_: LikelihoodMap) -> None:
     scene, belief = draw_step(run, STEP, map_).axes
     for axes in (scene, belief):
         (image,) = axes.images
@@ -107,7 +109,7 @@ def test_the_map_lies_about_the_truth_and_stays_white_where_nothing_is(run: Trac
     np.testing.assert_allclose(alpha, np.exp(log - log.max()), atol=1e-6)
 
 
-def test_the_object_is_drawn_twice_and_force_only_in_contact(run: Trace) -> None:
+def test_true_and_estimated_object_and_contact_force(run: Trace) -> None:
     task = DOOR
     assert task.outline is not None
     scene = draw_step(run, STEP).axes[0]
@@ -121,8 +123,8 @@ def test_the_object_is_drawn_twice_and_force_only_in_contact(run: Trace) -> None
     assert not draw_step(run, free).axes[0].texts
 
 
-def test_what_a_run_has_not_is_left_out(run: Trace, tmp_path: Path) -> None:
-    bare = replace(
+def test_unavailable_values_are_omitted(run: Trace, tmp_path: Path) -> None:
+    estimates_only = replace(
         run,
         particles=None,
         log_weights=None,
@@ -130,13 +132,13 @@ def test_what_a_run_has_not_is_left_out(run: Trace, tmp_path: Path) -> None:
         modality_mean=np.full_like(run.modality_mean, np.nan),
         episode=replace(run.episode, qpos=run.episode.qpos[:, :0]),
     )
-    (belief,) = draw_step(bare, STEP).axes
+    (belief,) = draw_step(estimates_only, STEP).axes
     assert not belief.collections
     assert not belief.patches
     assert [line.get_label() for line in belief.lines] == ["fused", "truth"]
 
 
-def test_the_same_moment_gives_the_same_file(run: Trace, map_: LikelihoodMap, tmp_path: Path) -> None:
+def test_files_are_reproducible(run: Trace, map_: LikelihoodMap, tmp_path: Path) -> None:
     for name in ("a.svg", "b.svg"):
         write_figure(draw_step(run, STEP, map_), tmp_path / name)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()

@@ -1,10 +1,11 @@
-"""A run taken again has the bits of the first one, whatever the kind of filter."""
+"""Replays of all kinds of filters are bit-identical."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint
@@ -13,7 +14,7 @@ from beliefscope.inspect.traces.replay import Edit, Replay
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ukf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"])
-def test_nothing_edited_changes_no_bit(name: str) -> None:
+def test_empty_edit_is_bit_identical(name: str) -> None:
     checkpoint = Checkpoint(build(architecture("door", name)).eval().requires_grad_(False), name, "0" * 64, {})
     with open_dataset(sample_path("door")) as data:
         replay = Replay(checkpoint, trace(checkpoint, data[9], 9, seed=3, particles=50))
@@ -21,3 +22,9 @@ def test_nothing_edited_changes_no_bit(name: str) -> None:
     again = replay.edited(Edit(40, 100))
     for array in ARRAYS:
         np.testing.assert_array_equal(getattr(again, array), getattr(replay.original, array), err_msg=array)
+
+
+def test_edit_of_an_earlier_version() -> None:
+    edit = Edit(3, 5, Faults.parse("blackout"))
+    values = edit.to_json()
+    assert Edit.from_json({**values, "recipe": values.pop("faults")}) == edit

@@ -1,4 +1,4 @@
-"""Filters with the public interface of torchfilter, written anew: what is captured of them is captured of those."""
+"""Stubs with the public interface of torchfilter."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Q = 0.05
 
 
 class Walk(nn.Module):
-    """Dynamics: nothing moves but by noise."""
+    """Random walk dynamics."""
 
     def forward(self, *, initial_states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:
         return initial_states, Q * torch.eye(N_STATE).expand(len(initial_states), -1, -1)
 
 
 class Sensor(nn.Module):
-    """Virtual sensor: a linear look at one observation, and its Cholesky factor."""
+    """Virtual sensor: a function of one observation and a Cholesky factor."""
 
     def __init__(self, key: str, size: int, noise: float, seed: int) -> None:
         super().__init__()
@@ -29,12 +29,12 @@ class Sensor(nn.Module):
         self.weight = nn.Parameter(0.3 * weight)
 
     def forward(self, *, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        seen = observations[self.key]
-        return torch.tanh(seen @ self.weight.T), self.noise * torch.eye(N_STATE).expand(len(seen), -1, -1)
+        values = observations[self.key]
+        return torch.tanh(values @ self.weight.T), self.noise * torch.eye(N_STATE).expand(len(values), -1, -1)
 
 
 class VirtualSensorKalman(nn.Module):
-    """As ``torchfilter.filters.VirtualSensorExtendedKalmanFilter``."""
+    """Like ``torchfilter.filters.VirtualSensorExtendedKalmanFilter``."""
 
     def __init__(self, sensor: nn.Module) -> None:
         super().__init__()
@@ -54,15 +54,15 @@ class VirtualSensorKalman(nn.Module):
 
 
 class WeightsOfFilters(nn.Module):
-    """(K, N, n) weights of each component."""
+    """Weights (K, N, n) by component."""
 
     def forward(self, *, observations: dict[str, Tensor]) -> Tensor:
-        pull = observations["force"].abs()
-        return torch.stack([0.2 + pull, 0.7 + 0.0 * pull])
+        force = observations["force"].abs()
+        return torch.stack([0.2 + force, 0.7 + 0.0 * force])
 
 
 class CrossmodalKalman(nn.Module):
-    """Several Kalman filters, their means averaged by weights."""
+    """Weighted average of several Kalman filters."""
 
     def __init__(self, *filters: nn.Module) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ class CrossmodalKalman(nn.Module):
 
 
 class Likelihood(nn.Module):
-    """Measurement model of particles: a Gaussian about what a sensor says."""
+    """Measurement model of particles: a Gaussian around the sensor output."""
 
     def __init__(self, sensor: nn.Module) -> None:
         super().__init__()
@@ -95,26 +95,26 @@ class Likelihood(nn.Module):
 
 
 class WeightsOfLikelihoods(nn.Module):
-    """(N, K) log-weights, not normalised."""
+    """Log weights (N, K), not normalised."""
 
     def forward(self, *, observations: dict[str, Tensor]) -> Tensor:
         return torch.cat([observations["contact"], 0.5 - observations["contact"]], dim=1)
 
 
 class CrossmodalLikelihood(nn.Module):
-    """Several measurement models as a mixture."""
+    """Mixture of several measurement models."""
 
     def __init__(self, *models: nn.Module) -> None:
         super().__init__()
         self.measurement_models, self.crossmodal_weight_model = nn.ModuleList(models), WeightsOfLikelihoods()
 
     def forward(self, *, states: Tensor, observations: dict[str, Tensor]) -> Tensor:
-        each = torch.stack([model(states=states, observations=observations) for model in self.measurement_models], 2)
-        return torch.logsumexp(self.crossmodal_weight_model(observations=observations).unsqueeze(1) + each, dim=2)
+        terms = torch.stack([model(states=states, observations=observations) for model in self.measurement_models], 2)
+        return torch.logsumexp(self.crossmodal_weight_model(observations=observations).unsqueeze(1) + terms, dim=2)
 
 
 class Particles(nn.Module):
-    """As ``torchfilter.filters.ParticleFilter``: it resamples within its step, after the estimate."""
+    """Like ``torchfilter.filters.ParticleFilter``: resamples within the step, after the estimate."""
 
     def __init__(self, model: nn.Module, count: int = 80) -> None:
         super().__init__()
@@ -122,21 +122,21 @@ class Particles(nn.Module):
         self.at_end: Callable[[], None] = lambda: None
 
     def initialize_beliefs(self, *, mean: Tensor, covariance: Tensor) -> None:
-        draws = torch.distributions.MultivariateNormal(mean, covariance).sample((self.num_particles,))
-        self.particle_states = draws.transpose(0, 1)
+        samples = torch.distributions.MultivariateNormal(mean, covariance).sample((self.num_particles,))
+        self.particle_states = samples.transpose(0, 1)
         self.particle_log_weights = torch.full(self.particle_states.shape[:2], -math.log(self.num_particles))
 
     def forward(self, *, observations: dict[str, Tensor], controls: Tensor) -> Tensor:
-        count, many, n = self.particle_states.shape
+        count, particles, n = self.particle_states.shape
         flat = self.particle_states.reshape(-1, n)
-        mean, factor = self.dynamics_model(initial_states=flat, controls=controls.repeat_interleave(many, 0))
+        mean, factor = self.dynamics_model(initial_states=flat, controls=controls.repeat_interleave(particles, 0))
         noise = torch.distributions.MultivariateNormal(mean, scale_tril=factor)
-        self.particle_states = noise.rsample().view(count, many, n)
+        self.particle_states = noise.rsample().view(count, particles, n)
         fused = self.measurement_model(states=self.particle_states, observations=observations)
         self.particle_log_weights = torch.log_softmax(self.particle_log_weights + fused, dim=1)
         estimate = (self.particle_log_weights.exp().unsqueeze(-1) * self.particle_states).sum(1)
-        index = torch.distributions.Categorical(logits=self.particle_log_weights).sample((many,)).T
+        index = torch.distributions.Categorical(logits=self.particle_log_weights).sample((particles,)).T
         self.particle_states = self.particle_states.gather(1, index.unsqueeze(-1).expand(-1, -1, n))
-        self.particle_log_weights = torch.full_like(self.particle_log_weights, -math.log(many))
+        self.particle_log_weights = torch.full_like(self.particle_log_weights, -math.log(particles))
         self.at_end()
         return estimate
