@@ -35,8 +35,8 @@ def slice_json(value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def training_record(record: Mapping[str, Any]) -> dict[str, Any]:
-    """A checkpoint's record with ``base`` for ``parent``, ``validations`` for ``looks``, and present slice names."""
-    record = rename_keys(record, {"parent": "base", "looks": "validations"})
+    """A checkpoint's record with present keys and slice names, such as ``base`` for ``parent``."""
+    record = rename_keys(record, {"parent": "base", "looks": "validations", "recipe": "faults"})
     if isinstance(base := record.get("base"), Mapping) and isinstance(settings := base.get("settings"), Mapping):
         settings = rename_keys(settings, SETTINGS)
         if isinstance(mix := settings.get("mix"), list):

@@ -45,7 +45,8 @@ class CallRecorder:
     def files(self) -> Iterator[list[str]]:
         """Give a list that holds the repository's files, sorted, once the block has ended."""
         files: list[str] = []
-        self._names = names = set()
+        names: set[str] = set()
+        self._names = names
         yield files
         self._names = None
         paths = {Path(name).resolve() for name in names if not name.startswith("<")}

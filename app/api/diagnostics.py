@@ -98,7 +98,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             "settings": store.settings.to_json(),
             "diagnostic": entry.name,
             "options": options,
-            "selections": [one.to_json() for one in selections],
+            "selections": [item.to_json() for item in selections],
         }
         scope = f"all {len(selections)} held-out episodes" if episodes else f"episode {selection.episode}"
         parts = [f"{entry.title} of {selection.filter}", f"{selection.task} {scope}", str(selection.faults)]

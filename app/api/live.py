@@ -54,7 +54,7 @@ def block(run: LiveRun, first: int) -> bytes:
         "first": min(first, steps),
         "steps": len(part),
         "columns": descriptions,
-        "pictures": 0 if images is None else images.nbytes,
+        "image_bytes": 0 if images is None else images.nbytes,
         "total": steps,
         "written": run.reader.path.stat().st_mtime,
         "state": run.state,

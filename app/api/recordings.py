@@ -23,7 +23,7 @@ from starlette.requests import ClientDisconnect
 from beliefscope import __version__
 from beliefscope.app.api.models.catalog import JobReply
 from beliefscope.app.api.models.files import DeletedId, Freed, RecordingEntry, RecordingList, RunNames, WrittenRecording
-from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.jobs.recording import write
 from beliefscope.app.protocol.etag import tagged_json
 from beliefscope.app.protocol.messages import READ_ONLY
@@ -134,6 +134,36 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
         seconds = None if existed else time.perf_counter() - start
         return WrittenRecording(name=path.name, url=_url(path.name), bytes=path.stat().st_size, seconds=seconds)
 
+    @router.post("/api/recordings/{name}.rrd/run", status_code=202)
+    def open_run(name: str) -> JobReply:
+        return JobReply(job=_open_run(store, files, jobs, name))
+
+    _add_file_routes(router, files, matcher)
+    return router
+
+
+def _open_run(store: TraceStore, files: RecordingFolder, jobs: Jobs, name: str) -> Job:
+    recording = files.get(name)
+    info = recording.info
+    if info is None or info.problem:
+        raise BadInput(info.problem if info else f"{recording.name!r} is still being read.")
+    assert info.filter is not None
+    key = repr((recording.name, recording.bytes, recording.modified))
+    run = f"{recording.name.removesuffix(ENDING)} {hashlib.sha256(key.encode()).hexdigest()[:8]}"
+    task = str(info.task)
+    filter_name = display_name(info.filter, info.checkpoint_hash, store.filters(task))
+    link = permalink(find_task(task), filter_name, LIVE_PREFIX + run, info.episode or 0, 0)
+    output = store.live.folder / f"{run}{SUFFIX}"
+    arguments = {"recording": str(files.path(name)), "run": str(output)}
+    return jobs.submit("reading", f"The run in {recording.name}", arguments, key, link, output.is_file())
+
+
+def _add_file_routes(router: APIRouter, files: RecordingFolder, matcher: RunMatcher) -> None:
+    """Routes that do not need the runs."""
+
+    def entry(recording: Recording) -> RecordingEntry:
+        return _entry(recording, *matcher.match(recording.info, matcher.tasks()))
+
     @router.get("/api/recordings/{name}.rrd", response_class=Response)
     def download(name: str) -> FileResponse:
         path = files.path(name)
@@ -170,24 +200,6 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
     def delete(name: str) -> DeletedId:
         return DeletedId(deleted=files.delete(name))
 
-    @router.post("/api/recordings/{name}.rrd/run", status_code=202)
-    def open_run(name: str) -> JobReply:
-        recording = files.get(name)
-        info = recording.info
-        if info is None or info.problem:
-            raise BadInput(info.problem if info else f"{recording.name!r} is still being read.")
-        assert info.filter is not None
-        key = repr((recording.name, recording.bytes, recording.modified))
-        run = f"{recording.name.removesuffix(ENDING)} {hashlib.sha256(key.encode()).hexdigest()[:8]}"
-        task = str(info.task)
-        filter_name = display_name(info.filter, info.checkpoint_hash, store.filters(task))
-        link = permalink(find_task(task), filter_name, LIVE_PREFIX + run, info.episode or 0, 0)
-        output = store.live.folder / f"{run}{SUFFIX}"
-        arguments = {"recording": str(files.path(name)), "run": str(output)}
-        return JobReply(
-            job=jobs.submit("reading", f"The run in {recording.name}", arguments, key, link, output.is_file())
-        )
-
     @router.post("/api/recordings/deleted/{id}")
     def restore(id: str) -> RecordingEntry:
         return entry(files.restore(id))
@@ -197,11 +209,6 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
         freed = sum(file.bytes for file in files.list_deleted())
         files.empty_trash()
         return Freed(freed=freed)
-
-    def entry(recording: Recording) -> RecordingEntry:
-        return _entry(recording, *matcher.match(recording.info, matcher.tasks()))
-
-    return router
 
 
 class RunMatcher:

@@ -74,9 +74,9 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         return JobReply(job=jobs.submit("report", title, arguments, key, link, folder.is_dir()))
 
     @router.get("/api/reports/{name}.html", response_class=Response)
-    def page(name: str, shown: bool = False) -> FileResponse:
+    def page(name: str, inline: bool = False) -> FileResponse:
         path = reports.page(name)
-        disposition = "inline" if shown else "attachment"
+        disposition = "inline" if inline else "attachment"
         response = FileResponse(
             path, media_type="text/html; charset=utf-8", filename=f"{name}.html", content_disposition_type=disposition
         )

@@ -81,7 +81,7 @@ def render(*items: RenderableType) -> str:
     console = Console(width=1000, color_system=None)
     with console.capture() as capture:
         console.print(*items, sep="\n")
-    return "\n".join(line.rstrip() for line in capture.get().strip("\n").splitlines())
+    return "\n".join(line.rstrip() for line in capture.get().splitlines()).strip("\n")
 
 
 @contextmanager

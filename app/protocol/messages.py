@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, Protocol, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, TypeAdapter, ValidationError
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-
-if TYPE_CHECKING:
-    from fastapi.exceptions import RequestValidationError
 
 MAX_ANGLE = 1e3  # rad: beyond the turns of any door
 READ_ONLY = "This server is read-only."
@@ -39,7 +37,7 @@ class Cursor(_Message):
         serial: counter of the page's cursors. data: name of the data set; empty for the task's first.
         faults: injected faults. scene: whether the 3D scene is updated, or only the maps.
         against: differences of the comparison run (``Selection.against``), whose estimate the scene shows; empty
-            without one. beside: whether its maps are sent, too.
+            without one. comparison_maps: whether its maps are sent, too.
     """
 
     type: Literal["cursor"] = "cursor"
@@ -54,7 +52,7 @@ class Cursor(_Message):
     scene: bool = True
     data: str = ""
     against: str = ""
-    beside: bool = False
+    comparison_maps: bool = False
 
 
 class SceneLayers(_Message):
@@ -103,7 +101,13 @@ def parse_view_message(message: Any) -> ViewMessage:
         raise BadInput(f"{describe_error(error)}.") from None
 
 
-def describe_error(error: ValidationError | RequestValidationError) -> str:
+class _HasErrors(Protocol):
+    """pydantic's ValidationError, or FastAPI's RequestValidationError."""
+
+    def errors(self) -> Sequence[Any]: ...
+
+
+def describe_error(error: _HasErrors) -> str:
     """The first error of a failed validation, in one line: ``cursor.size: Input should be 41 or 135``."""
     first = error.errors()[0]
     message = first["msg"].removeprefix("Value error, ").rstrip(".")

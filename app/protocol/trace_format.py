@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
 from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import nees_bounds
-from beliefscope.inspect.diagnostics.consistency import innovations
 from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.innovations import innovations
 from beliefscope.inspect.trace import Trace
 
 SENSORS = ("effector_position", "force")
@@ -92,7 +92,7 @@ def header(trace: Trace, column_descriptions: list[dict[str, Any]], task: Task, 
         "settings": dict(trace.settings),
         "nees_bounds": nees_bounds(len(components), 1) if trace.has_covariance else None,
         "no_maps": no_maps,
-        "pictures": None if images is None else list(images.shape[1:]),
+        "image_size": None if images is None else list(images.shape[1:]),
         "columns": column_descriptions,
         "scene": scene_layers(task, trace, no_maps),
     }

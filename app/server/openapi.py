@@ -22,5 +22,5 @@ def document() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    models = {"paths": {}} if "--models" in sys.argv else {}
+    models: dict[str, Any] = {"paths": {}} if "--models" in sys.argv else {}
     print(json.dumps(document() | models, indent=1))

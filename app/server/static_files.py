@@ -53,8 +53,9 @@ class PageFiles:
 
     def _files(self) -> dict[str, tuple[Path, int, int]]:
         """Name -> path, size and time of modification; takes about 0.2 ms."""
-        own = {path.relative_to(self._folder).as_posix(): path for path in sorted(self._folder.rglob("*.*"))}
-        stats = {name: (path, path.stat()) for name, path in (own | {path.name: path for path in self._others}).items()}
+        paths = {path.relative_to(self._folder).as_posix(): path for path in sorted(self._folder.rglob("*.*"))}
+        paths |= {path.name: path for path in self._others}
+        stats = {name: (path, path.stat()) for name, path in paths.items()}
         return {name: (path, status.st_size, status.st_mtime_ns) for name, (path, status) in stats.items()}
 
 

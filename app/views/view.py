@@ -142,7 +142,7 @@ class View:
         if run.no_maps:
             await websocket.send_json({"type": "no_maps", "serial": cursor.serial, "step": cursor.step})
         else:
-            if cursor.beside and comparison is not None and not comparison.no_maps:
+            if cursor.comparison_maps and comparison is not None and not comparison.no_maps:
                 other = await self._maps(cursor, comparison)
                 await websocket.send_bytes(other.message(cursor.serial, other=True))
             encoded = await self._maps(cursor, run)

@@ -53,7 +53,7 @@ class ReportFolder:
         with self._lock:
             manifests = [path for path in self.folder.glob("*/manifest.json") if NAME.fullmatch(path.parent.name)]
             entries = [self._entry(path) for path in manifests]
-        return sorted((entry for entry in entries if entry), key=lambda entry: entry["made"], reverse=True)
+        return sorted((entry for entry in entries if entry), key=lambda entry: entry["created"], reverse=True)
 
     def page(self, name: str, file: str = "report.html") -> Path:
         """Path of a file of a report. Raises NotFound."""
@@ -93,7 +93,8 @@ class ReportFolder:
                 self._entries[name] = (
                     modified,
                     {
-                        **manifest.model_dump(include={"title", "made", "task", "filter"}),
+                        **manifest.model_dump(include={"title", "task", "filter"}),
+                        "created": manifest.made,
                         "episode": run.episode,
                         "faults": str(Faults.from_json(run.faults)),
                         "name": name,

@@ -97,7 +97,7 @@ class Trainer:
             add("dynamics", self.train_shared, "dynamics", [filter_.dynamics], self.train_dynamics)
         encoders = self.image_encoders()
         if encoders:
-            add(IMAGES, self.train_shared, "pictures", encoders, self.train_image_encoder)
+            add(IMAGES, self.train_shared, IMAGES, encoders, self.train_image_encoder)
         for name in filter_.names:
             if (module := self.measurement_module(name)) is not None:
                 add(f"{name} model", self.train_model, name, module)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.filters.checkpoint import Checkpoint
@@ -21,15 +20,14 @@ from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Curve, Line, Plot, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import (
-    LAGS,
     LEVELS,
     calibration_curve,
     gaussian_crps,
     gaussian_level,
-    ljung_box,
     particle_crps,
     particle_level,
 )
+from beliefscope.inspect.statistics.innovations import Whiteness, innovations, whiteness_of
 from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float64]
@@ -95,25 +93,6 @@ class LayerConsistency:
         """NEES / n and its bounds."""
         low, high = self.bounds
         return f"NEES/n {_number(self.nees)}, 95 % bounds {low:.2f} to {high:.2f}"
-
-
-@dataclass(frozen=True)
-class Whiteness:
-    """Whiteness test of the innovations of one modality in one component.
-
-    Attributes:
-        autocorrelation: at lag 1, mean over trajectories.
-        statistic: Ljung-Box statistic, summed over trajectories.
-        degrees: its degrees of freedom.
-        p_value: probability of a larger statistic for white innovations.
-    """
-
-    modality: str
-    component: str
-    autocorrelation: float
-    statistic: float
-    degrees: int
-    p_value: float
 
 
 @dataclass(frozen=True)
@@ -296,27 +275,13 @@ def consistency(traces: Sequence[Trace]) -> Consistency:
         filter=first.filter,
         trajectories=len(traces),
         by_layer=tuple(by_layer),
-        whiteness=tuple(_whiteness(traces)),
+        whiteness=tuple(whiteness_of(traces)),
         levels=LEVELS,
         nees=pooled["nees"][:keep],
         nis=pooled["nis"][:keep, : len(first.modalities) if has_nis else 0],
         contact=first.episode.contact.astype(bool)[:keep],
         blackout=measures.blackout(first)[:keep],
     )
-
-
-def innovations(trace: Trace) -> tuple[Array, Array] | None:
-    """``z - H x`` (T, K, n), angles wrapped, and ``P + R`` (T, K, n, n), H = I; None unless a Kalman filter."""
-    parts = (
-        trace.observation_mean,
-        trace.predicted_mean,
-        trace.observation_covariance,
-        trace.predicted_covariance,
-    )
-    if any(part is None for part in parts):
-        return None
-    z, predicted, r, p = (np.asarray(part, dtype=np.float64) for part in parts)
-    return measures.wrapped(measures.task_of(trace), z - predicted), p + r
 
 
 def _step_measures(trace: Trace) -> dict[str, Array]:
@@ -365,28 +330,6 @@ def _summarise(layer: str, phase: str, trajectories: int, steps: dict[str, Array
         sharpness=np.sqrt(steps["variance"].mean(0)),
         crps=steps["crps"].mean(0),
     )
-
-
-def _whiteness(traces: Sequence[Trace]) -> list[Whiteness]:
-    """Test innovations in predicted standard deviations; statistics of independent trajectories add up."""
-    results: list[tuple[Array, Array]] = []
-    for trace in traces:
-        pair = innovations(trace)
-        keep = measures.counted(trace)
-        if pair is None or keep.sum() <= 2 * LAGS:
-            continue
-        nu, s = pair
-        normalised = nu / np.sqrt(np.diagonal(s, axis1=-2, axis2=-1))
-        results.append(ljung_box(normalised[keep].reshape(keep.sum(), -1)))
-    if not results:
-        return []
-    statistic, correlation = np.sum([q for q, _ in results], axis=0), np.mean([r for _, r in results], axis=0)
-    degrees = LAGS * len(results)
-    pairs = [(m, c.name) for m in traces[0].modalities for c in measures.task_of(traces[0]).components]
-    return [
-        Whiteness(modality, component, float(r), float(q), degrees, float(chdtrc(degrees, q)))
-        for (modality, component), q, r in zip(pairs, statistic, correlation, strict=True)
-    ]
 
 
 def _inconsistency(entry: LayerConsistency) -> float:

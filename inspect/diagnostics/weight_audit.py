@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES, correlate, correlation_sums
+from beliefscope.inspect.statistics.oracle import oracle_weights
 from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float64]
@@ -34,9 +34,6 @@ OTHERS = {"oracle": "the oracle weight", "contact": "contact", "blackout": "blac
 
 LABELS = {"beta": "beta", "effective_weights": "effective weight", "oracle": "oracle"}
 """Display names of the weight fields."""
-
-TIE = 1e-9
-"""Weight of the distance to the effective weights relative to squared errors scaled to 1; breaks ties."""
 
 
 @dataclass(frozen=True)
@@ -286,40 +283,6 @@ def audit(traces: Sequence[Trace]) -> WeightAudit:
         contact=first.episode.contact.astype(bool)[:keep],
         blackout=measures.blackout(first)[:keep],
     )
-
-
-def oracle_weights(errors: Array, near: Array) -> Array:
-    """Convex weights of K estimates whose weighted mean is closest to the true state.
-
-    ``min |sum_k w_k e_k|^2`` over ``w_k >= 0, sum w_k = 1``. The solution is exact: the minimum on each face of the
-    simplex has a closed form, and the best feasible one is selected. Two scalar errors give
-    ``w_1 = e_2 / (e_2 - e_1)``, clipped to 0..1. Ties are resolved in favour of weights close to ``near``.
-
-    Args:
-        errors: (..., d, K) errors of the K estimates in d components.
-        near: (..., K).
-
-    Returns:
-        (..., K).
-    """
-    count = errors.shape[-1]
-    gram = np.swapaxes(errors, -1, -2) @ errors
-    size = np.trace(gram, axis1=-2, axis2=-1)[..., None, None]
-    gram = np.divide(gram, size, out=np.zeros_like(gram), where=size > 0)
-    best, lowest = np.zeros_like(near), np.full(near.shape[:-1], np.inf)
-    for members in (list(face) for size in range(count, 0, -1) for face in combinations(range(count), size)):
-        inverse = np.linalg.inv(gram[..., members, :][..., members] + TIE * np.eye(len(members)))
-        target, ones = TIE * (inverse @ near[..., members, None])[..., 0], inverse.sum(-1)
-        multiplier = (1.0 - target.sum(-1, keepdims=True)) / ones.sum(-1, keepdims=True)
-        weights = np.zeros_like(near)
-        weights[..., members] = target + multiplier * ones
-        cost = (weights[..., None, :] @ gram @ weights[..., None])[..., 0, 0]
-        cost = cost + TIE * np.square(weights - near).sum(-1)
-        better = (weights >= -1e-12).all(-1) & (cost < lowest)
-        best = np.where(better[..., None], weights, best)
-        lowest = np.where(better, cost, lowest)
-    best = np.maximum(best, 0.0)
-    return best / best.sum(-1, keepdims=True)
 
 
 def position_regret(trace: Trace) -> Array:

@@ -103,6 +103,13 @@ def client(settings: Settings) -> Iterator[TestClient]:
         yield client
 
 
+@pytest.fixture(scope="module")
+def shared_client(base_settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """Client of a server for all tests of a module that do not depend on the contents of its workspace."""
+    with Browser(replace(base_settings, workspace=tmp_path_factory.mktemp("workspace"))) as client:
+        yield client
+
+
 @pytest.fixture
 def address(settings: Settings) -> Iterator[str]:
     """``localhost:port`` of a server in a thread."""
@@ -119,8 +126,7 @@ def address(settings: Settings) -> Iterator[str]:
     assert not thread.is_alive()
 
 
-@pytest.fixture
-def trace_url(client: TestClient) -> str:
+def compute_trace(client: TestClient) -> str:
     """URL of a trace that has been computed."""
     url = "/api/trace/door/crossmodal-pf/1"
     deadline = time.monotonic() + 30.0
@@ -129,3 +135,15 @@ def trace_url(client: TestClient) -> str:
         assert time.monotonic() < deadline
     assert response.status_code == 200, response.text
     return url
+
+
+@pytest.fixture
+def trace_url(client: TestClient) -> str:
+    """URL of a trace that has been computed."""
+    return compute_trace(client)
+
+
+@pytest.fixture(scope="module")
+def shared_trace_url(shared_client: TestClient) -> str:
+    """URL of a trace on the shared server."""
+    return compute_trace(shared_client)

@@ -30,7 +30,7 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     page.until("() => !document.querySelector('#compare').hidden")
     assert [form.locator(f"[name={name}]").input_value() for name in ("from", "last")] == ["45", "55"]
     form.get_by_role("button", name="Compare").click()
-    assert "Nothing is edited yet" in form.locator(".error").text_content()
+    assert "Nothing is changed yet" in form.locator(".error").text_content()
     form.locator("[name=edit_faults]").select_option("blackout=0.8")
     form.get_by_role("button", name="Compare").click()
     page.until(READY)
@@ -69,7 +69,7 @@ def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
     assert [head for head in heads if head in both] == both
     assert page.page.locator("#compare [name=filter]").input_value() == "crossmodal-pf"
     page.page.locator("#compare .gain input").check()
-    page.until("() => document.querySelector('#maps-kind').textContent === 'Gain on crossmodal-pf'")
+    page.until("() => document.querySelector('#maps-kind').textContent === 'Gain over crossmodal-pf'")
     overflow = page.page.evaluate(
         "() => ['#compare', '#compare form', '#timeline .bar'].map((e) => document.querySelector(e))"
         ".map((e) => e.scrollWidth - e.clientWidth)"
@@ -77,7 +77,7 @@ def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
     assert max(overflow) <= 1
     page.picture("compare-filters")
     page.page.locator("#filter").select_option("crossmodal-pf")  # the two change places
-    page.until("() => document.querySelector('#maps-kind').textContent === 'Gain on crossmodal-ekf'")
+    page.until("() => document.querySelector('#maps-kind').textContent === 'Gain over crossmodal-ekf'")
     assert page.state["against"] == "filter=crossmodal-ekf"
     page.page.locator("#compare .clear").click()
     page.until("() => beliefscope.state().against === '' && !location.search.includes('against')")

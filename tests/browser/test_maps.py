@@ -132,13 +132,13 @@ def test_looks_are_in_the_address_and_a_pinned_moment_is_what_others_gain_on(
     assert all(text.endswith("gain 0.00 nats") for text in said)  # on itself
     page.page.keyboard.press("Shift+ArrowRight")
     page.settle(STEP + 10)
-    assert page.page.locator("#maps-kind").text_content() == f"Gain on step {STEP}"
+    assert page.page.locator("#maps-kind").text_content() == f"Gain over step {STEP}"
     said = page.page.locator("#heatmaps figcaption").all_text_contents()
     assert not any(text.endswith("gain 0.00 nats") for text in said)
     page.picture("maps-gain")
     page.until(f"() => location.search.includes('pin=') && location.search.includes('step={STEP + 10}')")
     again = open_page("?" + page.page.url.partition("?")[2])  # a link has the pinned moment, though nobody went there
-    again.until(f"() => document.querySelector('#maps-kind').textContent === 'Gain on step {STEP}'")
+    again.until(f"() => document.querySelector('#maps-kind').textContent === 'Gain over step {STEP}'")
     assert (again.state["pin"], again.state["step"]) == (page.state["pin"], STEP + 10)
     again.page.locator("#heatmaps canvas").first.hover()
     assert again.page.locator("#heatmaps figcaption").all_text_contents() == said

@@ -120,7 +120,9 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     image, haptics = 100 * column(page, "innovation")[44, :, 0]
     assert told(page, 2) == {"image": [near(image)], "haptics": [near(haptics)]}
     page.page.locator("#track").select_option("particles")
-    page.until("() => document.querySelector('#tracks .track-note')?.textContent.includes('a Gaussian belief and no particles')")
+    page.until(
+        "() => document.querySelector('#tracks .track-note')?.textContent.includes('a Gaussian belief and no particles')"
+    )
     page.until("() => location.search.includes('track=particles')")
     page.picture("timeline-why-not")
 

@@ -74,7 +74,7 @@ export function makeTrace(arrays, header = {}, images = null) {
       components: TASK.components,
       modalities: TASK.modalities,
       settings: {},
-      pictures: null,
+      image_size: null,
       nees_bounds: null,
       no_maps: null,
       columns,

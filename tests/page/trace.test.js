@@ -53,7 +53,7 @@ test('weights are shared by all components or separate', () => {
 
 test('a black image is a blackout', () => {
   const images = Uint8Array.from([0, 0, 0, 0, 0, 7, 0, 0]).buffer;
-  const trace = makeTrace(FUSION, { pictures: [2, 2] }, images);
+  const trace = makeTrace(FUSION, { image_size: [2, 2] }, images);
   assert.deepEqual([...trace.blackout], [1, 0]);
   assert.deepEqual([...(trace.image(1) ?? [])], [0, 7, 0, 0]);
 });
@@ -75,7 +75,7 @@ test('a live trace grows, and missing values are NaN', () => {
 });
 
 test('a block of a live run is decoded', () => {
-  const header = new TextEncoder().encode(JSON.stringify({ first: 3, steps: 1, pictures: 2 }));
+  const header = new TextEncoder().encode(JSON.stringify({ first: 3, steps: 1, image_bytes: 2 }));
   const padding = -header.length & 3;
   const message = new Uint8Array(4 + header.length + padding + 4 + 2);
   new DataView(message.buffer).setUint32(0, header.length, true);

@@ -81,12 +81,12 @@ class WrittenRecording(Reply):
 
 
 class ReportEntry(Reply):
-    """A report. made: ISO 8601. pdf: address of its PDF, or None."""
+    """A report. created: ISO 8601. pdf: address of its PDF, or None."""
 
     name: str
     url: str
     title: str
-    made: str
+    created: str
     task: str
     filter: str
     episode: int

@@ -111,7 +111,7 @@ class PhaseInfo(Reply):
     steps: int
     events: int
     share: Number
-    failures: Number
+    event_share: Number
     lift: Number
     p_value: Number
     inside: Number

@@ -17,7 +17,7 @@ class LiveState(Reply):
 
 
 class LiveRun(LiveState):
-    """A live run. expected: number of steps, if announced. started: s since 1970."""
+    """A live run. expected: number of steps, if announced. started: ISO 8601."""
 
     data: str
     task: str
@@ -25,7 +25,7 @@ class LiveRun(LiveState):
     faults: str
     steps: int
     expected: int | None
-    started: float
+    started: str
 
 
 class ListedLiveRun(LiveRun):
@@ -57,7 +57,7 @@ class TraceHeader(Reply):
     Attributes:
         weight_width: 0 for a filter without weights. settings: of the run.
         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
-        no_maps: why there are no likelihood maps, or None. pictures: height and width of the camera images, or None.
+        no_maps: why there are no likelihood maps, or None. image_size: height and width of the camera images, or None.
         scene: layers of its 3D scene. live: present while the trace is of a live run.
     """
 
@@ -76,7 +76,7 @@ class TraceHeader(Reply):
     settings: dict[str, Any]
     nees_bounds: tuple[float, float] | None
     no_maps: str | None
-    pictures: tuple[int, int] | None
+    image_size: tuple[int, int] | None
     columns: list[Column]
     scene: list[SceneLayer]
     live: LiveRun | None = None

@@ -80,10 +80,10 @@ def counterfactual(
         "task": checkpoint.task.name,
         "filter": checkpoint.name,
         "episode": index,
-        "edit": edit.to_json(),
         "seed": seed,
         "checkpoint_hash": checkpoint.hash,
         "data_hash": original.data_hash,
         **result.to_dict(),
+        "edit": edit.to_json(),
     }
     console.result(document, "\n\n".join([result.verdict, *console.grids(result.tables())]), json)

@@ -23,10 +23,10 @@ def faults(json: opt.Json = None) -> None:
     catalog = fault_catalog()
     lines = []
     for fault in catalog:
-        lines.append(f"{fault['fault']:<18}{fault['meaning']}")
+        lines.append(f"{fault['fault']:<20}{fault['meaning']}")
         for parameter in fault["parameters"][:-2]:
             name, default = parameter["name"], parameter["default"]
             usage = name if default is None else f"{name}={default}".removesuffix(".0")
-            lines.append(f"  {usage:<16}{parameter['unit']}: {parameter['meaning']}")
+            lines.append(f"  {usage:<18}{parameter['unit']}: {parameter['meaning']}")
     lines += ["", "Presets:", *(f"  {text:<30}{name}" for name, text in FAULT_PRESETS.items())]
     output.result({"faults": catalog, "presets": FAULT_PRESETS}, "\n".join(lines), json)

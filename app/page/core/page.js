@@ -15,12 +15,12 @@ import { Camera } from '../scene/camera.js';
 import { SceneFrame } from '../scene/scene_frame.js';
 import { SceneMenu } from '../scene/scene_menu.js';
 import { StepTable } from '../step/step_table.js';
-import { Compare } from '../tabs/comparison.js';
+import { ComparisonTab } from '../tabs/comparison.js';
 import { Diagnostics } from '../tabs/diagnostics.js';
 import { Failures } from '../tabs/failures.js';
 import { Finetune } from '../tabs/finetune.js';
 import { Live } from '../tabs/live_runs.js';
-import { Library } from '../tabs/recordings.js';
+import { Recordings } from '../tabs/recordings.js';
 import { Rerun } from '../tabs/rerun.js';
 import { Study } from '../tabs/study.js';
 import { Timeline } from '../timeline/timeline.js';
@@ -106,7 +106,7 @@ export class Page {
     );
     this.diagnostics = new Diagnostics(html('#diagnostics'), store, this.jobs);
     this.failures = new Failures(html('#failures'), store, this.jobs, this.timeline, catalog);
-    this.compare = new Compare(
+    this.compare = new ComparisonTab(
       html('#compare'),
       catalog,
       store,
@@ -116,8 +116,8 @@ export class Page {
     );
     this.finetune = new Finetune(html('#finetune'), catalog, store, this.jobs, faultDialog);
     this.study = new Study(html('#study'), catalog, store, this.failures, this.jobs);
-    this.live = new Live(document.body, catalog, store, this.#liveHandlers(refreshPickers), live);
-    this.recordings = new Library(html('#recordings'), catalog, store, this.jobs, this.rerun);
+    this.live = new Live(catalog, store, this.#liveHandlers(refreshPickers), live);
+    this.recordings = new Recordings(html('#recordings'), catalog, store, this.jobs, this.rerun);
     this.selectTab = tabBar(store);
     this.socket = new ViewSocket(
       this.#socketHandlers(),
@@ -192,7 +192,7 @@ export class Page {
         this.failures.show(trace);
       },
       listed: refreshPickers,
-      say: (/** @type {string} */ line) => this.#messages.show('live', line),
+      message: (/** @type {string} */ text) => this.#messages.show('live', text),
     };
   }
 
@@ -368,8 +368,8 @@ export class Page {
     this.failures.move(step);
     this.compare.move(step);
     this.rerun.move(step, origin === 'rerun');
-    const beside = state.beside === 'gain';
-    this.socket.move({ ...trace.selection, step, angle, against, beside }, inputTime);
+    const cursor = { ...trace.selection, step, angle, against };
+    this.socket.move({ ...cursor, comparison_maps: state.beside === 'gain' }, inputTime);
     showSummary(trace, step, state.component);
     showCount(trace, step);
   }

@@ -5,7 +5,7 @@ const CONTROLS =
   '#save, #report, #jobs li > button, .doing > button, #finetune .start, #finetune .decide > button, #study .cells > button';
 
 /**
- * Disables the controls below an element, and those that panels add or enable later.
+ * Disables the controls below an element, also when panels add or enable them later.
  * @param {HTMLElement} root
  */
 export function disableChanges(root) {

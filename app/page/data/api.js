@@ -171,7 +171,7 @@ export async function loadTrace(task, selection, progress, signal) {
   const buffer = async (part) => (await load(part)).arrayBuffer();
   const [columns, images] = await Promise.all([
     buffer('columns'),
-    header.pictures && buffer('images'),
+    header.image_size && buffer('images'),
   ]);
   return new Trace(task, selection, header, columns, images);
 }

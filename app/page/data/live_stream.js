@@ -90,7 +90,7 @@ export function decodeBlock(message) {
   const length = new DataView(message).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
   const start = 4 + Math.ceil(length / 4) * 4;
-  const { pictures: imageBytes, ...block } = header;
+  const { image_bytes: imageBytes, ...block } = header;
   const end = message.byteLength - imageBytes;
   return {
     ...block,

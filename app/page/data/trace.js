@@ -278,7 +278,7 @@ export class Trace {
    * @param {number} step
    */
   image(step) {
-    const [height, width] = this.header.pictures ?? [0, 0];
+    const [height, width] = this.header.image_size ?? [0, 0];
     return this.images && this.images.subarray(step * height * width, (step + 1) * height * width);
   }
 

@@ -197,7 +197,7 @@ export class MapPanel {
     const log = this.#store.state.scale === 'log';
     const kind = html('#maps-kind', this.#panel);
     kind.textContent = log ? 'Log-likelihood' : 'Likelihood';
-    if (reference) kind.textContent = `Gain on ${reference.name}`;
+    if (reference) kind.textContent = `Gain over ${reference.name}`;
     html('h2', this.#panel).title = this.#title();
     const quantity = html('#maps-of', this.#panel);
     quantity.hidden = Boolean(reference);

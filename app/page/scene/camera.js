@@ -23,8 +23,8 @@ export class Camera {
   show(trace) {
     this.#trace = trace;
     this.#figure.hidden = !trace.images;
-    if (!trace.header.pictures) return;
-    const [height, width] = trace.header.pictures;
+    if (!trace.header.image_size) return;
+    const [height, width] = trace.header.image_size;
     Object.assign(this.#context.canvas, { height, width });
     html('figcaption', this.#figure).textContent = `camera, ${width} × ${height}`;
   }

@@ -19,7 +19,7 @@ const LABELS = {
   contours: '2σ contours',
   particles: 'Particles',
   force: 'Contact force',
-  map: 'Likelihood map',
+  map: 'Likelihood',
   camera: 'Camera and its image',
 };
 /** Options of layers: a key of the state, and the label. @type {Partial<Record<SceneLayer, [string, string][]>>} */

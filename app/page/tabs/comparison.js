@@ -1,68 +1,84 @@
-/** The run that is shown beside another one: what differs, drawn over the time line and told in this panel. */
+/** The comparison run: drawn over the timeline, and compared with the current run in this panel. */
 
+/** @import { Store } from '../core/state.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Catalog, Comparison } from '../data/api.js' */
+/** @import { FaultDialog } from '../widgets/fault_dialog.js' */
+
+import { element, html, messageOf } from '../core/dom.js';
 import * as api from '../data/api.js';
-import { Edit } from './comparison_form.js';
 import { Figures } from '../widgets/figures.js';
 import { setPanelState } from '../widgets/panel_state.js';
+import { ComparisonForm } from './comparison_form.js';
 
-const NOTHING =
-  'Nothing to compare with yet. Choose another filter, other sensors or an edit over some steps, and run it beside this one.';
+const NO_COMPARISON =
+  'No comparison yet. Choose another filter, other sensor faults or an intervention over some steps, then compare.';
 
-export class Compare {
+export class ComparisonTab {
   #catalog;
   #store;
   #result;
   #figures;
   #form;
   #overlay;
+  /** @type {Trace | null} */
   #trace = null;
+  /** @type {Trace | null} */
   #other = null;
   #gain;
-  /** What the other run is called in a sentence; empty without one. */
+  #gainBox;
+  /** Name of the comparison run in a sentence; empty without one. */
   name = '';
   #loading = new AbortController();
   #open = false;
 
   /**
-   * @param {HTMLElement} host @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
-   * @param {import('../widgets/fault_dialog.js').FaultDialog} sheet
-   * @param {(other: import('../data/trace.js').Trace | null, label: string) => void} overlay is told of the other run as it comes and goes
+   * @param {HTMLElement} host
+   * @param {Catalog} catalog
+   * @param {Store} store
+   * @param {FaultDialog} dialog
+   * @param {(other: Trace | null, label: string) => void} overlay called when the comparison run changes
    */
-  constructor(host, catalog, store, sheet, overlay) {
-    [this.#catalog, this.#store, this.#overlay] = [catalog, store, overlay];
-    this.#result = host.querySelector('.result');
-    this.#gain = host.querySelector('.gain');
-    this.#gain.addEventListener('change', ({ target }) =>
-      store.set({ beside: target.checked ? 'gain' : 'alone' }),
+  constructor(host, catalog, store, dialog, overlay) {
+    this.#catalog = catalog;
+    this.#store = store;
+    this.#overlay = overlay;
+    this.#result = html('.result', host);
+    this.#gain = html('.gain', host);
+    this.#gainBox = element('input', HTMLInputElement, this.#gain);
+    this.#gainBox.addEventListener('change', () =>
+      store.set({ beside: this.#gainBox.checked ? 'gain' : 'alone' }),
     );
     store.listen((_, changed) => changed.has('beside') && this.#showGain());
-    this.#figures = new Figures(host.querySelector('.figures'), store);
-    this.#form = new Edit(host.querySelector('form'), catalog, store, sheet, (against) =>
+    this.#figures = new Figures(html('.figures', host), store);
+    const form = element('form', HTMLFormElement, host);
+    this.#form = new ComparisonForm(form, catalog, store, dialog, (against) =>
       api.checkSelection({ ...store.state, against }),
     );
     setPanelState(this.#result, 'loading', 'Loading …');
     this.#showGain();
   }
 
-  /** Whether the panel can be seen. */
-  set open(open) {
+  /** Whether the panel is visible. */
+  set open(/** @type {boolean} */ open) {
     this.#open = open;
     if (open && this.#trace) this.move(this.#store.state.step);
   }
 
-  /** @param {import('../data/trace.js').Trace} trace that the page shows */
+  /** @param {Trace} trace the current run */
   show(trace) {
     this.#trace = trace;
     this.choose();
   }
 
-  /** Another other run was chosen. */
+  /** Loads the comparison run of the state. */
   choose() {
     if (!this.#trace) return;
     this.#form.show(this.#trace);
-    this.#load();
+    this.#load(this.#trace);
   }
 
+  /** @param {number} step */
   move(step) {
     if (this.#open) this.#figures.move(step);
   }
@@ -71,63 +87,81 @@ export class Compare {
     this.#figures.redraw();
   }
 
-  /** An edit begins or ends at a step. @param {'from' | 'last'} end */
+  /**
+   * Sets the first or the last step of an intervention.
+   * @param {'from' | 'last'} end
+   * @param {number} step
+   */
   mark(end, step) {
     this.#form.mark(end, step);
   }
 
-  /** Loads the other run, and what is said of both. */
-  async #load() {
+  /** @param {Trace} trace */
+  async #load(trace) {
     const { against, task: name } = this.#store.state;
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
-    this.#draw(null, '');
+    this.#setOther(null, '');
     this.#show(null);
-    if (!against) return setPanelState(this.#result, 'empty', NOTHING);
-    const wait = (share) => setPanelState(this.#result, 'loading', 'Running the other one …', share);
-    wait(null);
+    if (!against) return setPanelState(this.#result, 'empty', NO_COMPARISON);
+    const progress = (/** @type {number | null} */ share) =>
+      setPanelState(this.#result, 'loading', 'Computing the comparison run …', share);
+    progress(null);
     try {
-      const task = this.#catalog.tasks.find((t) => t.name === name);
-      const selection = { ...this.#trace.selection, against };
-      const other = await api.loadTrace(task, selection, wait, signal);
-      const found = await api.comparison(selection, signal);
-      this.#draw(other, found.names[1], found.edit ? 'the edited run' : found.names[1]);
-      this.#show(found);
+      const task = this.#catalog.tasks.find((t) => t.name === name) ?? this.#catalog.tasks[0];
+      const selection = { ...trace.selection, against };
+      const other = await api.loadTrace(task, selection, progress, signal);
+      const result = await api.comparison(selection, signal);
+      const label = result.names[1];
+      this.#setOther(other, label, result.edit ? 'the run with the intervention' : label);
+      this.#show(result);
       setPanelState(this.#result, 'ready');
     } catch (error) {
-      if (error.name === 'AbortError') return;
+      if (error instanceof Error && error.name === 'AbortError') return;
       if (!(error instanceof api.ServerError)) console.error(error);
-      setPanelState(this.#result, 'error', error.message);
+      setPanelState(this.#result, 'error', messageOf(error));
     }
   }
 
-  #draw(other, label, name = label) {
+  /**
+   * @param {Trace | null} other
+   * @param {string} label
+   * @param {string} [name]
+   */
+  #setOther(other, label, name = label) {
     if (other === this.#other) return;
-    [this.#other, this.name] = [other, name];
+    this.#other = other;
+    this.name = name;
     this.#overlay(other, label);
     this.#showGain();
   }
 
-  /** Whether the maps show what they gain on the other run's, or why they cannot. */
+  /** Shows whether the maps display the difference of the two runs, or why they cannot. */
   #showGain() {
-    const [box, text] = this.#gain.children;
-    const none = this.#other && whyNoGain(this.#trace, this.#other);
+    const reason = this.#trace && this.#other && noGainReason(this.#trace, this.#other);
     this.#gain.hidden = !this.#other;
-    [box.checked, box.disabled] = [this.#store.state.beside === 'gain' && !none, Boolean(none)];
-    text.textContent = none ?? `In the maps, show what this run gains on ${this.name}`;
+    this.#gainBox.checked = this.#store.state.beside === 'gain' && !reason;
+    this.#gainBox.disabled = Boolean(reason);
+    html('span', this.#gain).textContent =
+      reason ?? `In the maps, show the difference from ${this.name}`;
   }
 
-  #show(found) {
-    this.#result.querySelector('.verdict').textContent = found?.verdict ?? '';
-    this.#figures.show(found, this.#trace);
+  /** @param {Comparison | null} result */
+  #show(result) {
+    html('.verdict', this.#result).textContent = result?.verdict ?? '';
+    this.#figures.show(result, this.#trace);
     if (this.#open) this.#figures.move(this.#store.state.step);
   }
 }
 
-/** Why the maps of two runs cannot be set against each other, in a line; null where they can. */
-function whyNoGain(trace, other) {
-  if (trace.header.no_maps || other.header.no_maps)
-    return `No gain in the maps: ${trace.header.no_maps ?? other.header.no_maps}.`;
+/**
+ * Returns why the maps of two runs cannot be subtracted; null if they can.
+ * @param {Trace} trace
+ * @param {Trace} other
+ */
+function noGainReason(trace, other) {
+  const noMaps = trace.header.no_maps ?? other.header.no_maps;
+  if (noMaps) return `No difference in the maps: ${noMaps}.`;
   if (trace.modalities.join() === other.modalities.join()) return null;
-  return 'No gain in the maps: the runs do not have the same modalities.';
+  return 'No difference in the maps: the runs have different modalities.';
 }

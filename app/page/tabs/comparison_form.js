@@ -1,284 +1,319 @@
-/** The form that says what the other run is: another filter, other sensors, or an edit of this run over some steps. */
+/** Form for the comparison run: another filter, other sensor faults, or an intervention over some steps of this run. */
 
-import { choice } from '../widgets/pickers.js';
+/** @import { Store } from '../core/state.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Catalog } from '../types/server.js' */
+/** @import { FaultDialog } from '../widgets/fault_dialog.js' */
+
+import { create, element, html } from '../core/dom.js';
+import { fixed } from '../core/units.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
-import { fixed, sentence } from '../core/units.js';
+import { choice } from '../widgets/pickers.js';
 
+/** @typedef {'filter' | 'faults' | 'edit'} Kind of comparison */
+
+/** @type {[Kind, string][]} */
 const KINDS = [
   ['filter', 'another filter'],
-  ['faults', 'other sensors'],
-  ['edit', 'an edit of some steps'],
+  ['faults', 'other sensor faults'],
+  ['edit', 'an intervention'],
 ];
-const FIRST_SPAN = 20; // steps of an edit, until somebody chooses others
+const DEFAULT_SPAN = 20; // steps of an intervention
 
-/** `a=1&b=2`, as an address has it, with as few signs escaped as can be. */
+/**
+ * Joins pairs to `a=1&b=2`, with as few escaped characters as possible.
+ * @param {[string, string | number][]} pairs
+ */
 const joined = (pairs) =>
   pairs
     .map(([key, value]) => `${key}=${String(value).replace(/[%&+#]/g, encodeURIComponent)}`)
     .join('&');
 
-/** What an other run is: `filter`, `faults` or `edit`. @param {string} against as in the state */
-const kindOf = (against) => {
-  const asked = new URLSearchParams(against);
-  return asked.has('from')
-    ? 'edit'
-    : asked.has('faults') && !asked.has('filter')
-      ? 'faults'
-      : 'filter';
-};
+/**
+ * Returns the kind of a comparison.
+ * @param {URLSearchParams} against
+ * @returns {Kind}
+ */
+function kindOf(against) {
+  if (against.has('from')) return 'edit';
+  return against.has('faults') && !against.has('filter') ? 'faults' : 'filter';
+}
 
-export class Edit {
+export class ComparisonForm {
   #form;
   #store;
   #catalog;
+  #filter;
+  #first;
+  #last;
+  #clearButton;
+  /** @type {Trace | null} */
   #trace = null;
+  /** @type {Kind} */
   #kind = 'filter';
   #faults = '';
   #editFaults = '';
-  /** @type {Map<string, number>} modality to beta, those set by hand, the newest last */
-  #held = new Map();
+  /** Weights beta that the user has set, by modality, the newest last. @type {Map<string, number>} */
+  #manual = new Map();
   #showFaults;
   #showEditFaults;
 
   /**
-   * @param {HTMLFormElement} form @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
-   * @param {import('../widgets/fault_dialog.js').FaultDialog} sheet
-   * @param {(against: string) => Promise<unknown>} check raises what is wrong with an other run
+   * @param {HTMLFormElement} form
+   * @param {Catalog} catalog
+   * @param {Store} store
+   * @param {FaultDialog} dialog
+   * @param {(against: string) => Promise<unknown>} check throws the reason if a comparison is invalid
    */
-  constructor(form, catalog, store, sheet, check) {
-    [this.#form, this.#catalog, this.#store] = [form, catalog, store];
-    const pick = (name, set, of) =>
-      faultPicker(form.elements[name], sheet, {
-        ...of,
-        choose: (faults) => (set(faults), this.#tell('')),
-      });
-    this.#showFaults = pick('faults', (faults) => (this.#faults = faults), {
+  constructor(form, catalog, store, dialog, check) {
+    this.#form = form;
+    this.#catalog = catalog;
+    this.#store = store;
+    this.#filter = element('[name=filter]', HTMLSelectElement, form);
+    this.#first = element('[name=from]', HTMLInputElement, form);
+    this.#last = element('[name=last]', HTMLInputElement, form);
+    this.#clearButton = element('.clear', HTMLButtonElement, form);
+    this.#showFaults = faultPicker(element('[name=faults]', HTMLSelectElement, form), dialog, {
       none: 'as recorded',
-      chosen: () => this.#faults,
-      check: (faults) => faults && check(joined([['faults', faults]])),
+      selected: () => this.#faults,
+      choose: (faults) => ((this.#faults = faults), this.#setError('')),
+      check: async (faults) => faults && check(joined([['faults', faults]])),
     });
-    this.#showEditFaults = pick('edit_faults', (faults) => (this.#editFaults = faults), {
-      none: 'as they are',
-      chosen: () => this.#editFaults,
-      check: (faults) => faults && check(joined([...this.#span, ['faults', faults]])),
+    const editSelect = element('[name=edit_faults]', HTMLSelectElement, form);
+    this.#showEditFaults = faultPicker(editSelect, dialog, {
+      none: 'unchanged',
+      selected: () => this.#editFaults,
+      choose: (faults) => ((this.#editFaults = faults), this.#setError('')),
+      check: async (faults) => faults && check(joined([...this.#span, ['faults', faults]])),
     });
-    form.addEventListener('submit', (event) => (event.preventDefault(), this.#run()));
-    form.addEventListener('input', () => this.#tell(''));
-    form.querySelector('.clear').addEventListener('click', () => store.set({ against: '' }));
-    form
-      .querySelector('.release')
-      .addEventListener('click', () => (this.#held.clear(), this.#showBetas()));
-    for (const name of ['from', 'last'])
-      form.elements[name].addEventListener('change', () => this.#showBetas());
+    form.addEventListener('submit', (event) => (event.preventDefault(), this.#submit()));
+    form.addEventListener('input', () => this.#setError(''));
+    this.#clearButton.addEventListener('click', () => store.set({ against: '' }));
+    html('.release', form).addEventListener('click', () => {
+      this.#manual.clear();
+      this.#showBetas();
+    });
+    for (const input of [this.#first, this.#last])
+      input.addEventListener('change', () => this.#showBetas());
   }
 
-  /** Another trace, or another other run, from a link or undone: the form says what is so. @param {import('../data/trace.js').Trace} trace */
+  /**
+   * Shows the comparison of the state for a trace.
+   * @param {Trace} trace
+   */
   show(trace) {
-    const fresh = !this.#trace || this.#trace.steps !== trace.steps;
+    const isNew = this.#trace?.steps !== trace.steps;
     this.#trace = trace;
-    const { against, filter, task: name } = this.#store.state;
+    const { against, filter, task: name, step } = this.#store.state;
     const task = this.#catalog.tasks.find((t) => t.name === name);
-    const others = task.filters.filter((f) => f.name !== filter).map((f) => f.name);
-    const fields = this.#form.elements;
-    fields.filter.replaceChildren(...others.map((other) => new Option(other, other)));
-    for (const field of ['from', 'last']) fields[field].max = String(trace.steps - 1);
-    if (fresh) this.#setSpan(this.#store.state.step, this.#store.state.step + FIRST_SPAN - 1);
-    for (const held of this.#held.keys())
-      if (!trace.modalities.includes(held)) this.#held.delete(held);
-    if (against) this.#read(against);
+    const others = (task?.filters ?? []).map((f) => f.name).filter((other) => other !== filter);
+    this.#filter.replaceChildren(...others.map((other) => new Option(other, other)));
+    for (const input of [this.#first, this.#last]) input.max = String(trace.steps - 1);
+    if (isNew) this.#setSpan(step, step + DEFAULT_SPAN - 1);
+    for (const modality of this.#manual.keys())
+      if (!trace.modalities.includes(modality)) this.#manual.delete(modality);
+    if (against) this.#read(new URLSearchParams(against));
     else if (!others.length && this.#kind === 'filter') this.#kind = 'edit';
-    this.#form.querySelector('.clear').disabled = !against;
-    this.#showFaults(task.fault_presets);
-    this.#showEditFaults(task.fault_presets);
-    this.#buildBetas();
-    this.#showKind(others);
+    this.#clearButton.disabled = !against;
+    this.#showFaults(task?.fault_presets ?? []);
+    this.#showEditFaults(task?.fault_presets ?? []);
+    this.#buildBetas(trace);
+    this.#showKind();
   }
 
-  /** One end of the edit is here, the form shows edits. @param {'from' | 'last'} end */
+  /**
+   * Sets the first or the last step of an intervention.
+   * @param {'from' | 'last'} end
+   * @param {number} step
+   */
   mark(end, step) {
     if (!this.#trace) return;
-    const at = { from: this.#step('from'), last: this.#step('last'), [end]: step };
-    if (at.from > at.last)
-      at[end === 'from' ? 'last' : 'from'] =
-        end === 'from' ? step + FIRST_SPAN - 1 : Math.max(0, step - FIRST_SPAN + 1);
-    this.#setSpan(at.from, at.last);
+    let [first, last] = [this.#first.valueAsNumber, this.#last.valueAsNumber];
+    if (end === 'from') [first, last] = [step, last < step ? step + DEFAULT_SPAN - 1 : last];
+    else [first, last] = [first > step ? Math.max(0, step - DEFAULT_SPAN + 1) : first, step];
+    this.#setSpan(first, last);
     this.#kind = 'edit';
     this.#showKind();
     this.#showBetas();
   }
 
-  /** What the state says, into the fields. */
+  /**
+   * Fills the fields.
+   * @param {URLSearchParams} against
+   */
   #read(against) {
-    const asked = new URLSearchParams(against);
     this.#kind = kindOf(against);
-    const { filter } = this.#form.elements;
-    if ([...filter.options].some(({ value }) => value === asked.get('filter')))
-      filter.value = asked.get('filter');
-    if (this.#kind === 'faults') this.#faults = asked.get('faults');
+    const filter = against.get('filter') ?? '';
+    if ([...this.#filter.options].some(({ value }) => value === filter))
+      this.#filter.value = filter;
+    if (this.#kind === 'faults') this.#faults = against.get('faults') ?? '';
     if (this.#kind !== 'edit') return;
-    this.#setSpan(Number(asked.get('from')), Number(asked.get('to')) - 1);
-    this.#editFaults = asked.get('faults') ?? '';
-    const pairs = (asked.get('weights') ?? '')
-      .split(',')
-      .filter(Boolean)
-      .map((part) => part.split('='));
-    this.#held = new Map(pairs.map(([name, beta]) => [name, Number(beta)]));
+    this.#setSpan(Number(against.get('from')), Number(against.get('to')) - 1);
+    this.#editFaults = against.get('faults') ?? '';
+    const weights = (against.get('weights') ?? '').split(',').filter(Boolean);
+    this.#manual = new Map(
+      weights.map((part) => {
+        const [modality, beta] = part.split('=');
+        return [modality, Number(beta)];
+      }),
+    );
   }
 
+  /** @returns {[string, number][]} */
   get #span() {
     return [
-      ['from', this.#step('from')],
-      ['to', this.#step('last') + 1],
+      ['from', this.#first.valueAsNumber],
+      ['to', this.#last.valueAsNumber + 1],
     ];
   }
 
-  #step(field) {
-    return this.#form.elements[field].valueAsNumber;
+  /**
+   * @param {number} first
+   * @param {number} last
+   */
+  #setSpan(first, last) {
+    const maximum = (this.#trace?.steps ?? 1) - 1;
+    this.#first.value = String(Math.min(first, maximum));
+    this.#last.value = String(Math.min(last, maximum));
   }
 
-  #setSpan(from, last) {
-    const most = this.#trace.steps - 1;
-    this.#form.elements.from.value = String(Math.min(from, most));
-    this.#form.elements.last.value = String(Math.min(last, most));
-  }
-
-  #run() {
-    const against = this.#text();
+  #submit() {
+    const against = this.#against();
     if (against) this.#store.set({ against, playing: false });
   }
 
-  /** The other run as the fields have it; empty, with the reason said, where they have none. */
-  #text() {
-    const { filter, from, last } = this.#form.elements;
-    if (this.#kind === 'filter')
-      return filter.value
-        ? joined([['filter', filter.value]])
-        : this.#tell('There is no other filter of this task.');
+  /** Returns the comparison in the fields; if it is incomplete, shows the reason and returns an empty text. */
+  #against() {
+    if (this.#kind === 'filter') {
+      const { value } = this.#filter;
+      return value ? joined([['filter', value]]) : this.#setError('This task has no other filter.');
+    }
     if (this.#kind === 'faults') {
       return this.#faults === this.#store.state.faults
-        ? this.#tell('This run has these sensors. Choose others.')
+        ? this.#setError('This run has these sensor faults already. Choose others.')
         : joined([['faults', this.#faults]]);
     }
-    if (!(from.valueAsNumber <= last.valueAsNumber))
-      return this.#tell('The last step of the edit comes before its first.');
-    const weights = [...this.#held].map(([name, beta]) => `${name}=${beta}`).join(',');
-    if (!this.#editFaults && !weights)
-      return this.#tell(
-        'Nothing is edited yet: choose how the sensors are broken, or move a weight.',
-      );
-    return joined([
-      ...this.#span,
-      ...(this.#editFaults ? [['faults', this.#editFaults]] : []),
-      ...(weights ? [['weights', weights]] : []),
-    ]);
+    if (!(this.#first.valueAsNumber <= this.#last.valueAsNumber))
+      return this.#setError('The last step of the intervention is before its first step.');
+    const weights = [...this.#manual].map(([name, beta]) => `${name}=${beta}`).join(',');
+    const pairs = this.#span.map(
+      ([key, value]) => /** @type {[string, string]} */ ([key, `${value}`]),
+    );
+    if (this.#editFaults) pairs.push(['faults', this.#editFaults]);
+    if (weights) pairs.push(['weights', weights]);
+    return pairs.length > 2
+      ? joined(pairs)
+      : this.#setError('Nothing is changed yet: choose sensor faults, or move a weight.');
   }
 
-  #tell(line) {
-    this.#form.querySelector('.error').textContent = line;
+  /** @param {string} message */
+  #setError(message) {
+    html('.error', this.#form).textContent = message;
     return '';
   }
 
-  #showKind(others = [...this.#form.elements.filter.options]) {
-    choice(
-      this.#form.querySelector('#against-kind'),
-      KINDS,
-      this.#kind,
-      (kind) => ((this.#kind = kind), this.#showParts()),
-    );
-    this.#form.querySelector('[data-kind="filter"] .why-not').textContent = others.length
+  #showKind() {
+    const hasOthers = this.#filter.options.length > 0;
+    choice(html('#against-kind', this.#form), KINDS, this.#kind, (kind) => {
+      this.#kind = KINDS.find(([value]) => value === kind)?.[0] ?? 'filter';
+      this.#showFields();
+    });
+    html('[data-kind="filter"] .why-not', this.#form).textContent = hasOthers
       ? ''
-      : 'There is no other filter of this task: give one to the server with --filter.';
-    this.#form.elements.filter.disabled = !others.length;
-    this.#showParts();
+      : 'This task has no other filter. Start the server with --filter to add one.';
+    this.#filter.disabled = !hasOthers;
+    this.#showFields();
   }
 
-  #showParts() {
-    this.#tell('');
-    for (const part of this.#form.querySelectorAll('[data-kind]'))
-      part.hidden = part.dataset.kind !== this.#kind;
-    const external = this.#trace.header.kind === 'external';
-    const refused =
-      external &&
-      `${this.#trace.header.filter} is a filter from outside, whose steps cannot be taken again one by one: it cannot be edited.`;
-    this.#form.querySelector('[data-kind="edit"] > .why-not').textContent = refused
-      ? sentence(refused)
+  #showFields() {
+    this.#setError('');
+    /** @type {NodeListOf<HTMLElement>} */
+    const parts = this.#form.querySelectorAll('[data-kind]');
+    for (const part of parts) part.hidden = part.dataset.kind !== this.#kind;
+    const isExternal = this.#trace?.header.kind === 'external';
+    html('[data-kind="edit"] > .why-not', this.#form).textContent = isExternal
+      ? 'Interventions are not possible: an external filter cannot be resumed at a step.'
       : '';
-    this.#form.querySelector('.betas').hidden = external;
-    for (const field of this.#form.querySelectorAll('[data-kind="edit"] :is(input, select)'))
-      field.disabled = external;
-    this.#form.querySelector('.run').disabled =
-      (this.#kind === 'edit' && external) ||
-      (this.#kind === 'filter' && this.#form.elements.filter.disabled);
+    html('.betas', this.#form).hidden = isExternal;
+    const fields = this.#form.querySelectorAll('[data-kind="edit"] :is(input, select)');
+    for (const field of fields) field.toggleAttribute('disabled', isExternal);
+    element('.run', HTMLButtonElement, this.#form).disabled =
+      (this.#kind === 'edit' && isExternal) || (this.#kind === 'filter' && this.#filter.disabled);
   }
 
-  /** A slider for each modality, where the filter weighs them by beta. */
-  #buildBetas() {
-    const trace = this.#trace;
-    const weighed = trace.has('weights') && trace.header.kind !== 'external';
-    this.#form.querySelector('.betas .why-not').textContent =
-      weighed || trace.header.kind === 'external'
-        ? ''
-        : `${sentence(trace.header.filter).slice(0, -1)} weighs nothing by beta, so there is none to set.`;
-    if (!weighed) this.#held.clear();
-    this.#form.querySelector('.sliders').replaceChildren(
-      ...(weighed ? trace.modalities : []).map((name) => {
-        const label = document.createElement('label');
-        const input = Object.assign(document.createElement('input'), {
-          type: 'range',
-          min: '0',
-          max: '1',
-          step: '0.01',
-        });
-        input.dataset.modality = name;
-        input.addEventListener('input', () => this.#hold(name, input.valueAsNumber));
-        label.append(`β ${name}`, input, document.createElement('output'));
-        return label;
-      }),
-    );
+  /**
+   * Creates a slider for each modality if the filter has fusion weights.
+   * @param {Trace} trace
+   */
+  #buildBetas(trace) {
+    const isExternal = trace.header.kind === 'external';
+    const hasWeights = trace.has('weights') && !isExternal;
+    html('.betas .why-not', this.#form).textContent =
+      hasWeights || isExternal ? '' : `${trace.header.filter} has no fusion weights to set.`;
+    if (!hasWeights) this.#manual.clear();
+    const sliders = (hasWeights ? trace.modalities : []).map((name) => {
+      const input = create('input', { type: 'range', min: '0', max: '1', step: '0.01' });
+      input.dataset.modality = name;
+      input.addEventListener('input', () => this.#setBeta(name, input.valueAsNumber));
+      return create('label', {}, `β ${name}`, input, document.createElement('output'));
+    });
+    html('.sliders', this.#form).replaceChildren(...sliders);
     this.#showBetas();
   }
 
-  /** A weight set by hand. One modality is always left to take the rest; no sum is above one. */
-  #hold(name, beta) {
-    this.#held.delete(name);
-    if (this.#held.size === this.#trace.modalities.length - 1)
-      this.#held.delete(this.#held.keys().next().value);
-    const others = [...this.#held.values()].reduce((a, b) => a + b, 0);
-    this.#held.set(name, Number(Math.min(beta, 1 - others).toFixed(2)));
+  /**
+   * Sets a weight. One modality always remains for the rest, and the sum is at most 1.
+   * @param {string} modality
+   * @param {number} beta
+   */
+  #setBeta(modality, beta) {
+    this.#manual.delete(modality);
+    const [oldest] = this.#manual.keys();
+    if (this.#manual.size === (this.#trace?.modalities.length ?? 0) - 1)
+      this.#manual.delete(oldest);
+    this.#manual.set(modality, Number(Math.min(beta, 1 - sum(this.#manual.values())).toFixed(2)));
     this.#showBetas();
   }
 
-  /** Those by hand; the others share the rest as the network would have it, on average over the steps. */
+  /** Shows the weights; the remainder is divided in the ratio of the network's mean weights. */
   #showBetas() {
-    const sliders = [...this.#form.querySelectorAll('.sliders input')];
-    const rest = 1 - [...this.#held.values()].reduce((a, b) => a + b, 0);
-    const usual = new Map(
-      sliders.map(({ dataset: { modality } }) => [modality, this.#usual(modality)]),
+    const sliders = html('.sliders', this.#form).querySelectorAll('input');
+    const remainder = 1 - sum(this.#manual.values());
+    const means = new Map(
+      [...sliders].map(({ dataset }) => this.#meanBeta(dataset.modality ?? '')),
     );
-    const free = [...usual]
-      .filter(([name]) => !this.#held.has(name))
-      .reduce((sum, [, beta]) => sum + beta, 0);
+    const total = sum([...means].flatMap(([name, beta]) => (this.#manual.has(name) ? [] : [beta])));
     for (const input of sliders) {
-      const { modality } = input.dataset;
-      const held = this.#held.has(modality);
-      const beta = held
-        ? this.#held.get(modality)
-        : free > 0
-          ? (rest * usual.get(modality)) / free
-          : 0;
-      if (document.activeElement !== input || held) input.value = String(beta);
-      input.parentElement.classList.toggle('held', held);
-      input.parentElement.querySelector('output').textContent =
-        `${fixed(beta, 2)} ${held ? 'by hand' : this.#held.size ? 'the rest' : 'the network’s'}`;
+      const modality = input.dataset.modality ?? '';
+      const manual = this.#manual.get(modality);
+      const isManual = manual !== undefined;
+      const automatic = total > 0 ? (remainder * (means.get(modality) ?? 0)) / total : 0;
+      const beta = manual ?? automatic;
+      if (document.activeElement !== input || isManual) input.value = String(beta);
+      const label = input.parentElement;
+      if (!label) continue;
+      label.classList.toggle('held', isManual);
+      const origin = isManual ? 'manual' : this.#manual.size ? 'remainder' : 'network';
+      html('output', label).textContent = `${fixed(beta, 2)} ${origin}`;
     }
-    this.#form.querySelector('.release').hidden = !this.#held.size;
+    html('.release', this.#form).hidden = !this.#manual.size;
   }
 
-  /** Mean of the network's beta over the edited steps, first component. */
-  #usual(modality) {
-    const beta = this.#trace
-      .weight('raw', modality, 0)
-      .slice(this.#step('from') || 0, (this.#step('last') || 0) + 1);
-    return beta.length ? beta.reduce((a, b) => a + b, 0) / beta.length : 0;
+  /**
+   * Returns a modality and the mean of its weight over the edited steps, for the first component.
+   * @param {string} modality
+   * @returns {[string, number]}
+   */
+  #meanBeta(modality) {
+    const [first, last] = [this.#first.valueAsNumber || 0, this.#last.valueAsNumber || 0];
+    const beta = this.#trace?.weight('raw', modality, 0)?.slice(first, last + 1) ?? [];
+    return [modality, beta.length ? sum(beta) / beta.length : 0];
   }
+}
+
+/** @param {Iterable<number>} values */
+function sum(values) {
+  let total = 0;
+  for (const value of values) total += value;
+  return total;
 }

@@ -1,68 +1,93 @@
-/** The diagnostics of what is shown: all of them with what they say, or one with its figures; slow ones as jobs. */
+/** Diagnostics of the current run or of all held-out episodes: a list with their verdicts, or one with its figures. */
 
+/** @import { Store } from '../core/state.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { DiagnosticResult, Job, TraceDiagnosticInfo } from '../types/server.js' */
+/** @import { Jobs, Pending } from '../widgets/jobs.js' */
+
+import { create, element, html, messageOf } from '../core/dom.js';
+import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
-import { pending, jobSummary, isActive } from '../widgets/jobs.js';
+import { isActive, jobState, jobSummary, pending } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
-import { sentence } from '../core/units.js';
 
+/**
+ * Result of a diagnostic with its options, or why there is none.
+ * @typedef {Pending<DiagnosticResult> | {state: 'loading', job?: undefined} | {state: 'error' | 'refused', error: string, job?: undefined}} Result
+ */
+
+/** @type {[string, string][]} */
 const OVER = [
   ['episode', 'this episode'],
   ['held-out', 'all held-out'],
 ];
-const KEPT = 48; // results
-
-/**
- * @typedef {object} Result what is known of one diagnostic, with one choice of options, of one trace or of all held out
- * @property {'loading' | 'ready' | 'absent' | 'active' | 'ended' | 'error'} state
- * @property {api.DiagnosticResult} [found] @property {api.Job} [job] @property {string} [error]
- */
+const MAX_RESULTS = 48;
+/** Labels of the button by state. @type {Partial<Record<Result['state'], string>>} */
+const ACTIONS = { absent: 'Compute', ended: 'Try again', active: 'Cancel' };
 
 export class Diagnostics {
   #host;
   #store;
   #jobs;
   #figures;
+  #list;
+  #article;
+  #form;
+  #backButton;
+  /** @type {Trace | null} */
   #trace = null;
-  #entries = null;
+  /** @type {TraceDiagnosticInfo[]} */
+  #entries = [];
+  /** @type {Map<string, HTMLElement>} */
   #rows = new Map();
   /** @type {Map<string, Result>} */
   #results = new Map();
   #loading = new AbortController();
   #open = false;
-  #stale = true; // whether what is shown is of another trace
+  #stale = true; // whether the entries are those of another trace
 
-  /** @param {HTMLElement} host @param {import('../core/state.js').Store} store @param {import('../widgets/jobs.js').Jobs} jobs */
+  /**
+   * @param {HTMLElement} host
+   * @param {Store} store
+   * @param {Jobs} jobs
+   */
   constructor(host, store, jobs) {
-    [this.#host, this.#store, this.#jobs] = [host, store, jobs];
-    this.#figures = new Figures(host.querySelector('.figures'), store);
-    host.querySelector('#all-diagnostics').addEventListener('click', () => {
-      const { diagnostic } = store.state;
+    this.#host = host;
+    this.#store = store;
+    this.#jobs = jobs;
+    this.#figures = new Figures(html('.figures', host), store);
+    this.#list = html('.list', host);
+    this.#article = html('article', host);
+    this.#form = element('form', HTMLFormElement, host);
+    this.#backButton = html('#all-diagnostics', host);
+    this.#backButton.addEventListener('click', () => {
+      const row = this.#rows.get(store.state.diagnostic);
       store.set({ diagnostic: '', options: '' });
       store.flush();
-      this.#rows.get(diagnostic)?.querySelector('.title').focus();
+      if (row) html('.title', row).focus();
     });
-    host
-      .querySelector('form')
-      .addEventListener('submit', (event) => (event.preventDefault(), this.#takeOptions()));
-    host.querySelector('form').addEventListener('change', () => this.#takeOptions());
-    jobs.listen((list) => this.#hear(list));
+    this.#form.addEventListener('submit', (event) => (event.preventDefault(), this.#setOptions()));
+    this.#form.addEventListener('change', () => this.#setOptions());
+    jobs.listen((list) => this.#updateJobs(list));
     setPanelState(host, 'loading', 'Loading …');
   }
 
-  /** Whether the panel can be seen: nothing is asked for before. */
-  set open(open) {
+  /** Whether the panel is visible; nothing is requested before. */
+  set open(/** @type {boolean} */ open) {
     this.#open = open;
     if (open) this.#load();
   }
 
-  /** @param {import('../data/trace.js').Trace} trace */
+  /** @param {Trace} trace */
   show(trace) {
-    [this.#trace, this.#stale] = [trace, true];
+    this.#trace = trace;
+    this.#stale = true;
     this.#load();
   }
 
+  /** @param {number} step */
   move(step) {
     if (this.#open && this.#store.state.diagnostic) this.#figures.move(step);
   }
@@ -71,108 +96,126 @@ export class Diagnostics {
     this.#figures.redraw();
   }
 
-  /** Another diagnostic was opened, or what they are made over was changed. */
+  /** Shows the diagnostic, options and episodes of the state. */
   choose() {
-    if (!this.#entries || !this.#open || this.#stale) return;
-    this.#showOpen();
-    this.#ask();
+    if (!this.#open || this.#stale) return;
+    this.#showSelected();
+    this.#request();
   }
 
   async #load() {
-    if (!this.#open || !this.#trace || !this.#stale) return;
+    const trace = this.#trace;
+    if (!this.#open || !trace || !this.#stale) return;
     this.#loading.abort();
     this.#loading = new AbortController();
-    const trace = this.#trace;
-    if (trace.live?.state === 'running')
-      return setPanelState(
-        this.#host,
-        'empty',
-        'The run goes on. Diagnostics are made of all its steps once it has ended, and show here by themselves.',
-      );
+    if (trace.live?.state === 'running') {
+      const text = 'The run is still active. Its diagnostics are computed when it has ended.';
+      return setPanelState(this.#host, 'empty', text);
+    }
     try {
       this.#entries = await api.diagnostics(trace.selection, this.#loading.signal);
     } catch (error) {
-      if (error.name !== 'AbortError') setPanelState(this.#host, 'error', error.message);
+      if (!isAbort(error)) setPanelState(this.#host, 'error', messageOf(error));
       return;
     }
     this.#stale = false;
-    setPanelState(this.#host, this.#entries.length ? 'ready' : 'empty', 'There are no diagnostics.');
-    this.#build();
-    this.#showOpen();
-    this.#ask();
+    setPanelState(
+      this.#host,
+      this.#entries.length ? 'ready' : 'empty',
+      'There are no diagnostics.',
+    );
+    this.#buildRows();
+    this.#showSelected();
+    this.#request();
   }
 
-  /** Asks for what is seen: the open one, or each in turn. */
-  async #ask() {
+  /** Requests the selected diagnostic, or one after the other. */
+  async #request() {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
-    const open = this.#opened;
-    for (const entry of open ? [open] : this.#entries) {
-      if (!entry.why_not) await this.#askFor(entry, signal);
+    const selected = this.#selected;
+    for (const entry of selected ? [selected] : this.#entries) {
+      if (!entry.why_not) await this.#requestEntry(entry, signal);
       if (signal.aborted) return;
     }
   }
 
-  async #askFor(entry, signal) {
+  /**
+   * @param {TraceDiagnosticInfo} entry
+   * @param {AbortSignal} signal
+   */
+  async #requestEntry(entry, signal) {
+    const trace = this.#trace;
+    if (!trace) return;
     const key = this.#key(entry);
     if (this.#results.get(key)?.state === 'ready') return this.#draw(entry);
-    if (!this.#results.has(key)) this.#keep(key, { state: 'loading' });
+    if (!this.#results.has(key)) this.#setResult(key, { state: 'loading' });
     this.#draw(entry);
     try {
-      const body = await api.diagnostic(
-        this.#trace.selection,
-        entry.name,
-        this.#query(entry),
-        signal,
-      );
-      this.#keep(key, pending(body));
+      const query = this.#query(entry);
+      const body = await api.diagnostic(trace.selection, entry.name, query, signal);
+      this.#setResult(key, pending(body));
     } catch (error) {
-      if (error.name === 'AbortError') return;
-      this.#keep(key, { state: 'error', error: error.message });
+      if (isAbort(error)) return;
+      this.#setResult(key, { state: 'error', error: messageOf(error) });
     }
     this.#draw(entry);
   }
 
+  /** @param {TraceDiagnosticInfo} entry */
   async #compute(entry) {
+    const trace = this.#trace;
+    if (!trace) return;
     const key = this.#key(entry);
     try {
-      this.#keep(
-        key,
-        pending(await api.startDiagnostic(this.#trace.selection, entry.name, this.#query(entry))),
-      );
+      const body = await api.startDiagnostic(trace.selection, entry.name, this.#query(entry));
+      this.#setResult(key, jobState(body.job));
     } catch (error) {
-      this.#keep(key, { state: 'error', error: error.message });
+      this.#setResult(key, { state: 'error', error: messageOf(error) });
     }
     this.#draw(entry);
     this.#jobs.refresh();
   }
 
-  /** Jobs have changed: those that are shown are drawn again, and what is done is fetched. */
-  #hear(list) {
-    if (!this.#entries || this.#stale) return;
-    const byId = new Map(list.map((job) => [job.id, job]));
-    let done = false;
+  /**
+   * Updates the states of jobs, and requests the results of those that are done.
+   * @param {Job[]} jobs
+   */
+  #updateJobs(jobs) {
+    if (this.#stale) return;
+    let isDone = false;
     for (const [key, { job }] of [...this.#results]) {
       if (!job) continue;
-      const now = byId.get(job.id);
-      if (now?.state === 'done') [done] = [true, this.#results.delete(key)];
-      else this.#keep(key, pending({ job: now ?? null }));
+      const update = jobs.find(({ id }) => id === job.id) ?? null;
+      if (update?.state === 'done') {
+        isDone = true;
+        this.#results.delete(key);
+      } else this.#setResult(key, jobState(update));
     }
     for (const entry of this.#entries) this.#draw(entry);
-    if (done && this.#open) this.#ask();
+    if (isDone && this.#open) this.#request();
   }
 
-  #keep(key, kept) {
+  /**
+   * @param {string} key
+   * @param {Result} result
+   */
+  #setResult(key, result) {
     this.#results.delete(key);
-    this.#results.set(key, kept);
-    if (this.#results.size > KEPT) this.#results.delete(this.#results.keys().next().value);
+    this.#results.set(key, result);
+    const [oldest] = this.#results.keys();
+    if (this.#results.size > MAX_RESULTS) this.#results.delete(oldest);
   }
 
-  get #opened() {
+  get #selected() {
     return this.#entries.find(({ name }) => name === this.#store.state.diagnostic);
   }
 
-  /** What is asked for beside the trace; only the open one has options. */
+  /**
+   * Returns the query of a request; only the selected diagnostic has options.
+   * @param {TraceDiagnosticInfo} entry
+   * @returns {Record<string, string>}
+   */
   #query({ name }) {
     const { diagnostic, options, over } = this.#store.state;
     return {
@@ -181,151 +224,158 @@ export class Diagnostics {
     };
   }
 
+  /** @param {TraceDiagnosticInfo} entry */
   #key(entry) {
-    const { episode, ...selection } = this.#trace.selection;
-    const { over } = this.#store.state;
-    return JSON.stringify([
-      selection,
-      over === 'episode' && episode,
-      entry.name,
-      this.#query(entry),
-    ]);
+    const { episode, ...names } = this.#trace?.selection ?? {};
+    const isEpisode = this.#store.state.over === 'episode';
+    return JSON.stringify([names, isEpisode && episode, entry.name, this.#query(entry)]);
   }
 
-  /** A row for each, made once; what is in it changes. */
-  #build() {
+  /** Creates a row for each diagnostic; later only their contents change. */
+  #buildRows() {
     if (this.#rows.size) return;
-    for (const entry of this.#entries) {
-      const row = document.createElement('li');
-      row.innerHTML =
-        '<button type="button" class="title"></button><p class="question"></p><p class="verdict"></p><div class="doing"></div>';
-      row.querySelector('.title').textContent = entry.title;
-      row.querySelector('.question').textContent = entry.question;
-      row.querySelector('.title').addEventListener('click', () => {
-        this.#store.set({ diagnostic: entry.name, options: '' });
+    for (const { name, title, question } of this.#entries) {
+      const button = create('button', { type: 'button', className: 'title', textContent: title });
+      button.addEventListener('click', () => {
+        this.#store.set({ diagnostic: name, options: '' });
         this.#store.flush();
-        this.#host.querySelector('#all-diagnostics').focus();
+        this.#backButton.focus();
       });
-      this.#rows.set(entry.name, row);
+      const row = create(
+        'li',
+        {},
+        button,
+        create('p', { className: 'question', textContent: question }),
+        create('p', { className: 'verdict' }),
+        create('div', { className: 'doing' }),
+      );
+      this.#rows.set(name, row);
     }
-    this.#host.querySelector('.list').replaceChildren(...this.#rows.values());
+    this.#list.replaceChildren(...this.#rows.values());
   }
 
-  /** The list of all, or the one that is open. */
-  #showOpen() {
-    const { state } = this.#store;
-    const open = this.#opened;
-    if (state.diagnostic && !open) {
-      const names = this.#entries.map(({ name }) => name).join(', ');
-      const line = `The link asks for diagnostic “${state.diagnostic}”, which does not exist. Available: ${names}.`;
-      this.#host.querySelector('.top h3').textContent = line;
-    } else {
-      this.#host.querySelector('.top h3').textContent = open
-        ? open.title
-        : 'Diagnostics of this run';
-    }
-    this.#host.querySelector('.list').hidden = Boolean(open);
-    this.#host.querySelector('article').hidden = !open;
-    this.#host.querySelector('#all-diagnostics').hidden = !open;
-    choice(this.#host.querySelector('#over'), OVER, state.over, (over) =>
-      this.#store.set({ over }),
-    );
-    if (open) {
-      this.#host.querySelector('article .question').textContent = open.question;
-      this.#host.querySelector('article').scrollTop = 0;
-      this.#showOptions(open);
+  /** Shows the selected diagnostic, or the list of all. */
+  #showSelected() {
+    const { diagnostic, over } = this.#store.state;
+    const selected = this.#selected;
+    const names = this.#entries.map(({ name }) => name).join(', ');
+    html('.top h3', this.#host).textContent =
+      diagnostic && !selected
+        ? `The link asks for diagnostic “${diagnostic}”, which does not exist. Available: ${names}.`
+        : (selected?.title ?? 'Diagnostics of this run');
+    this.#list.hidden = Boolean(selected);
+    this.#article.hidden = this.#backButton.hidden = !selected;
+    choice(html('#over', this.#host), OVER, over, (value) => this.#store.set({ over: value }));
+    if (selected) {
+      html('.question', this.#article).textContent = selected.question;
+      this.#article.scrollTop = 0;
+      this.#showOptions(selected);
     }
     for (const entry of this.#entries) this.#draw(entry);
   }
 
-  #showOptions(entry) {
-    const form = this.#host.querySelector('form');
-    const asked = `${entry.name} ${this.#store.state.options}`;
-    if (form.dataset.of === asked) return;
-    const focused = form.contains(document.activeElement) && document.activeElement.name;
-    form.dataset.of = asked;
-    form.hidden = !entry.options.length;
-    const chosen = new URLSearchParams(this.#store.state.options);
+  /** @param {TraceDiagnosticInfo} entry */
+  #showOptions({ name, options }) {
+    const form = this.#form;
+    const key = `${name} ${this.#store.state.options}`;
+    if (form.dataset.key === key) return;
+    const { activeElement } = document;
+    const focused =
+      activeElement instanceof HTMLInputElement && form.contains(activeElement)
+        ? activeElement.name
+        : '';
+    form.dataset.key = key;
+    form.hidden = !options.length;
+    const values = new URLSearchParams(this.#store.state.options);
+    const help = options.map((option) => `${option.name}: ${option.meaning}`).join('\n');
     form.replaceChildren(
-      ...entry.options.map(({ name, default: usual }) => {
-        const label = document.createElement('label');
-        const input = document.createElement('input');
-        Object.assign(input, {
-          name,
-          placeholder: usual,
-          value: chosen.get(name) ?? '',
-          autocomplete: 'off',
-          spellcheck: false,
-        });
-        label.textContent = name;
-        label.append(input);
-        if (name !== 'step') return label;
-        const here = document.createElement('button');
-        [here.type, here.className, here.textContent] = ['button', 'text quiet', 'at the cursor'];
-        here.addEventListener(
-          'click',
-          () => ((input.value = String(this.#store.state.step)), this.#takeOptions()),
-        );
-        label.append(here);
-        return label;
-      }),
-      Object.assign(document.createElement('p'), {
-        textContent: entry.options.map(({ name, meaning }) => `${name}: ${meaning}`).join('\n'),
-      }),
+      ...options.map((option) => this.#optionField(option, values.get(option.name) ?? '')),
+      create('p', { textContent: help }),
     );
-    if (focused) form.elements[focused]?.focus();
+    if (focused) html(`[name="${focused}"]`, form).focus();
   }
 
-  #takeOptions() {
-    const given = [...new FormData(this.#host.querySelector('form'))].filter(([, text]) =>
-      text.trim(),
-    );
-    this.#store.set({ options: String(new URLSearchParams(given)) });
+  /**
+   * @param {TraceDiagnosticInfo['options'][number]} option
+   * @param {string} value
+   */
+  #optionField({ name, default: placeholder }, value) {
+    const input = create('input', {
+      name,
+      placeholder,
+      value,
+      autocomplete: 'off',
+      spellcheck: false,
+    });
+    const label = create('label', {}, name, input);
+    if (name !== 'step') return label;
+    const button = create('button', { type: 'button', className: 'text quiet' }, 'current step');
+    button.addEventListener('click', () => {
+      input.value = String(this.#store.state.step);
+      this.#setOptions();
+    });
+    label.append(button);
+    return label;
   }
 
-  /** Writes what is known of one into its row and, if it is open, into the page. */
+  #setOptions() {
+    const options = new URLSearchParams();
+    for (const [name, text] of new FormData(this.#form))
+      if (String(text).trim()) options.set(name, String(text));
+    this.#store.set({ options: String(options) });
+  }
+
+  /**
+   * Draws the row of a diagnostic and, if it is selected, its article.
+   * @param {TraceDiagnosticInfo} entry
+   */
   #draw(entry) {
-    const known = entry.why_not
+    /** @type {Result} */
+    const result = entry.why_not
       ? { state: 'refused', error: entry.why_not }
       : (this.#results.get(this.#key(entry)) ?? { state: 'loading' });
-    this.#tell(this.#rows.get(entry.name), entry, known);
-    if (entry !== this.#opened) return;
-    const article = this.#host.querySelector('article');
-    this.#tell(article, entry, known);
-    this.#figures.show(known.result ?? null, this.#trace);
+    const row = this.#rows.get(entry.name);
+    if (row) this.#drawState(row, entry, result);
+    if (entry !== this.#selected) return;
+    this.#drawState(this.#article, entry, result);
+    this.#figures.show(result.state === 'ready' ? result.result : null, this.#trace);
   }
 
-  #tell(host, entry, known) {
-    const [verdict, doing] = [host.querySelector('.verdict'), host.querySelector('.doing')];
-    const text = said(entry, known);
+  /**
+   * @param {HTMLElement} host
+   * @param {TraceDiagnosticInfo} entry
+   * @param {Result} result
+   */
+  #drawState(host, entry, result) {
+    const [verdict, controls] = [html('.verdict', host), html('.doing', host)];
+    const { state } = result;
+    const text = summary(result);
     if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
-    const before = host.dataset.state;
-    host.dataset.state = known.state;
-    host.setAttribute('aria-busy', String(known.state === 'loading' || known.state === 'active'));
-    const acts = { unasked: 'Compute', ended: 'Try again', working: 'Cancel' }[known.state];
-    if (before !== known.state || (acts && !doing.firstChild)) {
-      const focused = doing.contains(document.activeElement);
-      doing.replaceChildren(...(acts ? [this.#button(acts, entry)] : []));
-      if (known.state === 'active') doing.prepend(document.createElement('progress'));
-      if (focused)
-        (
-          doing.querySelector('button') ??
-          host.querySelector('.title') ??
-          this.#host.querySelector('#all-diagnostics')
-        ).focus();
+    const isNew = host.dataset.state !== state;
+    host.dataset.state = state;
+    host.setAttribute('aria-busy', String(state === 'loading' || state === 'active'));
+    const action = ACTIONS[state];
+    if (isNew || (action && !controls.firstChild)) {
+      const hadFocus = controls.contains(document.activeElement);
+      controls.replaceChildren(...(action ? [this.#button(action, entry)] : []));
+      if (state === 'active') controls.prepend(document.createElement('progress'));
+      if (hadFocus) (controls.querySelector('button') ?? this.#backButton).focus();
     }
-    const progress = doing.querySelector('progress');
+    const progress = controls.querySelector('progress');
     if (!progress) return;
     progress.setAttribute('aria-label', `Progress of ${entry.title}`);
-    progress.value = known.job.progress;
+    progress.value = result.job?.progress ?? 0;
   }
 
-  #button(name, entry) {
-    const button = document.createElement('button');
-    [button.type, button.className, button.textContent] = ['button', 'text', name];
-    button.setAttribute('aria-label', `${name}: ${entry.title}`);
+  /**
+   * @param {string} action
+   * @param {TraceDiagnosticInfo} entry
+   */
+  #button(action, entry) {
+    const button = create('button', { type: 'button', className: 'text', textContent: action });
+    button.setAttribute('aria-label', `${action}: ${entry.title}`);
     button.addEventListener('click', () => {
-      const { job } = this.#results.get(this.#key(entry)) ?? {};
+      const job = this.#results.get(this.#key(entry))?.job;
       if (job && isActive(job)) this.#jobs.cancel(job.id);
       else this.#compute(entry);
     });
@@ -333,10 +383,16 @@ export class Diagnostics {
   }
 }
 
-function said(entry, { state, found, job, error }) {
-  if (state === 'ready') return found.verdict;
-  if (state === 'refused' || state === 'error') return sentence(error);
-  if (state === 'active' || state === 'ended') return jobSummary(job);
-  if (state === 'absent') return 'Takes a while, so it is computed only when asked for.';
-  return 'Measuring …';
+/** @param {unknown} error */
+const isAbort = (error) => error instanceof Error && error.name === 'AbortError';
+
+/**
+ * Returns the state of a result in a sentence.
+ * @param {Result} result
+ */
+function summary(result) {
+  if (result.state === 'ready') return result.result.verdict;
+  if (result.state === 'refused' || result.state === 'error') return sentence(result.error);
+  if (result.state === 'active' || result.state === 'ended') return jobSummary(result.job);
+  return result.state === 'absent' ? 'Takes a while: computed on request.' : 'Computing …';
 }

@@ -1,25 +1,45 @@
-/** Live runs: which there are, and how the page fills while one of them goes on. */
+/** Live runs: their list, and the updates of the page while one of them continues. */
 
+/** @import { State, Store } from '../core/state.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Catalog, ListedLiveRun, LiveList } from '../types/server.js' */
+
+import { create, element, html } from '../core/dom.js';
+import { displayName } from '../core/units.js';
 import * as api from '../data/api.js';
 import { liveStatus } from '../data/live_stream.js';
-import { displayName } from '../core/units.js';
 
-const AGAIN = 2000; // ms until it is asked again which there are
-const SOONEST = 50; // ms from one question for more steps to the next
-const KEPT = 1000; // latencies
+/** A run, or a damaged file that holds none. @typedef {LiveList['runs'][number]} ListedRun */
+/** @typedef {{step: number, ms: number, at: number}} Latency from the write to the file until the step was drawn; at: time in ms */
+/**
+ * @typedef {object} LiveHandlers
+ * @property {(trace: Trace, hasNewColumns: boolean) => void} grown called when a trace has more steps
+ * @property {(trace: Trace) => void} ended called when the run of a trace has ended
+ * @property {() => void} listed called when the list of runs has changed
+ * @property {(message: string) => void} message shows a message, or removes it if empty
+ */
 
-/** @typedef {{name: string, data: string, task: string, filter: string, available: boolean, episode: number, steps: number, expected: number | null, state: string, message: string}} Run */
+const LIST_INTERVAL = 2000; // ms between two requests for the list
+const MIN_INTERVAL = 50; // ms between two requests for steps
+const MAX_LATENCIES = 1000;
+const LIST_WIDTH = 388; // px, with its margin
 
-/** Puts runs into the catalog, each as a data set of one episode, in place of those before. @param {import('../data/api.js').Catalog} catalog */
+/**
+ * Replaces the live runs in the catalog; each is a data set of one episode.
+ * @param {Catalog} catalog
+ * @param {LiveList} list
+ */
 export function addLiveRuns(catalog, { runs, tasks }) {
   for (const task of catalog.tasks) {
     task.data = task.data.filter(({ live }) => !live);
     task.filters = task.filters.filter(({ live }) => !live);
   }
-  for (const run of runs.filter(({ data }) => data)) {
-    let task = catalog.tasks.find(({ name }) => name === run.task);
-    if (!task) catalog.tasks.push((task = tasks.find(({ name }) => name === run.task)));
-    const label = [run.episode, run.state === 'running' ? 'live' : 'live, ended'].join(' · ');
+  for (const run of runs.filter(isReadable)) {
+    const known = catalog.tasks.find(({ name }) => name === run.task);
+    const task = known ?? tasks.find(({ name }) => name === run.task);
+    if (!task) continue;
+    if (!known) catalog.tasks.push(task);
+    const label = `${run.episode} · ${run.state === 'running' ? 'live' : 'live, ended'}`;
     task.data.push({
       name: run.data,
       first: run.episode,
@@ -31,229 +51,276 @@ export function addLiveRuns(catalog, { runs, tasks }) {
   }
 }
 
-/** What the state must become to show a run at its newest step. @param {import('../data/api.js').Catalog} catalog @param {Run} run */
-export function liveRunState(catalog, { task: name, filter, data, episode, steps, state }, now) {
-  const { map } = catalog.tasks.find((task) => task.name === name);
-  const component = now.task === name ? now.component : map.x;
-  const running = state === 'running';
+/**
+ * Returns the changes of the state that select a live run at its newest step.
+ * @param {Catalog} catalog
+ * @param {ListedLiveRun} run
+ * @param {State} current
+ * @returns {Partial<State>}
+ */
+export function liveRunState(catalog, { task, filter, data, episode, steps, state }, current) {
+  const map = catalog.tasks.find(({ name }) => name === task)?.map;
+  const isRunning = state === 'running';
   return {
-    task: name,
+    task,
     filter,
     data,
     episode,
     faults: '',
     against: '',
-    step: running ? Math.max(0, steps - 1) : 0,
+    step: isRunning ? Math.max(0, steps - 1) : 0,
     angle: null,
-    component,
+    component: current.task === task || !map ? current.component : map.x,
     window: '',
     playing: false,
-    follow: running,
+    follow: isRunning,
   };
 }
 
 export class Live {
-  #button;
-  #list;
-  #follow;
+  #button = element('#live', HTMLButtonElement);
+  #list = html('#live-runs');
+  #follow = html('#follow');
   #catalog;
   #store;
   #handlers;
+  /** @type {ListedRun[]} */
   #runs = [];
+  /** @type {Trace | null} */
   #trace = null;
+  /** @type {Latency[]} */
   #latencies = [];
 
   /**
-   * @param {HTMLElement} root of the page @param {import('../data/api.js').Catalog} catalog @param {import('../core/state.js').Store} store
-   * @param {{grown: (trace: import('../data/trace.js').Trace, fresh: boolean) => void, ended: (trace: import('../data/trace.js').Trace) => void, listed: () => void, say: (line: string) => void}} handlers
-   *   are told that a trace has more steps (fresh: and columns), that its run has ended, that there are other runs, what is to be said
-   * @param {import('../data/api.js').LiveList} first
+   * @param {Catalog} catalog
+   * @param {Store} store
+   * @param {LiveHandlers} handlers
+   * @param {LiveList} list
    */
-  constructor(root, catalog, store, handlers, first) {
-    [this.#button, this.#list, this.#follow] = ['#live', '#live-runs', '#follow'].map((part) =>
-      root.querySelector(part),
-    );
-    [this.#catalog, this.#store, this.#handlers] = [catalog, store, handlers];
+  constructor(catalog, store, handlers, list) {
+    this.#catalog = catalog;
+    this.#store = store;
+    this.#handlers = handlers;
     this.#follow.addEventListener('click', () => this.newest());
-    this.#list.addEventListener(
-      'beforetoggle',
-      ({ newState }) => newState === 'open' && this.#place(),
-    );
-    store.listen((state, changed) => this.#heed(state, changed));
-    this.#take(first);
-    setInterval(() => document.hidden || this.#look(), AGAIN);
+    this.#list.addEventListener('beforetoggle', (event) => {
+      if (event.newState === 'open') this.#place();
+    });
+    store.listen((state, changed) => this.#update(state, changed));
+    this.#setList(list);
+    setInterval(() => document.hidden || this.#refreshList(), LIST_INTERVAL);
   }
 
-  /** Latencies of the newest steps, ms from the file's write until they were drawn: for tests and measurements. */
+  /** Latencies of the newest steps, for tests and measurements. */
   get latencies() {
     return this.#latencies;
   }
 
-  /** Another trace is shown; one whose run goes on is filled. @param {import('../data/trace.js').Trace | null} trace */
+  /**
+   * Follows the run of the displayed trace while it continues.
+   * @param {Trace | null} trace
+   */
   show(trace) {
     if (trace === this.#trace) return;
     this.#trace?.stream?.close();
     this.#trace = trace;
     this.#latencies = [];
-    const { live } = trace ?? {};
-    this.#handlers.say(live?.message ?? this.#shown?.message ?? '');
-    if (this.#running && this.#store.state.follow) this.#go();
-    this.#tell();
-    if (this.#running) this.#fill(trace);
+    this.#handlers.message(trace?.live?.message ?? this.#selectedRun?.message ?? '');
+    if (this.#isRunning && this.#store.state.follow) this.#goToNewest();
+    this.#showFollowButton();
+    if (trace && this.#isRunning) this.#receive(trace);
   }
 
-  /** Goes to the newest step and stays there; without a run that goes on, to the newest such, or shows which there are. */
+  /** Follows the newest step of the current run, or opens the newest active run, or the list of runs. */
   newest() {
-    const run = this.#runs.find(({ state }) => state === 'running');
-    if (this.#running) this.#store.set({ follow: true });
+    const run = this.#runs.filter(isReadable).find(({ state }) => state === 'running');
+    if (this.#isRunning) this.#store.set({ follow: true });
     else if (run) this.#open(run);
     else if (this.#runs.length) this.#list.togglePopover();
   }
 
-  get #running() {
+  get #isRunning() {
     return this.#trace?.live?.state === 'running';
   }
 
-  /** The shown run as the list has it. */
-  get #shown() {
-    return this.#runs.find(({ data }) => data === this.#store.state.data);
+  get #selectedRun() {
+    return this.#runs.filter(isReadable).find(({ data }) => data === this.#store.state.data);
   }
 
-  #heed({ data, step, playing, follow }, changed) {
-    if (!this.#running || data !== this.#trace.selection.data || changed.has('data')) return;
-    // Who moves the cursor away leaves the newest step, who moves it there comes back to it.
+  /**
+   * @param {State} state
+   * @param {Set<string>} changed
+   */
+  #update({ data, step, playing, follow }, changed) {
+    const trace = this.#trace;
+    if (!trace || !this.#isRunning || data !== trace.selection.data || changed.has('data')) return;
+    // Moving the cursor away from the newest step stops following, moving it there resumes.
     if (changed.has('step') && this.#store.origin !== 'live')
-      this.#store.set({ follow: step >= this.#trace.steps - 1 });
+      this.#store.set({ follow: step >= trace.steps - 1 });
     else if (changed.has('playing') && playing) this.#store.set({ follow: false });
-    else if (changed.has('follow') && follow) this.#go();
-    this.#tell();
+    else if (changed.has('follow') && follow) this.#goToNewest();
+    this.#showFollowButton();
   }
 
-  #go() {
-    this.#store.set({ step: this.#trace.steps - 1, playing: false }, { origin: 'live' });
+  #goToNewest() {
+    const step = (this.#trace?.steps ?? 1) - 1;
+    this.#store.set({ step, playing: false }, { origin: 'live' });
   }
 
-  /** Asks for more once what has come is drawn: a page that is slow, or out of sight, gets larger blocks, and none wait. */
-  async #fill(trace) {
-    while (this.#trace === trace && this.#running) {
-      const asked = performance.now();
-      const block = await trace.stream.next(trace.steps, trace.live.state);
+  /**
+   * Receives the steps of a live run. The next block is requested when the last one is drawn, so that a slow or hidden
+   * page receives larger blocks instead of a queue.
+   * @param {Trace} trace
+   */
+  async #receive(trace) {
+    const { stream } = trace;
+    if (!stream || !trace.live) return;
+    while (this.#trace === trace && this.#isRunning) {
+      const start = performance.now();
+      const block = await stream.next(trace.steps, trace.live.state);
       if (!block || this.#trace !== trace) break;
       trace.live = { ...trace.live, ...liveStatus(block) };
       if (block.steps) {
-        const fresh = trace.grow(block);
-        this.#handlers.grown(trace, fresh);
-        if (this.#store.state.follow) this.#go();
-        this.#tell();
+        const hasNewColumns = trace.grow(block);
+        this.#handlers.grown(trace, hasNewColumns);
+        if (this.#store.state.follow) this.#goToNewest();
+        this.#showFollowButton();
       }
-      await drawn();
-      if (block.steps)
-        this.#latencies = [
-          ...this.#latencies,
-          { step: trace.steps - 1, ms: Date.now() - 1000 * block.written, at: Date.now() },
-        ].slice(-KEPT);
-      const behind = trace.steps < block.total;
-      if (!behind)
-        await new Promise((resolve) =>
-          setTimeout(resolve, Math.max(0, asked + SOONEST - performance.now())),
-        );
+      await nextPaint();
+      if (block.steps) this.#addLatency(trace.steps - 1, block.written);
+      if (trace.steps >= block.total) await pause(start + MIN_INTERVAL - performance.now());
     }
-    trace.stream.close();
+    stream.close();
     if (this.#trace !== trace) return;
-    if (trace.stream.error)
-      trace.live = {
-        ...trace.live,
-        state: 'gone',
-        message: `The live run has gone: ${trace.stream.error}.`,
-      };
-    this.#tell();
-    this.#handlers.say(trace.live.message);
+    if (stream.error) {
+      const message = `The live run cannot be read: ${stream.error}.`;
+      trace.live = { ...trace.live, state: 'gone', message };
+    }
+    this.#showFollowButton();
+    this.#handlers.message(trace.live.message);
     this.#handlers.ended(trace);
-    this.#look();
+    this.#refreshList();
   }
 
-  /** The button that leads to the newest step. */
-  #tell() {
+  /**
+   * @param {number} step
+   * @param {number} written time in s
+   */
+  #addLatency(step, written) {
+    const now = Date.now();
+    this.#latencies.push({ step, ms: now - 1000 * written, at: now });
+    this.#latencies.splice(0, this.#latencies.length - MAX_LATENCIES);
+  }
+
+  #showFollowButton() {
     const { follow, step } = this.#store.state;
-    this.#follow.hidden = !this.#running;
-    if (!this.#running) return;
+    this.#follow.hidden = !this.#isRunning;
+    if (!this.#trace || !this.#isRunning) return;
     const behind = this.#trace.steps - 1 - step;
     this.#follow.setAttribute('aria-pressed', String(Boolean(follow)));
-    this.#follow.lastChild.textContent = follow || !behind ? 'Live' : `${behind} behind`;
+    if (this.#follow.lastChild)
+      this.#follow.lastChild.textContent = follow || !behind ? 'Live' : `${behind} behind`;
   }
 
-  async #look() {
-    const found = await api.liveRuns().catch(() => null);
-    if (found) this.#take(found);
+  async #refreshList() {
+    const list = await api.liveRuns().catch(() => null);
+    if (list) this.#setList(list);
   }
 
-  #take(found) {
-    const others = identity(found.runs) !== identity(this.#runs);
-    this.#runs = found.runs;
-    if (others) {
-      addLiveRuns(this.#catalog, found);
+  /** @param {LiveList} list */
+  #setList(list) {
+    const isNew = fingerprint(list.runs) !== fingerprint(this.#runs);
+    this.#runs = list.runs;
+    if (isNew) {
+      addLiveRuns(this.#catalog, list);
       this.#handlers.listed();
     }
     const running = this.#runs.filter(({ state }) => state === 'running').length;
+    const summary = running
+      ? `${running} active live ${running > 1 ? 'runs' : 'run'}`
+      : 'Live runs, all ended';
     this.#button.hidden = !this.#runs.length;
     this.#button.classList.toggle('on', running > 0);
-    this.#button.title = `${running ? `${running} live ${running > 1 ? 'runs go' : 'run goes'} on` : 'Live runs, all ended'} (l)`;
+    this.#button.title = `${summary} (l)`;
     this.#draw();
   }
 
-  /** A row for each run, the newest first; rows stay, so that the focus does. */
+  /** Shows the runs, the newest first. Rows are reused, so that the focus stays. */
   #draw() {
-    const host = this.#list.querySelector('ol');
-    while (host.children.length > this.#runs.length) host.lastChild.remove();
+    const host = html('ol', this.#list);
+    while (host.children.length > this.#runs.length) host.lastChild?.remove();
+    while (host.children.length < this.#runs.length) host.append(row());
     this.#runs.forEach((run, i) => {
-      const row = host.children[i] ?? host.appendChild(this.#row());
-      const [name, what, how] = row.firstChild.children;
-      row.dataset.state = run.state;
-      row.firstChild.disabled = !run.data;
-      row.firstChild.setAttribute('aria-current', String(run.data === this.#store.state.data));
-      [name.textContent, what.textContent] = [
-        run.name,
-        run.data ? `${run.filter} · ${displayName(run.task)} ${run.episode}` : '',
-      ];
-      how.textContent = how.title = said(run);
-      row.firstChild.onclick = () => this.#open(run);
+      const line = host.children[i];
+      const button = element('button', HTMLButtonElement, line);
+      if (line instanceof HTMLElement) line.dataset.state = run.state;
+      const isCurrent = isReadable(run) && run.data === this.#store.state.data;
+      button.disabled = !isReadable(run);
+      button.setAttribute('aria-current', String(isCurrent));
+      html('b', button).textContent = run.name;
+      html('span', button).textContent = isReadable(run)
+        ? `${run.filter} · ${displayName(run.task)} ${run.episode}`
+        : '';
+      const status = html('small', button);
+      status.textContent = status.title = statusLine(run);
+      button.onclick = () => isReadable(run) && this.#open(run);
     });
   }
 
-  #row() {
-    const row = document.createElement('li');
-    row.innerHTML = '<button type="button"><b></b><span></span><small></small></button>';
-    return row;
-  }
-
+  /** @param {ListedLiveRun} run */
   #open(run) {
     this.#list.hidePopover();
     const { state } = this.#store;
-    if (run.data === state.data && this.#running) this.#store.set({ follow: true });
+    if (run.data === state.data && this.#isRunning) this.#store.set({ follow: true });
     else this.#store.set(liveRunState(this.#catalog, run, state));
   }
 
   #place() {
     const { left, bottom } = this.#button.getBoundingClientRect();
-    Object.assign(this.#list.style, {
-      left: `${Math.max(8, Math.min(left, innerWidth - 388))}px`,
-      top: `${bottom + 5}px`,
-    });
+    this.#list.style.left = `${Math.max(8, Math.min(left, innerWidth - LIST_WIDTH))}px`;
+    this.#list.style.top = `${bottom + 5}px`;
     this.#draw();
   }
 }
 
-/** What the pickers depend on. */
-const identity = (runs) =>
-  JSON.stringify(runs.map(({ name, state, started, filter }) => [name, state, started, filter]));
+const row = () =>
+  create(
+    'li',
+    {},
+    create(
+      'button',
+      { type: 'button' },
+      ...['b', 'span', 'small'].map((tag) => document.createElement(tag)),
+    ),
+  );
 
-/** How a run is, in a line. @param {Run} run */
-function said({ state, message: line, steps, expected, available }) {
-  if (line) return line;
-  const count = expected ? `${steps} of ${expected} steps` : `${steps} steps`;
-  const absent = available ? '' : ' · its checkpoint is not served here (--filter)';
-  return `${state === 'running' ? 'goes on' : 'ended'}, ${count}${absent}`;
+/**
+ * Returns what the pickers depend on.
+ * @param {ListedRun[]} runs
+ */
+const fingerprint = (runs) =>
+  JSON.stringify(
+    runs.map((run) => [run.name, run.state, ...(isReadable(run) ? [run.started, run.filter] : [])]),
+  );
+
+/**
+ * @param {ListedRun} run
+ * @returns {run is ListedLiveRun}
+ */
+function isReadable(run) {
+  return 'data' in run;
 }
 
-/** When the browser has drawn; a page out of sight waits here. */
-const drawn = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+/** @param {ListedRun} run */
+function statusLine(run) {
+  if (run.message || !isReadable(run)) return run.message;
+  const { state, steps, expected, available } = run;
+  const count = expected ? `${steps} of ${expected} steps` : `${steps} steps`;
+  const missing = available ? '' : ' · checkpoint not on this server (--filter)';
+  return `${state === 'running' ? 'running' : 'ended'}, ${count}${missing}`;
+}
+
+/** Resolves after the next paint; waits while the page is hidden. */
+const nextPaint = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+
+const pause = (/** @type {number} */ ms) =>
+  new Promise((resolve) => setTimeout(resolve, Math.max(0, ms)));

@@ -1,654 +1,410 @@
-/** What the workspace keeps: recordings, the user's own among them, and reports; opened, compared, named, tagged, deleted, had back. */
+/** The Recordings tab: search, import, rename, tag, compare, delete and restore recordings and reports. */
 
-import { Uploads } from '../widgets/upload.js';
-import * as api from '../data/api.js';
-import { FileTable } from '../widgets/file_table.js';
-import { jobSummary, isActive } from '../widgets/jobs.js';
-import { setPanelState } from '../widgets/panel_state.js';
+/** @import { State, Store } from '../core/state.js' */
+/** @import { Catalog, Job, RecordingEntry, RecordingList, ReportEntry, ReportList } from '../types/server.js' */
+/** @import { Jobs } from '../widgets/jobs.js' */
+/** @import { Status } from '../widgets/status_line.js' */
+/** @import { Run } from './recorded_run.js' */
+/** @import { Rerun } from './rerun.js' */
+/** @import { TrashedFile } from './trash.js' */
+
+import { element, html, messageOf } from '../core/dom.js';
 import { formatBytes, sentence } from '../core/units.js';
+import * as api from '../data/api.js';
+import { acceptDrops } from '../widgets/file_drop.js';
+import { FileTable } from '../widgets/file_table.js';
+import { isActive, jobSummary } from '../widgets/jobs.js';
+import { setPanelState } from '../widgets/panel_state.js';
+import { StatusLine } from '../widgets/status_line.js';
+import { Uploads } from '../widgets/upload.js';
+import { FileActions } from './file_actions.js';
+import { differences, recordedRun, selectRun } from './recorded_run.js';
+import { REPORT_COLUMNS, recordingColumns } from './recording_columns.js';
+import { SelectionBar } from './selection_bar.js';
+import { Trash } from './trash.js';
 
-const AGAIN = 4000; // ms until the list is asked for again: another browser may have changed it
-const SOON = 700; // while a file is being looked into
-const READ_ONLY = 'This server only shows: nothing can be changed here';
-const TIME = new Intl.DateTimeFormat('en-GB', { hour: '2-digit', minute: '2-digit' });
-const DAY = new Intl.DateTimeFormat('en-GB', { day: 'numeric', month: 'short' });
+const POLL_INTERVAL = 4000; // ms; other clients may change the files
+const READING_INTERVAL = 700; // ms, while the server reads a new file
+const READ_ONLY = 'Read-only server: nothing can be changed';
 
 const BODY = `
   <div class="top">
     <input type="search" placeholder="Search name, task, filter, tag" aria-label="Search recordings and reports" autocomplete="off" spellcheck="false">
-    <span class="told" aria-live="polite"></span>
-    <button type="button" class="text add" title="An .rrd file of any application, to open it here and keep it. Or drop it anywhere on this tab">Add .rrd…</button>
+    <span class="summary" aria-live="polite"></span>
+    <button type="button" class="text add" title="Add .rrd files of any application. Files can also be dropped on this tab">Add .rrd…</button>
     <input type="file" accept=".rrd" multiple hidden aria-label="Recordings to add">
   </div>
-  <div class="chosen" hidden><span></span><button type="button" class="text both">Both in Rerun</button><button type="button" class="text compare">Compare the runs</button><span class="apart"></span><span class="spacer"></span><button type="button" class="text quiet none">Choose none</button></div>
-  <ul class="adding"></ul>
-  <p class="said" role="status" hidden><span></span> <button type="button" class="text">Undo</button><button type="button" class="quiet" aria-label="Dismiss">×</button></p>
+  <div class="selection" hidden></div>
+  <ul class="uploads"></ul>
+  <p class="status" role="status" hidden></p>
   <div class="scroll" tabindex="-1">
     <table class="recordings" aria-label="Recordings"><thead></thead><tbody></tbody></table>
     <p class="rest"></p>
     <p class="automatic" hidden><span></span> <button type="button" class="text quiet">Show</button></p>
     <section class="reports"><h2>Reports</h2><table aria-label="Reports"><thead></thead><tbody></tbody></table></section>
-    <details class="trash" hidden><summary>Trash</summary><ul></ul><p><button type="button" class="text empty">Empty the trash</button> <span class="sure" hidden>For good? <button type="button" class="text yes">Delete for good</button> <button type="button" class="text no">Keep</button></span></p></details>
+    <details class="trash" hidden></details>
   </div>
   <div class="drop" hidden><p>Drop <b>.rrd</b> files to add them</p></div>
   <p class="note"></p>`;
 
-const words = (name, title, help, value = (file) => file[name] ?? null) => ({
-  name,
-  title,
-  help,
-  value,
-  content: (file) => String(value(file) ?? '–'),
-});
-const OF_A_RUN = [
-  words('task', 'task', 'What it is of'),
-  words('filter', 'filter', 'That made it'),
-  { ...words('episode', 'ep.', 'Index of the episode'), number: true },
-  {
-    ...words('faults', 'sensors', 'How they were broken', ({ task, faults }) =>
-      task === null ? null : faults || 'as recorded',
-    ),
-    hint: ({ faults }) => faults,
-  },
-];
-const size = {
-  name: 'bytes',
-  title: 'size',
-  help: 'On the disk',
-  value: (file) => file.bytes,
-  content: (file) => formatBytes(file.bytes),
-  number: true,
-};
-const when = (name) => ({
-  name: 'when',
-  title: 'when',
-  help: 'It was written',
-  value: (file) => Date.parse(file[name]),
-  content: (file) => moment(new Date(file[name])),
-  hint: (file) => new Date(file[name]).toLocaleString('en-GB'),
-  number: true,
-});
-const data = {
-  ...words('data', 'data', 'Data set, as it is named here', (file) => file.run?.data ?? null),
-  hint: (file) => file.data_hash && `Episode ${file.data_hash.slice(0, 12)}`,
-};
-
-export class Library {
+export class Recordings {
   #host;
   #store;
   #catalog;
   #jobs;
   #rerun;
+  #search;
   #recordings;
   #reports;
-  #adding;
-  #kept = null; // what the server keeps
-  #read = ''; // as it said it last
-  #chosen = new Set();
-  #point = '';
-  #automatic = false; // whether those are listed that were written for the Rerun tab
-  #undo = null;
-  #awaited = ''; // id of the job that reads a run
+  #selection;
+  #uploads;
+  #trash;
+  #status;
+  /** @type {{recordings: RecordingList, reports: ReportList} | null} */
+  #files = null;
+  #reply = ''; // last files as JSON
+  #highlighted = ''; // file to highlight once it is listed
+  #showsAutomatic = false;
+  #import = ''; // ID of the job that imports a run
   #open = false;
   #timer = 0;
 
   /**
-   * @param {HTMLElement} host @param {api.Catalog} catalog @param {import('../core/state.js').Store} store @param {import('../widgets/jobs.js').Jobs} jobs
-   * @param {import('./rerun.js').Rerun} rerun that shows recordings
+   * @param {HTMLElement} host
+   * @param {Catalog} catalog
+   * @param {Store} store
+   * @param {Jobs} jobs
+   * @param {Rerun} rerun displays recordings
    */
   constructor(host, catalog, store, jobs, rerun) {
-    [this.#host, this.#catalog, this.#store, this.#jobs, this.#rerun] = [
-      host,
-      catalog,
-      store,
-      jobs,
-      rerun,
-    ];
+    this.#host = host;
+    this.#catalog = catalog;
+    this.#store = store;
+    this.#jobs = jobs;
+    this.#rerun = rerun;
     host.innerHTML = BODY;
-    const name = {
-      name: 'name',
-      title: 'name',
-      help: 'Of the file',
-      value: (file) => file.name,
-      content: (file) => this.#tags(file),
-      hint: (file) => (file.reading ? '' : file.problem),
-    };
+    this.#search = element('[type=search]', HTMLInputElement, host);
+    this.#selection = new SelectionBar(html('.selection', host), {
+      open: (files) => this.#openInRerun(files),
+      compare: (files) => this.#compare(files),
+      clear: () => this.#draw(),
+    });
+    const actions = this.#fileActions();
     this.#recordings = new FileTable(
-      this.#part('.recordings'),
-      [name, ...OF_A_RUN, data, size, when('modified')],
+      element('table.recordings', HTMLTableElement, host),
+      recordingColumns((tag) => this.#toggleSearch(tag)),
       {
-        actions: (file) => this.#acts(file),
+        actions: (file) => actions.forRecording(file),
         sort: { name: 'when', down: true },
-        selection: { has: (file) => this.#chosen.has(file), toggle: (file) => this.#choose(file) },
+        selection: this.#selection,
       },
     );
     this.#reports = new FileTable(
-      this.#part('.reports table'),
-      [{ ...name, content: () => '', hint: ({ title }) => title }, ...OF_A_RUN, size, when('made')],
-      {
-        actions: (file) => this.#actsOfReport(file),
-        sort: { name: 'when', down: true },
-      },
+      element('.reports table', HTMLTableElement, host),
+      REPORT_COLUMNS,
+      { actions: (file) => actions.forReport(file), sort: { name: 'when', down: true } },
     );
-    this.#adding = new Uploads(this.#part('.adding'), (added) => this.#added(added));
-    jobs.listen((list) => this.#hear(list));
-    this.#take();
-    this.#takeDrops();
+    this.#uploads = new Uploads(html('.uploads', host), (added) => this.#showAdded(added));
+    this.#status = new StatusLine(html('.status', host));
+    this.#trash = new Trash(
+      html('.trash', host),
+      this.#readOnlyReason,
+      (file) => this.#restore(file),
+      () => this.#emptyTrash(),
+    );
+    jobs.listen((list) => this.#followJobs(list));
+    this.#bindControls();
+    acceptDrops(host, html('.drop', host), (files) => this.#upload(files));
   }
 
-  /** Whether the panel can be seen; nothing is asked for before. */
-  set open(open) {
+  /** Whether the tab is selected. */
+  set open(/** @type {boolean} */ open) {
     if (open && !this.#open) this.load();
     this.#open = open;
     if (!open) clearTimeout(this.#timer);
   }
 
-  /** Shows where a file is, once it is there. */
+  /**
+   * Highlights a file as soon as it is listed.
+   * @param {string} name
+   */
   point(name) {
-    this.#part('[type=search]').value = '';
-    [this.#point, this.#read] = [name, ''];
+    this.#search.value = '';
+    this.#highlighted = name;
+    this.#reply = '';
     this.load();
   }
 
-  /** Asks what there is, now and again for as long as the panel can be seen. */
+  /** Gets the files, and again at intervals while the tab is selected. */
   async load() {
     clearTimeout(this.#timer);
-    if (!this.#kept) setPanelState(this.#host, 'loading', 'Loading …');
+    if (!this.#files) setPanelState(this.#host, 'loading', 'Loading …');
     try {
-      const [kept, made] = await Promise.all([api.recordings(), api.reports()]);
-      const read = JSON.stringify([kept, made]);
-      if (read !== this.#read) {
-        [this.#read, this.#kept] = [
-          read,
-          {
-            ...kept,
-            reports: made.reports,
-            trash: [
-              ...kept.deleted.map((one) => ({ ...one, of: 'recordings' })),
-              ...made.deleted.map((one) => ({ ...one, of: 'reports' })),
-            ],
-          },
-        ];
+      const [recordings, reports] = await Promise.all([api.recordings(), api.reports()]);
+      const reply = JSON.stringify([recordings, reports]);
+      if (reply !== this.#reply) {
+        this.#reply = reply;
+        this.#files = { recordings, reports };
         this.#draw();
       }
       setPanelState(this.#host, 'ready');
     } catch (error) {
-      if (!this.#kept) setPanelState(this.#host, 'error', error.message);
-      else this.#say(error.message);
+      if (!this.#files) setPanelState(this.#host, 'error', messageOf(error));
+      else this.#status.show({ text: messageOf(error) });
     }
     clearTimeout(this.#timer);
-    const soon = this.#kept?.recordings.some(({ reading }) => reading);
-    if (this.#open)
-      this.#timer = setTimeout(
-        () => (document.hidden ? this.#later() : this.load()),
-        soon ? SOON : AGAIN,
-      );
+    if (!this.#open) return;
+    const isReading = this.#list.some(({ reading }) => reading);
+    this.#timer = setTimeout(
+      () => (document.hidden ? this.#loadWhenVisible() : this.load()),
+      isReading ? READING_INTERVAL : POLL_INTERVAL,
+    );
   }
 
-  #later() {
+  #loadWhenVisible() {
     document.addEventListener('visibilitychange', () => this.#open && this.load(), { once: true });
   }
 
-  #part(selector) {
-    return this.#host.querySelector(selector);
+  /** @returns {RecordingEntry[]} */
+  get #list() {
+    return this.#files?.recordings.recordings ?? [];
   }
 
-  get #readOnly() {
+  get #readOnlyReason() {
     return this.#catalog.read_only ? READ_ONLY : undefined;
   }
 
+  #fileActions() {
+    return new FileActions(this.#catalog, this.#readOnlyReason, {
+      openInRerun: (file) => this.#openInRerun([file]),
+      openRun: (run) => this.#openRun(run),
+      importRun: (file) => this.#importRun(file),
+      keep: (file) => this.#keep(file),
+      rename: (file) => this.#rename(file),
+      editTags: (file) => this.#editTags(file),
+      remove: (file, kind) => this.#delete(file, kind),
+    });
+  }
+
   #draw() {
-    const { recordings, reports, trash, bytes: used, free } = this.#kept;
-    const there = new Set(recordings.map(({ name }) => name));
-    for (const name of this.#chosen) if (!there.has(name)) this.#chosen.delete(name);
-    const kept = recordings.filter(({ automatic }) => this.#automatic || !automatic);
-    const found = kept.filter((file) => this.#sought(file));
-    this.#recordings.show(found);
-    this.#reports.show(reports.filter((file) => this.#sought(file)));
-    this.#part('section.reports').hidden = !reports.length;
-    const many = `${kept.length} recording${kept.length === 1 ? '' : 's'}`;
-    const what = found.length < kept.length ? `${found.length} of ${many}` : many;
-    const disk = reports.reduce((sum, one) => sum + one.bytes, used);
-    this.#part('.told').textContent =
-      `${what} · ${formatBytes(disk)} used, ${formatBytes(free)} free`;
-    const none =
-      'None yet. “Save .rrd” above writes one of the run that is shown; “Add .rrd…” takes one from elsewhere.';
-    this.#part('.rest').textContent = kept.length
-      ? found.length
+    if (!this.#files) return;
+    const { recordings, reports } = this.#files;
+    this.#selection.show(this.#list);
+    const candidates = this.#list.filter(({ automatic }) => this.#showsAutomatic || !automatic);
+    const matches = candidates.filter((file) => this.#matches(file));
+    this.#recordings.show(matches);
+    this.#reports.show(reports.reports.filter((file) => this.#matches(file)));
+    html('section.reports', this.#host).hidden = !reports.reports.length;
+    const total = `${candidates.length} recording${candidates.length === 1 ? '' : 's'}`;
+    const count = matches.length < candidates.length ? `${matches.length} of ${total}` : total;
+    const used = reports.reports.reduce((sum, { bytes }) => sum + bytes, recordings.bytes);
+    html('.summary', this.#host).textContent =
+      `${count} · ${formatBytes(used)} used, ${formatBytes(recordings.free)} free`;
+    html('.rest', this.#host).textContent = candidates.length
+      ? matches.length
         ? ''
-        : 'No recording has all these words.'
-      : none;
-    this.#drawAutomatic(recordings.filter((file) => file.automatic && this.#sought(file)));
-    this.#drawTrash(trash);
-    this.#drawChosen();
-    if (!there.has(this.#point)) return;
-    this.#recordings.point(this.#point);
-    this.#point = '';
+        : 'No recording matches all words.'
+      : 'No recordings yet. “Save .rrd” above writes the current run; “Add .rrd…” imports a file.';
+    this.#drawAutomatic(this.#list.filter((file) => file.automatic && this.#matches(file)));
+    this.#trash.show([
+      ...recordings.deleted.map((file) => ({ ...file, kind: /** @type {const} */ ('recordings') })),
+      ...reports.deleted.map((file) => ({ ...file, kind: /** @type {const} */ ('reports') })),
+    ]);
+    if (!this.#list.some(({ name }) => name === this.#highlighted)) return;
+    this.#recordings.point(this.#highlighted);
+    this.#highlighted = '';
   }
 
-  /** Those that nobody asked to be kept. */
+  /** @param {RecordingEntry[]} files written for the Rerun tab */
   #drawAutomatic(files) {
-    const host = this.#part('.automatic');
+    const host = html('.automatic', this.#host);
     host.hidden = !files.length;
-    const [text, button] = host.children;
-    const size = formatBytes(files.reduce((sum, one) => sum + one.bytes, 0));
-    text.textContent = `${files.length} ${files.length === 1 ? 'was' : 'were'} written for the Rerun tab, ${size}; the oldest go when there are many.`;
-    button.textContent = this.#automatic ? 'Hide' : 'Show';
+    const size = formatBytes(files.reduce((sum, { bytes }) => sum + bytes, 0));
+    const count = `${files.length} automatic recording${files.length === 1 ? '' : 's'}`;
+    html('span', host).textContent =
+      `${count} of the Rerun tab, ${size}. The oldest are deleted when there are many.`;
+    html('button', host).textContent = this.#showsAutomatic ? 'Hide' : 'Show';
   }
 
-  #sought({ name, task, filter, tags = [], faults, application = '', run }) {
-    const text = [name, task, filter, ...tags, faults, application, run?.data]
-      .join(' ')
-      .toLowerCase();
-    return this.#part('[type=search]')
-      .value.toLowerCase()
-      .split(/\s+/)
-      .every((word) => text.includes(word));
+  /**
+   * Returns whether a file matches all words of the search.
+   * @param {RecordingEntry | ReportEntry} file
+   */
+  #matches(file) {
+    const { name, task, filter, faults } = file;
+    const more = 'tags' in file ? [...file.tags, file.application, file.run?.data] : [];
+    const text = [name, task, filter, faults, ...more].join(' ').toLowerCase();
+    const words = this.#search.value.toLowerCase().split(/\s+/);
+    return words.every((word) => text.includes(word));
   }
 
-  /** What stands behind a name: its tags; of a file that is no run of ours, what it is. */
-  #tags(file) {
-    const host = document.createElement('span');
-    host.className = 'tags';
-    if (file.reading) host.append(note('is looked into …'));
-    else if (!file.application) host.append(note('cannot be read', 'bad'));
-    else if (file.problem) host.append(note(`of ${file.application}`));
-    else if (file.automatic) host.append(note('for the Rerun tab'));
-    for (const tag of file.tags) {
-      const button = Object.assign(document.createElement('button'), {
-        type: 'button',
-        className: 'tag',
-        textContent: tag,
-        title: `Search for ${tag}`,
-      });
-      button.dataset.part = `tag ${tag}`;
-      button.addEventListener('click', () => this.#search(tag));
-      host.append(button);
-    }
-    return host;
-  }
-
-  #search(text) {
-    const field = this.#part('[type=search]');
-    field.value = field.value.trim() === text ? '' : text;
+  /**
+   * Searches for a text, or clears the search if it is the current one.
+   * @param {string} text
+   */
+  #toggleSearch(text) {
+    this.#search.value = this.#search.value.trim() === text ? '' : text;
     this.#draw();
   }
 
-  /** @returns {import('../widgets/file_table.js').Act[]} */
-  #acts(file) {
-    const unread = file.reading
-      ? 'It is looked into just now'
-      : file.application
-        ? undefined
-        : sentence(file.problem);
-    return [
-      { name: 'Open in Rerun', key: 'Enter', run: () => this.#show([file]), disabledReason: unread },
-      { name: 'Open the run here', ...this.#run(file, unread) },
-      ...(file.automatic
-        ? [
-            {
-              name: 'Keep',
-              run: () => this.#keep(file),
-              disabledReason: this.#readOnly,
-              hint: 'It was written for the Rerun tab, and goes when there are many.',
-            },
-          ]
-        : []),
-      { name: 'Rename', key: 'F2', run: () => this.#rename(file), disabledReason: this.#readOnly },
-      { name: 'Tags', run: () => this.#tag(file), disabledReason: this.#readOnly },
-      { name: `Download, ${formatBytes(file.bytes)}`, href: file.url, download: file.name },
-      {
-        name: 'Delete',
-        key: 'Delete',
-        run: () => this.#delete(file, 'recordings'),
-        disabledReason: this.#readOnly,
-      },
-    ];
-  }
-
-  /** The run of a recording: this server's own, or read out of the file. */
-  #run(file, unread) {
-    if (file.run) return { run: () => this.#store.set({ ...this.#selection(file), tab: 'scene' }) };
-    const known = this.#catalog.tasks.some(({ name }) => name === file.task);
-    if (unread || file.problem || !known)
-      return { disabledReason: unread ?? sentence(file.problem || `This server has no task ${file.task}`) };
-    return {
-      run: () => this.#readRun(file),
-      disabledReason: this.#readOnly,
-      hint: `As it was recorded. ${file.why_not}`,
-    };
-  }
-
-  /** Has a run read out of its file, and opens it when that is done. */
-  #readRun(file) {
-    return this.#try(async () => {
+  /** @param {RecordingEntry} file */
+  #importRun(file) {
+    return this.#attempt(async () => {
       const { job } = await api.importRun(file);
       if (job.state === 'done') location.assign(`/${job.link}`);
-      this.#awaited = job.id;
-      this.#say(`The run in ${file.name} is read; it opens in a moment.`);
+      this.#import = job.id;
+      this.#status.show({ text: `Importing the run of ${file.name} …` });
       await this.#jobs.refresh();
     });
   }
 
-  #hear(list) {
-    const job = list.find(({ id }) => id === this.#awaited);
-    if (job?.state === 'done')
-      location.assign(`/${job.link}`); // its episode is new to this page
-    else if (job && !isActive(job)) [this.#awaited] = ['', this.#say(jobSummary(job), null, true)];
+  /** @param {Job[]} list */
+  #followJobs(list) {
+    const job = list.find(({ id }) => id === this.#import);
+    if (job?.state === 'done') {
+      location.assign(`/${job.link}`); // reloads the page, because the catalog has changed
+    } else if (job && !isActive(job)) {
+      this.#import = '';
+      this.#status.show({ text: jobSummary(job), failed: true });
+    }
     if (this.#open) this.load();
   }
 
-  #actsOfReport(file) {
-    return [
-      { name: 'Open', key: 'Enter', href: `${file.url}?shown=true`, newWindow: true },
-      {
-        name: 'Open its run here',
-        run: () => this.#store.set({ ...this.#selection({ ...file, run: file }), tab: 'scene' }),
-        disabledReason: this.#lacking(file),
-      },
-      { name: 'Download the page', href: file.url, download: `${file.name}.html` },
-      ...(file.pdf
-        ? [{ name: 'Download the PDF', href: file.pdf, download: `${file.name}.pdf` }]
-        : []),
-      {
-        name: 'Delete',
-        key: 'Delete',
-        run: () => this.#delete(file, 'reports'),
-        disabledReason: this.#readOnly,
-      },
-    ];
+  /**
+   * @param {Run} run
+   * @param {Partial<State>} [patch]
+   */
+  #openRun(run, patch = { tab: 'scene' }) {
+    this.#store.set({ ...selectRun(this.#catalog, this.#store.state, run), ...patch });
   }
 
-  /** Why a report's run cannot be opened: a filter of this name may have gone since. */
-  #lacking({ task, filter, episode }) {
-    const found = this.#catalog.tasks.find(({ name }) => name === task);
-    if (!found?.filters.some(({ name }) => name === filter))
-      return `Filter ${filter} of ${task} is not one of this server’s.`;
-    return found.data.some((set) => set.episodes.some(({ index }) => index === episode))
-      ? undefined
-      : `No data set here has an episode ${episode}.`;
-  }
-
-  /** The state that shows a file's run. */
-  #selection({ task, episode, faults, run }) {
-    const { state } = this.#store;
-    const found = this.#catalog.tasks.find(({ name }) => name === task);
-    const set = run.data ?? found.data[0].name;
-    const same = state.task === task && state.data === set && state.episode === episode;
-    const other = state.task === task ? {} : { component: found.map.x };
-    return {
-      task,
-      filter: run.filter,
-      data: set,
-      episode,
-      faults,
-      against: '',
-      playing: false,
-      angle: null,
-      step: same ? state.step : 0,
-      ...other,
-    };
-  }
-
-  #show(files) {
+  /** @param {RecordingEntry[]} files */
+  #openInRerun(files) {
     this.#rerun.files(files.map(({ name, url }) => ({ name, url })));
     this.#store.set({ tab: 'rerun', playing: false });
   }
 
-  #choose(name) {
-    if (!this.#chosen.delete(name)) this.#chosen.add(name);
-    this.#drawChosen();
+  /** @param {RecordingEntry[]} files two of them */
+  #compare(files) {
+    const [run, comparison] = files.map(recordedRun);
+    if (run && comparison)
+      this.#openRun(run, { against: differences(run, comparison), tab: 'compare' });
   }
 
-  /** The files that are ticked, the first that was first. */
-  get #two() {
-    return [...this.#chosen]
-      .map((name) => this.#kept.recordings.find((file) => file.name === name))
-      .filter(Boolean);
-  }
-
-  /** What two files that are ticked can be compared by. */
-  #drawChosen() {
-    const files = this.#two;
-    const host = this.#part('.chosen');
-    host.hidden = !files.length;
-    if (!files.length) return;
-    const [text, both, compare, why] = host.children;
-    text.textContent =
-      files.length === 1 ? 'One chosen: choose another to compare.' : `${files.length} chosen.`;
-    const unread =
-      files.length !== 2
-        ? 'Choose two.'
-        : files.some(({ application }) => !application)
-          ? 'One of them cannot be read.'
-          : '';
-    both.disabled = Boolean(unread);
-    const cannot = unread || apart(...files);
-    compare.disabled = Boolean(cannot);
-    why.textContent = files.length === 2 ? cannot : '';
-  }
-
-  #compare() {
-    const [one, other] = this.#two;
-    this.#store.set({ ...this.#selection(one), against: against(one, other), tab: 'compare' });
-  }
-
+  /** @param {RecordingEntry} file */
   #rename(file) {
-    this.#recordings.edit(
-      file,
-      `New name of ${file.name}`,
-      file.name.replace(/\.rrd$/, ''),
-      async (text) => {
-        const { name } = await api.changeRecording(file, { name: text });
-        if (this.#chosen.delete(file.name)) this.#chosen.add(name);
-        this.#point = name;
-        await this.load();
-      },
-    );
+    const stem = file.name.replace(/\.rrd$/, '');
+    this.#recordings.edit(file, `New name of ${file.name}`, stem, async (text) => {
+      const { name } = await api.changeRecording(file, { name: text });
+      this.#selection.rename(file.name, name);
+      this.#highlighted = name;
+      await this.load();
+    });
   }
 
-  #tag(file) {
-    this.#recordings.edit(
-      file,
-      `Tags of ${file.name}, divided by commas`,
-      file.tags.join(', '),
-      async (text) => {
-        await api.changeRecording(file, {
-          tags: text
-            .split(',')
-            .map((tag) => tag.trim())
-            .filter(Boolean),
-        });
-        await this.load();
-      },
-    );
+  /** @param {RecordingEntry} file */
+  #editTags(file) {
+    const label = `Tags of ${file.name}, separated by commas`;
+    this.#recordings.edit(file, label, file.tags.join(', '), async (text) => {
+      const tags = text.split(',').map((tag) => tag.trim());
+      await api.changeRecording(file, { tags: tags.filter(Boolean) });
+      await this.load();
+    });
   }
 
+  /** @param {RecordingEntry} file */
   #keep(file) {
-    return this.#try(async () => {
+    return this.#attempt(async () => {
       await api.changeRecording(file, { automatic: false });
-      this.#point = file.name;
-      return [`${file.name} is kept.`];
+      this.#highlighted = file.name;
+      return { text: `${file.name} is no longer deleted automatically.` };
     });
   }
 
-  async #delete(file, of) {
-    await this.#try(async () => {
-      const { deleted } = await api.deleteFile(file);
-      return [
-        `${file.name} is in the trash.`,
-        () => this.#restore({ id: deleted, name: file.name, of }),
-      ];
+  /**
+   * @param {{name: string, url: string}} file
+   * @param {TrashedFile['kind']} kind
+   */
+  async #delete(file, kind) {
+    await this.#attempt(async () => {
+      const { deleted: id } = await api.deleteFile(file);
+      const undo = () => this.#restore({ id, name: file.name, kind });
+      return { text: `${file.name} was moved to the trash.`, undo };
     });
-    this.#part('.said button').focus();
+    this.#status.focus();
   }
 
-  #restore({ id, name, of }) {
-    return this.#try(async () => {
-      await api.restoreFile(of, id);
-      this.#point = of === 'recordings' ? name : '';
-      return [`${name} is back.`];
-    });
-  }
-
-  async #empty() {
-    this.#part('.sure').hidden = true;
-    await this.#try(async () => {
-      const freed = (await Promise.all(['recordings', 'reports'].map(api.emptyTrash))).reduce(
-        (sum, one) => sum + one.freed,
-        0,
-      );
-      return [`The trash is empty: ${formatBytes(freed)} are free again.`];
+  /** @param {TrashedFile} file */
+  #restore({ id, name, kind }) {
+    return this.#attempt(async () => {
+      await api.restoreFile(kind, id);
+      this.#highlighted = kind === 'recordings' ? name : '';
+      return { text: `${name} was restored.` };
     });
   }
 
-  /** Does it, asks what there is now, and says what was done, with what undoes it, or what went wrong. */
-  async #try(act) {
-    const said = await act().catch((error) => [error.message, null, true]);
+  #emptyTrash() {
+    return this.#attempt(async () => {
+      const replies = [await api.emptyTrash('recordings'), await api.emptyTrash('reports')];
+      const freed = replies.reduce((sum, reply) => sum + reply.freed, 0);
+      return { text: `The trash was emptied: ${formatBytes(freed)} freed.` };
+    });
+  }
+
+  /**
+   * Performs an action, updates the list, and shows the status that the action returns, or its error.
+   * @param {() => Promise<Status | void>} action
+   */
+  async #attempt(action) {
+    const status = await action().catch((error) => ({ text: messageOf(error), failed: true }));
     await this.load();
-    if (said) this.#say(...said);
+    if (status) this.#status.show(status);
   }
 
-  #say(text, undo = null, bad = false) {
-    const line = this.#part('.said');
-    this.#undo = undo;
-    line.hidden = !text;
-    line.dataset.state = bad ? 'error' : 'done';
-    line.firstElementChild.textContent = text;
-    line.querySelector('.text').hidden = !undo;
-  }
-
-  #drawTrash(trash) {
-    const host = this.#part('.trash');
-    host.hidden = !trash.length;
-    const all = formatBytes(trash.reduce((sum, one) => sum + one.bytes, 0));
-    host.querySelector('summary').textContent = `Deleted: ${trash.length}, ${all}`;
-    const button = host.querySelector('.empty');
-    [button.textContent, button.disabled, button.title] = [
-      `Empty the trash (${all})`,
-      Boolean(this.#readOnly),
-      this.#readOnly ?? '',
-    ];
-    host.querySelector('ul').replaceChildren(
-      ...trash.map((one) => {
-        const line = document.createElement('li');
-        const back = Object.assign(document.createElement('button'), {
-          type: 'button',
-          className: 'text quiet',
-          textContent: 'Restore',
-          ariaLabel: `Restore ${one.name}`,
-          disabled: Boolean(this.#readOnly),
-        });
-        back.addEventListener('click', () => this.#restore(one));
-        line.append(
-          back,
-          one.name,
-          note(`${formatBytes(one.bytes)}, deleted ${moment(new Date(1000 * one.deleted))}`),
-        );
-        return line;
-      }),
-    );
-  }
-
-  #added({ name, problem, application }) {
-    this.#say(problem ? `${name} is added. ${problem}` : `${name} is added.`);
-    if (application) this.#point = name;
+  /** @param {RecordingEntry} file */
+  #showAdded({ name, problem, application }) {
+    this.#status.show({ text: `${name} was added.${problem && ` ${sentence(problem)}`}` });
+    if (application) this.#highlighted = name;
     this.load();
   }
 
-  #add(files) {
-    if (this.#readOnly) return this.#say(`${READ_ONLY}.`, null, true);
-    const taken = new Set(this.#kept?.recordings.map(({ name }) => name));
-    const free = (name) => {
-      const [stem] = /^(.*?)(\.rrd)?$/s.exec(name).slice(1);
-      let [wanted, number] = [`${stem}.rrd`, 2];
-      while (taken.has(wanted)) wanted = `${stem}-${number++}.rrd`;
-      taken.add(wanted);
-      return wanted;
+  /** @param {File[]} files */
+  #upload(files) {
+    if (this.#readOnlyReason) return this.#status.show({ text: `${READ_ONLY}.`, failed: true });
+    const names = new Set(this.#list.map(({ name }) => name));
+    /** @param {string} name */
+    const unusedName = (name) => {
+      const stem = name.replace(/\.rrd$/, '');
+      let candidate = `${stem}.rrd`;
+      for (let n = 2; names.has(candidate); n++) candidate = `${stem}-${n}.rrd`;
+      names.add(candidate);
+      return candidate;
     };
-    this.#adding.add([...files], free, this.#kept?.largest ?? Infinity);
+    this.#uploads.add(files, unusedName, this.#files?.recordings.largest ?? Infinity);
   }
 
-  #take() {
-    const press = (selector, act) => this.#part(selector).addEventListener('click', act);
-    const picker = this.#part('[type=file]');
-    const field = this.#part('[type=search]');
-    [this.#part('.add').disabled, this.#part('.add').title] = [
-      Boolean(this.#readOnly),
-      this.#readOnly ?? this.#part('.add').title,
-    ];
-    press('.add', () => picker.click());
-    press('.both', () => this.#show(this.#two));
-    press('.compare', () => this.#compare());
-    press('.automatic button', () => ((this.#automatic = !this.#automatic), this.#draw()));
-    press('.none', () => (this.#chosen.clear(), this.#draw()));
-    press('.empty', () => ((this.#part('.sure').hidden = false), this.#part('.no').focus()));
-    press('.yes', () => this.#empty());
-    press('.no', () => ((this.#part('.sure').hidden = true), this.#part('.empty').focus()));
-    press('.said .text', () => this.#undo?.());
-    press('.said .quiet', () => this.#say(''));
-    picker.addEventListener('change', () => (this.#add(picker.files), (picker.value = '')));
-    field.addEventListener('input', () => this.#kept && this.#draw());
-    field.addEventListener(
-      'keydown',
-      (event) => event.key === 'Escape' && this.#search(field.value.trim()),
-    );
+  #bindControls() {
+    /**
+     * @param {string} selector
+     * @param {() => void} action
+     */
+    const onClick = (selector, action) =>
+      html(selector, this.#host).addEventListener('click', action);
+    const picker = element('[type=file]', HTMLInputElement, this.#host);
+    const add = element('.add', HTMLButtonElement, this.#host);
+    if (this.#readOnlyReason) [add.disabled, add.title] = [true, this.#readOnlyReason];
+    onClick('.add', () => picker.click());
+    onClick('.automatic button', () => {
+      this.#showsAutomatic = !this.#showsAutomatic;
+      this.#draw();
+    });
+    picker.addEventListener('change', () => {
+      this.#upload([...(picker.files ?? [])]);
+      picker.value = '';
+    });
+    this.#search.addEventListener('input', () => this.#draw());
+    this.#search.addEventListener('keydown', (event) => {
+      if (event.key === 'Escape') this.#toggleSearch(this.#search.value.trim());
+    });
   }
-
-  /** Files that are dragged here. A drag enters and leaves every element on its way. */
-  #takeDrops() {
-    const drop = this.#part('.drop');
-    let inside = 0;
-    const show = (by) => (drop.hidden = (inside = Math.max(0, inside + by)) === 0);
-    const ours = (act) => (event) => {
-      if (![...event.dataTransfer.types].includes('Files')) return;
-      event.preventDefault();
-      act(event);
-    };
-    this.#host.addEventListener(
-      'dragenter',
-      ours(() => show(1)),
-    );
-    this.#host.addEventListener(
-      'dragover',
-      ours(() => {}),
-    );
-    this.#host.addEventListener(
-      'dragleave',
-      ours(() => show(-1)),
-    );
-    this.#host.addEventListener(
-      'drop',
-      ours((event) => (show(-inside), this.#add(event.dataTransfer.files))),
-    );
-  }
-}
-
-/** Why two recordings' runs cannot be compared on the page; empty where they can. */
-function apart(one, other) {
-  const without = [one, other].find(({ run }) => !run);
-  if (one.task !== other.task) return 'They are of different tasks.';
-  if (without) return `${without.name}: ${without.why_not}`;
-  if (one.episode !== other.episode || one.run.data !== other.run.data)
-    return 'They are of different episodes: Rerun shows both.';
-  return against(one, other) ? '' : 'They are of the same run.';
-}
-
-/** What differs in the other's run, as the page's address says it. */
-function against(one, other) {
-  const differs = {};
-  if (one.run.filter !== other.run.filter) differs.filter = other.run.filter;
-  if (one.faults !== other.faults) differs.faults = other.faults;
-  return String(new URLSearchParams(differs));
-}
-
-/** The time of today, the day of any other. */
-function moment(date) {
-  const now = new Date();
-  if (date.toDateString() === now.toDateString()) return TIME.format(date);
-  return `${DAY.format(date)}${date.getFullYear() === now.getFullYear() ? '' : ` ${date.getFullYear()}`}`;
-}
-
-function note(text, kind = '') {
-  return Object.assign(document.createElement('small'), { textContent: text, className: kind });
 }

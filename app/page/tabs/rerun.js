@@ -1,171 +1,214 @@
-/** Rerun's viewer in the page, loaded when its tab is first opened; its time and the page's step follow each other. It shows
- *  the page's run, or files in its place, which keep their own time. */
+/**
+ * Rerun's viewer, loaded when its tab is first opened. It shows the recording of the current run, whose time follows the
+ * page's step and the reverse; or files instead, with their own time.
+ */
 
+/** @import { WebViewer } from '/vendor/rerun/viewer.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Jobs } from '../widgets/jobs.js' */
+
+import { create, html, messageOf } from '../core/dom.js';
 import { recordingRequest } from '../data/api.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { writeRecording } from '../widgets/save_button.js';
 
-const SETTLING = 30; // frames at most until a recording that is being opened keeps our time
-const ECHO_FRAMES = 4; // that the viewer may take to tell back a time that we set
+/** @typedef {{name?: string, url: string}} RecordingFile */
+
+const SETTLE_FRAMES = 30; // at most, until a recording that is being opened keeps our time
+const STABLE_FRAMES = 3; // with our time, after which it is kept
+const ECHO_FRAMES = 4; // until the viewer reports a time that we have set
 
 export class Rerun {
   #host;
   #jobs;
-  #moved;
+  #onMove;
+  /** @type {WebViewer | null} */
   #viewer = null;
+  /** @type {Promise<WebViewer> | null} */
   #starting = null;
-  #shown = null; // the trace whose recording is open, or the files
+  /** What the viewer displays. @type {Trace | RecordingFile[] | null} */
+  #source = null;
+  /** @type {Trace | null} */
   #trace = null;
-  #files = null; // that are to be shown in place of the trace
-  #settled = null; // of what is shown, once it keeps our time
-  #opened = []; // store ids in the viewer that we opened
-  #bar = document.createElement('p');
+  /** Files to display in place of the trace. @type {RecordingFile[] | null} */
+  #files = null;
+  /** The source, once it keeps our time. @type {Trace | RecordingFile[] | null} */
+  #settled = null;
+  /** IDs of the stores that we have opened. @type {string[]} */
+  #stores = [];
+  #fileName = document.createElement('span');
+  #bar = create('p', { className: 'files', hidden: true }, this.#fileName);
   #step = 0;
+  /** Step to be set next. @type {number | null} */
   #pending = null;
   #busy = false;
-  #echo = null; // the step that we set last, until the viewer has told it back
+  /** Step that was set last, until the viewer reports it. @type {number | null} */
+  #echo = null;
   #open = false;
 
-  /** @param {HTMLElement} host @param {import('../widgets/jobs.js').Jobs} jobs @param {(step: number) => void} moved called when the time was moved in the viewer. */
-  constructor(host, jobs, moved) {
-    [this.#host, this.#jobs, this.#moved] = [host, jobs, moved];
-    [this.#bar.className, this.#bar.hidden] = ['files', true];
-    this.#bar.innerHTML =
-      '<span></span><button type="button" class="text">Back to the run</button>';
-    this.#bar.querySelector('button').addEventListener('click', () => this.files(null));
+  /**
+   * @param {HTMLElement} host
+   * @param {Jobs} jobs
+   * @param {(step: number) => void} onMove called when the time was changed in the viewer
+   */
+  constructor(host, jobs, onMove) {
+    this.#host = host;
+    this.#jobs = jobs;
+    this.#onMove = onMove;
+    const back = create('button', { type: 'button', className: 'text' }, 'Back to the current run');
+    back.addEventListener('click', () => this.files(null));
+    this.#bar.append(back);
     host.append(this.#bar);
   }
 
-  /** @param {import('../data/trace.js').Trace} trace */
+  /** @param {Trace} trace */
   show(trace) {
     this.#trace = trace;
     this.files(null);
   }
 
-  /** Shows files in place of the run, until another run is shown; null for the run again. @param {{name: string, url: string}[] | null} files */
+  /**
+   * Displays files until the next run is selected; null for the current run.
+   * @param {RecordingFile[] | null} files
+   */
   files(files) {
     this.#files = files;
     this.#bar.hidden = !files;
-    this.#bar.firstElementChild.textContent = files
-      ? files.map(({ name }) => name).join(' and ')
-      : '';
-    if (this.#open && (files || this.#trace)) this.#load();
+    this.#fileName.textContent = files?.map(({ name }) => name).join(' and ') ?? '';
+    this.#load();
   }
 
-  /** The tab is in front, or no longer. */
-  set open(open) {
+  /** Whether the tab is selected. */
+  set open(/** @type {boolean} */ open) {
     this.#open = open;
-    if (open && (this.#files || this.#trace)) this.#load();
+    this.#load();
   }
 
-  /** @param {number} step @param {boolean} fromRerun whether it was moved in the viewer itself. */
+  /**
+   * @param {number} step
+   * @param {boolean} fromRerun whether the step was changed in the viewer
+   */
   move(step, fromRerun) {
     this.#step = step;
     if (!fromRerun) this.#seek(step);
   }
 
-  /** What the viewer shows: for tests. */
+  /** Returns the state of the viewer, for tests. */
   async getState() {
     return this.#viewer ? this.#viewer.get_state() : null;
   }
 
   async #load() {
-    const [trace, files] = [this.#trace, this.#files];
-    if (this.#shown === (files ?? trace)) {
+    const source = this.#files ?? this.#trace;
+    if (!this.#open || !source) return;
+    if (this.#source === source) {
       this.#seek(this.#step);
       return;
     }
-    const shown = (this.#shown = files ?? trace);
+    this.#source = source;
     this.#settled = null;
     try {
-      setPanelState(this.#host, 'loading', files ? 'Starting Rerun …' : 'Writing the recording …');
-      const [recordings] = await Promise.all([
-        files ?? Promise.all([trace.stream ? this.#growing(trace) : this.#record(trace)]),
-        this.#start(),
-      ]);
-      if (this.#shown !== shown) return;
-      setPanelState(this.#host, 'loading', 'Opening the recording …');
-      const { store_ids: kept } = await this.#viewer.open(
-        recordings.map(({ url }) => new URL(url, location.href).href),
-      );
-      const others = this.#opened.filter((id) => !kept.includes(id));
-      this.#opened = [...others, ...kept];
-      if (this.#shown !== shown) return;
-      this.#viewer.override_panel_state(
-        'blueprint',
-        recordings.length > 1 ? 'expanded' : undefined,
-      );
-      setPanelState(this.#host, 'ready');
-      // What follows takes a drawing or more for each answer: the recording can be looked at meanwhile.
-      if (!files) await this.#settle(shown);
-      if (this.#shown !== shown) return;
-      this.#opened = kept;
-      await Promise.allSettled(others.map((id) => this.#viewer.close({ store_ids: [id] }))); // somebody may have before
-      this.#seek(this.#step);
+      await this.#display(source);
     } catch (error) {
-      if (this.#shown !== shown) return;
-      this.#shown = null;
-      setPanelState(this.#host, 'error', `Rerun cannot show this: ${error.message ?? error}`);
+      if (this.#source !== source) return;
+      this.#source = null;
+      setPanelState(this.#host, 'error', `Rerun cannot display this: ${messageOf(error)}`);
     }
   }
 
-  #record(trace) {
+  /** @param {Trace | RecordingFile[]} source */
+  async #display(source) {
+    const isTrace = !Array.isArray(source);
+    setPanelState(this.#host, 'loading', isTrace ? 'Writing the recording …' : 'Starting Rerun …');
+    const [recordings, viewer] = await Promise.all([
+      isTrace ? Promise.all([this.#recordingOf(source)]) : source,
+      this.#start(),
+    ]);
+    if (this.#source !== source) return;
+    setPanelState(this.#host, 'loading', 'Opening the recording …');
+    const urls = recordings.map(({ url }) => new URL(url, location.href).href);
+    const { store_ids: stores } = await viewer.open(urls);
+    const others = this.#stores.filter((id) => !stores.includes(id));
+    this.#stores = [...others, ...stores];
+    if (this.#source !== source) return;
+    viewer.override_panel_state('blueprint', recordings.length > 1 ? 'expanded' : undefined);
+    setPanelState(this.#host, 'ready');
+    // Each of the following requests takes one drawing or more; the recording is already visible.
+    if (isTrace) await this.#settle(viewer, source);
+    if (this.#source !== source) return;
+    this.#stores = stores;
+    await Promise.allSettled(others.map((id) => viewer.close({ store_ids: [id] })));
+    this.#seek(this.#step);
+  }
+
+  /**
+   * Returns the recording of a trace. A live run writes it as it grows; that of any other run is written now.
+   * @param {Trace} trace
+   * @returns {Promise<RecordingFile>}
+   */
+  async #recordingOf(trace) {
+    if (trace.stream && trace.live) {
+      const url = `/api/live/${encodeURIComponent(trace.live.name)}.rrd`;
+      const response = await fetch(url);
+      await response.body?.cancel();
+      if (response.ok) return { url };
+    }
     return writeRecording(recordingRequest(trace, true), this.#jobs, ({ progress, message }) => {
-      if (this.#shown === trace)
-        setPanelState(this.#host, 'loading', `Writing the recording: ${message || 'starting'} …`, progress);
+      if (this.#source !== trace) return;
+      const text = `Writing the recording: ${message || 'starting'} …`;
+      setPanelState(this.#host, 'loading', text, progress);
     });
   }
 
-  /** The recording that a live run writes itself, which is sent on as it grows; of one that writes none, what there is by now. */
-  async #growing(trace) {
-    const url = `/api/live/${encodeURIComponent(trace.live.name)}.rrd`;
-    const found = await fetch(url);
-    await found.body.cancel();
-    return found.ok ? { url } : this.#record(trace);
-  }
-
-  /** A recording that has just been opened sets its own time once more when its blueprint comes: insist on ours. */
-  async #settle(shown) {
-    for (let tries = 0, kept = 0; tries < SETTLING && kept < 3 && this.#shown === shown; tries++) {
-      const { active_store_id: active, recordings } = await this.#viewer.get_state();
-      const now = recordings.find((r) => r.store_id === active)?.current_time;
-      kept = now?.timeline === 'step' && Number(now.time) === this.#step ? kept + 1 : 0;
-      const time = { timeline: 'step', sequence: this.#step, play_state: 'paused' };
-      if (!kept) await this.#viewer.set_time(time).catch(() => frame());
+  /**
+   * Sets our time until the recording keeps it: its blueprint, which arrives later, sets another one.
+   * @param {WebViewer} viewer
+   * @param {Trace} source
+   */
+  async #settle(viewer, source) {
+    let stable = 0;
+    for (let i = 0; i < SETTLE_FRAMES && stable < STABLE_FRAMES && this.#source === source; i++) {
+      const { active_store_id: active, recordings } = await viewer.get_state();
+      const time = recordings.find((r) => r.store_id === active)?.current_time;
+      stable = time?.timeline === 'step' && Number(time.time) === this.#step ? stable + 1 : 0;
+      if (!stable) await viewer.set_time(timeOf(this.#step)).catch(() => frame());
     }
-    if (this.#shown === shown) this.#settled = shown;
+    if (this.#source === source) this.#settled = source;
   }
 
+  /** @returns {Promise<WebViewer>} */
   #start() {
-    this.#starting ??= (async () => {
-      // Its log of every shader it compiles is tens of thousands of lines and takes seconds.
-      console.debug = () => {};
-      const { WebViewer } = await import('/vendor/rerun/viewer.js');
-      const viewer = new WebViewer();
-      viewer.on('time_update', (event) => this.#heard(event.time));
-      const place = document.createElement('div');
-      place.className = 'viewer';
-      place.setAttribute('role', 'application'); // it takes the keys while it has the focus
-      place.setAttribute('aria-label', 'Rerun’s viewer');
-      this.#host.append(place);
-      await viewer.start(null, place, {
-        width: '100%',
-        height: '100%',
-        hide_welcome_screen: true,
-        check_for_updates_on_startup: false,
-        theme: 'system',
-      });
-      this.#viewer = viewer;
-      document.activeElement?.blur(); // it takes the keys as it starts; they are the page's until somebody clicks in it
-    })();
-    this.#starting.catch(() => (this.#starting = null));
+    if (!this.#starting) {
+      this.#starting = this.#startViewer();
+      this.#starting.catch(() => (this.#starting = null));
+    }
     return this.#starting;
   }
 
-  /** Whether the viewer's time and ours are the same. */
-  get #follows() {
+  async #startViewer() {
+    console.debug = () => {}; // the viewer logs every shader, which takes seconds
+    const { WebViewer } = await import('/vendor/rerun/viewer.js');
+    const viewer = new WebViewer();
+    viewer.on('time_update', ({ time }) => this.#timeUpdate(time));
+    const place = create('div', { className: 'viewer', role: 'application' });
+    place.ariaLabel = 'Rerun viewer';
+    this.#host.append(place);
+    await viewer.start(null, place, {
+      width: '100%',
+      height: '100%',
+      hide_welcome_screen: true,
+      check_for_updates_on_startup: false,
+      theme: 'system',
+    });
+    this.#viewer = viewer;
+    // The viewer takes the focus, and with it the keys, when it starts.
+    if (document.activeElement instanceof HTMLElement) document.activeElement.blur();
+    return viewer;
+  }
+
+  /** Whether the viewer's time and the page's step are coupled. */
+  get #isCoupled() {
     return (
-      this.#viewer !== null &&
       !this.#files &&
       this.#open &&
       this.#settled === this.#trace &&
@@ -173,40 +216,46 @@ export class Rerun {
     );
   }
 
-  /** Moves the viewer's time, one request at a time: the newest wins. */
+  /**
+   * Sets the viewer's time, one request after the other; of several pending steps only the newest is set.
+   * @param {number} step
+   */
   async #seek(step) {
     this.#pending = step;
-    if (this.#busy || !this.#follows) return;
+    if (this.#busy || !this.#viewer || !this.#isCoupled) return;
     this.#busy = true;
     while (this.#pending !== null) {
-      const started = performance.now();
+      const start = performance.now();
       [this.#echo, this.#pending] = [this.#pending, null];
       try {
-        await this.#viewer.set_time({
-          timeline: 'step',
-          sequence: this.#echo,
-          play_state: 'paused',
-        });
-        // It tells nothing back if it was there already. Its frames are ours: how long they take does not matter.
+        await this.#viewer.set_time(timeOf(this.#echo));
+        // The viewer reports nothing if it has this time already.
         for (let i = 0; i < ECHO_FRAMES && this.#echo !== null && this.#pending === null; i++)
           await frame();
       } catch (error) {
-        console.warn('Rerun did not take the time:', error);
+        console.warn('Rerun rejected the time:', error);
       }
       this.#echo = null;
-      // It draws in our thread: as long as it took, the rest of the page has its turn.
-      await new Promise((resolve) => setTimeout(resolve, performance.now() - started));
+      // The viewer draws in this thread: leave the same time to the rest of the page.
+      await new Promise((resolve) => setTimeout(resolve, performance.now() - start));
     }
     this.#busy = false;
   }
 
-  #heard(time) {
+  /** @param {number} time */
+  #timeUpdate(time) {
     const step = Math.round(time);
-    const ours = this.#echo !== null || this.#pending !== null; // on its way: whatever comes is older
+    const isOlder = this.#echo !== null || this.#pending !== null; // than the step that we are setting
     if (step === this.#echo) this.#echo = null;
-    if (ours || !this.#follows || step === this.#step) return;
-    if (step >= 0 && step < this.#trace.steps) this.#moved(step);
+    if (isOlder || !this.#isCoupled || step === this.#step) return;
+    if (this.#trace && step >= 0 && step < this.#trace.steps) this.#onMove(step);
   }
 }
+
+/**
+ * @param {number} step
+ * @returns {{timeline: string, sequence: number, play_state: 'paused'}}
+ */
+const timeOf = (step) => ({ timeline: 'step', sequence: step, play_state: 'paused' });
 
 const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));

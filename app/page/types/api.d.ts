@@ -64,8 +64,8 @@ export interface components {
             };
             /** Plots */
             plots: components["schemas"]["Plot"][];
-            /** Pictures */
-            pictures: components["schemas"]["PixelMap"][];
+            /** Images */
+            images: components["schemas"]["PixelMap"][];
             /** Names */
             names: [
                 string,
@@ -184,8 +184,8 @@ export interface components {
             };
             /** Plots */
             plots: components["schemas"]["Plot"][];
-            /** Pictures */
-            pictures: components["schemas"]["PixelMap"][];
+            /** Images */
+            images: components["schemas"]["PixelMap"][];
             /** Trajectories */
             trajectories: number;
         };
@@ -736,7 +736,7 @@ export interface components {
             /** Expected */
             expected: number | null;
             /** Started */
-            started: number;
+            started: string;
             /** Filter */
             filter: string;
             /** Available */
@@ -756,7 +756,7 @@ export interface components {
         };
         /**
          * LiveRun
-         * @description A live run. expected: number of steps, if announced. started: s since 1970.
+         * @description A live run. expected: number of steps, if announced. started: ISO 8601.
          */
         LiveRun: {
             /** Name */
@@ -781,7 +781,7 @@ export interface components {
             /** Expected */
             expected: number | null;
             /** Started */
-            started: number;
+            started: string;
         };
         /**
          * LiveState
@@ -851,8 +851,8 @@ export interface components {
             events: number;
             /** Share */
             share: number | null;
-            /** Failures */
-            failures: number | null;
+            /** Event Share */
+            event_share: number | null;
             /** Lift */
             lift: number | null;
             /** P Value */
@@ -1059,7 +1059,7 @@ export interface components {
         };
         /**
          * ReportEntry
-         * @description A report. made: ISO 8601. pdf: address of its PDF, or None.
+         * @description A report. created: ISO 8601. pdf: address of its PDF, or None.
          */
         ReportEntry: {
             /** Name */
@@ -1068,8 +1068,8 @@ export interface components {
             url: string;
             /** Title */
             title: string;
-            /** Made */
-            made: string;
+            /** Created */
+            created: string;
             /** Task */
             task: string;
             /** Filter */
@@ -1139,8 +1139,8 @@ export interface components {
             };
             /** Plots */
             plots: components["schemas"]["Plot"][];
-            /** Pictures */
-            pictures: components["schemas"]["PixelMap"][];
+            /** Images */
+            images: components["schemas"]["PixelMap"][];
         };
         /**
          * RunNames
@@ -1160,7 +1160,9 @@ export interface components {
             /** Name */
             name: string;
             /** Faults */
-            faults: string;
+            faults: {
+                [key: string]: unknown;
+            }[];
             /** Contact */
             contact: boolean | null;
             /** Only */
@@ -1317,7 +1319,7 @@ export interface components {
          *     Attributes:
          *         weight_width: 0 for a filter without weights. settings: of the run.
          *         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
-         *         no_maps: why there are no likelihood maps, or None. pictures: height and width of the camera images, or None.
+         *         no_maps: why there are no likelihood maps, or None. image_size: height and width of the camera images, or None.
          *         scene: layers of its 3D scene. live: present while the trace is of a live run.
          */
         TraceHeader: {
@@ -1356,8 +1358,8 @@ export interface components {
             ] | null;
             /** No Maps */
             no_maps: string | null;
-            /** Pictures */
-            pictures: [
+            /** Image Size */
+            image_size: [
                 number,
                 number
             ] | null;

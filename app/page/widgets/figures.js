@@ -22,6 +22,7 @@ import {
   padded,
 } from './plots.js';
 
+/** @typedef {Omit<DiagnosticResult, 'trajectories'>} Views */
 /** @typedef {{plot: uPlot, cursor: HTMLElement, values: HTMLElement[], curves: Curve[]}} CurveChart */
 
 const HEIGHT = { chart: scaled(104), axis: scaled(30) }; // px
@@ -30,7 +31,7 @@ const MESSAGE_TIME = 1500; // ms
 export class Figures {
   #host;
   #store;
-  /** @type {DiagnosticResult | null} */
+  /** @type {Views | null} */
   #result = null;
   /** @type {Trace | null} */
   #trace = null;
@@ -52,7 +53,7 @@ export class Figures {
   }
 
   /**
-   * @param {DiagnosticResult | null} result
+   * @param {Views | null} result
    * @param {Trace | null} trace the displayed trace; null if the result is not of a single trace
    */
   show(result, trace) {
@@ -77,7 +78,7 @@ export class Figures {
     const groups = curvesByChart(result.curves);
     groups.forEach((curves, i) => this.#curveChart(charts, curves, i === groups.length - 1));
     for (const plot of result.plots) this.#plots.push(drawPlot(panels, plot));
-    panels.append(...result.pictures.map(drawPixelMap));
+    panels.append(...result.images.map(drawPixelMap));
     if (this.#host.parentElement) this.#host.parentElement.scrollTop = scrollTop;
   }
 

@@ -211,9 +211,15 @@ export function jobSummary(job) {
  * @param {T | JobReply} body
  * @returns {Pending<T>}
  */
-export function pending(body) {
-  if (!('job' in body)) return { state: 'ready', result: body };
-  const { job } = body;
+export const pending = (body) =>
+  'job' in body ? jobState(body.job) : { state: 'ready', result: body };
+
+/**
+ * Returns the state of a result whose job is not done; null if there is no job.
+ * @param {Job | null} job
+ * @returns {{state: 'absent', job?: undefined} | {state: 'active' | 'ended', job: Job}}
+ */
+export function jobState(job) {
   if (!job) return { state: 'absent' };
   return { state: isActive(job) ? 'active' : 'ended', job };
 }

@@ -120,14 +120,14 @@ def test_compare_with_another_filter_or_other_faults(
         ("filter=kalman", "'kalman'"),
         ("faults=lightning", "lightning"),
         ("speed=3", "the comparison run"),
-        ("from=40&to=60", "nothing is edited"),
-        ("from=40&faults=blackout", "'to' of the edit"),
+        ("from=40&to=60", "is empty: give faults"),
+        ("from=40&faults=blackout", "'to' of edit"),
         ("from=60&to=40&faults=blackout", "has no steps"),
-        ("from=40&to=5000&faults=blackout", "beyond this trace"),
+        ("from=40&to=5000&faults=blackout", "after the last step of this trace"),
         ("from=40&to=60&weights=touch=1", "touch"),
-        ("from=40&to=60&weights=image=2", "from 0 to 1"),
+        ("from=40&to=60&weights=image=2", "must be between 0 and 1"),
         ("from=40&to=60&filter=crossmodal-pf&faults=blackout", "part of an edit"),
-        ("from=40&to=60&faults=blackout:from=2", "span of its own"),
+        ("from=40&to=60&faults=blackout:from=2", "has its own steps"),
     ],
 )
 def test_invalid_comparison_is_reported(server: TestClient, against: str, message: str) -> None:
@@ -168,12 +168,12 @@ def test_scene_shows_comparison_run(server: TestClient) -> None:
     try:
         scene.show(run, 45, other)
         nodes = scene.viser.server.scene._handle_from_node_name
-        there = {name: nodes[name] for name in ("/other/pole", "/other/ghost")}
-        ghost = run.checkpoint.task.outline
-        assert ghost is not None
-        placed = ghost(other.estimate_mean)
-        np.testing.assert_allclose(there["/other/ghost"].position, placed.position[45], atol=1e-6)
-        np.testing.assert_allclose(there["/other/pole"].position[:2], placed.anchor[45, :2], atol=1e-6)
+        handles = {name: nodes[name] for name in ("/other/pole", "/other/outline")}
+        outline = run.checkpoint.task.outline
+        assert outline is not None
+        placed = outline(other.estimate_mean)
+        np.testing.assert_allclose(handles["/other/outline"].position, placed.position[45], atol=1e-6)
+        np.testing.assert_allclose(handles["/other/pole"].position[:2], placed.anchor[45, :2], atol=1e-6)
         scene.show(run, 46)
         assert not any(name.startswith("/other") for name in nodes)
     finally:
@@ -193,7 +193,7 @@ def test_maps_of_comparison_run_are_sent_first(server: TestClient) -> None:
         "angle": None,
     }
     with server.websocket_connect(f"ws://localhost:8000{view['socket']}") as socket:
-        for serial, extra in enumerate(({}, {"against": against}, {"against": against, "beside": True})):
+        for serial, extra in enumerate(({}, {"against": against}, {"against": against, "comparison_maps": True})):
             socket.send_json({**cursor, "serial": serial, "size": 41, "scene": False, **extra})
             headers = [header(socket.receive_bytes()) for _ in range(1 + len(extra) // 2)]
             assert [h["other"] for h in headers] == [True, False][-len(headers) :]

@@ -71,7 +71,7 @@ def test_list_of_diagnostics(server: TestClient) -> None:
             {"name": o["name"], "meaning": DIAGNOSTICS[entry["name"]].options[o["name"]], "default": o["default"]}
             for o in entry["options"]
         ]
-    assert {"name": "size", "meaning": "cells along a side, 41 by default", "default": "41"} in next(
+    assert {"name": "size", "meaning": "cells per side, 41 by default", "default": "41"} in next(
         entry for entry in listed if entry["name"] == "maps"
     )["options"]
 
@@ -138,7 +138,7 @@ def test_errors_name_the_reason(server: TestClient) -> None:
         bad = server.request(method, url("maps"), params={"size": "large"})
         assert bad.status_code == 400
         assert bad.json()["error"] == (
-            "option 'size' of maps (cells along a side, 41 by default) is 'large': "
+            "option 'size' of maps (cells per side, 41 by default) is 'large': "
             "Input should be a valid integer, unable to parse string as an integer."
         )
         unknown_option = server.request(method, url("maps"), params={"colour": "red"})

@@ -58,14 +58,14 @@ def header(client: TestClient, task: Task) -> dict[str, Any]:
 
 
 def map_layers(client: TestClient, task: Task) -> list[str] | None:
-    """Send a cursor; the layers of the received maps, None if there are none. The scene is drawn, too."""
+    """Send a cursor; the layers of the received maps, None if there are none. The scene is reply, too."""
     view = client.post("/api/views").json()
     cursor = {"serial": 1, "task": task.name, "filter": "own", "episode": 0, "step": 7, "size": 41, "data": "data"}
     with client.websocket_connect(view["socket"]) as socket:
         socket.send_json({"type": "cursor", **cursor})
         answer = socket.receive()
-        drawn = socket.receive_json()
-    assert drawn == {"type": "drawn", "serial": 1, "step": 7}
+        reply = socket.receive_json()
+    assert reply == {"type": "drawn", "serial": 1, "step": 7}
     if "bytes" not in answer:
         assert json.loads(answer["text"]) == {"type": "no_maps", "serial": 1, "step": 7}
         return None
@@ -116,7 +116,7 @@ def test_task_without_replay(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(TASKS, PLAIN.name, PLAIN)
     client = serve(PLAIN, "crossmodal-pf")
     assert [c["name"] for c in header(client, PLAIN)["components"]] == ["x", "y"]
-    assert header(client, PLAIN)["pictures"] == [32, 32]
+    assert header(client, PLAIN)["image_size"] == [32, 32]
     assert map_layers(client, PLAIN) == ["image", "haptics", "fused"]
     images = client.get(f"/api/trace/{PLAIN.name}/own/0/images").content
     assert len(images) == 20 * 32 * 32
@@ -132,6 +132,6 @@ def test_task_without_images(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> N
     )
     monkeypatch.setitem(TASKS, task.name, task)
     client = serve(task, "haptics-ekf")
-    assert header(client, task)["pictures"] is None
+    assert header(client, task)["image_size"] is None
     assert map_layers(client, task) == ["haptics", "fused"]
     assert client.get(f"/api/trace/{task.name}/own/0/images").status_code == 404

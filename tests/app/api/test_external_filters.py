@@ -90,8 +90,8 @@ def test_server_needs_the_task(tmp_path: Path) -> None:
 
 @pytest.fixture
 def client(base_settings: Settings, tmp_path: Path, open_client: Callable[..., TestClient]) -> TestClient:
-    own = load_external(SPEC)
-    return open_client(Settings(tmp_path / "workspace", base_settings.data, {own.name: own}))
+    filter_ = load_external(SPEC)
+    return open_client(Settings(tmp_path / "workspace", base_settings.data, {filter_.name: filter_}))
 
 
 def test_page_shows_available_values(client: TestClient) -> None:

@@ -37,8 +37,8 @@ def filters(client: TestClient) -> list[str]:
     return [f["name"] for f in next(task for task in tasks if task["name"] == "door")["filters"]]
 
 
-def test_options(client: TestClient) -> None:
-    offer = client.get(URL).json()
+def test_options(shared_client: TestClient) -> None:
+    offer = shared_client.get(URL).json()
     assert offer["why_not"] is None
     names = [m["name"] for m in offer["modules"]]
     assert {"dynamics", "virtual_sensors.haptics.state", "weight_model"} <= set(names)
@@ -128,6 +128,6 @@ def test_invalid_settings_create_no_job(client: TestClient, body: dict[str, Any]
     assert client.get("/api/jobs").json() == []
 
 
-def test_unknown_run_is_404(client: TestClient) -> None:
-    assert client.get("/api/tuned/0123").status_code == 404
-    assert client.post("/api/tuned/0123/save").status_code == 404
+def test_unknown_run_is_404(shared_client: TestClient) -> None:
+    assert shared_client.get("/api/tuned/0123").status_code == 404
+    assert shared_client.post("/api/tuned/0123/save").status_code == 404

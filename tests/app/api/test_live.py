@@ -39,7 +39,7 @@ def part(run: Trace, first: int, last: int) -> Trace:
 
 
 @pytest.fixture(scope="module", params=["crossmodal-ekf", "crossmodal-pf"])
-def whole(request: pytest.FixtureRequest) -> Trace:
+def full_trace(request: pytest.FixtureRequest) -> Trace:
     checkpoint = load_checkpoint(shipped("door", request.param))
     with open_dataset(sample_path("door")) as data:
         episode = data[9]
@@ -62,8 +62,8 @@ def folder(settings: Any) -> Path:
 
 
 @pytest.fixture
-def writer(folder: Path, whole: Trace) -> Iterator[LiveFileWriter]:
-    writer = LiveFileWriter(folder / "run.live", whole, expected=STEPS)
+def writer(folder: Path, full_trace: Trace) -> Iterator[LiveFileWriter]:
+    writer = LiveFileWriter(folder / "run.live", full_trace, expected=STEPS)
     yield writer
     writer.close()
 
@@ -80,15 +80,15 @@ def values(head: dict[str, Any], buffer: bytes) -> dict[str, np.ndarray[Any, Any
     for column in head["columns"]:
         count = int(np.prod(column["shape"]))
         arrays[column["name"]] = np.frombuffer(buffer, "<f4", count, column["offset"]).reshape(column["shape"])
-    images = np.frombuffer(buffer[len(buffer) - head["pictures"] :], np.uint8)
-    return arrays | {"pictures": images.reshape(head["steps"], 32, 32)}
+    images = np.frombuffer(buffer[len(buffer) - head["image_bytes"] :], np.uint8)
+    return arrays | {"images": images.reshape(head["steps"], 32, 32)}
 
 
-def expected(whole: Trace) -> dict[str, np.ndarray[Any, Any]]:
-    descriptions, buffer = columns(whole)
-    images = camera_images(whole)
+def expected(full_trace: Trace) -> dict[str, np.ndarray[Any, Any]]:
+    descriptions, buffer = columns(full_trace)
+    images = camera_images(full_trace)
     assert images is not None
-    head = {"columns": descriptions, "pictures": images.nbytes, "steps": len(whole)}
+    head = {"columns": descriptions, "image_bytes": images.nbytes, "steps": len(full_trace)}
     return values(head, buffer + images.tobytes())
 
 
@@ -98,12 +98,12 @@ def assert_equal(actual: dict[str, Any], expected: dict[str, Any]) -> None:
         np.testing.assert_allclose(actual[name], expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
 
 
-def test_fast_and_slow_clients_receive_all_steps(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
+def test_fast_and_slow_clients_receive_all_steps(client: TestClient, writer: LiveFileWriter, full_trace: Trace) -> None:
     """The slow client receives larger blocks."""
     blocks: dict[str, list[Any]] = {"fast": [], "slow": []}
     with client.websocket_connect("/api/live/run") as fast, client.websocket_connect("/api/live/run") as slow:
         for step in range(STEPS):
-            writer.append(part(whole, step, step + 1))
+            writer.append(part(full_trace, step, step + 1))
             head, buffer = request_block(fast, step)
             assert (head["first"], head["steps"], head["total"], head["state"]) == (step, 1, step + 1, "running")
             blocks["fast"].append(values(head, buffer))
@@ -115,18 +115,18 @@ def test_fast_and_slow_clients_receive_all_steps(client: TestClient, writer: Liv
         head, _ = request_block(fast, STEPS)
         assert (head["steps"], head["state"], head["message"]) == (0, "ended", "")
     for parts in blocks.values():
-        assert_equal({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, expected(whole))
+        assert_equal({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, expected(full_trace))
 
 
-def test_nothing_is_sent_without_a_request(address: str, settings: Any, whole: Trace) -> None:
+def test_nothing_is_sent_without_a_request(address: str, settings: Any, full_trace: Trace) -> None:
     from websockets.sync.client import connect
 
     folder = settings.workspace / "live"
     folder.mkdir(parents=True)
-    writer = LiveFileWriter(folder / "run.live", whole)
+    writer = LiveFileWriter(folder / "run.live", full_trace)
     with connect(f"ws://{address}/api/live/run", origin=f"http://{address}", max_size=None) as socket:  # type: ignore[arg-type]
         for _ in range(20):
-            writer.append(whole)
+            writer.append(full_trace)
         with pytest.raises(TimeoutError):
             socket.recv(timeout=0.2)
         socket.send(json.dumps({"from": 0, "state": "running"}))
@@ -138,9 +138,9 @@ def test_nothing_is_sent_without_a_request(address: str, settings: Any, whole: T
 
 
 def test_size_of_a_message_is_limited(
-    client: TestClient, writer: LiveFileWriter, whole: Trace, monkeypatch: Any
+    client: TestClient, writer: LiveFileWriter, full_trace: Trace, monkeypatch: Any
 ) -> None:
-    writer.append(whole)
+    writer.append(full_trace)
     monkeypatch.setattr("beliefscope.app.api.live.MAX_BLOCK", 5 * bytes_per_step(writer))
     first, parts = 0, []
     with client.websocket_connect("/api/live/run") as socket:
@@ -149,7 +149,7 @@ def test_size_of_a_message_is_limited(
             assert 0 < head["steps"] <= 5
             parts.append(values(head, buffer))
             first += head["steps"]
-    assert_equal({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, expected(whole))
+    assert_equal({name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, expected(full_trace))
 
 
 def bytes_per_step(writer: LiveFileWriter) -> int:
@@ -158,10 +158,10 @@ def bytes_per_step(writer: LiveFileWriter) -> int:
     return reader.bytes_per_step
 
 
-def test_response_waits_for_the_next_step(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    writer.append(part(whole, 0, 1))
+def test_response_waits_for_the_next_step(client: TestClient, writer: LiveFileWriter, full_trace: Trace) -> None:
+    writer.append(part(full_trace, 0, 1))
     with client.websocket_connect("/api/live/run") as socket:
-        timer = threading.Timer(0.3, writer.append, [part(whole, 1, 2)])
+        timer = threading.Timer(0.3, writer.append, [part(full_trace, 1, 2)])
         timer.start()
         head, _ = request_block(socket, 1)
         assert head["steps"] == 1
@@ -172,34 +172,36 @@ def test_response_waits_for_the_next_step(client: TestClient, writer: LiveFileWr
         assert time.monotonic() - started >= TIMEOUT - 0.1
 
 
-def test_header_of_a_growing_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    url = TRACE.format(whole.filter)
+def test_header_of_a_growing_run(client: TestClient, writer: LiveFileWriter, full_trace: Trace) -> None:
+    url = TRACE.format(full_trace.filter)
     assert client.get(url).status_code == 202  # no step yet
-    writer.append(part(whole, 0, 10))
+    writer.append(part(full_trace, 0, 10))
     header = client.get(url).json()
     assert (header["steps"], header["live"]["state"], header["live"]["expected"]) == (10, "running", STEPS)
     assert header["no_maps"] is None
-    assert header["modalities"] == list(whole.modalities)
-    writer.append(part(whole, 10, STEPS))
+    assert header["modalities"] == list(full_trace.modalities)
+    writer.append(part(full_trace, 10, STEPS))
     writer.finish()
     header = client.get(url).json()
     assert header["steps"] == STEPS
     assert "live" not in header
-    content = client.get(f"/api/trace/door/{whole.filter}/9/columns?data=live:run").content
+    content = client.get(f"/api/trace/door/{full_trace.filter}/9/columns?data=live:run").content
     assert_equal(
-        values({"columns": header["columns"], "pictures": 0, "steps": 0}, content),
-        {**expected(whole), "pictures": np.zeros((0, 32, 32))},
+        values({"columns": header["columns"], "image_bytes": 0, "steps": 0}, content),
+        {**expected(full_trace), "images": np.zeros((0, 32, 32))},
     )
 
 
-def test_maps_of_growing_and_ended_runs_are_equal(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    writer.append(part(whole, 0, 12))
+def test_maps_of_growing_and_ended_runs_are_equal(
+    client: TestClient, writer: LiveFileWriter, full_trace: Trace
+) -> None:
+    writer.append(part(full_trace, 0, 12))
     store = client.app.state.store  # type: ignore[attr-defined]
-    selection = Selection("door", whole.filter, 9, data="live:run")
+    selection = Selection("door", full_trace.filter, 9, data="live:run")
     growing = store.request(selection)
     assert growing.growing
     maps = [growing.map(step, None, 41) for step in (0, 11)]
-    writer.append(part(whole, 12, STEPS))
+    writer.append(part(full_trace, 12, STEPS))
     writer.finish()
     ended = store.request(selection)
     assert not ended.growing
@@ -209,11 +211,11 @@ def test_maps_of_growing_and_ended_runs_are_equal(client: TestClient, writer: Li
         )
 
 
-def test_states_of_runs(client: TestClient, writer: LiveFileWriter, whole: Trace, folder: Path) -> None:
+def test_states_of_runs(client: TestClient, writer: LiveFileWriter, full_trace: Trace, folder: Path) -> None:
     """A running one, one killed at step 4, and a damaged file."""
-    writer.append(part(whole, 0, 3))
-    killed = LiveFileWriter(folder / "dead.live", whole)
-    killed.append(part(whole, 0, 5))
+    writer.append(part(full_trace, 0, 3))
+    killed = LiveFileWriter(folder / "dead.live", full_trace)
+    killed.append(part(full_trace, 0, 5))
     killed.close()
     (folder / "torn.live").write_bytes(b"BsL\nnot a run")
     for age, name in enumerate(("run", "dead", "torn")):
@@ -224,29 +226,31 @@ def test_states_of_runs(client: TestClient, writer: LiveFileWriter, whole: Trace
         ("dead", "died"),
         ("torn", "damaged"),
     ]
-    assert (listed[0]["filter"], listed[0]["steps"], listed[0]["available"]) == (whole.filter, 3, True)
+    assert (listed[0]["filter"], listed[0]["steps"], listed[0]["available"]) == (full_trace.filter, 3, True)
     assert listed[1]["message"] == "Live run 'dead' stopped at step 4: its process has exited without closing the file."
     assert "torn.live" in listed[2]["message"]
-    assert client.get(TRACE.format(whole.filter).replace("run", "dead")).json()["steps"] == 5
+    assert client.get(TRACE.format(full_trace.filter).replace("run", "dead")).json()["steps"] == 5
 
 
-def test_run_of_an_unavailable_filter(client: TestClient, folder: Path, whole: Trace) -> None:
+def test_run_of_an_unavailable_filter(client: TestClient, folder: Path, full_trace: Trace) -> None:
     """Gaussians have maps; a particle filter's maps need its networks."""
-    other = replace(whole, checkpoint_hash="f" * 64)
+    other = replace(full_trace, checkpoint_hash="f" * 64)
     writer = LiveFileWriter(folder / "run.live", other)
     writer.append(other)
     run = client.get("/api/live").json()["runs"][0]
-    assert (run["filter"], run["available"]) == (f"{whole.filter} (live)", False)
+    assert (run["filter"], run["available"]) == (f"{full_trace.filter} (live)", False)
     header = client.get(TRACE.format(run["filter"])).json()
-    assert (header["no_maps"] is None) == (whole.kind == "ekf")
+    assert (header["no_maps"] is None) == (full_trace.kind == "ekf")
     writer.finish()
     assert client.get(TRACE.format(run["filter"])).json()["no_maps"] == header["no_maps"]
     writer.close()
 
 
-def test_run_without_true_states(client: TestClient, folder: Path, whole: Trace) -> None:
+def test_run_without_true_states(client: TestClient, folder: Path, full_trace: Trace) -> None:
     """Values that need the truth are NaN, and maps are centered on the estimate."""
-    run = replace(whole, episode=replace(whole.episode, states=np.full_like(whole.episode.states, np.nan)))
+    run = replace(
+        full_trace, episode=replace(full_trace.episode, states=np.full_like(full_trace.episode.states, np.nan))
+    )
     writer = LiveFileWriter(folder / "run.live", run)
     writer.append(run)
     with client.websocket_connect("/api/live/run") as socket:
@@ -258,27 +262,27 @@ def test_run_without_true_states(client: TestClient, folder: Path, whole: Trace)
         for serial, finish in enumerate((False, True)):
             if finish:
                 writer.finish()
-            cursor = {"type": "cursor", "serial": serial, "task": "door", "filter": whole.filter, "episode": 9}
+            cursor = {"type": "cursor", "serial": serial, "task": "door", "filter": full_trace.filter, "episode": 9}
             socket.send_json(cursor | {"step": STEPS - 1, "angle": None, "size": 41, "data": "live:run"})
             message = socket.receive_bytes()
             head = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
             assert head["truth"] == [None, None, None]
             assert head["numbers"]["truth"] == [None] * len(head["layers"])
-            np.testing.assert_allclose(head["centre"], whole.estimate_mean[-1, :2], rtol=1e-5)
+            np.testing.assert_allclose(head["centre"], full_trace.estimate_mean[-1, :2], rtol=1e-5)
             assert socket.receive_json() == {"type": "drawn", "serial": serial, "step": STEPS - 1}
     writer.close()
-    failures = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
+    failures = client.get(f"/api/failures/door/{full_trace.filter}?data=live:run").json()
     assert [score["total"] for score in failures["scores"] if score["name"] == "error"] == [0]
 
 
-def test_invalid_requests_for_a_live_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    writer.append(part(whole, 0, 6))
+def test_invalid_requests_for_a_live_run(client: TestClient, writer: LiveFileWriter, full_trace: Trace) -> None:
+    writer.append(part(full_trace, 0, 6))
     for url, message in {
-        "/api/trace/door/image-ekf/9?data=live:run": "live run 'run' goes on",
+        "/api/trace/door/image-ekf/9?data=live:run": "live run 'run' is still running",
         "/api/trace/push/crossmodal-ekf/9?data=live:run": "is of task 'door', episode 9",
         "/api/trace/door/crossmodal-ekf/9?data=live:none": "live run 'none' does not exist",
         "/api/trace/door/crossmodal-ekf/9?data=live:../secret": "does not exist",
-        "/api/failures/door/crossmodal-ekf?data=live:run": "live run 'run' goes on",
+        "/api/failures/door/crossmodal-ekf?data=live:run": "live run 'run' is still running",
     }.items():
         answer = client.get(url)
         assert (answer.status_code, message in answer.json()["error"]) == (400, True), answer.text
@@ -287,8 +291,8 @@ def test_invalid_requests_for_a_live_run(client: TestClient, writer: LiveFileWri
         assert socket.receive()["code"] == 4000
 
 
-def test_another_filter_on_an_ended_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    writer.append(whole)
+def test_another_filter_on_an_ended_run(client: TestClient, writer: LiveFileWriter, full_trace: Trace) -> None:
+    writer.append(full_trace)
     writer.finish()
     url = "/api/trace/door/image-ekf/9?data=live:run"
     deadline = time.monotonic() + 30.0
@@ -297,17 +301,17 @@ def test_another_filter_on_an_ended_run(client: TestClient, writer: LiveFileWrit
     assert answer.json()["steps"] == STEPS
 
 
-def test_failures_of_an_ended_run(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    writer.append(whole)
+def test_failures_of_an_ended_run(client: TestClient, writer: LiveFileWriter, full_trace: Trace) -> None:
+    writer.append(full_trace)
     writer.finish()
-    failures = client.get(f"/api/failures/door/{whole.filter}?data=live:run").json()
+    failures = client.get(f"/api/failures/door/{full_trace.filter}?data=live:run").json()
     assert (failures["data"], failures["steps"], failures["faults"]) == ("live:run", STEPS, "")
     by_error = next(score for score in failures["scores"] if score["name"] == "error")
-    events = failures_of(Survey.from_traces([whole]), "error").events
+    events = failures_of(Survey.from_traces([full_trace]), "error").events
     assert [(e["step"], e["value"]) for e in by_error["events"]] == [(e.step, e.score) for e in events]
     assert {e["episode"] for e in by_error["events"]} == {9}
     assert "data=live%3Arun" in by_error["events"][0]["link"]
-    refused = client.post(f"/api/failures/door/{whole.filter}?data=live:run")
+    refused = client.post(f"/api/failures/door/{full_trace.filter}?data=live:run")
     assert "a single episode, not a data set" in refused.json()["error"]
 
 
@@ -321,29 +325,29 @@ def poll(client: TestClient, url: str) -> dict[str, Any]:
 
 
 def test_recording_comparison_and_diagnostics(
-    client: TestClient, writer: LiveFileWriter, whole: Trace, settings: Any
+    client: TestClient, writer: LiveFileWriter, full_trace: Trace, settings: Any
 ) -> None:
     """A recording contains the steps so far; the others need the end of the run."""
-    body = {"task": "door", "filter": whole.filter, "episode": 9, "data": "live:run", "maps": 4}
+    body = {"task": "door", "filter": full_trace.filter, "episode": 9, "data": "live:run", "maps": 4}
     written = []
     for first, last in ((0, 10), (10, STEPS)):
-        writer.append(part(whole, first, last))
+        writer.append(part(full_trace, first, last))
         answer = client.post("/api/recordings", json=body)
         assert answer.status_code == 201, answer.text
         written.append(read_recording(settings.workspace / "recordings" / answer.json()["name"]))
     assert [len(run) for run in written] == [10, STEPS]
-    np.testing.assert_array_equal(written[1].estimate_mean, whole.estimate_mean)
+    np.testing.assert_array_equal(written[1].estimate_mean, full_trace.estimate_mean)
     writer.finish()
-    path = f"door/{whole.filter}/9"
+    path = f"door/{full_trace.filter}/9"
     comparison = poll(client, f"/api/compare/{path}?data=live:run&against=filter%3Dimage-ekf")
-    assert comparison["names"] == [whole.filter, "image-ekf"]
+    assert comparison["names"] == [full_trace.filter, "image-ekf"]
     entries = {entry["name"]: entry for entry in client.get(f"/api/diagnostics/{path}?data=live:run").json()}
     name = next(name for name, entry in entries.items() if not entry["slow"] and not entry["why_not"])
     assert poll(client, f"/api/diagnostics/{name}/{path}?data=live:run")["trajectories"] == 1
 
 
-def test_growing_recording_is_streamed(client: TestClient, writer: LiveFileWriter, whole: Trace) -> None:
-    writer.append(part(whole, 0, 1))
+def test_growing_recording_is_streamed(client: TestClient, writer: LiveFileWriter, full_trace: Trace) -> None:
+    writer.append(part(full_trace, 0, 1))
     recording = writer.path.with_suffix(".rrd")
     parts = [bytes([i]) * 300_000 for i in range(3)]
 

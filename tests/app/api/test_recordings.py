@@ -34,7 +34,7 @@ TIMEOUT = 60.0  # s, including the import of Rerun by the reader
 
 
 @pytest.fixture(scope="session")
-def own(base_settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def run_recording(base_settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A recording of the first filter's run over the second episode."""
     checkpoint = load_checkpoint(Path(str(base_settings.checkpoints["crossmodal-ekf"])))
     with open_dataset(base_settings.data["mine"], DOOR) as data:
@@ -157,25 +157,17 @@ def test_invalid_requests_write_nothing(
     assert not (settings.workspace / "recordings").exists()
 
 
-def test_upload_reads_metadata(client: TestClient, own: bytes, folder: Path) -> None:
-    answer = client.put(f"{URL}/theirs%20(1).rrd", content=own)
+def test_upload_reads_metadata(client: TestClient, run_recording: bytes, folder: Path) -> None:
+    answer = client.put(f"{URL}/theirs%20(1).rrd", content=run_recording)
     assert answer.status_code == 201, answer.text
-    assert (folder / "theirs (1).rrd").read_bytes() == own
+    assert (folder / "theirs (1).rrd").read_bytes() == run_recording
     (entry,) = listed(client).values()
     assert answer.json() == entry
     values = {key: entry[key] for key in ("name", "task", "filter", "episode", "steps", "faults", "problem", "why_not")}
-    assert values == {
-        "name": "theirs (1).rrd",
-        "task": "door",
-        "filter": "crossmodal-ekf",
-        "episode": 1,
-        "steps": 40,
-        "faults": "",
-        "problem": "",
-        "why_not": "",
-    }
+    run = {"task": "door", "filter": "crossmodal-ekf", "episode": 1, "steps": 40, "faults": ""}
+    assert values == run | {"name": "theirs (1).rrd", "problem": "", "why_not": ""}
     assert entry["run"] == {"filter": "crossmodal-ekf", "data": "mine"}
-    assert client.get(entry["url"]).content == own
+    assert client.get(entry["url"]).content == run_recording
     assert not [path for path in folder.iterdir() if path.name.endswith(".part")]
 
 
@@ -183,15 +175,15 @@ def test_upload_reads_metadata(client: TestClient, own: bytes, folder: Path) -> 
 def test_recording_of_another_application(client: TestClient, foreign: bytes) -> None:
     entry = client.put(f"{URL}/foreign.rrd", content=foreign).json()
     assert (entry["application"], entry["task"], entry["run"]) == ("their_app", None, None)
-    assert "written by 'their_app', not by beliefscope" in entry["problem"]
+    assert "Written by 'their_app', not by beliefscope" in entry["problem"]
     assert entry["entities"] >= 1
 
 
 @IN_PROCESS
 def test_reason_why_a_run_is_not_in_the_catalog(
-    settings: Settings, open_client: Callable[..., TestClient], own: bytes, folder: Path
+    settings: Settings, open_client: Callable[..., TestClient], run_recording: bytes, folder: Path
 ) -> None:
-    (folder / "run.rrd").write_bytes(own)
+    (folder / "run.rrd").write_bytes(run_recording)
     for changes, reason in (
         ({"checkpoints": {}}, "Filter crossmodal-ekf of door with checkpoint"),
         ({"data": {}}, "No data set of this server contains its episode 1"),
@@ -206,18 +198,20 @@ def test_reason_why_a_run_is_not_in_the_catalog(
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "not a whole Rerun recording"),
+        (b"", "not a complete Rerun recording"),
         (b"\x89PNG\r\n", "begin with RRF"),
-        (b"RRF2" + bytes(8), "not a whole Rerun recording"),
-        (b"RRF2\x00\x29\x00\x00\x01\x02\x00\x00" + bytes(range(256)) * 40, "not a whole Rerun recording"),
-        (None, "not a whole Rerun recording"),
+        (b"RRF2" + bytes(8), "not a complete Rerun recording"),
+        (b"RRF2\x00\x29\x00\x00\x01\x02\x00\x00" + bytes(range(256)) * 40, "not a complete Rerun recording"),
+        (None, "not a complete Rerun recording"),
     ],
     ids=["empty", "image", "zeros", "junk", "truncated"],
 )
 def test_invalid_files_are_refused(
-    client: TestClient, own: bytes, folder: Path, content: bytes | None, message: str
+    client: TestClient, run_recording: bytes, folder: Path, content: bytes | None, message: str
 ) -> None:
-    answer = client.put(f"{URL}/x.rrd", content=own[: len(own) // 2] if content is None else content)
+    answer = client.put(
+        f"{URL}/x.rrd", content=run_recording[: len(run_recording) // 2] if content is None else content
+    )
     assert answer.status_code == 400
     assert message in answer.json()["error"]
     assert str(folder) not in answer.json()["error"]
@@ -226,10 +220,14 @@ def test_invalid_files_are_refused(
 
 
 @IN_PROCESS
-def test_upload_size_is_limited(client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_upload_size_is_limited(
+    client: TestClient, run_recording: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(recordings, "MAX_UPLOAD", 10_000)
-    chunks = (own[start : start + 4000] for start in range(0, len(own), 4000))  # without content-length
-    for content in (own, chunks):
+    chunks = (
+        run_recording[start : start + 4000] for start in range(0, len(run_recording), 4000)
+    )  # without content-length
+    for content in (run_recording, chunks):
         answer = client.put(f"{URL}/x.rrd", content=content)
         assert answer.status_code == 413
         assert "larger than 0 MB" in answer.json()["error"]
@@ -237,34 +235,38 @@ def test_upload_size_is_limited(client: TestClient, own: bytes, folder: Path, mo
     assert not list(folder.iterdir())
 
 
-def test_crash_of_the_reader(client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_of_the_reader(
+    client: TestClient, run_recording: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Rerun 0.41 aborts on ``abort.rrd``, which has one flipped bit; ``/bin/false`` stands for any crash."""
     (folder / "bad.rrd").write_bytes((Path(__file__).parent / "abort.rrd").read_bytes())
     (entry,) = listed(client).values()
     assert entry["problem"]
     assert (entry["application"], entry["run"]) == ("", None)
     monkeypatch.setattr("sys.executable", "/bin/false")
-    (folder / "bad.rrd").write_bytes(own)
+    (folder / "bad.rrd").write_bytes(run_recording)
     (entry,) = listed(client).values()
     assert "Reading the file failed" in entry["problem"]
-    answer = client.put(f"{URL}/x.rrd", content=own)
+    answer = client.put(f"{URL}/x.rrd", content=run_recording)
     assert answer.status_code == 400
     assert "Reading the file failed" in answer.json()["error"]
 
 
 @IN_PROCESS
-def test_names_and_tags_are_stored(settings: Settings, open_client: Callable[..., TestClient], own: bytes) -> None:
+def test_names_and_tags_are_stored(
+    settings: Settings, open_client: Callable[..., TestClient], run_recording: bytes
+) -> None:
     with open_client(settings) as client:
-        client.put(f"{URL}/a.rrd", content=own)
-        client.put(f"{URL}/b.rrd", content=own)
+        client.put(f"{URL}/a.rrd", content=run_recording)
+        client.put(f"{URL}/b.rrd", content=run_recording)
         answer = client.patch(f"{URL}/a.rrd", json={"tags": ["paper", "Fig  3", "PAPER"]})
         assert answer.json()["tags"] == ["paper", "Fig 3"]
         conflict = client.patch(f"{URL}/a.rrd", json={"name": "b"})
         assert (conflict.status_code, "'b.rrd' already exists" in conflict.json()["error"]) == (409, True)
-        assert client.put(f"{URL}/b.rrd", content=own).status_code == 409
+        assert client.put(f"{URL}/b.rrd", content=run_recording).status_code == 409
         renamed = client.patch(f"{URL}/a.rrd", json={"name": "Tür (neu)"}).json()
         assert (renamed["name"], renamed["tags"]) == ("Tür (neu).rrd", ["paper", "Fig 3"])
-        assert client.get(renamed["url"]).content == own
+        assert client.get(renamed["url"]).content == run_recording
         assert client.get(f"{URL}/a.rrd").status_code == 404
     with open_client(settings) as client:
         assert {name: r["tags"] for name, r in listed(client).items()} == {
@@ -274,8 +276,8 @@ def test_names_and_tags_are_stored(settings: Settings, open_client: Callable[...
 
 
 @IN_PROCESS
-def test_invalid_names_and_tags_are_refused(client: TestClient, own: bytes) -> None:
-    before = client.put(f"{URL}/a.rrd", content=own).json()
+def test_invalid_names_and_tags_are_refused(client: TestClient, run_recording: bytes) -> None:
+    before = client.put(f"{URL}/a.rrd", content=run_recording).json()
     names = ("", "..", "../x", "a\\b", ".hidden", "a" * 300)
     tags = ([""], ["a,b"], ["x" * 41], [f"{i}" for i in range(30)], "x")
     for body in (*({"name": name} for name in names), *({"tags": value} for value in tags), {"tag": 1}, [], None):
@@ -292,38 +294,40 @@ def test_invalid_file_names(name: str) -> None:
 
 
 @IN_PROCESS
-def test_delete_and_restore(client: TestClient, own: bytes, folder: Path) -> None:
-    client.put(f"{URL}/a.rrd", content=own)
+def test_delete_and_restore(client: TestClient, run_recording: bytes, folder: Path) -> None:
+    client.put(f"{URL}/a.rrd", content=run_recording)
     before = client.patch(f"{URL}/a.rrd", json={"tags": ["paper"]}).json()
     id = client.delete(f"{URL}/a.rrd").json()["deleted"]
     lists = client.get(URL).json()
     assert lists["recordings"] == []
-    assert [(d["id"], d["name"], d["bytes"]) for d in lists["deleted"]] == [(id, "a.rrd", len(own))]
-    client.put(f"{URL}/a.rrd", content=own)
+    assert [(d["id"], d["name"], d["bytes"]) for d in lists["deleted"]] == [(id, "a.rrd", len(run_recording))]
+    client.put(f"{URL}/a.rrd", content=run_recording)
     assert client.post(f"{URL}/deleted/{id}").status_code == 409
     client.patch(f"{URL}/a.rrd", json={"name": "other"})
     assert client.post(f"{URL}/deleted/{id}").json() == before
     assert client.post(f"{URL}/deleted/{id}").status_code == 404
     client.delete(f"{URL}/a.rrd")
-    assert client.delete(f"{URL}/deleted").json() == {"freed": len(own)}
+    assert client.delete(f"{URL}/deleted").json() == {"freed": len(run_recording)}
     assert client.get(URL).json()["deleted"] == []
     assert not list((folder / ".deleted").iterdir())
 
 
 @IN_PROCESS
-def test_deleted_files_expire(client: TestClient, own: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (folder / "a.rrd").write_bytes(own)
+def test_deleted_files_expire(
+    client: TestClient, run_recording: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "a.rrd").write_bytes(run_recording)
     client.delete(f"{URL}/a.rrd")
     assert len(client.get(URL).json()["deleted"]) == 1
-    later = time.time() + 86400 * trash.DAYS + 1
+    later = time.time() + 86400 * trash.RETENTION_DAYS + 1
     monkeypatch.setattr(trash.time, "time", lambda: later)
     assert client.get(URL).json()["deleted"] == []
     assert not list((folder / ".deleted").iterdir())
 
 
 @IN_PROCESS
-def test_list_has_an_etag(client: TestClient, own: bytes, folder: Path) -> None:
-    client.put(f"{URL}/a.rrd", content=own)
+def test_list_has_an_etag(client: TestClient, run_recording: bytes, folder: Path) -> None:
+    client.put(f"{URL}/a.rrd", content=run_recording)
     tag = client.get(URL).headers["etag"]
     assert client.get(URL, headers={"If-None-Match": tag}).status_code == 304
     (folder / "a.rrd").unlink()
@@ -339,9 +343,9 @@ def test_list_has_an_etag(client: TestClient, own: bytes, folder: Path) -> None:
 
 @IN_PROCESS
 def test_metadata_are_read_again_after_a_change(
-    client: TestClient, own: bytes, foreign: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, run_recording: bytes, foreign: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (folder / "a.rrd").write_bytes(own)
+    (folder / "a.rrd").write_bytes(run_recording)
     client.patch(f"{URL}/a.rrd", json={"tags": ["x"]})
     assert listed(client)["a.rrd"]["task"] == "door"
     metadata = folder / ".about" / "a.rrd.json"
@@ -374,7 +378,7 @@ def test_links_and_partial_files_are_not_listed(
 
 @IN_PROCESS
 def test_renamed_recording_is_recognised_by_content(
-    client: TestClient, trace_url: str, own: bytes, folder: Path
+    client: TestClient, trace_url: str, run_recording: bytes, folder: Path
 ) -> None:
     body = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
     written = client.post(URL, json=body).json()
@@ -382,7 +386,7 @@ def test_renamed_recording_is_recognised_by_content(
     again = client.post(URL, json=body)
     assert (again.status_code, again.json()["name"]) == (200, "mine.rrd")
     client.delete(f"{URL}/mine.rrd")
-    client.put(f"{URL}/{written['name']}", content=own)  # same name, other content
+    client.put(f"{URL}/{written['name']}", content=run_recording)  # same name, other content
     other = client.post(URL, json=body)
     assert (other.status_code, other.json()["name"]) == (201, written["name"].replace(".rrd", "-2.rrd"))
     assert read_recording(folder / other.json()["name"]).filter == "crossmodal-pf"

@@ -50,5 +50,5 @@ def test_run_equals_the_recorded_one(settings: Settings, open_client: Callable[.
         np.testing.assert_array_equal(estimate, run.estimate_mean.ravel())
         assert client.post(url).json()["job"]["state"] == "done", "the recording is read once"
         refused = client.post("/api/recordings/no%20run.rrd/run")
-        assert (refused.status_code, "not a whole Rerun recording" in refused.json()["error"]) == (400, True)
+        assert (refused.status_code, "not a complete Rerun recording" in refused.json()["error"]) == (400, True)
         assert client.post("/api/recordings/none.rrd/run").status_code == 404

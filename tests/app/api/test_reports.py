@@ -55,7 +55,7 @@ def test_report_is_written_downloaded_deleted_and_restored(tmp_path: Path) -> No
         assert client.get(listed["url"].replace(".html", ".pdf")).status_code == 404
         run = tuple(listed[key] for key in ("task", "filter", "episode", "faults"))
         assert run == ("door", "crossmodal-ekf", 9, "blackout=0.4")
-        inline = client.get(listed["url"], params={"shown": "true"})
+        inline = client.get(listed["url"], params={"inline": "true"})
         assert inline.headers["content-disposition"].startswith("inline")
         assert inline.headers["content-security-policy"].startswith("sandbox")
         id = client.delete(listed["url"]).json()["deleted"]

@@ -54,11 +54,11 @@ def test_oldest_automatic_recordings_are_deleted(
         name: str = client.post(URL, json=request).json()["name"]
         return name
 
-    oldest, kept = record(1), record(2)
-    assert record(2, automatic=False) == kept
+    oldest, saved = record(1), record(2)
+    assert record(2, automatic=False) == saved
     others = [record(3), record(4)]
     recordings = listed(client)
-    assert {name: r["automatic"] for name, r in recordings.items()} == {kept: False} | dict.fromkeys(others, True)
+    assert {name: r["automatic"] for name, r in recordings.items()} == {saved: False} | dict.fromkeys(others, True)
     assert not (settings.workspace / "recordings" / ".about" / f"{oldest}.json").exists()
     assert client.patch(f"{URL}/{others[0]}", json={"automatic": False}).json()["automatic"] is False
     assert client.patch(f"{URL}/{others[1]}", json={"tags": ["x"]}).json()["automatic"] is False

@@ -29,8 +29,8 @@ def columns(client: TestClient, url: str) -> dict[str, np.ndarray[Any, Any]]:
     }
 
 
-def test_catalog(client: TestClient, steps: int) -> None:
-    catalog = client.get("/api/catalog").json()
+def test_catalog(shared_client: TestClient, steps: int) -> None:
+    catalog = shared_client.get("/api/catalog").json()
     assert catalog["version"] == __version__
     assert catalog["problems"] == []
     door = catalog["tasks"][0]
@@ -66,11 +66,11 @@ def test_columns_equal_the_trace(client: TestClient, trace_url: str, settings: S
     np.testing.assert_array_equal(images, trace.episode.observations["image"])
 
 
-def test_ekf_has_no_effective_sample_size(client: TestClient) -> None:
+def test_ekf_has_no_effective_sample_size(shared_client: TestClient) -> None:
     url = "/api/trace/door/crossmodal-ekf/0"
-    while client.get(url).status_code == 202:
+    while shared_client.get(url).status_code == 202:
         pass
-    assert "effective_sample_size" not in columns(client, url)
+    assert "effective_sample_size" not in columns(shared_client, url)
 
 
 def test_trace_file_is_reused(client: TestClient, trace_url: str, settings: Settings, open_client: OpenClient) -> None:
@@ -94,22 +94,22 @@ def test_damaged_trace_file_is_replaced(trace_url: str, settings: Settings, open
     assert len(file.read_bytes()) == len(content)
 
 
-def test_faults_change_the_images(client: TestClient, trace_url: str) -> None:
-    tasks = {t["name"]: t for t in client.get("/api/catalog").json()["tasks"]}
+def test_faults_change_the_images(shared_client: TestClient, shared_trace_url: str) -> None:
+    tasks = {t["name"]: t for t in shared_client.get("/api/catalog").json()["tasks"]}
     fault_sets = {r["name"]: r["faults"] for r in tasks["door"]["fault_presets"]}
     assert fault_sets["40 % image blackout"] == "blackout=0.4"
     assert {"force axis stuck", "end-effector offset 2 cm", "haptics dropped"} <= fault_sets.keys()
-    clean = client.get(f"{trace_url}/images").content
+    clean = shared_client.get(f"{shared_trace_url}/images").content
     for faults in ("blackout=0.8", '[{"fault": "image_frozen", "from": 20}]'):
         query = {"faults": faults}
-        while (answer := client.get(trace_url, params=query)).status_code == 202:
+        while (answer := shared_client.get(shared_trace_url, params=query)).status_code == 202:
             pass
         assert answer.json()["faults"] == str(Faults.parse(faults))
-        images = client.get(f"{trace_url}/images", params=query).content
+        images = shared_client.get(f"{shared_trace_url}/images", params=query).content
         assert len(images) == len(clean)
         assert images != clean
-    assert client.get(trace_url).json()["faults"] == ""
-    assert client.get(f"{trace_url}/images").content == clean
+    assert shared_client.get(shared_trace_url).json()["faults"] == ""
+    assert shared_client.get(f"{shared_trace_url}/images").content == clean
 
 
 @pytest.mark.parametrize(
@@ -122,10 +122,14 @@ def test_faults_change_the_images(client: TestClient, trace_url: str) -> None:
         ("secret.json", "fault 'secret.json' does not exist"),
     ],
 )
-def test_invalid_faults_are_refused(client: TestClient, trace_url: str, faults: str, message: str) -> None:
+def test_invalid_faults_are_refused(
+    shared_client: TestClient, shared_trace_url: str, faults: str, message: str
+) -> None:
     body = {"task": "door", "filter": "crossmodal-pf", "episode": 1, "faults": faults}
-    answers = [client.get(trace_url + part, params={"faults": faults}) for part in ("", "/columns", "/images")]
-    for answer in (*answers, client.post("/api/recordings", json=body)):
+    answers = [
+        shared_client.get(shared_trace_url + part, params={"faults": faults}) for part in ("", "/columns", "/images")
+    ]
+    for answer in (*answers, shared_client.post("/api/recordings", json=body)):
         assert answer.status_code == 400
         assert message in answer.json()["error"]
 
@@ -140,8 +144,8 @@ def test_invalid_faults_are_refused(client: TestClient, trace_url: str, faults: 
         ("door/crossmodal-pf/-1", "episode -1 does not exist."),
     ],
 )
-def test_unknown_names_are_refused(client: TestClient, path: str, part: str, message: str) -> None:
-    answer = client.get(f"/api/trace/{path}{part}")
+def test_unknown_names_are_refused(shared_client: TestClient, path: str, part: str, message: str) -> None:
+    answer = shared_client.get(f"/api/trace/{path}{part}")
     assert answer.status_code == 400
     assert message in answer.json()["error"]
     assert "\n" not in answer.json()["error"]
@@ -150,27 +154,29 @@ def test_unknown_names_are_refused(client: TestClient, path: str, part: str, mes
 @pytest.mark.parametrize(
     "path", ["/nowhere", "/scene/none/", "/static/none.js", "/static/0/none.js", "/api/recordings/x.rrd"]
 )
-def test_404_is_json(client: TestClient, path: str) -> None:
-    answer = client.get(path)
+def test_404_is_json(shared_client: TestClient, path: str) -> None:
+    answer = shared_client.get(path)
     assert answer.status_code == 404
     assert answer.json()["error"]
 
 
-def test_columns_have_an_etag(client: TestClient, trace_url: str) -> None:
-    first = client.get(f"{trace_url}/columns")
-    again = client.get(f"{trace_url}/columns", headers={"If-None-Match": first.headers["etag"]})
+def test_columns_have_an_etag(shared_client: TestClient, shared_trace_url: str) -> None:
+    first = shared_client.get(f"{shared_trace_url}/columns")
+    again = shared_client.get(f"{shared_trace_url}/columns", headers={"If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_data_sets_with_equal_episode_indices(client: TestClient, trace_url: str) -> None:
-    mine = columns(client, trace_url)["truth"]
+def test_data_sets_with_equal_episode_indices(shared_client: TestClient, shared_trace_url: str) -> None:
+    mine = columns(shared_client, shared_trace_url)["truth"]
     url = "/api/trace/door/crossmodal-pf/1?data="
-    while (answer := client.get(f"{url}sample")).status_code == 202:
+    while (answer := shared_client.get(f"{url}sample")).status_code == 202:
         pass
-    assert answer.json()["data_hash"] != client.get(trace_url).json()["data_hash"]
-    assert client.get(f"{url}mine").json()["data_hash"] == client.get(trace_url).json()["data_hash"]
+    assert answer.json()["data_hash"] != shared_client.get(shared_trace_url).json()["data_hash"]
+    assert (
+        shared_client.get(f"{url}mine").json()["data_hash"] == shared_client.get(shared_trace_url).json()["data_hash"]
+    )
     assert answer.json()["steps"] != len(mine)
-    answer = client.get(f"{url}yours")
+    answer = shared_client.get(f"{url}yours")
     assert answer.status_code == 400
     assert answer.json()["error"] == "data 'yours' does not exist. Available: mine, sample."
 

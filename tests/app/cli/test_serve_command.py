@@ -68,7 +68,7 @@ def test_sigterm_saves_jobs_and_is_logged(tmp_path: Path) -> None:
         _, errors = server.communicate(timeout=TIMEOUT)
         assert server.returncode == 0, errors
     lines = [json.loads(line) for line in errors.splitlines()]
-    assert [line["event"] for line in lines] == ["started", "job began", "job ended", "stopped"]
+    assert [line["event"] for line in lines] == ["started", "job started", "job ended", "stopped"]
     assert lines[0]["url"].startswith(address)
     assert lines[2]["state"] == "interrupted"
     (job,) = Jobs(workspace / "jobs").all()

@@ -1,4 +1,4 @@
-"""The page's colours by their numbers: what is read and what is drawn stands out, light and dark."""
+"""Contrast of the page's text and line colours, light and dark (WCAG 2.2)."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ from pathlib import Path
 import pytest
 
 STYLE = (Path(__file__).resolve().parents[3] / "app" / "page" / "styles" / "page.css").read_text()
-FOUND = re.findall(r"^  --([\w-]+): light-dark\((#\w+), (#\w+)\);", STYLE, re.MULTILINE)
-COLOURS = {name: (light, dark) for name, light, dark in FOUND}
-GROUNDS = ("surface", "raised", "ground")
+DEFINITIONS = re.findall(r"^  --([\w-]+): light-dark\((#\w+), (#\w+)\);", STYLE, re.MULTILINE)
+COLOURS = {name: (light, dark) for name, light, dark in DEFINITIONS}
+BACKGROUNDS = ("surface", "raised", "ground")
 TEXTS = ("ink", "muted", "accent", "bad", "good")
 LINES = ("truth", "image", "haptics", "fused", "spare-0", "spare-1", "spare-2")
 
 
 def luminance(colour: str) -> float:
-    """Relative, 0 to 1: WCAG 2.2's definition."""
-    digits = colour[1:] if len(colour) == 7 else "".join(2 * one for one in colour[1:])
+    """Relative luminance, 0..1."""
+    digits = colour[1:] if len(colour) == 7 else "".join(2 * digit for digit in colour[1:])
     shares = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
     linear = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares]
     return sum(weight * s for weight, s in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
-def contrast(one: str, other: str) -> float:
-    """Of two colours, 1 to 21: WCAG 2.2's definition."""
-    dark, light = sorted((luminance(one), luminance(other)))
+def contrast(colour: str, background: str) -> float:
+    """Contrast ratio, 1..21."""
+    dark, light = sorted((luminance(colour), luminance(background)))
     return (light + 0.05) / (dark + 0.05)
 
 
-def test_contrast_is_what_the_standard_says() -> None:
+def test_contrast_of_reference_colours() -> None:
     assert contrast("#fff", "#000") == pytest.approx(21.0)
-    assert contrast("#767676", "#ffffff") == pytest.approx(4.54, abs=0.005)  # the lightest gray that is AA on white
+    assert contrast("#767676", "#ffffff") == pytest.approx(4.54, abs=0.005)  # the lightest gray with level AA on white
 
 
 @pytest.mark.parametrize("theme", [0, 1], ids=["light", "dark"])
-def test_what_is_read_and_drawn_stands_out(theme: int) -> None:
-    read = {(t, g): contrast(COLOURS[t][theme], COLOURS[g][theme]) for t in TEXTS for g in GROUNDS}
-    assert {pair: ratio for pair, ratio in read.items() if ratio < 4.5} == {}  # AA for text
-    drawn = {line: contrast(COLOURS[line][theme], COLOURS["surface"][theme]) for line in LINES}
-    assert {line: ratio for line, ratio in drawn.items() if ratio < 3.0} == {}  # AA for what is drawn
+def test_contrast_meets_level_aa(theme: int) -> None:
+    text = {(t, b): contrast(COLOURS[t][theme], COLOURS[b][theme]) for t in TEXTS for b in BACKGROUNDS}
+    assert {pair: ratio for pair, ratio in text.items() if ratio < 4.5} == {}  # text
+    lines = {line: contrast(COLOURS[line][theme], COLOURS["surface"][theme]) for line in LINES}
+    assert {line: ratio for line, ratio in lines.items() if ratio < 3.0} == {}  # graphics

@@ -185,9 +185,7 @@ def test_token_is_optional_on_loopback() -> None:
         assert token_for(host, False, {VARIABLE: TOKEN}) == TOKEN
 
 
-@pytest.mark.parametrize(
-    "token", ["short", "x" * (MIN_LENGTH - 1), "with spaces in between", "not-ascii-über-über"]
-)
+@pytest.mark.parametrize("token", ["short", "x" * (MIN_LENGTH - 1), "with spaces in between", "not-ascii-über-über"])
 def test_weak_tokens_are_refused(token: str) -> None:
     with pytest.raises(BadInput, match=VARIABLE) as error:
         token_for("127.0.0.1", False, {VARIABLE: token})

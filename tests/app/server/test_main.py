@@ -76,23 +76,23 @@ def test_installed_viewer_has_the_expected_code() -> None:
         ("/vendor/rerun/viewer.js", "text/javascript", b'{ credentials: "same-origin" }'),
     ],
 )
-def test_files_have_type_and_etag(client: TestClient, path: str, kind: str, content: bytes) -> None:
-    answer = client.get(path)
+def test_files_have_type_and_etag(shared_client: TestClient, path: str, kind: str, content: bytes) -> None:
+    answer = shared_client.get(path)
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith(kind)
     assert answer.headers["cache-control"] == "no-cache"
     assert content in answer.content
     if "etag" in answer.headers:
-        assert client.get(path, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+        assert shared_client.get(path, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
 
 
-def test_page_preloads_modules_at_immutable_addresses(client: TestClient) -> None:
-    page = client.get("/").text
+def test_page_preloads_modules_at_immutable_addresses(shared_client: TestClient) -> None:
+    page = shared_client.get("/").text
     preloads = re.findall(r'<link rel="modulepreload" href="(/static/[0-9a-f]+/([\w./]+))">', page)
     assert {name for _, name in preloads} >= {"core/main.js", "data/api.js", "maps/map_values.js"}
     assert len({name for _, name in preloads}) == len(preloads)
     for address, name in preloads:
-        answer = client.get(address)
+        answer = shared_client.get(address)
         assert "immutable" in answer.headers["cache-control"]
         assert answer.content == (PAGE / name).read_bytes()
         # All imported modules are preloaded.
@@ -101,7 +101,7 @@ def test_page_preloads_modules_at_immutable_addresses(client: TestClient) -> Non
             n for _, n in preloads
         }
     # An outdated address is revalidated, so that browsers do not cache the new content under the old address.
-    assert client.get("/static/0123456789ab/core/main.js").headers["cache-control"] == "no-cache"
+    assert shared_client.get("/static/0123456789ab/core/main.js").headers["cache-control"] == "no-cache"
 
 
 def test_edited_file_has_a_new_address(tmp_path: Path) -> None:
@@ -120,8 +120,8 @@ def test_edited_file_has_a_new_address(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ["/static/../server.py", "/static/..%2fserver.py", "/static/x/..%2f__init__.py"])
-def test_files_outside_the_page_are_not_served(client: TestClient, path: str) -> None:
-    assert client.get(path).status_code == 404
+def test_files_outside_the_page_are_not_served(shared_client: TestClient, path: str) -> None:
+    assert shared_client.get(path).status_code == 404
 
 
 def test_busy_port_is_reported(settings: Settings) -> None:

@@ -96,22 +96,22 @@ def test_ipv6_host() -> None:
     assert refusal(Guard(_nothing, ["fe80::1"]), scope("[fe80::1]:8000")) == ""
 
 
-def test_refusal_states_the_reason(client: TestClient) -> None:
-    answer = client.get("/healthz", headers={"Host": "evil.example"})
+def test_refusal_states_the_reason(shared_client: TestClient) -> None:
+    answer = shared_client.get("/healthz", headers={"Host": "evil.example"})
     assert answer.status_code == 403
     assert answer.json()["error"].startswith("Host 'evil.example' is not allowed. Allowed: ")
-    answer = client.post("/api/views", headers={"Origin": "http://evil.example"})
+    answer = shared_client.post("/api/views", headers={"Origin": "http://evil.example"})
     assert answer.status_code == 403
     assert "http://evil.example" in answer.json()["error"]
 
 
 @pytest.mark.parametrize("path", ["/api/views/{}", "/scene/{}"])
-def test_sockets_are_checked(client: TestClient, path: str) -> None:
-    view = client.post("/api/views").json()["view"]
+def test_sockets_are_checked(shared_client: TestClient, path: str) -> None:
+    view = shared_client.post("/api/views").json()["view"]
     for headers in ({"Origin": "http://evil.example"}, {"Host": "evil.example"}):
         with (
             pytest.raises(WebSocketDenialResponse) as refused,
-            client.websocket_connect(path.format(view), headers=headers),
+            shared_client.websocket_connect(path.format(view), headers=headers),
         ):
             pass
         assert refused.value.status_code == 403
@@ -120,8 +120,8 @@ def test_sockets_are_checked(client: TestClient, path: str) -> None:
 
 @pytest.mark.parametrize("path", ["/api/views/{}", "/scene/{}", "/api/live/{}"])
 @pytest.mark.parametrize("name", ["x" * 3000, "%E2%82%AC" * 500])
-def test_close_reason_is_truncated(client: TestClient, path: str, name: str) -> None:
-    with client.websocket_connect(path.format(name)) as socket:
+def test_close_reason_is_truncated(shared_client: TestClient, path: str, name: str) -> None:
+    with shared_client.websocket_connect(path.format(name)) as socket:
         socket.send_json({"from": 0})
         with pytest.raises(WebSocketDisconnect) as closed:
             socket.receive_text()
@@ -141,8 +141,8 @@ ALWAYS = {
 @pytest.mark.parametrize(
     "path", ["/", "/healthz", "/api/catalog", "/nowhere", "/api/trace/door/none/0", "/static/core/main.js"]
 )
-def test_security_headers(client: TestClient, path: str) -> None:
-    headers = client.get(path).headers
+def test_security_headers(shared_client: TestClient, path: str) -> None:
+    headers = shared_client.get(path).headers
     assert {name: headers.get(name) for name in ALWAYS} == ALWAYS
     assert "camera=()" in headers["permissions-policy"]
     assert "microphone=()" in headers["permissions-policy"]
@@ -152,46 +152,46 @@ def test_security_headers(client: TestClient, path: str) -> None:
     assert "'unsafe-eval'" not in policy
 
 
-def test_refusal_has_security_headers(client: TestClient) -> None:
-    headers = client.get("/healthz", headers={"Host": "evil.example"}).headers
+def test_refusal_has_security_headers(shared_client: TestClient) -> None:
+    headers = shared_client.get("/healthz", headers={"Host": "evil.example"}).headers
     assert {name: headers.get(name) for name in ALWAYS} == ALWAYS
 
 
-def test_framing(client: TestClient) -> None:
-    scene = client.post("/api/views").json()["scene"]
+def test_framing(shared_client: TestClient) -> None:
+    scene = shared_client.post("/api/views").json()["scene"]
     for path, ancestors, frame_options in (
         ("/", "'none'", "DENY"),
         ("/api/jobs", "'none'", "DENY"),
         (scene, "'self'", "SAMEORIGIN"),
     ):
-        headers = client.get(path).headers
+        headers = shared_client.get(path).headers
         assert f"frame-ancestors {ancestors};" in headers["content-security-policy"]
         assert headers["x-frame-options"] == frame_options
 
 
-def test_inline_scripts_are_limited_to_the_scene(client: TestClient) -> None:
-    scene = client.post("/api/views").json()["scene"]
-    assert "script-src 'self' 'unsafe-inline'" in client.get(scene).headers["content-security-policy"]
-    assert "script-src 'self' 'wasm-unsafe-eval';" in client.get("/").headers["content-security-policy"]
+def test_inline_scripts_are_limited_to_the_scene(shared_client: TestClient) -> None:
+    scene = shared_client.post("/api/views").json()["scene"]
+    assert "script-src 'self' 'unsafe-inline'" in shared_client.get(scene).headers["content-security-policy"]
+    assert "script-src 'self' 'wasm-unsafe-eval';" in shared_client.get("/").headers["content-security-policy"]
 
 
-def test_data_is_sandboxed(client: TestClient) -> None:
+def test_data_is_sandboxed(shared_client: TestClient) -> None:
     for path in ("/api/catalog", "/static/icon.svg", "/vendor/rerun/viewer.js"):
-        policy = client.get(path).headers["content-security-policy"]
+        policy = shared_client.get(path).headers["content-security-policy"]
         assert policy.startswith("default-src 'none';")
         assert policy.endswith("sandbox")
 
 
-def test_body_size_is_limited(client: TestClient) -> None:
+def test_body_size_is_limited(shared_client: TestClient) -> None:
     def chunks() -> Iterator[bytes]:
         for _ in range(20):
             yield b" " * (MAX_BODY // 10)
 
     for body in (b" " * (MAX_BODY + 1), chunks()):
-        answer = client.post("/api/recordings", content=body, headers={"content-type": "application/json"})
+        answer = shared_client.post("/api/recordings", content=body, headers={"content-type": "application/json"})
         assert answer.status_code == 413
         assert str(MAX_BODY) in answer.json()["error"]
-    assert client.post("/api/views", content=b" " * 1000 + b'{"dark": true}', headers=JSON).status_code == 201
+    assert shared_client.post("/api/views", content=b" " * 1000 + b'{"dark": true}', headers=JSON).status_code == 201
 
 
 def test_body_timeout(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from scipy.stats import chi2, kstest, norm
 from statsmodels.stats.diagnostic import acorr_ljungbox
 from uncertainty_toolbox.metrics_scoring_rule import crps_gaussian
 
-from beliefscope.inspect.diagnostics.consistency import Consistency, consistency, innovations
+from beliefscope.inspect.diagnostics.consistency import Consistency, consistency
 from beliefscope.inspect.statistics.calibration import (
     gaussian_crps,
     gaussian_level,
@@ -22,6 +22,7 @@ from beliefscope.inspect.statistics.calibration import (
     particle_crps,
     particle_level,
 )
+from beliefscope.inspect.statistics.innovations import innovations
 
 sys.path.insert(0, str(Path(__file__).parent))
 import planted_traces as plant
@@ -35,7 +36,7 @@ def exact() -> Consistency:
 def test_an_exact_filter_is_consistent(exact: Consistency) -> None:
     assert exact.layers == ("image", "haptics", "fused")
     for entry in exact.by_layer:
-        # 2000 steps, some 500 of them independent: the mean of chi2_3 / 3 has a standard error of sqrt(2 / 3 / 500) = 0.04.
+        # About 500 independent steps: the mean of chi2_3 / 3 has a standard error of sqrt(2 / 3 / 500) = 0.04.
         assert entry.nees == pytest.approx(1.0, abs=0.12), (entry.layer, entry.phase)
         assert entry.bounds[0] < entry.nees < entry.bounds[1]
         assert entry.assessment == "consistent"

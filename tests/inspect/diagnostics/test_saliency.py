@@ -19,15 +19,8 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.models.pf import ParticleFilter
-from beliefscope.inspect.diagnostics.saliency import (
-    ENTRY,
-    MIN_CHANGE,
-    TOLERANCE,
-    Saliency,
-    integrate,
-    occlude,
-    saliency,
-)
+from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
+from beliefscope.inspect.diagnostics.saliency import ENTRY, MIN_CHANGE, Saliency, saliency
 from beliefscope.inspect.diagnostics.single_step import SingleStep, channel_names
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beliefscope.inspect.diagnostics.weight_audit import ENTRY, audit, oracle_weights
+from beliefscope.inspect.diagnostics.weight_audit import ENTRY, audit
 from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES, correlate, correlation_sums
+from beliefscope.inspect.statistics.oracle import oracle_weights
 from beliefscope.inspect.trace import Trace
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -1,0 +1,78 @@
+/** Runs in recordings and reports: their selection on the page, and the comparison of two of them. */
+
+/** @import { State } from '../core/state.js' */
+/** @import { Catalog, RecordingEntry, ReportEntry } from '../types/server.js' */
+
+/** @typedef {Pick<State, 'task' | 'filter' | 'data' | 'episode' | 'faults'>} Run */
+
+/**
+ * Returns the run of a recording; null if the catalog does not contain it.
+ * @param {RecordingEntry} recording
+ * @returns {Run | null}
+ */
+export function recordedRun({ task, episode, faults, run }) {
+  return run && task !== null && episode !== null ? { task, episode, faults, ...run } : null;
+}
+
+/**
+ * Returns the run of a report, or why the catalog does not contain it.
+ * @param {Catalog} catalog
+ * @param {ReportEntry} report
+ * @returns {{run: Run, problem?: undefined} | {run?: undefined, problem: string}}
+ */
+export function reportedRun(catalog, { task: name, filter, episode, faults }) {
+  const task = catalog.tasks.find((item) => item.name === name);
+  if (!task?.filters.some((item) => item.name === filter))
+    return { problem: `This server has no filter ${filter} for task ${name}.` };
+  const set = task.data.find(({ episodes }) => episodes.some(({ index }) => index === episode));
+  if (!set) return { problem: `No data set of this server has an episode ${episode}.` };
+  return { run: { task: name, filter, data: set.name, episode, faults } };
+}
+
+/**
+ * Returns the changes of the state that select a run.
+ * @param {Catalog} catalog
+ * @param {State} state
+ * @param {Run} run
+ * @returns {Partial<State>}
+ */
+export function selectRun(catalog, state, run) {
+  const isSameTask = state.task === run.task;
+  const isSameEpisode = isSameTask && state.data === run.data && state.episode === run.episode;
+  const component = catalog.tasks.find(({ name }) => name === run.task)?.map.x;
+  return {
+    ...run,
+    ...(isSameTask ? {} : { component }),
+    against: '',
+    playing: false,
+    angle: null,
+    step: isSameEpisode ? state.step : 0,
+  };
+}
+
+/**
+ * Returns why the runs of two recordings cannot be compared on the page; empty if they can.
+ * @param {RecordingEntry} recording
+ * @param {RecordingEntry} other
+ */
+export function comparisonProblem(recording, other) {
+  const [run, comparison] = [recordedRun(recording), recordedRun(other)];
+  if (recording.task !== other.task) return 'The tasks differ.';
+  if (!run) return `${recording.name}: ${recording.why_not}`;
+  if (!comparison) return `${other.name}: ${other.why_not}`;
+  if (run.episode !== comparison.episode || run.data !== comparison.data)
+    return 'The episodes differ; Rerun can display both.';
+  return differences(run, comparison) ? '' : 'The runs are the same.';
+}
+
+/**
+ * Returns the differences of a comparison run as in the page's address.
+ * @param {Run} run
+ * @param {Run} comparison
+ */
+export function differences(run, comparison) {
+  const query = new URLSearchParams();
+  if (run.filter !== comparison.filter) query.set('filter', comparison.filter);
+  if (run.faults !== comparison.faults) query.set('faults', comparison.faults);
+  return String(query);
+}
