@@ -108,7 +108,7 @@ $(VENV)/tools:
 	@$@/bin/python -m pip install -qq $(PIP_FLAGS) uv pip-audit
 
 lock: $(VENV)/tools
-	@$(VENV)/tools/bin/uv pip compile pyproject.toml --extra ray --extra export --extra meshes -c constraints.txt \
+	@$(VENV)/tools/bin/uv pip compile pyproject.toml --extra all --extra ray -c constraints.txt \
 	  --universal --python-version 3.11 --generate-hashes --no-annotate --no-header -o $(VENV)/lock -q
 	@sed '/^[^#]/,$$d' requirements.lock | cat - $(VENV)/lock > $(VENV)/lock.new
 	@mv $(VENV)/lock.new requirements.lock

@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures of all tests. Heavy packages are imported by the fixtures that need them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import h5py
-import numpy as np
 import pytest
-import torch
-from safetensors.torch import save_file
-
-from beliefscope.app.cli.main import main
-from beliefscope.datasets.store import sample_path
-from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.checkpoint import save_checkpoint
 
 Run = Callable[[str], tuple[int, str, str]]
 
@@ -28,22 +19,24 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 @pytest.fixture(scope="session")
 def chromium() -> str:
-    """Path of a Chromium: ``BELIEFSCOPE_CHROMIUM``, or one on the path. Skips the test where there is none."""
-    named = os.environ.get("BELIEFSCOPE_CHROMIUM")
-    found = named or next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        pytest.skip("no Chromium: install it, or give its path in BELIEFSCOPE_CHROMIUM")
-    return found
+    """Path of Chromium: ``BELIEFSCOPE_CHROMIUM`` or from ``PATH``. Tests are skipped without one."""
+    path = os.environ.get("BELIEFSCOPE_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        pytest.skip("Chromium not found: install it or set BELIEFSCOPE_CHROMIUM to its path")
+    return path
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The browser's files first: they are the longest, and for one that came last the other processes would wait."""
-    items.sort(key=lambda item: "browser" not in item.path.parts)
+    """Marks the browser tests and moves them to the front: they take longest, so parallel processes finish together."""
+    browser_tests = [item for item in items if item.path.parent.name == "browser"]
+    for item in browser_tests:
+        item.add_marker("browser")
+    items[:] = browser_tests + [item for item in items if item.path.parent.name != "browser"]
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_torch_thread() -> Iterator[None]:
-    """Tensors are small here: more threads only wait for one another."""
+    """The tensors of the tests are too small to profit from several threads."""
     import torch
 
     before = torch.get_num_threads()
@@ -54,7 +47,8 @@ def one_torch_thread() -> Iterator[None]:
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs a command line in this process: (exit code, standard output, standard error)."""
+    """Runs a command line in this process. Returns exit code, standard output and standard error."""
+    from beliefscope.app.cli.main import main
 
     def run(line: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["beliefscope", *shlex.split(line)])
@@ -70,27 +64,36 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with files that can be used and files that cannot."""
-    place = tmp_path_factory.mktemp("files")
+    """A folder with valid and invalid files."""
+    import h5py
+    import numpy as np
+    import torch
+    from safetensors.torch import save_file
+
+    from beliefscope.datasets.store import sample_path
+    from beliefscope.filters.catalog import architecture, build
+    from beliefscope.filters.checkpoint import save_checkpoint
+
+    folder = tmp_path_factory.mktemp("files")
     sample = sample_path("door").read_bytes()
-    (place / "cut.h5").write_bytes(sample[: len(sample) // 2])
-    (place / "foreign.h5").write_text("no HDF5 at all\n")
-    with h5py.File(place / "other.h5", "w") as file:
+    (folder / "cut.h5").write_bytes(sample[: len(sample) // 2])
+    (folder / "foreign.h5").write_text("no HDF5 at all\n")
+    with h5py.File(folder / "other.h5", "w") as file:
         file["numbers"] = np.arange(3)
-    (place / "shape.h5").write_bytes(sample)
-    with h5py.File(place / "shape.h5", "r+") as file:
+    (folder / "shape.h5").write_bytes(sample)
+    with h5py.File(folder / "shape.h5", "r+") as file:
         group = file["trajectory9"]
         states = group["states"][()]
         del group["states"]
         group["states"] = states[:, :2]
     untrained = build(architecture("door", "crossmodal-ekf"))
-    save_checkpoint(untrained, "crossmodal-ekf", {}, place / "ekf.safetensors")
-    (place / "cut.safetensors").write_bytes((place / "ekf.safetensors").read_bytes()[:-1000])
-    (place / "foreign.safetensors").write_bytes(b"\x80\x04" + bytes(100))
-    save_file({"weight": torch.zeros(2)}, place / "other.safetensors")
-    (place / "notes.txt").write_text("{not json")
-    (place / "taken").mkdir()
-    return place
+    save_checkpoint(untrained, "crossmodal-ekf", {}, folder / "ekf.safetensors")
+    (folder / "cut.safetensors").write_bytes((folder / "ekf.safetensors").read_bytes()[:-1000])
+    (folder / "foreign.safetensors").write_bytes(b"\x80\x04" + bytes(100))
+    save_file({"weight": torch.zeros(2)}, folder / "other.safetensors")
+    (folder / "notes.txt").write_text("{not json")
+    (folder / "taken").mkdir()
+    return folder
 
 
 @pytest.fixture

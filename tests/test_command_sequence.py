@@ -16,6 +16,8 @@ from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import load_trace
 from beliefscope.recordings.read import read_recording
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[[str], tuple[int, str, str]]
 EKF = "door --filter ekf.safetensors"
 

@@ -28,6 +28,8 @@ from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import load_trace, trace
 from beliefscope.inspect.traces.live_file import load_live
 
+pytestmark = pytest.mark.slow
+
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_task.py"
 SPEC = f"{EXAMPLE}:TASK"
 

@@ -24,6 +24,8 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import load_trace, save_trace, trace
 
+pytestmark = pytest.mark.slow
+
 
 def set_format(path: Path, entry: str, version: int) -> None:
     """Change the format version in the header of a safetensors file."""

@@ -13,6 +13,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 LICENCES = runpy.run_path(str(ROOT / "bench" / "licences.py"))
 LOCK = (ROOT / "requirements.lock").read_text()

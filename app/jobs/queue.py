@@ -313,7 +313,7 @@ def _id(kind: str, key: str) -> str:
 
 
 def _read_jobs(folder: Path) -> list[Job]:
-    """The stored jobs, except those that are active in another server."""
+    """The stored jobs, except jobs that are active in another server."""
     jobs = []
     for path in folder.glob("*/job.json"):
         # Skips files that are damaged or of another version.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Protocol, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, ValidationError
 
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 
 MAX_ANGLE = 1e3  # rad: beyond the turns of any door
@@ -23,7 +23,11 @@ Viewpoint = Literal["first", "above", "camera"]
 
 
 def _parse_faults(value: Any) -> Any:
-    return Faults.parse(value) if isinstance(value, str) else value
+    if isinstance(value, Faults):
+        return value
+    if not isinstance(value, str):
+        raise ValueError("Input should be a valid string")
+    return Faults.parse(value)
 
 
 class _Message(BaseModel):
@@ -40,7 +44,6 @@ class Cursor(_Message):
             without one. comparison_maps: whether its maps are sent, too.
     """
 
-    type: Literal["cursor"] = "cursor"
     serial: NonNegativeInt
     task: str
     filter: str
@@ -65,7 +68,6 @@ class SceneLayers(_Message):
         scale, range, colours: as for the page's maps.
     """
 
-    type: Literal["scene_layers"] = "scene_layers"
     hidden: Annotated[frozenset[SceneLayer], Field(strict=False)] = frozenset()
     ground: str = "fused"
     height: Literal["floor", "belief"] = "floor"
@@ -78,27 +80,33 @@ class SceneLayers(_Message):
 class MoveViewpoint(_Message):
     """Move the viewpoint of the 3D scene."""
 
-    type: Literal["viewpoint"] = "viewpoint"
     at: Viewpoint
 
 
 class Theme(_Message):
     """The page's color theme."""
 
-    type: Literal["theme"] = "theme"
     dark: bool = False
 
 
 ViewMessage = Cursor | SceneLayers | MoveViewpoint | Theme
-_VIEW_MESSAGE: TypeAdapter[ViewMessage] = TypeAdapter(Annotated[ViewMessage, Field(discriminator="type")])
+_MODELS: dict[str, type[ViewMessage]] = {
+    "cursor": Cursor,
+    "scene_layers": SceneLayers,
+    "theme": Theme,
+    "viewpoint": MoveViewpoint,
+}
 
 
-def parse_view_message(message: Any) -> ViewMessage:
+def parse_view_message(message: Mapping[str, Any]) -> ViewMessage:
     """Validate a decoded JSON message. Raises BadInput naming the first invalid field."""
+    type_ = message.get("type")
+    if not isinstance(type_, str) or type_ not in _MODELS:
+        raise unknown_name("message type", str(type_), _MODELS)
     try:
-        return _VIEW_MESSAGE.validate_python(message)
+        return _MODELS[type_].model_validate(message)
     except ValidationError as error:
-        raise BadInput(f"{describe_error(error)}.") from None
+        raise BadInput(f"{type_}.{describe_error(error)}.") from None
 
 
 class _HasErrors(Protocol):

@@ -44,7 +44,7 @@ class LineFormatter(logging.Formatter):
             line = json.dumps({"time": when, "level": record.levelname.lower(), **values}, default=str)
         else:
             event, traceback = values.pop("event"), values.pop("traceback", "")
-            # JSON encoding prevents values from outside from starting a new line.
+            # JSON encoding prevents external values from starting a new line.
             pairs = "".join(f" {key}={json.dumps(value, default=str)}" for key, value in values.items())
             line = f"{when} {record.levelname.lower()}: {_escape(' '.join(event.split()))}{pairs}"
             line += "".join(f"\n  {_escape(each)}" for each in traceback.splitlines())

@@ -8,7 +8,6 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-from mjviser import ViserMujocoScene
 from numpy.typing import NDArray
 from PIL import Image
 from viser import ViserServer
@@ -203,6 +202,8 @@ class RobotScene:
 
     def __init__(self, server: ViserServer, replay: Replay) -> None:
         self._add_translucent_bodies(server, replay.model)
+        from mjviser import ViserMujocoScene  # imports trimesh, which takes a second
+
         self._robot = ViserMujocoScene(server, replay.model, num_envs=1)
         self._robot.camera_tracking_enabled = False
         self.fixed_bodies = self._robot.fixed_bodies_frame

@@ -7,13 +7,9 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib import colormaps, rc_context
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import unknown_name
@@ -21,6 +17,10 @@ from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.inspect.diagnostics.views import Curve, ImagePanel, Plot, Views
 from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics.measures import intervals
+
+if TYPE_CHECKING:  # functions import matplotlib when they draw: it takes half a second
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -61,6 +61,8 @@ def write_figure(figure: Figure, path: Path) -> None:
     """Write a figure as SVG, PDF or PNG (300 dpi) depending on the suffix. Raises BadInput for other suffixes."""
     suffix = figure_format(path)
     data = io.BytesIO()
+    from matplotlib import rc_context
+
     with rc_context(STYLE):
         figure.savefig(data, format=suffix, **FORMATS[suffix])
     write_atomically(path, data.getvalue())
@@ -74,15 +76,26 @@ def figure_format(path: Path) -> str:
     return suffix
 
 
+def new_figure(**settings: Any) -> Figure:
+    """A figure with a canvas of its own, independent of pyplot; settings as for matplotlib's ``Figure``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(**settings)
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def draw_figure(diagnostic: Views) -> Figure:
     """Draw the verdict, charts below one another, then plots and image panels, two per row."""
     charts = charts_of(diagnostic)
     panels: list[Plot | ImagePanel] = [*diagnostic.plots(), *diagnostic.images()]
     rows = len(charts) + -(-len(panels) // 2)
+    from matplotlib import rc_context
+
     with rc_context(STYLE):
         height = PANEL_HEIGHT * (len(charts) + 1.6 * -(-len(panels) // 2)) + 0.5
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = new_figure(figsize=(WIDTH, height), layout="constrained")
         figure.suptitle(diagnostic.verdict, fontsize=8, x=0.01, ha="left", wrap=True)
         if not rows:
             return figure
@@ -101,9 +114,10 @@ def draw_figure(diagnostic: Views) -> Figure:
 def panel_png(panel: Plot | ImagePanel) -> bytes:
     """Draw one plot or image panel as PNG, half as wide as a figure."""
     data = io.BytesIO()
+    from matplotlib import rc_context
+
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH / 2, 1.6 * PANEL_HEIGHT), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = new_figure(figsize=(WIDTH / 2, 1.6 * PANEL_HEIGHT), layout="constrained")
         draw_panel(figure.add_subplot(), panel)
         figure.savefig(data, format="png", dpi=200)
     return data.getvalue()
@@ -189,5 +203,7 @@ def colour_of(layer: str, layers: Sequence[str]) -> str:
 @cache
 def colour_table(name: str) -> NDArray[np.uint8]:
     """(256, 3) RGB values of a matplotlib colour map."""
+    from matplotlib import colormaps
+
     colours = np.asarray(colormaps[name](np.linspace(0.0, 1.0, 256)))
     return np.rint(255.0 * colours[:, :3]).astype(np.uint8)

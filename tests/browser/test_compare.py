@@ -1,19 +1,15 @@
-"""A run beside another one on the page: an edit over some steps, and another filter."""
+"""Compare tab: an intervention over some steps, and another filter."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
-pytestmark = pytest.mark.browser
-
 READY = "() => document.querySelector('#compare .result').dataset.state === 'ready'"
 RUN = "?filter=crossmodal-ekf&episode=9&step=45"
 
 
-def apart(page: Any) -> float:
-    """cm that the fused estimates are apart at the cursor, as the first chart says."""
+def difference(page: Any) -> float:
+    """Distance of the fused estimates at the cursor in cm, from the first chart."""
     return float(page.page.locator("#compare .curves figure").first.locator(".line b").first.text_content())
 
 
@@ -21,8 +17,8 @@ def verdict(page: Any) -> str:
     return page.page.locator("#compare .verdict").text_content()
 
 
-def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> None:
-    page = open_page(f"{RUN}&tab=diagnostics")  # whose tab is soon drawn
+def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> None:
+    page = open_page(f"{RUN}&tab=diagnostics")  # a tab that loads quickly
     keyboard, form = page.page.keyboard, page.page.locator("#compare form")
     keyboard.press("[")
     keyboard.press("Shift+ArrowRight")
@@ -36,19 +32,19 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     page.until(READY)
     assert page.state["against"] == "from=45&to=56&faults=blackout=0.8"
     assert "over steps 45 to 55" in verdict(page)
-    assert apart(page) > 0.0  # at the last edited step
+    assert difference(page) > 0.0  # at the last step of the intervention
     assert page.page.locator("#comparison-key").text_content().strip() == "edited"
     for _ in range(11):
         keyboard.press("ArrowLeft")
     page.until("() => beliefscope.state().step === 44 && document.querySelector('#readout b').textContent[0] === '4'")
-    assert apart(page) == 0.0  # at the last step before them
+    assert difference(page) == 0.0  # at the last step before it
     page.until("() => location.search.includes('against=') && location.search.includes('step=44')")
 
     second = open_page("?" + page.page.url.partition("?")[2], viewport={"width": 1440, "height": 900})
     second.until(READY)
     assert second.state == page.state
     assert verdict(second) == verdict(page)
-    second.picture("compare-edit")
+    second.screenshot("compare-edit")
 
     keyboard.press("Control+z")
     page.until("() => document.querySelector('#compare .result').dataset.state === 'empty'")
@@ -59,14 +55,14 @@ def test_an_edit_is_made_by_keys_kept_in_the_link_and_undone(open_page: Any) -> 
     assert page.state["against"] == second.state["against"]
 
 
-def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
+def test_two_filters_are_compared(open_page: Any) -> None:
     page = open_page(f"{RUN}&tab=compare&against=filter%3Dcrossmodal-pf", color_scheme="dark")
     page.until(READY)
-    both = ["crossmodal-ekf", "crossmodal-pf"]
-    assert all(name in verdict(page) for name in both)
+    filters = ["crossmodal-ekf", "crossmodal-pf"]
+    assert all(name in verdict(page) for name in filters)
     assert page.page.locator("#comparison-key").text_content().strip() == "crossmodal-pf"
     heads = page.page.locator("#compare .table th").all_text_contents()
-    assert [head for head in heads if head in both] == both
+    assert [head for head in heads if head in filters] == filters
     assert page.page.locator("#compare [name=filter]").input_value() == "crossmodal-pf"
     page.page.locator("#compare .gain input").check()
     page.until("() => document.querySelector('#maps-kind').textContent === 'Gain over crossmodal-pf'")
@@ -75,8 +71,8 @@ def test_two_filters_are_shown_side_by_side(open_page: Any) -> None:
         ".map((e) => e.scrollWidth - e.clientWidth)"
     )
     assert max(overflow) <= 1
-    page.picture("compare-filters")
-    page.page.locator("#filter").select_option("crossmodal-pf")  # the two change places
+    page.screenshot("compare-filters")
+    page.page.locator("#filter").select_option("crossmodal-pf")  # exchanges the two filters
     page.until("() => document.querySelector('#maps-kind').textContent === 'Gain over crossmodal-ekf'")
     assert page.state["against"] == "filter=crossmodal-ekf"
     page.page.locator("#compare .clear").click()

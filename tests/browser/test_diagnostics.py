@@ -1,4 +1,4 @@
-"""The diagnostics on the page, and the jobs behind the slow ones, done in Chromium."""
+"""Diagnostics tab, and the jobs of slow diagnostics."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import json
 from typing import Any
 
 import pytest
-
-pytestmark = pytest.mark.browser
 
 EPISODE = 9
 TAB = f"?tab=diagnostics&episode={EPISODE}"
@@ -18,14 +16,14 @@ def row(page: Any, title: str) -> Any:
     return page.page.locator("#diagnostics li").filter(has=page.page.get_by_role("button", name=title, exact=True))
 
 
-def opened(open_page: Any, name: str, more: str = "", **options: Any) -> Any:
-    page = open_page(f"{TAB}&diagnostic={name}{more}", **options)
+def open_diagnostic(open_page: Any, name: str, parameters: str = "", **options: Any) -> Any:
+    page = open_page(f"{TAB}&diagnostic={name}{parameters}", **options)
     page.until(READY)
     return page
 
 
 @pytest.mark.parametrize(("window", "theme"), [((1024, 768), "dark"), ((1440, 900), "light")])
-def test_all_are_listed_with_what_they_say_or_why_not(open_page: Any, window: tuple[int, int], theme: str) -> None:
+def test_list_has_verdicts_and_reasons(open_page: Any, window: tuple[int, int], theme: str) -> None:
     width, height = window
     page = open_page(
         f"{TAB}&filter=crossmodal-ekf&step=40", viewport={"width": width, "height": height}, color_scheme=theme
@@ -44,10 +42,10 @@ def test_all_are_listed_with_what_they_say_or_why_not(open_page: Any, window: tu
         ".map((e) => e.scrollWidth - e.clientWidth)"
     )
     assert max(overflow) <= 1
-    page.picture(f"diagnostics-{width}-{theme}")
+    page.screenshot(f"diagnostics-{width}-{theme}")
 
 
-def test_one_is_opened_and_left_by_keyboard_and_kept_in_the_link(open_page: Any) -> None:
+def test_diagnostic_is_opened_by_keyboard_and_in_the_permalink(open_page: Any) -> None:
     page = open_page(f"?episode={EPISODE}&step=40")
     page.page.keyboard.press("3")
     page.until("() => document.querySelector('#diagnostics li[data-state=ready]')")
@@ -61,61 +59,63 @@ def test_one_is_opened_and_left_by_keyboard_and_kept_in_the_link(open_page: Any)
     second.until(READY)
     assert second.state == page.state
     assert second.page.locator("#diagnostics article > .verdict").text_content().startswith("Consistent")
-    page.page.keyboard.press("Enter")  # the way back has the focus
+    page.page.keyboard.press("Enter")  # the back button has the focus
     page.until("() => beliefscope.state().diagnostic === ''")
     assert page.page.evaluate("() => document.activeElement.textContent") == "Consistency"
 
 
 @pytest.mark.parametrize(("window", "theme"), [((1024, 768), "light"), ((1440, 900), "dark")])
-def test_its_charts_follow_and_move_the_cursor(open_page: Any, window: tuple[int, int], theme: str) -> None:
+def test_charts_and_cursor_are_synchronized(open_page: Any, window: tuple[int, int], theme: str) -> None:
     width, height = window
     viewport = {"width": width, "height": height}
-    page = opened(open_page, "particles", "&step=40&faults=blackout%3D0.4", viewport=viewport, color_scheme=theme)
+    page = open_diagnostic(
+        open_page, "particles", "&step=40&faults=blackout%3D0.4", viewport=viewport, color_scheme=theme
+    )
     plot = page.page.locator(".curves .u-over").first
     box = plot.bounding_box()
     mark = page.page.locator(".curves .mark.cursor").first
     steps = int(page.page.locator("#readout b").text_content().split("/")[1])
 
-    def shown() -> float:
-        """Step at which the chart's cursor stands."""
+    def cursor_step() -> float:
+        """Step of the cursor in the chart."""
         at = mark.bounding_box()
         return steps * (at["x"] + at["width"] / 2 - box["x"]) / box["width"]
 
-    assert shown() == pytest.approx(40, abs=0.5)
-    told = page.page.locator(".curves .line b").first
-    before = told.text_content()
-    page.picture(f"diagnostic-{width}-{theme}")
+    assert cursor_step() == pytest.approx(40, abs=0.5)
+    value = page.page.locator(".curves .line b").first
+    before = value.text_content()
+    page.screenshot(f"diagnostic-{width}-{theme}")
     page.page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 30)
     page.page.mouse.down()
     page.page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 30)
     page.page.mouse.up()
     page.until(f"() => Math.abs(beliefscope.state().step - {0.7 * steps}) <= 1")
     page.settle(page.state["step"])  # maps and scene follow
-    assert shown() == pytest.approx(page.state["step"], abs=0.5)
-    assert told.text_content() != before
+    assert cursor_step() == pytest.approx(page.state["step"], abs=0.5)
+    assert value.text_content() != before
     page.page.locator("#tracks").focus()
     page.page.keyboard.press("Home")
     page.settle(0)
-    assert shown() == pytest.approx(0, abs=0.5)
+    assert cursor_step() == pytest.approx(0, abs=0.5)
 
 
 def test_a_table_is_copied_as_csv(open_page: Any) -> None:
-    page = opened(open_page, "consistency", permissions=["clipboard-read", "clipboard-write"])
-    found = page.page.request.get(f"{page.url}api/diagnostics/consistency/door/crossmodal-pf/{EPISODE}").json()
-    table = found["tables"][0]
+    page = open_diagnostic(open_page, "consistency", permissions=["clipboard-read", "clipboard-write"])
+    result = page.page.request.get(f"{page.url}api/diagnostics/consistency/door/crossmodal-pf/{EPISODE}").json()
+    table = result["tables"][0]
     page.page.get_by_role("button", name=f"Copy {table['title']} as CSV").click()
     page.until("() => [...document.querySelectorAll('.table button')].some((b) => b.textContent === 'Copied')")
     lines = page.page.evaluate("() => navigator.clipboard.readText()").splitlines()
     assert lines[0].split(",") == table["columns"]
     assert len(lines) == 1 + len(table["rows"])
     assert float(lines[1].split(",")[table["columns"].index("NEES/n")]) == table["rows"][0][4]
-    # On the page: three digits, to the right.
+    # The page shows three digits, aligned to the right.
     cell = page.page.locator(".figures tbody tr").first.locator("td").nth(4)
     assert float(cell.text_content()) == pytest.approx(table["rows"][0][4], rel=5e-3)
     assert cell.evaluate("(e) => getComputedStyle(e).textAlign") == "right"
 
 
-def test_a_slow_one_is_computed_and_survives_a_reload(open_page: Any) -> None:
+def test_slow_diagnostic_survives_a_reload(open_page: Any) -> None:
     page = open_page(f"{TAB}&diagnostic=maps&filter=crossmodal-ekf")
     page.until("() => document.querySelector('#diagnostics article').dataset.state === 'unasked'")
     page.page.locator(".options input").fill("21")
@@ -132,7 +132,7 @@ def test_a_slow_one_is_computed_and_survives_a_reload(open_page: Any) -> None:
     assert jobs.first.locator("h3").text_content() == f"Likelihood maps of crossmodal-ekf, door episode {EPISODE}"
     jobs.first.locator("summary").click()
     page.until("() => document.querySelector('#jobs pre').textContent")
-    page.picture("jobs")
+    page.screenshot("jobs")
     link = jobs.first.get_by_role("link").get_attribute("href")
     for part in ("filter=crossmodal-ekf", "diagnostic=maps", "options=size%3D21"):
         assert part in link
@@ -144,7 +144,7 @@ def test_a_slow_one_is_computed_and_survives_a_reload(open_page: Any) -> None:
     assert page.page.locator(".curves figure").count() >= 2
 
 
-def test_over_all_held_out_it_is_a_job_that_can_be_cancelled(open_page: Any) -> None:
+def test_held_out_diagnostic_is_a_job_that_can_be_cancelled(open_page: Any) -> None:
     page = open_page(f"{TAB}&diagnostic=weights")
     page.until(READY)
     assert page.page.locator(".curves figure").count() > 0
@@ -157,19 +157,19 @@ def test_over_all_held_out_it_is_a_job_that_can_be_cancelled(open_page: Any) -> 
     page.until("() => document.querySelector('#diagnostics article').dataset.state === 'ended'")
     assert article.locator("> .verdict").text_content() == "Cancelled."
     article.get_by_role("button", name="Try again").click()
-    page.until(READY, patience=180.0)
-    assert "Intervals need" not in article.locator("> .verdict").text_content()  # of one trajectory only
+    page.until(READY, timeout=180.0)
+    assert "Intervals need" not in article.locator("> .verdict").text_content()  # a note of single trajectories
     assert page.page.locator(".curves figure").count() == 0
-    page.picture("held-out")
+    page.screenshot("held-out")
 
 
 FIGURES = {
-    "verdict": "One of each kind.",
+    "verdict": "All kinds of figures.",
     "trajectories": 1,
-    "tables": [{"title": "None known", "columns": ["a", "b (cm)"], "rows": [["x, y", None], ['say "x"', 0.000123456]]}],
+    "tables": [{"title": "Values", "columns": ["a", "b (cm)"], "rows": [["x, y", None], ['say "x"', 0.000123456]]}],
     "curves": [
         {"name": n, "values": [None, *range(99)], "chart": "Any", "unit": "cm", "layer": layer, "bounds": None}
-        for n, layer in (("one", "image"), ("another", "image"), ("third", ""))
+        for n, layer in (("first", "image"), ("second", "image"), ("third", ""))
     ],
     "bands": {"contact": [False] * 50 + [True] * 50},
     "plots": [
@@ -205,10 +205,10 @@ def test_every_kind_of_figure_is_drawn(open_page: Any) -> None:
         ".map((c) => [...c.getContext('2d').getImageData(0, 0, 2, 2).data])"
     )
     signed, unsigned = ([tuple(p[4 * i : 4 * i + 4]) for i in range(4)] for p in pixels)
-    assert signed[0] == (0x05, 0x30, 0x61, 255)  # the lowest: blue, although nothing reaches as far above zero
+    assert signed[0] == (0x05, 0x30, 0x61, 255)  # the lowest value is dark blue, as the scale is symmetric
     assert min(signed[1][:3]) > 240  # zero is white
-    assert signed[2][0] > signed[2][2]  # above it: red
-    assert signed[3][3] == 0  # not known: nothing
+    assert signed[2][0] > signed[2][2]  # positive values are red
+    assert signed[3][3] == 0  # missing values are transparent
     assert unsigned[0] == (0x44, 0x01, 0x54, 255)
     assert unsigned[1] == (0xFD, 0xE7, 0x25, 255)
     for kind in ("line", "points", "bars"):
@@ -220,12 +220,12 @@ def test_every_kind_of_figure_is_drawn(open_page: Any) -> None:
     dashes = page.page.locator(".curves .swatch path").evaluate_all(
         "(all) => all.map((p) => p.getAttribute('stroke-dasharray'))"
     )
-    assert len(set(dashes)) == 3  # lines differ without colour too
+    assert len(set(dashes)) == 3  # lines also differ without colour
     assert page.page.locator(".figures tbody td").all_text_contents() == ["x, y", "\N{EN DASH}", 'say "x"', "0.000123"]
-    page.picture("diagnostic-figures")
+    page.screenshot("diagnostic-figures")
 
 
-def test_a_link_to_one_that_does_not_exist_says_so(open_page: Any) -> None:
+def test_unknown_diagnostic_is_reported(open_page: Any) -> None:
     page = open_page(f"{TAB}&diagnostic=tea-leaves")
     page.until("() => document.querySelector('#diagnostics .top h3').textContent.includes('“tea-leaves”')")
     assert page.page.locator("#diagnostics .list").is_visible()

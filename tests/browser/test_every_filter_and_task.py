@@ -1,4 +1,4 @@
-"""The page of one's own filters, data and tasks: what there is not is said, and nothing stays behind of what was."""
+"""The page with user-defined filters, data and tasks."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import save_checkpoint
 
-pytestmark = pytest.mark.browser
-
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
 
 
@@ -28,17 +26,17 @@ def untrained(task: str, name: str, data: Path, path: Path) -> None:
     save_checkpoint(filter_, name, {}, path)
 
 
-def choose(page: Any, picker: str, value: str) -> None:
+def select(page: Any, picker: str, value: str) -> None:
     page.page.locator(f"#{picker}").select_option(value)
 
 
-@pytest.mark.long  # tests/app/api/test_every_filter_and_task.py asks the server the same
-def test_what_a_filter_has_not_is_said(open_page: Any, serve: Any, tmp_path: Path) -> None:
+@pytest.mark.long  # tests/app/api/test_every_filter_and_task.py has the same checks of the server
+def test_missing_outputs_are_explained_per_filter(open_page: Any, start_server: Any, tmp_path: Path) -> None:
     names = ("feature-ekf", "lstm")
     for name in names:
         untrained("door", name, sample_path("door"), tmp_path / f"my-{name}.safetensors")
     options = [part for name in names for part in ("--filter", str(tmp_path / f"my-{name}.safetensors"))]
-    page = open_page(url=serve(0, *options, "--data", str(sample_path("door"))).url)
+    page = open_page(url=start_server(*options, "--data", str(sample_path("door"))).url)
     text = page.page.locator
 
     assert page.state["filter"] == "my-feature-ekf"
@@ -46,9 +44,9 @@ def test_what_a_filter_has_not_is_said(open_page: Any, serve: Any, tmp_path: Pat
     assert text("#step-table tbody th").all_text_contents() == ["estimate"]
     assert "a single measurement model uses" in text("#timeline .track-note").text_content()
     assert text("#data").locator("option").all_text_contents() == ["door", "sample"]
-    page.picture("one-model")
+    page.screenshot("single-model")
 
-    choose(page, "filter", "my-lstm")
+    select(page, "filter", "my-lstm")
     page.until("() => document.querySelector('#heatmaps').dataset.state === 'empty'")
     assert "an LSTM estimates the state" in text("#heatmaps .note").text_content()
     assert text("#step-summary").text_content().endswith("no predicted standard deviation.")
@@ -56,31 +54,33 @@ def test_what_a_filter_has_not_is_said(open_page: Any, serve: Any, tmp_path: Pat
     assert not text("#angle-label").is_visible()
     page.page.keyboard.press("ArrowRight")
     page.settle(1)
-    page.picture("lstm")
+    page.screenshot("lstm")
 
-    choose(page, "filter", "crossmodal-pf")
+    select(page, "filter", "crossmodal-pf")
     page.until("() => document.querySelectorAll('#heatmaps h3').length === 3")
     assert text("#step-table tbody th").all_text_contents() == ["image", "haptics", "fused"]
     assert text("#angle-label").is_visible()
-    choose(page, "data", "sample")
+    select(page, "data", "sample")
     page.until("() => location.search.includes('data=sample')")
     assert page.state["step"] == 0
 
 
 @pytest.mark.long
-def test_a_task_of_ones_own(open_page: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    data, own = tmp_path / "ball.h5", tmp_path / "own.safetensors"
+def test_user_defined_task(open_page: Any, start_server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, checkpoint = tmp_path / "ball.h5", tmp_path / "checkpoint.safetensors"
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), str(data)])
     before = dict(TASKS)
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     name = load_task(f"{EXAMPLE}:TASK").name
     try:
-        untrained(name, "crossmodal-pf", data, own)
+        untrained(name, "crossmodal-pf", data, checkpoint)
     finally:
         for other in TASKS.keys() - before.keys():
-            del TASKS[other]  # for good: whoever comes next has not heard of it
+            del TASKS[other]  # other tests must not see it
         catalog._user_tasks.clear()
-    page = open_page(url=serve(0, "--task", f"{EXAMPLE}:TASK", "--data", str(data), "--filter", str(own)).url)
+    page = open_page(
+        url=start_server("--task", f"{EXAMPLE}:TASK", "--data", str(data), "--filter", str(checkpoint)).url
+    )
     text = page.page.locator
     assert page.state["task"] == name
     assert text("#maps-quantity").text_content() == "position"
@@ -88,8 +88,8 @@ def test_a_task_of_ones_own(open_page: Any, serve: Any, tmp_path: Path, monkeypa
     assert not text("#angle-label").is_visible()
     assert text("#camera figcaption").text_content() == "camera, 16 \N{MULTIPLICATION SIGN} 16"
     page.settle(0)
-    page.picture("own-task")
-    choose(page, "task", "door")
+    page.screenshot("user-defined-task")
+    select(page, "task", "door")
     page.until("() => document.querySelector('#maps-quantity').textContent === 'hinge'")
     assert page.state["component"] == "hinge_x"
     assert text("#angle-label").is_visible()

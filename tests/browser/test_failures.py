@@ -1,4 +1,4 @@
-"""Where a filter fails, on the page: looked for, gone to, shared, and the episodes sorted, in Chromium."""
+"""Failures tab: search, events, permalinks and the table of episodes."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from urllib.parse import parse_qsl
 
 import pytest
 
-pytestmark = pytest.mark.browser
-
 TAB = "?tab=failures&filter=crossmodal-ekf"
 API = "api/failures/door/crossmodal-ekf"
 READY = "() => document.querySelector('#failures').dataset.state === 'ready'"
 
 
-def looked(open_page: Any, more: str = "", **options: Any) -> Any:
-    """The tab, once failures have been looked for; they need not be looked for twice."""
-    page = open_page(TAB + more, **options)
+def open_results(open_page: Any, parameters: str = "", **options: Any) -> Any:
+    """The tab with results. The search is started unless an earlier test has done it."""
+    page = open_page(TAB + parameters, **options)
     page.until("() => ['unasked', 'ready'].includes(document.querySelector('#failures').dataset.state)")
     if page.page.locator("#failures").get_attribute("data-state") == "unasked":
         page.page.get_by_role("button", name="Look for failures").click()
@@ -24,19 +22,19 @@ def looked(open_page: Any, more: str = "", **options: Any) -> Any:
     return page
 
 
-def chosen(page: Any, episode: int, step: int) -> None:
-    """Waits until the page's state is at a event."""
+def wait_for_step(page: Any, episode: int, step: int) -> None:
+    """Waits until the page shows a step of an episode."""
     page.until(f"() => beliefscope.state().episode === {episode} && beliefscope.state().step === {step}")
 
 
-def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) -> None:
-    page = looked(open_page, "&step=40", permissions=["clipboard-read", "clipboard-write"])
+def test_event_is_opened_and_shared_by_permalink(open_page: Any) -> None:
+    page = open_results(open_page, "&step=40", permissions=["clipboard-read", "clipboard-write"])
     scores = {score["name"]: score for score in page.page.request.get(page.url + API).json()["scores"]}
     worst, second, *_ = events = scores["error"]["events"]
     rows = page.page.locator("#failures .events tbody tr")
     assert rows.count() == len(events)
     rows.first.click()
-    chosen(page, worst["episode"], worst["step"])
+    wait_for_step(page, worst["episode"], worst["step"])
     page.settle(worst["step"])
     assert page.state["tab"] == "failures"
     assert rows.first.get_attribute("class") == "here"
@@ -46,13 +44,13 @@ def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) 
     rows.first.get_by_role("button", name="Copy link").click()
     page.until("() => document.querySelector('#failures .link').textContent === '✓'")
     copied = page.page.evaluate("() => navigator.clipboard.readText()")
-    page.picture("failures")
+    page.screenshot("failures")
 
     page.page.keyboard.press("n")
-    chosen(page, second["episode"], second["step"])
+    wait_for_step(page, second["episode"], second["step"])
     page.page.keyboard.press("b")
-    chosen(page, worst["episode"], worst["step"])
-    page.page.get_by_text("angle", exact=True).first.click()  # by another measure, which the time line draws
+    wait_for_step(page, worst["episode"], worst["step"])
+    page.page.get_by_text("angle", exact=True).first.click()  # another measure, which the timeline shows as well
     page.until("() => location.search.includes('by=angle')")
     assert page.state["component"] == "angle"
     assert rows.count() == scores["angle"]["total"]
@@ -60,59 +58,61 @@ def test_the_worst_moment_is_opened_and_its_link_opens_the_same(open_page: Any) 
     page.until("() => document.querySelector('#failures .verdict').textContent.includes('has no particles')")
 
     other = open_page("?" + copied.partition("?")[2])
-    chosen(other, worst["episode"], worst["step"])
+    wait_for_step(other, worst["episode"], worst["step"])
     other.settle(worst["step"])
     assert dict(parse_qsl(copied.partition("?")[2]))["step"] == str(worst["step"])
     assert other.state["filter"] == "crossmodal-ekf"
 
 
 def column(page: Any, name: str) -> list[str]:
-    """What a column of the episodes says."""
+    """Cells of a column of the table of episodes."""
     table = page.page.locator("#failures .episodes")
-    place = table.locator("thead th").all_text_contents().index(name)
-    return table.locator(f"tbody tr td:nth-child({place + 1})").all_text_contents()
+    position = table.locator("thead th").all_text_contents().index(name)
+    return table.locator(f"tbody tr td:nth-child({position + 1})").all_text_contents()
 
 
 def test_episodes_are_sorted_and_opened(open_page: Any) -> None:
-    page = looked(open_page, "&list=episodes", viewport={"width": 1440, "height": 900}, color_scheme="dark")
+    page = open_results(open_page, "&list=episodes", viewport={"width": 1440, "height": 900}, color_scheme="dark")
     episodes = page.page.request.get(page.url + API).json()["episodes"]
-    by_worst = sorted(episodes, key=lambda one: -one["worst"])
-    known = [str(one["index"]) for one in by_worst]
+    by_worst = sorted(episodes, key=lambda episode: -episode["worst"])
+    scored = [str(episode["index"]) for episode in by_worst]
     listed = column(page, "episode")
-    assert listed[: len(known)] == known  # the worst first, those that nobody looked at last
-    assert len(listed) == len(set(listed)) > len(known)
+    assert listed[: len(scored)] == scored  # largest error first, training episodes without results last
+    assert len(listed) == len(set(listed)) > len(scored)
     assert column(page, "RMSE cm")[-1] == "\N{EN DASH}"
     page.page.get_by_role("button", name="RMSE cm").click()
-    rmse = [float(text) for text in column(page, "RMSE cm")[: len(known)]]
+    rmse = [float(text) for text in column(page, "RMSE cm")[: len(scored)]]
     assert rmse == sorted(rmse, reverse=True)
-    assert rmse[0] == pytest.approx(100 * max(one["rmse"] for one in episodes), abs=0.005)
+    assert rmse[0] == pytest.approx(100 * max(episode["rmse"] for episode in episodes), abs=0.005)
     page.page.get_by_role("button", name="RMSE cm").click()
-    assert [float(text) for text in column(page, "RMSE cm")[: len(known)]] == rmse[::-1]
+    assert [float(text) for text in column(page, "RMSE cm")[: len(scored)]] == rmse[::-1]
     page.page.get_by_role("button", name="contact", exact=True).focus()
     page.page.keyboard.press("Enter")
     shares = [int(text.removesuffix(" %")) for text in column(page, "contact")]
     assert shares == sorted(shares)
-    assert page.page.evaluate("() => document.activeElement.textContent") == "contact"  # it may be turned round at once
-    page.picture("episodes")
+    assert (
+        page.page.evaluate("() => document.activeElement.textContent") == "contact"
+    )  # the focus stays for the reverse order
+    page.screenshot("episodes")
 
     worst = by_worst[0]
     row = page.page.locator("#failures .episodes tbody tr").filter(
         has=page.page.get_by_role("button", name=f"Episode {worst['index']}", exact=True)
     )
     row.get_by_role("button").click()
-    chosen(page, worst["index"], 0)
+    wait_for_step(page, worst["index"], 0)
     box = row.locator("svg").bounding_box()
     page.page.mouse.click(box["x"] + 0.6 * box["width"], box["y"] + 5)
     page.until(f"() => Math.abs(beliefscope.state().step - {0.6 * worst['steps']}) <= 1")  # steps are thin
     assert row.get_attribute("class") == "here"
 
 
-def test_before_the_search_there_are_episodes_all_the_same(open_page: Any) -> None:
+def test_episodes_are_listed_before_the_search(open_page: Any) -> None:
     page = open_page("?tab=failures&list=episodes&filter=image-ekf&among=all")
     page.until("() => document.querySelector('#failures').dataset.state === 'unasked'")
     catalog = page.page.request.get(f"{page.url}api/catalog").json()
     (door,) = (task for task in catalog["tasks"] if task["name"] == "door")
-    assert column(page, "episode") == [str(one["index"]) for one in door["data"][0]["episodes"]]
+    assert column(page, "episode") == [str(episode["index"]) for episode in door["data"][0]["episodes"]]
     assert set(column(page, "worst cm")) == {"\N{EN DASH}"}
-    page.page.keyboard.press("n")  # there is none to go to: it says what to do
+    page.page.keyboard.press("n")  # without events the key opens the search
     assert page.page.get_by_role("button", name="Look for failures").is_visible()

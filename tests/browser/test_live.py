@@ -1,4 +1,4 @@
-"""A filter that runs now fills the page: its newest step is followed, left and come back to; its death is told."""
+"""Live runs: the page follows the newest step, can leave and rejoin it, and reports an interrupted run."""
 
 from __future__ import annotations
 
@@ -11,18 +11,16 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.browser
-
 NEWEST = "Number(document.querySelector('#tracks').getAttribute('aria-valuemax'))"
 
 
 @pytest.fixture
-def running(served: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """A run that is slow enough not to end by itself: 100 steps, one a second."""
+def running(server: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """A run of 100 steps at one step per second, which outlasts the test."""
     command = Path(sysconfig.get_path("scripts")) / "beliefscope"
-    options = ["--filter", "crossmodal-ekf", "--rate", "1", "--name", "go", "--workspace", str(served.workspace)]
+    options = ["--filter", "crossmodal-ekf", "--rate", "1", "--name", "go", "--workspace", str(server.workspace)]
     process = subprocess.Popen([str(command), "live", "door", *options], stderr=subprocess.DEVNULL)
-    folder = served.workspace / "live"
+    folder = server.workspace / "live"
     while not (folder / "go.live").exists():
         assert process.poll() is None
         time.sleep(0.1)
@@ -33,14 +31,14 @@ def running(served: Any) -> Iterator[subprocess.Popen[bytes]]:
         file.unlink()
 
 
-def test_a_run_fills_the_page_as_it_goes(open_page: Any, running: Any) -> None:
+def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
     page = open_page("?data=live:go")
     assert page.page.evaluate("() => document.querySelector('#live').className") == "on"
     first = page.page.evaluate(f"() => {NEWEST}")
     page.until(f"() => {NEWEST} > {first} + 1 && beliefscope.state().step === {NEWEST}")
     assert page.state["follow"]
     assert page.page.locator("#heatmaps figure").count() == 3
-    page.picture("live")
+    page.screenshot("live")
 
     page.page.keyboard.press("Home")
     page.until("() => !beliefscope.state().follow")
@@ -60,8 +58,8 @@ def test_a_run_fills_the_page_as_it_goes(open_page: Any, running: Any) -> None:
 
     running.kill()
     page.until("() => /stopped at step [0-9]+/.test(document.querySelector('#messages').textContent)")
-    said = page.page.inner_text("#messages")
-    assert f"at step {page.page.evaluate(f'() => {NEWEST}')}:" in said
+    message = page.page.inner_text("#messages")
+    assert f"at step {page.page.evaluate(f'() => {NEWEST}')}:" in message
     assert page.page.locator("#follow").is_hidden()
     page.until("() => document.querySelectorAll('#failures .events tbody tr').length > 0")
     page.page.click("#tab-diagnostics")

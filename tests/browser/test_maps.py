@@ -1,4 +1,4 @@
-"""The likelihood maps as an instrument: their looks are in the address, their values and files are the engine's."""
+"""Likelihood maps: values, exported files, display options and permalinks."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
 from beliefscope.inspect.maps.statistics import measure_maps
 from beliefscope.inspect.trace import Trace, trace
 
-pytestmark = pytest.mark.browser
-
 STEP = 25
 LINK = f"?filter=crossmodal-pf&step={STEP}&tab=diagnostics"
 
@@ -32,7 +30,7 @@ def engine() -> MapEngine:
 
 
 @pytest.fixture(scope="module")
-def told(engine: MapEngine) -> LikelihoodMap:
+def expected(engine: MapEngine) -> LikelihoodMap:
     return engine.map(STEP)
 
 
@@ -40,13 +38,13 @@ def numbers(text: str) -> list[float]:
     return [float(n.replace("\N{MINUS SIGN}", "-")) for n in re.findall("[+\N{MINUS SIGN}]?\\d+(?:\\.\\d+)?", text)]
 
 
-def test_values_and_files_are_the_engines(
-    open_page: Any, engine: MapEngine, told: LikelihoodMap, tmp_path: Path
+def test_values_and_exports_match_the_engine(
+    open_page: Any, engine: MapEngine, expected: LikelihoodMap, tmp_path: Path
 ) -> None:
     page = open_page(LINK)
     assert page.state["episode"] == 9
-    check_numbers(page, told, engine.trace)
-    check_probe(page, told)
+    check_numbers(page, expected, engine.trace)
+    check_probe(page, expected)
     page.page.locator("#maps-view").click()
     files = {}
     for kind in ("csv", "svg", "png"):
@@ -56,28 +54,32 @@ def test_values_and_files_are_the_engines(
         download.value.save_as(files[kind])
     assert files["csv"].name == "door-crossmodal-pf-episode9-step25-maps.csv"
     rows = list(csv.reader(line for line in files["csv"].read_text().splitlines() if not line.startswith("#")))
-    assert rows[0] == ["dx_cm", "dy_cm", "x_cm", "y_cm"] + [f"{m}_ln_likelihood_nats" for m in told.layers]
+    assert rows[0] == ["dx_cm", "dy_cm", "x_cm", "y_cm"] + [f"{m}_ln_likelihood_nats" for m in expected.layers]
     cells = np.array(rows[1:], dtype=float)
-    # Four decimals of values in 65535 steps of a range below 64 nats; places to three decimals of a cm.
-    np.testing.assert_allclose(cells[:, 4:].T.reshape(told.log_likelihood.shape), told.log_likelihood, atol=6e-4)
-    dx, dy = np.meshgrid(100.0 * told.offsets_x, 100.0 * told.offsets_y)
+    # Likelihoods have four decimals and 65535 levels over less than 64 nats; positions have three decimals in cm.
+    np.testing.assert_allclose(
+        cells[:, 4:].T.reshape(expected.log_likelihood.shape), expected.log_likelihood, atol=6e-4
+    )
+    dx, dy = np.meshgrid(100.0 * expected.offsets_x, 100.0 * expected.offsets_y)
     np.testing.assert_allclose(cells[:, :2], np.stack([dx.ravel(), dy.ravel()], axis=1), atol=1e-3)
-    np.testing.assert_allclose(cells[:, 2:4] - cells[:, :2], 100.0 * told.centre[None].repeat(len(cells), 0), atol=2e-3)
+    np.testing.assert_allclose(
+        cells[:, 2:4] - cells[:, :2], 100.0 * expected.centre[None].repeat(len(cells), 0), atol=2e-3
+    )
     drawing = ElementTree.parse(files["svg"]).getroot()
     assert len(drawing.findall(".//{*}clipPath")) == 3
     texts = [text.text for text in drawing.iter("{http://www.w3.org/2000/svg}text")]
-    assert {*told.layers, "Δx (cm)"} <= {*texts}
+    assert {*expected.layers, "Δx (cm)"} <= {*texts}
     assert files["png"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
-def check_numbers(page: Any, told: LikelihoodMap, run: Trace) -> None:
-    """What stands beneath the maps, as it is rounded there."""
-    measured = measure_maps([told], run)
+def check_numbers(page: Any, expected: LikelihoodMap, run: Trace) -> None:
+    """Numbers below the maps, with their displayed precision."""
+    measured = measure_maps([expected], run)
     for layer, figure in enumerate(page.page.locator("#heatmaps figcaption").all()):
         peak, areas, ridge = figure.locator("p").all_text_contents()
-        assert numbers(peak) == pytest.approx((100.0 * told.peaks()[layer]).tolist(), abs=0.051)
-        want = [1e4 * a[0, layer] for a in (measured.area50, measured.area95)]
-        assert numbers(areas)[1::2] == pytest.approx(want, abs=0.51)
+        assert numbers(peak) == pytest.approx((100.0 * expected.peaks()[layer]).tolist(), abs=0.051)
+        areas_cm2 = [1e4 * a[0, layer] for a in (measured.area50, measured.area95)]
+        assert numbers(areas)[1::2] == pytest.approx(areas_cm2, abs=0.51)
         assert numbers(ridge)[-1] == pytest.approx(measured.entropy[0, layer] + np.log(1e4), abs=0.0051)
         if "ridge" in ridge and "no" not in ridge:
             assert numbers(ridge)[0] == pytest.approx(np.degrees(measured.off_line[0, layer]), abs=0.51)
@@ -86,8 +88,8 @@ def check_numbers(page: Any, told: LikelihoodMap, run: Trace) -> None:
     assert pair[2] == pytest.approx(100.0 * measured.overlap[0, 0, 1], abs=0.51)
 
 
-def check_probe(page: Any, told: LikelihoodMap) -> None:
-    """Arrow keys on a map read its values, and leave the step alone."""
+def check_probe(page: Any, expected: LikelihoodMap) -> None:
+    """Arrow keys on a map move the probe and keep the step."""
     heights = "() => document.querySelector('#maps').offsetHeight"
     before = page.page.evaluate(heights)
     page.page.locator("#heatmaps canvas").nth(1).focus()
@@ -95,8 +97,8 @@ def check_probe(page: Any, told: LikelihoodMap) -> None:
         page.page.keyboard.press(key)
     assert page.state["step"] == STEP
     assert page.page.locator("#maps-value").text_content() == "at +0.2, +1.0 cm"
-    values = told.log_likelihood[:, 67 + 5, 67 + 1]
-    relative = np.exp(values - told.log_likelihood.max(axis=(1, 2)))
+    values = expected.log_likelihood[:, 67 + 5, 67 + 1]
+    relative = np.exp(values - expected.log_likelihood.max(axis=(1, 2)))
     for layer, caption in enumerate(page.page.locator("#heatmaps figcaption").all_text_contents()):
         assert numbers(caption) == pytest.approx([relative[layer], values[layer]], abs=0.0061)
     assert "haptics" in page.page.locator("#maps-announcement").text_content()
@@ -105,22 +107,22 @@ def check_probe(page: Any, told: LikelihoodMap) -> None:
     assert page.page.locator("#maps-value").text_content() == ""
 
 
-def test_looks_are_in_the_address_and_a_pinned_moment_is_what_others_gain_on(
-    open_page: Any, told: LikelihoodMap
+def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
+    open_page: Any, expected: LikelihoodMap
 ) -> None:
     page = open_page(LINK)
     plain = page.maps()
     page.page.locator("#maps-view").click()
-    for look, value in [("scale", "log"), ("range", "same"), ("axes", "world"), ("cloud", "shown")]:
+    for option, value in [("scale", "log"), ("range", "same"), ("axes", "world"), ("cloud", "images")]:
         before = page.maps()
-        page.page.locator(f"#maps-{look} label", has=page.page.locator(f"[value={value}]")).click()
-        page.until(f"() => location.search.includes('{look}={value}')")
+        page.page.locator(f"#maps-{option} label", has=page.page.locator(f"[value={value}]")).click()
+        page.until(f"() => location.search.includes('{option}={value}')")
         assert page.maps() != before
-    top = told.log_likelihood.max()
-    lowest = max(told.log_likelihood.min(), top - 40.0)
+    top = expected.log_likelihood.max()
+    lowest = max(expected.log_likelihood.min(), top - 40.0)
     ends = page.page.locator("#heatmaps .colours b").all_text_contents()
     assert [numbers(end)[0] for end in ends] == pytest.approx(3 * [lowest, top], abs=0.51)
-    page.picture("maps-log-world")
+    page.screenshot("maps-log-world")
     second = open_page("?" + page.page.url.partition("?")[2])
     assert second.state == page.state
     page.page.locator("#maps-scale label").first.click()
@@ -128,37 +130,37 @@ def test_looks_are_in_the_address_and_a_pinned_moment_is_what_others_gain_on(
     page.page.locator("h1").click()
     page.page.keyboard.press("m")
     page.page.locator("#heatmaps canvas").first.hover()
-    said = page.page.locator("#heatmaps figcaption").all_text_contents()
-    assert all(text.endswith("gain 0.00 nats") for text in said)  # on itself
+    captions = page.page.locator("#heatmaps figcaption").all_text_contents()
+    assert all(text.endswith("gain 0.00 nats") for text in captions)  # relative to itself
     page.page.keyboard.press("Shift+ArrowRight")
     page.settle(STEP + 10)
     assert page.page.locator("#maps-kind").text_content() == f"Gain over step {STEP}"
-    said = page.page.locator("#heatmaps figcaption").all_text_contents()
-    assert not any(text.endswith("gain 0.00 nats") for text in said)
-    page.picture("maps-gain")
+    captions = page.page.locator("#heatmaps figcaption").all_text_contents()
+    assert not any(text.endswith("gain 0.00 nats") for text in captions)
+    page.screenshot("maps-gain")
     page.until(f"() => location.search.includes('pin=') && location.search.includes('step={STEP + 10}')")
-    again = open_page("?" + page.page.url.partition("?")[2])  # a link has the pinned moment, though nobody went there
+    again = open_page("?" + page.page.url.partition("?")[2])  # the pinned step is restored without a visit
     again.until(f"() => document.querySelector('#maps-kind').textContent === 'Gain over step {STEP}'")
     assert (again.state["pin"], again.state["step"]) == (page.state["pin"], STEP + 10)
     again.page.locator("#heatmaps canvas").first.hover()
-    assert again.page.locator("#heatmaps figcaption").all_text_contents() == said
+    assert again.page.locator("#heatmaps figcaption").all_text_contents() == captions
     page.page.keyboard.press("m")
     page.page.keyboard.press("Shift+ArrowLeft")
     page.settle(STEP)
-    for look in ("range", "axes", "cloud"):
-        page.page.evaluate(f"() => document.querySelector('#maps-{look} input').click()")
+    for option in ("range", "axes", "cloud"):
+        page.page.evaluate(f"() => document.querySelector('#maps-{option} input').click()")
     page.page.mouse.move(5, 5)
     page.until("() => !location.search.includes('axes=')")
     assert page.maps() == plain
 
 
-def test_a_moment_is_told_and_drawn_close_where_its_maps_fit(open_page: Any) -> None:
+def test_summary_and_zoom_of_a_step(open_page: Any) -> None:
     page = open_page("?task=push&filter=crossmodal-ekf&episode=79&step=68")
     assert page.page.locator("#step-summary").text_content().endswith("although the image-only error is 0.8 cm.")
-    shown = {"fit": page.maps()}
+    images = {"fit": page.maps()}
     for zoom in ("4", "1"):
         page.page.evaluate(f"""() => document.querySelector('#maps-zoom input[value="{zoom}"]').click()""")
         page.until(f"() => beliefscope.state().zoom === '{zoom}'")
         page.page.evaluate("() => new Promise(requestAnimationFrame)")
-        shown[zoom] = page.maps()
-    assert shown["fit"] == shown["4"] != shown["1"]
+        images[zoom] = page.maps()
+    assert images["fit"] == images["4"] != images["1"]

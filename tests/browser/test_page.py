@@ -1,4 +1,4 @@
-"""What a user does on the page, done in Chromium."""
+"""Main interactions with the page in Chromium."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.browser
-
 NUMBER = "[+\N{MINUS SIGN}]?\\d+\\.\\d"
 WINDOWS = {"wide": (1440, 900), "small": (1024, 768)}
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("window", WINDOWS)
-def test_one_screen_in_both_colours(open_page: Any, window: str, theme: str) -> None:
+def test_page_fits_the_window(open_page: Any, window: str, theme: str) -> None:
     width, height = WINDOWS[window]
     page = open_page("?step=40", viewport={"width": width, "height": height}, color_scheme=theme)
     page.until("() => document.querySelector('#scene').dataset.state === 'ready'")
@@ -27,10 +25,10 @@ def test_one_screen_in_both_colours(open_page: Any, window: str, theme: str) -> 
         " ...[...document.querySelectorAll('.bar, header, .panel')].map((e) => e.scrollWidth - e.clientWidth)]"
     )
     assert max(overflow) <= 1
-    page.picture(f"scene-{window}-{theme}")
+    page.screenshot(f"scene-{window}-{theme}")
 
 
-def test_everything_that_can_be_used_has_a_name(open_page: Any) -> None:
+def test_controls_have_accessible_names(open_page: Any) -> None:
     page = open_page()
     nameless = page.page.evaluate(
         """() => [...document.querySelectorAll('button, select, input, [role=slider], iframe, canvas[role]')]
@@ -41,10 +39,10 @@ def test_everything_that_can_be_used_has_a_name(open_page: Any) -> None:
     assert nameless == []
 
 
-def test_keys_move_everything(open_page: Any) -> None:
+def test_keys_change_the_step(open_page: Any) -> None:
     page = open_page("?step=20")
     page.settle(20)
-    before, picture = page.maps(), page.page.evaluate(PICTURE)
+    before, image = page.maps(), page.page.evaluate(CAMERA_IMAGE)
     for key, step in [("ArrowRight", 21), ("Shift+ArrowRight", 31), ("ArrowLeft", 30), ("End", None), ("Home", 0)]:
         page.page.keyboard.press(key)
         if step is not None:
@@ -53,11 +51,11 @@ def test_keys_move_everything(open_page: Any) -> None:
     after = page.maps()
     assert len(after) == 3
     assert all(a != b for a, b in zip(before, after, strict=True))
-    assert page.page.evaluate(PICTURE) != picture
+    assert page.page.evaluate(CAMERA_IMAGE) != image
     assert len(page.stats["scrub"]) >= 3
 
 
-PICTURE = "() => document.querySelector('#camera canvas').toDataURL()"
+CAMERA_IMAGE = "() => document.querySelector('#camera canvas').toDataURL()"
 
 
 def test_dragging_scrubs(open_page: Any, record_property: Any) -> None:
@@ -83,14 +81,14 @@ def test_dragging_scrubs(open_page: Any, record_property: Any) -> None:
     delays = sorted(page.stats["scrub"])
     record_property("scrub_to_drawn_ms_p50", delays[len(delays) // 2])
     record_property("scrub_to_drawn_ms_p95", delays[int(0.95 * len(delays))])
-    assert delays[len(delays) // 2] < 1000  # a guard against sticking, not the bar: see the bench
+    assert delays[len(delays) // 2] < 1000  # detects a stalled page; bench/ measures performance
 
 
 def test_wheel_zooms_and_double_click_resets(open_page: Any) -> None:
     page = open_page("?step=20")
     box = page.page.locator("#tracks").bounding_box()
-    whole = page.page.locator("#reset-zoom")
-    assert whole.is_disabled()
+    reset = page.page.locator("#reset-zoom")
+    assert reset.is_disabled()
     page.page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 60)
     page.page.mouse.wheel(0, -600)
     page.until("() => !document.querySelector('#reset-zoom').disabled")
@@ -99,7 +97,7 @@ def test_wheel_zooms_and_double_click_resets(open_page: Any) -> None:
     page.until("() => document.querySelector('#reset-zoom').disabled")
 
 
-def test_wheel_over_a_map_steps_and_hover_tells_the_value(open_page: Any) -> None:
+def test_wheel_over_a_map_changes_the_step_and_hover_shows_values(open_page: Any) -> None:
     page = open_page("?step=20")
     page.page.locator("#heatmaps canvas").nth(1).hover()
     assert re.fullmatch(f"at {NUMBER}, {NUMBER} cm", page.page.locator("#maps-value").text_content())
@@ -109,7 +107,7 @@ def test_wheel_over_a_map_steps_and_hover_tells_the_value(open_page: Any) -> Non
     page.settle(21)
 
 
-def test_playing_follows_the_episodes_clock(open_page: Any) -> None:
+def test_playback_follows_the_episode_clock(open_page: Any) -> None:
     page = open_page("?step=0")
     page.page.keyboard.press(">")  # 2x
     page.page.keyboard.press("Space")
@@ -120,7 +118,7 @@ def test_playing_follows_the_episodes_clock(open_page: Any) -> None:
     page.settle(page.state["step"])
 
 
-def test_a_slice_at_another_angle_changes_the_maps(open_page: Any) -> None:
+def test_cross_section_angle_changes_the_maps(open_page: Any) -> None:
     page = open_page("?step=20")
     page.settle(20)
     before = page.maps()
@@ -135,61 +133,61 @@ def test_a_slice_at_another_angle_changes_the_maps(open_page: Any) -> None:
     page.until("() => beliefscope.state().angle === null")
 
 
-def test_black_pictures_are_named(open_page: Any) -> None:
+def test_image_blackout_is_labelled(open_page: Any) -> None:
     page = open_page("?step=20")
     assert not page.page.locator("#blackout-key").is_visible()
     page.page.locator("#faults").select_option("blackout=0.8")
     page.until("() => !document.querySelector('#blackout-key').hidden")
     for _ in range(30):
-        if page.page.locator(".blackout").is_visible():
+        if page.page.locator("#camera .blackout").is_visible():
             break
         page.page.keyboard.press("ArrowRight")
         time.sleep(0.1)
-    assert page.page.locator(".blackout").is_visible()
+    assert page.page.locator("#camera .blackout").is_visible()
     page.settle(page.state["step"])
-    page.picture("black-out")
+    page.screenshot("blackout")
 
 
-def test_a_ready_faults_breaks_a_sensor(open_page: Any) -> None:
+def test_fault_preset_is_applied_and_removed(open_page: Any) -> None:
     page = open_page("?step=40")
     page.settle(40)
-    before, picture = page.maps(), page.page.evaluate(PICTURE)
+    before, image = page.maps(), page.page.evaluate(CAMERA_IMAGE)
     names = page.page.locator("#faults option").all_text_contents()
     assert names[0] == "as recorded"
     assert {"40 % image blackout", "image frozen", "force drifting", "contact flipped", "haptics dropped"} <= {*names}
     page.page.locator("#faults").select_option("image_frozen=20")
-    wait_until(lambda: page.page.evaluate(PICTURE) != picture and page.maps()[0] != before[0])
+    wait_until(lambda: page.page.evaluate(CAMERA_IMAGE) != image and page.maps()[0] != before[0])
     page.until("() => location.search.includes('faults=image_frozen%3D20')")
     page.page.locator("#faults").select_option("")
-    wait_until(lambda: page.page.evaluate(PICTURE) == picture and page.maps() == before)
+    wait_until(lambda: page.page.evaluate(CAMERA_IMAGE) == image and page.maps() == before)
     page.until("() => !location.search.includes('faults')")
 
 
-def test_any_faults_can_be_typed_and_a_bad_one_leaves_the_view(open_page: Any) -> None:
-    own = "blackout=0.5,force_bias:x=5:from=20"
+def test_custom_faults_are_validated(open_page: Any) -> None:
+    custom = "blackout=0.5,force_bias:x=5:from=20"
     page = open_page("?step=40&faults=image_occluded%3D16%3Ax%3D0%3Ay%3D0")
     page.settle(40)
     faults = page.page.locator("#faults")
     assert faults.input_value() == "image_occluded=16:x=0:y=0"
     before = page.maps()
     faults.select_option("other")
-    sheet, text = page.page.locator("#fault-dialog"), page.page.locator("#fault-dialog input")
+    dialog, text = page.page.locator("#fault-dialog"), page.page.locator("#fault-dialog input")
     assert text.input_value() == "image_occluded=16:x=0:y=0"
-    assert sheet.locator("tr").count() == 15
+    assert dialog.locator("tr").count() == 15
     text.fill("blackout=1.5,force_bias:x=5")
     text.press("Enter")
     page.until("() => document.querySelector('#fault-dialog .error').textContent.includes(\"'probability' is 1.5\")")
-    page.picture("faults-wrong")
+    page.screenshot("faults-invalid")
     assert page.state["faults"] == "image_occluded=16:x=0:y=0"
     assert page.maps() == before
     text.fill("blackout=0.5")
-    sheet.get_by_role("button", name="force_bias").click()
+    dialog.get_by_role("button", name="force_bias").click()
     assert text.input_value() == "blackout=0.5,force_bias=0"
-    text.fill(own)
-    sheet.get_by_role("button", name="Apply").click()
+    text.fill(custom)
+    dialog.get_by_role("button", name="Apply").click()
     wait_until(lambda: page.maps() != before)
-    assert not sheet.is_visible()
-    assert faults.input_value() == page.state["faults"] == own
+    assert not dialog.is_visible()
+    assert faults.input_value() == page.state["faults"] == custom
     page.until("() => location.search.includes('force_bias')")
     second = open_page("?" + page.page.url.partition("?")[2])
     assert second.state == page.state
@@ -197,24 +195,24 @@ def test_any_faults_can_be_typed_and_a_bad_one_leaves_the_view(open_page: Any) -
     second.page.locator("#faults").select_option("other")
     second.page.keyboard.press("Escape")
     assert second.state == page.state
-    page.picture("faults-own")
-    refused(page)
+    page.screenshot("faults-custom")
+    ignore_bad_request(page)
 
 
-def wait_until(condition: Callable[[], bool], patience: float = 60.0) -> None:
-    end = time.monotonic() + patience
+def wait_until(condition: Callable[[], bool], timeout: float = 60.0) -> None:
+    end = time.monotonic() + timeout
     while not condition():
-        assert time.monotonic() < end, f"not within {patience} s"
+        assert time.monotonic() < end, f"not within {timeout} s"
         time.sleep(0.05)
 
 
-def refused(page: Any) -> None:
-    """Forgets the browser's own line about an answer of 400, of which there was one."""
-    (line,) = [line for line in page.wrong if "status of 400" in line]
-    page.wrong.remove(line)
+def ignore_bad_request(page: Any) -> None:
+    """Removes the single expected error about a response with status 400."""
+    (line,) = [error for error in page.errors if "status of 400" in error]
+    page.errors.remove(line)
 
 
-def test_a_link_opens_the_same_moment(open_page: Any) -> None:
+def test_permalink_restores_the_view(open_page: Any) -> None:
     first = open_page("?step=33&component=angle&weights=effective&angle=0.7")
     first.page.keyboard.press("ArrowRight")
     first.until("() => location.search.includes('step=34')")
@@ -222,9 +220,9 @@ def test_a_link_opens_the_same_moment(open_page: Any) -> None:
     assert second.state == first.state
 
 
-def test_a_bad_link_says_what_is_wrong(open_page: Any) -> None:
+def test_invalid_permalink_values_are_reported(open_page: Any) -> None:
     page = open_page("?filter=nope&episode=999&step=5000&component=elbow&faults=blakout")
-    said = page.page.locator("#messages").text_content()
+    message = page.page.locator("#messages").text_content()
     for part in (
         "filter “nope”",
         "crossmodal-ekf",
@@ -234,41 +232,41 @@ def test_a_bad_link_says_what_is_wrong(open_page: Any) -> None:
         "Step 5000",
         "fault 'blakout'",
     ):
-        assert part in said
+        assert part in message
     assert 0 < page.state["step"] < 5000
     assert page.state["faults"] == ""
-    refused(page)
+    ignore_bad_request(page)
     page.page.locator("#messages button").first.click()
-    page.picture("bad-link")
+    page.screenshot("invalid-permalink")
 
 
-def test_theme_and_help(open_page: Any) -> None:
+def test_theme_and_key_help(open_page: Any) -> None:
     page = open_page()
-    ground = "() => getComputedStyle(document.body).backgroundColor + getComputedStyle(document.body).color"
-    before = page.page.evaluate(ground)
+    colours = "() => getComputedStyle(document.body).backgroundColor + getComputedStyle(document.body).color"
+    before = page.page.evaluate(colours)
     page.page.keyboard.press("d")
-    assert page.page.evaluate(ground) != before
+    assert page.page.evaluate(colours) != before
     page.page.keyboard.press("?")
     assert page.page.locator("#keys").is_visible()
-    page.picture("keys-dark")
+    page.screenshot("keys-dark")
     page.page.keyboard.press("Escape")
     assert not page.page.locator("#keys").is_visible()
 
 
-def test_back_and_forward_go_through_what_was_chosen(open_page: Any) -> None:
+def test_back_and_forward_restore_selections(open_page: Any) -> None:
     page = open_page("?step=7")
     page.page.select_option("#episode", "19")
-    page.until("() => location.search.includes('episode=19')")  # else both may come in one frame, as one place
+    page.until("() => location.search.includes('episode=19')")  # two changes in one frame are a single history entry
     page.page.keyboard.press("f")
     page.until("() => location.search.includes('tab=failures')")
-    for way, episode, step in (("back", 19, 0), ("back", 9, 7), ("forward", 19, 0)):
-        page.page.evaluate(f"() => history.{way}()")
+    for direction, episode, step in (("back", 19, 0), ("back", 9, 7), ("forward", 19, 0)):
+        page.page.evaluate(f"() => history.{direction}()")
         page.until(f"() => beliefscope.state().episode === {episode} && beliefscope.state().tab === 'scene'")
         assert page.state["step"] == step
     assert page.page.locator("#episode").input_value() == "19"
 
 
-def test_the_scenes_own_slider_moves_the_page(open_page: Any) -> None:
+def test_scene_slider_changes_the_step(open_page: Any) -> None:
     page = open_page("?step=20")
     page.until("() => document.querySelector('#scene').dataset.state === 'ready'")
     scene = page.page.frame_locator("#scene iframe")
@@ -276,18 +274,18 @@ def test_the_scenes_own_slider_moves_the_page(open_page: Any) -> None:
     if not slider.is_visible():
         scene.get_by_text("Step", exact=True).first.click(timeout=60_000)
     slider.focus(timeout=60_000)
-    assert page.page.frames[-1].evaluate("() => frameThrottle.pause(0)")  # the page's hold on viser's drawing
+    assert page.page.frames[-1].evaluate("() => frameThrottle.pause(0)")  # resumes drawing, which the page pauses
     page.page.keyboard.press("ArrowRight")
     page.until("() => beliefscope.state().step === 21")
     page.settle(21)
 
 
-def test_save_a_recording_open_it_and_move_both_ways(open_page: Any, tmp_path: Path) -> None:
+def test_recording_is_saved_and_synchronized_with_rerun(open_page: Any, tmp_path: Path) -> None:
     page = open_page("?step=12")
     with page.page.expect_download(timeout=120_000) as download:
         page.page.keyboard.press("s")
         page.until("() => document.querySelector('#save-status progress:not([hidden])')")
-        page.page.reload()  # its job goes on, and the page waits for it again
+        page.page.reload()  # the job continues and the page waits for it again
     download.value.save_as(tmp_path / "run.rrd")
     assert (tmp_path / "run.rrd").read_bytes()[:3] == b"RRF"
     page.page.get_by_role("button", name="Open in Rerun tab").click()
@@ -305,25 +303,25 @@ def test_save_a_recording_open_it_and_move_both_ways(open_page: Any, tmp_path: P
     page.page.keyboard.press("Shift+ArrowRight")
     viewer_reaches(22)
     assert page.state["step"] == 22
-    # A key pressed in the viewer is the viewer's; the page follows it.
+    # Keys pressed in the viewer move its cursor; the page follows.
     page.page.locator("#rerun canvas").focus()
     page.page.keyboard.press("ArrowRight")
     page.until("() => beliefscope.state().step === 23")
     page.settle(23)
-    page.picture("rerun")
+    page.screenshot("rerun")
 
 
 @pytest.mark.long
-def test_a_server_that_goes_and_comes_back(open_page: Any, serve: Any) -> None:
-    first = serve()
+def test_page_reconnects_to_a_restarted_server(open_page: Any, start_server: Any) -> None:
+    first = start_server()
     page = open_page("?step=5", url=first.url)
     page.settle(5)
     first.stop()
     page.until("() => document.querySelector('#messages').textContent.includes('server')")
-    page.page.keyboard.press("ArrowRight")  # the page's own panels still follow
+    page.page.keyboard.press("ArrowRight")  # panels with loaded data still work
     page.until("() => document.querySelector('#readout b').textContent.startsWith('6 ')")
-    serve(int(first.url.rstrip("/").rpartition(":")[2]))
+    start_server("--port", first.url.rstrip("/").rpartition(":")[2])
     page.until("() => document.querySelector('#messages').textContent === ''")
     page.settle(6)
-    refused = [line for line in page.wrong if "ERR_CONNECTION_REFUSED" in line or "WebSocket" in line]
-    page.wrong[:] = [line for line in page.wrong if line not in refused]  # what the browser tells of each attempt
+    disconnections = [line for line in page.errors if "ERR_CONNECTION_REFUSED" in line or "WebSocket" in line]
+    page.errors[:] = [line for line in page.errors if line not in disconnections]

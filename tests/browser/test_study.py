@@ -1,32 +1,28 @@
-"""A study on the page: bars and table say the same, and lead to the worst moments of the checkpoint that is here."""
+"""Study tab: bars and table agree, and bars open the largest errors of available checkpoints."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
-pytestmark = pytest.mark.browser
-
-SHOWN = "() => document.querySelector('#study').dataset.state === 'ready'"
+READY = "() => document.querySelector('#study').dataset.state === 'ready'"
 LABELS = "(all) => all.map((a) => [a.getAttribute('aria-label'), a.hasAttribute('href')])"
 
 
-def test_a_bar_leads_to_the_worst_moment(open_page: Any) -> None:
+def test_bar_opens_the_largest_error(open_page: Any) -> None:
     page = open_page("?tab=study&step=40", viewport={"width": 1440, "height": 900})
-    page.until(SHOWN)
+    page.until(READY)
     panel = page.page.locator("#study")
     (study,) = page.page.request.get(f"{page.url}api/studies").json()["studies"]
     (door,) = (task for task in study["tasks"] if task["name"] == "door")
     rows = {(row["filter"], row["blackout"]): row for row in door["rows"]}
     labels = panel.locator(".chart a").evaluate_all(LABELS)
     assert len(labels) == len(rows) - 1  # the training mean is a line
-    for told, linked in labels:
-        name, black = told.split(": ")[0].split(", ")
+    for label, linked in labels:
+        name, black = label.split(": ")[0].split(", ")
         row = rows[name, int(black.split()[0]) / 100]
         each = ", ".join(f"seed {seed} {numbers['position_cm']:.2f}" for seed, numbers in row["each"].items())
-        assert f": {row['mean']['position_cm']:.2f} ± {row['spread']['position_cm']:.2f} cm ({each}); " in told
-        assert linked == (name not in ("crossmodal-ukf", "lstm")) == told.endswith("opens the worst events of seed 0")
+        assert f": {row['mean']['position_cm']:.2f} ± {row['spread']['position_cm']:.2f} cm ({each}); " in label
+        assert linked == (name not in ("crossmodal-ukf", "lstm")) == label.endswith("opens the worst events of seed 0")
 
     head = panel.locator("thead button")
     head.get_by_text("80 % black").click()
@@ -35,25 +31,25 @@ def test_a_bar_leads_to_the_worst_moment(open_page: Any) -> None:
     assert (means, sorted_[-1]) == (sorted(means), "training mean")
     panel.get_by_text("angle", exact=True).click()
     page.until("() => location.search.includes('quantity=angle_deg')")
-    page.picture("study")
+    page.screenshot("study")
 
     first = panel.locator(".chart a[tabindex='0']")
-    assert first.count() == 1, "the bars are one stop of the tab key"
+    assert first.count() == 1, "the bars are not a single stop of the tab key"
     first.focus()
-    page.page.keyboard.press("ArrowDown")  # the same filter with 40 % black pictures
+    page.page.keyboard.press("ArrowDown")  # the same filter with 40 % image blackout
     focused = page.page.evaluate("() => document.activeElement.getAttribute('aria-label')")
     assert focused.startswith("crossmodal-ekf, 40 % black")
     page.page.keyboard.press("Enter")
     page.until("() => document.querySelector('#failures').dataset.state === 'ready'", 120.0)
     address = f"{page.url}api/failures/door/crossmodal-ekf?faults=blackout%3D0.4&among=held-out"
-    scores = {one["name"]: one for one in page.page.request.get(address).json()["scores"]}
+    scores = {score["name"]: score for score in page.page.request.get(address).json()["scores"]}
     worst = scores["angle"]["events"][0]
     page.until(f"() => beliefscope.state().step === {worst['step']}")
-    wanted = {
+    expected = {
         "tab": "failures",
         "filter": "crossmodal-ekf",
         "faults": "blackout=0.4",
         "by": "angle",
         "component": "angle",
     }
-    assert page.state.items() >= {**wanted, "episode": worst["episode"]}.items()
+    assert page.state.items() >= {**expected, "episode": worst["episode"]}.items()

@@ -1,4 +1,4 @@
-"""The time line: its tracks, its zoom, marked moments, and another trace drawn over the first."""
+"""Timeline: tracks, zoom, event marks and a comparison run."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.browser
-
 EPISODE = 9
-HEAD = f"?filter=crossmodal-ekf&episode={EPISODE}&step=40"
+LINK = f"?filter=crossmodal-ekf&episode={EPISODE}&step=40"
 MINUS = "\N{MINUS SIGN}"
 
-OTHER = """async () => {
+ADD_COMPARISON = """async () => {
   const api = await import('/static/data/api.js');
   const { task: name, data, episode } = beliefscope.state();
   const task = (await api.catalog()).tasks.find((t) => t.name === name);
@@ -23,7 +21,7 @@ OTHER = """async () => {
   const other = await api.loadTrace(task, selection, () => {}, new AbortController().signal);
   beliefscope.timeline.compareWith(other, 'unimodal-ekf');
 }"""
-SHOWN = """(track) => {
+LEGEND = """(track) => {
   const rows = [];
   for (const cell of document.querySelectorAll('#tracks .track')[track].querySelectorAll('dt, dd')) {
     if (cell.tagName === 'DT') rows.push([cell.textContent]);
@@ -34,35 +32,35 @@ SHOWN = """(track) => {
 
 
 def column(page: Any, name: str, filter_: str = "crossmodal-ekf") -> np.ndarray[Any, Any]:
-    """A column of a trace, as the server gives it."""
+    """A column of a trace from the server."""
     url = f"{page.url}api/trace/door/{filter_}/{EPISODE}"
-    one = next(c for c in page.page.request.get(url).json()["columns"] if c["name"] == name)
+    entry = next(c for c in page.page.request.get(url).json()["columns"] if c["name"] == name)
     buffer = page.page.request.get(f"{url}/columns").body()
-    return np.frombuffer(buffer, "<f4", int(np.prod(one["shape"])), one["offset"]).reshape(one["shape"])
+    return np.frombuffer(buffer, "<f4", int(np.prod(entry["shape"])), entry["offset"]).reshape(entry["shape"])
 
 
-def told(page: Any, track: int) -> dict[str, list[float | None]]:
-    """What a track's legend says: name -> its value, and the other trace's."""
-    rows = page.page.evaluate(SHOWN, track)
+def legend(page: Any, track: int) -> dict[str, list[float | None]]:
+    """Legend of a track: name -> value, and value of the comparison run."""
+    rows = page.page.evaluate(LEGEND, track)
     return {name: [float(v.replace(MINUS, "-")) if v else None for v in values] for name, *values in rows}
 
 
 def near(value: float) -> Any:
-    """As far as one digit after the point tells."""
+    """Within the rounding to one decimal."""
     return pytest.approx(value, abs=0.051)
 
 
-def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
-    page = open_page(HEAD + "&track=nees&window=20-60")
+def test_tracks_zoom_and_permalink(open_page: Any) -> None:
+    page = open_page(LINK + "&track=nees&window=20-60")
     mouse, slider = page.page.mouse, page.page.locator("#tracks")
     nees = column(page, "nees")
     names = ("image", "haptics", "fused")
     assert page.page.evaluate("() => document.querySelector('#reset-zoom').disabled") is False
-    assert {name: value for name, (value,) in told(page, 2).items()} == {
+    assert {name: value for name, (value,) in legend(page, 2).items()} == {
         n: pytest.approx(v, rel=6e-3) for n, v in zip(names, nees[40], strict=True)
     }
 
-    # The values under the pointer, in the place of the cursor's; nothing moves.
+    # The legend shows the values at the pointer; the layout stays.
     box = slider.bounding_box()
     left, width = 140 + 46, box["width"] - 140 - 46 - 12  # px of the plots at this size of window
 
@@ -75,12 +73,12 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     before = page.page.evaluate(rows)
     mouse.move(at(30, (20, 60)), box["y"] + 100)
     assert page.page.locator("#timeline-readout").text_content() == "pointer 30 · 3.0 s"
-    assert told(page, 2)["fused"] == [pytest.approx(nees[30, 2], rel=6e-3)]
+    assert legend(page, 2)["fused"] == [pytest.approx(nees[30, 2], rel=6e-3)]
     assert page.page.evaluate(rows) == before
     mouse.move(box["x"] + 300, box["y"] - 200)
     assert page.page.locator("#timeline-readout").text_content() == "cursor 40 · 4.0 s"
 
-    # Shift and drag: closer, the cursor staying; keys; the link opens the same stretch.
+    # Shift and drag zooms and keeps the cursor; so do keys; the permalink restores the window.
     page.page.keyboard.down("Shift")
     mouse.move(at(35, (20, 60)), box["y"] + 60)
     mouse.down()
@@ -101,36 +99,34 @@ def test_tracks_zoom_and_the_link_to_them(open_page: Any) -> None:
     page.page.keyboard.press("0")
     assert page.state["window"] == ""
 
-    # Two fingers: each keeps the step that it took hold of.
-    whole = (0, len(nees) - 1)
+    # Pinch: each finger keeps its step.
+    episode = (0, len(nees) - 1)
     touch = page.page.context.new_cdp_session(page.page)
     for kind, steps in (("touchStart", (40, 60)), ("touchMove", (20, 80)), ("touchEnd", ())):
-        points = [{"x": at(step, whole), "y": box["y"] + 60, "id": i} for i, step in enumerate(steps)]
+        points = [{"x": at(step, episode), "y": box["y"] + 60, "id": i} for i, step in enumerate(steps)]
         touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     page.until("() => beliefscope.state().window.startsWith('33')")
-    wanted = [40 - 20 / 3, 40 - 20 / 3 + whole[1] / 3]
-    assert [float(v) for v in page.state["window"].split("-")] == pytest.approx(wanted, abs=0.3)
+    expected = [40 - 20 / 3, 40 - 20 / 3 + episode[1] / 3]
+    assert [float(v) for v in page.state["window"].split("-")] == pytest.approx(expected, abs=0.3)
     page.page.keyboard.press("0")
-    for _ in range(4):  # the first finger took the cursor to its step
+    for _ in range(4):  # the first finger has set the cursor
         page.page.keyboard.press("ArrowRight")
 
-    # What there is of the others, and why there is not.
+    # Other tracks, and the reason where one is empty.
     page.page.locator("#track").select_option("innovation")
     page.until("() => document.querySelector('#tracks .track:last-of-type h3').textContent.startsWith('Innovation')")
     image, haptics = 100 * column(page, "innovation")[44, :, 0]
-    assert told(page, 2) == {"image": [near(image)], "haptics": [near(haptics)]}
+    assert legend(page, 2) == {"image": [near(image)], "haptics": [near(haptics)]}
     page.page.locator("#track").select_option("particles")
-    page.until(
-        "() => document.querySelector('#tracks .track-note')?.textContent.includes('a Gaussian belief and no particles')"
-    )
+    page.until("() => document.querySelector('#tracks .track-note')?.textContent.includes('and no particles')")
     page.until("() => location.search.includes('track=particles')")
-    page.picture("timeline-why-not")
+    page.screenshot("timeline-note")
 
 
-def test_marked_moments_and_another_trace(open_page: Any) -> None:
-    page = open_page(HEAD + "&track=signed", color_scheme="dark")
-    moments = [{"step": s, "label": f"{s / 10} cm", "measure": "error"} for s in (70, 12, 55)]
-    page.page.evaluate("(moments) => beliefscope.timeline.mark(moments)", moments)
+def test_event_marks_and_comparison_run(open_page: Any) -> None:
+    page = open_page(LINK + "&track=signed", color_scheme="dark")
+    events = [{"step": s, "label": f"{s / 10} cm", "measure": "error"} for s in (70, 12, 55)]
+    page.page.evaluate("(events) => beliefscope.timeline.mark(events)", events)
     marks = page.page.locator("#marks button")
     assert [m.get_attribute("aria-label") for m in marks.all()] == [
         f"Step {s}: error, {s / 10} cm" for s in (12, 55, 70)
@@ -142,7 +138,7 @@ def test_marked_moments_and_another_trace(open_page: Any) -> None:
     page.page.keyboard.press("ArrowRight")
     page.until("() => beliefscope.state().step === 56")
     marks.nth(1).focus()
-    page.page.keyboard.press("ArrowRight")  # from mark to mark, not from step to step
+    page.page.keyboard.press("ArrowRight")  # the next mark instead of the next step
     page.page.keyboard.press("Enter")
     page.until("() => beliefscope.state().step === 70")
     page.page.keyboard.press("+")
@@ -151,15 +147,15 @@ def test_marked_moments_and_another_trace(open_page: Any) -> None:
     )
     page.page.keyboard.press("0")
 
-    page.page.evaluate(OTHER)
+    page.page.evaluate(ADD_COMPARISON)
     page.until("() => !document.querySelector('#comparison-key').hidden")
     assert page.page.locator("#comparison-key").text_content() == "unimodal-ekf"
-    here, there = (100 * column(page, "estimate_mean", f)[70, 0] for f in ("crossmodal-ekf", "unimodal-ekf"))
-    assert told(page, 1)["fused"] == [near(here), near(there)]
+    selected, comparison = (100 * column(page, "estimate_mean", f)[70, 0] for f in ("crossmodal-ekf", "unimodal-ekf"))
+    assert legend(page, 1)["fused"] == [near(selected), near(comparison)]
     truth = 100 * column(page, "truth")[70, 0]
-    assert told(page, 2)["fused"] == [near(here - truth), near(there - truth)]
+    assert legend(page, 2)["fused"] == [near(selected - truth), near(comparison - truth)]
     time.sleep(0.2)
-    page.picture("timeline-against")
+    page.screenshot("timeline-comparison")
     assert (
         page.page.evaluate(
             "() => Math.max(...[...document.querySelectorAll('.bar')].map((e) => e.scrollWidth - e.clientWidth))"
@@ -167,7 +163,7 @@ def test_marked_moments_and_another_trace(open_page: Any) -> None:
         <= 1
     )
 
-    # Of another episode neither the marks nor the other trace say anything.
+    # Another episode has neither these marks nor this comparison run.
     page.page.locator("#episode").select_option("8")
     page.until("() => document.querySelector('#comparison-key').hidden && !document.querySelector('#marks button')")
-    assert len(told(page, 1)["fused"]) == 1
+    assert len(legend(page, 1)["fused"]) == 1

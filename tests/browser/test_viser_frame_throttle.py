@@ -8,9 +8,7 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.browser
-
-# Draws without end, as viser does while something moves; each drawing takes `cost` ms.
+# Draws continuously, as viser does during motion; each frame takes `cost` ms.
 DRAWING = """(cost) => {
   const gl = document.createElement('canvas').getContext('webgl2');
   window.drawn = [];
@@ -25,7 +23,7 @@ DRAWING = """(cost) => {
 
 
 class Frame:
-    """A page of the server's own with our script in it and a drawing that costs what a test wants."""
+    """A page with the script and a drawing of adjustable cost."""
 
     def __init__(self, page: Any, url: str) -> None:
         self.page = page
@@ -50,23 +48,23 @@ class Frame:
 
 
 @pytest.fixture
-def frame(browser: Any, served: Any) -> Iterator[Frame]:
-    page = browser.new_page(bypass_csp=True)  # an answer of JSON may run no script
-    yield Frame(page, served.url)
+def frame(browser: Any, server: Any) -> Iterator[Frame]:
+    page = browser.new_page(bypass_csp=True)  # the policy of JSON answers forbids scripts
+    yield Frame(page, server.url)
     page.close()
 
 
-def test_what_is_drawn_fast_is_never_held(frame: Frame) -> None:
+def test_fast_drawing_is_not_paused(frame: Frame) -> None:
     frame.draw(1)
     assert frame.pause("Infinity")
     assert frame.drawn_within(500) > 5
     assert not frame.page.evaluate("() => document.hidden")
 
 
-def test_what_is_drawn_slowly_waits_for_the_hand(frame: Frame) -> None:
+def test_slow_drawing_is_paused_while_scrubbing(frame: Frame) -> None:
     frame.draw(100)
     assert not frame.pause("Infinity")
-    assert frame.drawn_within(800) <= 1  # one may have been under way
+    assert frame.drawn_within(800) <= 1  # a frame may have been in progress
     assert not frame.pause("Infinity")
     assert frame.drawn_within(800) == 0
     assert frame.page.evaluate("() => document.hidden")
@@ -74,13 +72,13 @@ def test_what_is_drawn_slowly_waits_for_the_hand(frame: Frame) -> None:
     assert frame.drawn_within(800) > 2
 
 
-def test_a_forgotten_pause_ends(frame: Frame) -> None:
+def test_pause_expires(frame: Frame) -> None:
     frame.draw(100)
     frame.pause("Infinity")
     frame.page.wait_for_function("(before) => drawn.length > before + 3", arg=frame.count(), timeout=10_000)
 
 
-def test_a_replay_leaves_the_page_its_share(frame: Frame) -> None:
+def test_playback_leaves_time_for_the_page(frame: Frame) -> None:
     frame.draw(100)
     frame.pause("3")
     frame.page.evaluate("() => void (drawn.length = 0)")
@@ -90,7 +88,7 @@ def test_a_replay_leaves_the_page_its_share(frame: Frame) -> None:
     assert min(b - a for a, b in pairwise(ends)) > 350
 
 
-def test_a_cancelled_callback_is_not_called_and_a_failing_one_stops_no_other(frame: Frame) -> None:
+def test_cancelled_and_failing_callbacks(frame: Frame) -> None:
     called = frame.page.evaluate(
         """async () => {
           const called = [];

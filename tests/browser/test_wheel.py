@@ -1,4 +1,4 @@
-"""The wheel, not the checkout: built, installed into an environment of its own, and its page in a real browser."""
+"""The wheel: contents, installation in a new environment, and its page in Chromium."""
 
 from __future__ import annotations
 
@@ -18,18 +18,16 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("datasets", "filters", "inspect", "recordings", "app")
 PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
 
-pytestmark = pytest.mark.browser
-
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a wheel is made of, apart from the checkout, where setuptools would leave traces and find older ones."""
+    """A copy of the sources, so that setuptools neither writes into the checkout nor reads older builds from it."""
     tree = tmp_path_factory.mktemp("tree")
     for name in ("README.md", "LICENSE", "pyproject.toml"):
         shutil.copy(ROOT / name, tree)
-    made = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
     for name in (*FOLDERS, "src"):
-        shutil.copytree(ROOT / name, tree / name, symlinks=True, ignore=made)
+        shutil.copytree(ROOT / name, tree / name, symlinks=True, ignore=ignored)
     return tree
 
 
@@ -43,12 +41,12 @@ def wheel(tree: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The command of an environment that has the wheel, and its dependencies from this environment."""
+    """The command of a new environment with the wheel, which shares the dependencies of this environment."""
     environment = tmp_path_factory.mktemp("environment")
     venv.create(environment, with_pip=False, symlinks=True)
     command = [*PIP, f"--python={environment / 'bin' / 'python'}", "install", "--no-deps", "--no-compile", wheel]
     subprocess.run(command, check=True, timeout=120)
-    # Without this environment's .pth files: an editable checkout is on the path only through one.
+    # .pth files in folders that a .pth file adds are not read: the editable installation of this environment is invisible.
     (site,) = environment.glob("lib/python3*/site-packages")
     (site / "dependencies.pth").write_text(f"{Path(pytest.__file__).parents[1]}\n")
     return environment / "bin" / "beliefscope"
@@ -56,7 +54,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def address(installed: Path, tmp_path: Path) -> Iterator[str]:
-    """Of a server of the installed wheel."""
+    """Address of a server of the installed wheel."""
     command = [installed, "serve", "--port", "0", "--workspace", tmp_path / "workspace"]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd="/")
     assert server.stdout is not None
@@ -65,29 +63,29 @@ def address(installed: Path, tmp_path: Path) -> Iterator[str]:
     assert server.wait(60) == 0
 
 
-def test_it_holds_everything(wheel: Path, tree: Path) -> None:
-    inside = set(zipfile.ZipFile(wheel).namelist())
+def test_wheel_contains_all_modules_and_data(wheel: Path, tree: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
     data = ("page", "samples", "pretrained")
-    wanted = [path for folder in FOLDERS for path in (tree / folder).rglob("*") if path.is_file()]
-    wanted = [path for path in wanted if path.suffix == ".py" or path.parent.name in data]
-    assert len(wanted) > 200
-    assert not {f"beliefscope/{path.relative_to(tree).as_posix()}" for path in wanted} - inside
-    assert {"beliefscope/__init__.py", "beliefscope/__main__.py", "beliefscope/py.typed"} <= inside
-    assert not [name for name in inside if "tests/" in name]
+    sources = [path for folder in FOLDERS for path in (tree / folder).rglob("*") if path.is_file()]
+    sources = [path for path in sources if path.suffix == ".py" or path.parent.name in data]
+    assert len(sources) > 200
+    assert not {f"beliefscope/{path.relative_to(tree).as_posix()}" for path in sources} - names
+    assert {"beliefscope/__init__.py", "beliefscope/__main__.py", "beliefscope/py.typed"} <= names
+    assert not [name for name in names if "tests/" in name]
 
 
-def test_it_is_well_where_it_is_installed(installed: Path, tmp_path: Path) -> None:
-    show = "import beliefscope.app.cli.main as c; print(c.__file__)"
-    run = [installed.with_name("python"), "-c", show]
-    found = subprocess.run(run, cwd="/", capture_output=True, text=True, check=True, timeout=120).stdout.strip()
-    assert Path(found).is_relative_to(installed.parents[1])
-    run = [installed, "doctor", "--workspace", tmp_path / "workspace", "--port", "0", "--json", "-"]
-    examined = subprocess.run(run, cwd="/", capture_output=True, text=True, check=False, timeout=300)
-    checks = json.loads(examined.stdout)["checks"]
-    assert not {name: one for name, one in checks.items() if one["state"] == "failed"}
+def test_doctor_accepts_the_installation(installed: Path, tmp_path: Path) -> None:
+    code = "import beliefscope.app.cli.main as c; print(c.__file__)"
+    command = [installed.with_name("python"), "-c", code]
+    path = subprocess.run(command, cwd="/", capture_output=True, text=True, check=True, timeout=120).stdout.strip()
+    assert Path(path).is_relative_to(installed.parents[1])
+    command = [installed, "doctor", "--workspace", tmp_path / "workspace", "--port", "0", "--json", "-"]
+    result = subprocess.run(command, cwd="/", capture_output=True, text=True, check=False, timeout=300)
+    checks = json.loads(result.stdout)["checks"]
+    assert not {name: check for name, check in checks.items() if check["state"] == "failed"}
 
 
-def test_its_page_is_drawn(address: str, open_page: Any) -> None:
+def test_page_of_the_installation_shows_maps(address: str, open_page: Any) -> None:
     page = open_page(url=address)
     before = page.maps()
     assert len(before) == 3

@@ -16,6 +16,8 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import arrays_of, load_trace, save_trace, trace
 
+pytestmark = pytest.mark.slow
+
 MAKE = """
 import sys, torch
 from pathlib import Path

@@ -10,11 +10,12 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import http_fuzz
 import mutate
 import readers
 
 from beliefscope.datasets.readers import hdf5_guard
+
+pytestmark = pytest.mark.slow
 
 SLOW = ("study", "mit-hdf5", "mit-json", "recording")
 """Readers whose files need a training or rendering, or that can crash the process."""
@@ -39,6 +40,8 @@ def test_slow_reader_raises_only_bad_input(name: str, tmp_path: Path) -> None:
 
 
 def test_server_survives_invalid_requests_and_messages(tmp_path: Path) -> None:
+    import http_fuzz  # its packages are slow to import
+
     threads, settings = threading.active_count(), readers.server_settings(tmp_path)
     with http_fuzz.running_server(settings) as (client, log):
         http = http_fuzz.fuzz_http(client, log, 250, 11)

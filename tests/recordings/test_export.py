@@ -26,6 +26,8 @@ from beliefscope.recordings.export import export_trace
 from beliefscope.recordings.rerun_log.columns import columns
 from beliefscope.recordings.write import write_recording
 
+pytestmark = pytest.mark.slow
+
 Compare = Callable[[Trace, Trace], None]
 
 

@@ -33,6 +33,8 @@ from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.rerun_log import live_views
 from beliefscope.recordings.write import write_recording
 
+pytestmark = pytest.mark.slow
+
 Compare = Callable[[Trace, Trace], None]
 Run = Callable[[str], tuple[int, str, str]]
 HOUSEKEEPING = ("rerun.controls.RowId", "log_time", "log_tick", "start_time")

@@ -10,11 +10,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, load_trace, trace
 from beliefscope.inspect.traces.live_file import LiveFileReader
 from beliefscope.recordings.read import read_recording
+
+pytestmark = pytest.mark.slow
 
 Compare = Callable[[Trace, Trace], None]
 Run = Callable[[str], tuple[int, str, str]]

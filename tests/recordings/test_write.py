@@ -22,6 +22,8 @@ from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.schema import HEADER, PROPERTIES, SCHEMA, STEP, TIME, Entity
 from beliefscope.recordings.write import CHUNKS, STEPS_PER_CHUNK, chunks, write_recording
 
+pytestmark = pytest.mark.slow
+
 MapMaker = Callable[..., LikelihoodMap]
 Compare = Callable[[Trace, Trace], None]
 

@@ -1,302 +1,253 @@
-/** The episodes of the data set as a table that can be sorted: what each is, and how the filter did on it where that is known. */
+/** Table of the episodes of a data set, with the errors of the filter once it has run over them. */
 
-import { setTabStop, navigateRows } from '../widgets/row_navigation.js';
+/** @import { Store } from '../core/state.js' */
+/** @import { Catalog, EpisodeErrors, EpisodeSummary, FailureScore, Failures } from '../types/server.js' */
+/** @import { Sort } from '../widgets/sorting.js' */
+
+import { create, element, html } from '../core/dom.js';
 import { fixed, percent } from '../core/units.js';
-
-const HEIGHT = 20; // of a sparkline, in its own units
-const SEEN = 0.95; // share of the episodes whose sparklines are not cut off
+import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
+import { sortHeading, sortRows } from '../widgets/sorting.js';
+import { centimetres, markRow } from './event_table.js';
+import { sparkline, sparklineScale } from './sparkline.js';
 
 /**
- * @typedef {{summary: import('../data/api.js').Summary, errors: object | undefined, failures: number | undefined}} Line
- * @typedef {object} Column
- * @property {string} name @property {string} title @property {string} help
- * @property {(line: Line) => number | string | null} value by which it is sorted; null where it is not known
- * @property {(line: Line) => string | Node} shown @property {boolean} [words]
- * @property {boolean} [surveyed] only known once the filter ran over it
+ * @typedef {object} EpisodeRow
+ * @property {EpisodeSummary} summary
+ * @property {EpisodeErrors | undefined} errors
+ * @property {number | null} failures
+ */
+/**
+ * @typedef {object} EpisodeColumn
+ * @property {string} name
+ * @property {string} title
+ * @property {string} help
+ * @property {boolean} number
+ * @property {boolean} [isResult] whether the values depend on the filter
+ * @property {(row: EpisodeRow) => number | string | null} value sort key; null if there is none
+ * @property {(row: EpisodeRow) => string} content
  */
 
-/** @type {Column[]} */
+/** @type {EpisodeColumn[]} */
 const COLUMNS = [
   {
-    name: 'index',
+    ...summaryColumn('index', 'Index in the data set', ({ index }) => index),
     title: 'episode',
-    help: 'Its index in the data set',
-    value: ({ summary }) => summary.index,
-    shown: ({ summary }) => String(summary.index),
+  },
+  summaryColumn('split', 'Training, validation or test', ({ split }) => split),
+  summaryColumn('policy', 'Policy of the robot', ({ policy }) => policy),
+  summaryColumn('seed', 'Seed of the simulation', ({ seed }) => seed),
+  summaryColumn('steps', 'Number of steps', ({ steps }) => steps),
+  {
+    ...summaryColumn('contact', 'Share of steps in contact', (s) => s.contact_fraction),
+    content: ({ summary }) => percent(summary.contact_fraction),
   },
   {
-    name: 'split',
-    title: 'split',
-    help: 'What it is kept for',
-    value: ({ summary }) => summary.split,
-    shown: ({ summary }) => summary.split,
-    words: true,
-  },
-  {
-    name: 'policy',
-    title: 'policy',
-    help: 'How the robot moved',
-    value: ({ summary }) => summary.policy,
-    shown: ({ summary }) => summary.policy,
-    words: true,
-  },
-  {
-    name: 'seed',
-    title: 'seed',
-    help: 'That it was simulated with',
-    value: ({ summary }) => summary.seed,
-    shown: ({ summary }) => String(summary.seed),
-  },
-  {
-    name: 'steps',
-    title: 'steps',
-    help: 'How long it is',
-    value: ({ summary }) => summary.steps,
-    shown: ({ summary }) => String(summary.steps),
-  },
-  {
-    name: 'contact',
-    title: 'contact',
-    help: 'Share of its steps in contact',
-    value: ({ summary }) => summary.contact_fraction,
-    shown: ({ summary }) => percent(summary.contact_fraction),
-  },
-  {
-    name: 'rmse',
+    ...errorColumn('rmse', 'Position RMSE, without the first 30 steps', (e) => e?.rmse),
     title: 'RMSE cm',
-    help: 'Of the position, without the first 30 steps',
-    value: ({ errors }) => errors?.rmse ?? null,
-    shown: ({ errors }) => centimetres(errors?.rmse),
-    surveyed: true,
   },
   {
-    name: 'worst',
+    ...errorColumn('worst', 'Largest position error', (e) => e?.worst),
     title: 'worst cm',
-    help: 'Largest error of the position',
-    value: ({ errors }) => errors?.worst ?? null,
-    shown: ({ errors }) => centimetres(errors?.worst),
-    surveyed: true,
   },
   {
     name: 'failures',
     title: 'failures',
-    help: 'Moments by the chosen measure',
-    value: ({ failures }) => failures ?? null,
-    shown: ({ failures }) => fixed(failures, 0),
-    surveyed: true,
+    help: 'Number of events by the selected score',
+    number: true,
+    isResult: true,
+    value: ({ failures }) => failures,
+    content: ({ failures }) => fixed(failures, 0),
   },
 ];
 
-/** m at which the sparklines end: the few episodes that are worse by far are cut off, so that the others can be seen. */
-function scale(lines) {
-  const worst = lines
-    .map(({ errors }) => errors?.worst ?? 0)
-    .filter(Boolean)
-    .sort((a, b) => a - b);
-  return worst[Math.ceil(SEEN * (worst.length - 1))] ?? 0;
+/**
+ * @param {string} name
+ * @param {string} help
+ * @param {(summary: EpisodeSummary) => number | string | undefined} read
+ * @returns {EpisodeColumn}
+ */
+function summaryColumn(name, help, read) {
+  return {
+    name,
+    title: name,
+    help,
+    number: !['split', 'policy'].includes(name),
+    value: ({ summary }) => read(summary) ?? '',
+    content: ({ summary }) => String(read(summary) ?? ''),
+  };
 }
 
-const centimetres = (metres) =>
-  fixed(metres === undefined || metres === null ? null : 100 * metres, 2);
+/**
+ * @param {string} name
+ * @param {string} help
+ * @param {(errors: EpisodeErrors | undefined) => number | null | undefined} read m
+ * @returns {EpisodeColumn}
+ */
+function errorColumn(name, help, read) {
+  return {
+    name,
+    title: name,
+    help,
+    number: true,
+    isResult: true,
+    value: ({ errors }) => read(errors) ?? null,
+    content: ({ errors }) => centimetres(read(errors)),
+  };
+}
 
 export class Episodes {
-  #host;
+  #table;
+  #head;
+  #body;
   #store;
   #catalog;
-  #chosen = null; // how they are sorted, once somebody said so
-  #found = null;
+  /** Selected order; null for the default one. @type {Sort | null} */
+  #selectedSort = null;
+  /** @type {Failures | null} */
+  #results = null;
+  /** @type {FailureScore | null} */
   #score = null;
-  #rows = new Map(); // by index
-  #shown = '';
+  /** Rows and their buttons by episode index. @type {Map<number, {row: HTMLTableRowElement, button: HTMLButtonElement}>} */
+  #rows = new Map();
+  #key = ''; // of the displayed table
 
-  /** @param {HTMLElement} host @param {import('../core/state.js').Store} store @param {import('../data/api.js').Catalog} catalog */
-  constructor(host, store, catalog) {
-    [this.#host, this.#store, this.#catalog] = [host, store, catalog];
-    navigateRows(host.querySelector('tbody'));
-    store.listen((_, changed) => changed.has('episode') && this.#here());
+  /**
+   * @param {HTMLTableElement} table
+   * @param {Store} store
+   * @param {Catalog} catalog
+   */
+  constructor(table, store, catalog) {
+    this.#table = table;
+    this.#store = store;
+    this.#catalog = catalog;
+    this.#head = element('thead', HTMLTableSectionElement, table);
+    this.#body = element('tbody', HTMLTableSectionElement, table);
+    navigateRows(this.#body);
+    store.listen((_, changed) => changed.has('episode') && this.#markEpisode());
   }
 
-  /** @param {import('../data/api.js').Failures | null} found null where nobody has looked @param {object | null} score whose moments are counted */
-  show(found, score) {
-    [this.#found, this.#score] = [found, score];
-    if (!this.#host.hidden) this.#draw();
+  /**
+   * @param {Failures | null} results null if the filter has not run over the episodes
+   * @param {FailureScore | null} score whose events are counted
+   */
+  show(results, score) {
+    this.#results = results;
+    this.#score = score;
+    if (!this.#table.hidden) this.#draw();
   }
 
-  /** The worst first where that is known. */
+  /** @returns {Sort} */
   get #sort() {
-    return (
-      this.#chosen ?? (this.#found ? { name: 'worst', down: true } : { name: 'index', down: false })
-    );
+    const standard = this.#results ? { name: 'worst', down: true } : { name: 'index', down: false };
+    return this.#selectedSort ?? standard;
   }
 
-  get #lines() {
+  /** Sorted rows. */
+  get #episodes() {
     const { task, data } = this.#store.state;
-    const { episodes } = this.#catalog.tasks
-      .find((t) => t.name === task)
-      .data.find((d) => d.name === data);
-    const errors = new Map((this.#found?.episodes ?? []).map((one) => [one.index, one]));
-    const lines = episodes.map((summary) => {
-      const known = errors.get(summary.index);
-      return {
-        summary,
-        errors: known,
-        failures: known && this.#score ? (this.#score.counts[summary.index] ?? 0) : undefined,
-      };
+    const sets = this.#catalog.tasks.find(({ name }) => name === task)?.data ?? [];
+    const summaries = sets.find(({ name }) => name === data)?.episodes ?? [];
+    const byIndex = new Map(this.#results?.episodes.map((errors) => [errors.index, errors]));
+    const episodes = summaries.map((summary) => {
+      const errors = byIndex.get(summary.index);
+      const failures = errors && this.#score ? (this.#score.counts?.[summary.index] ?? 0) : null;
+      return { summary, errors, failures };
     });
-    const { name: by, down } = this.#sort;
-    const { value } = COLUMNS.find(({ name }) => name === by);
-    const sign = down ? -1 : 1;
-    const order = (a, b) => (typeof a === 'string' ? a.localeCompare(b) : a - b);
-    const known = lines
-      .filter((line) => value(line) !== null)
-      .sort((a, b) => sign * order(value(a), value(b)));
-    return [...known, ...lines.filter((line) => value(line) === null)];
+    const { name: key, down } = this.#sort;
+    const column = COLUMNS.find(({ name }) => name === key) ?? COLUMNS[0];
+    return sortRows(episodes, column.value, down);
   }
 
   #draw() {
-    const { task, data, filter, faults, among } = this.#store.state;
-    const shown = JSON.stringify([
-      task,
-      data,
-      filter,
-      faults,
-      among,
-      this.#score?.name,
-      Boolean(this.#found),
-      this.#sort,
-    ]);
-    if (shown === this.#shown) return;
-    this.#shown = shown;
-    const focused = this.#host.contains(document.activeElement)
-      ? document.activeElement.dataset.column
-      : undefined;
-    const lines = this.#lines;
-    const most = scale(lines);
+    const { task, data, filter, faults, among, episode } = this.#store.state;
+    const run = [task, data, filter, faults, among];
+    const key = JSON.stringify([...run, this.#score?.name, Boolean(this.#results), this.#sort]);
+    if (key === this.#key) return;
+    this.#key = key;
+    const { activeElement } = document;
+    const focused =
+      activeElement instanceof HTMLElement && this.#table.contains(activeElement)
+        ? activeElement.dataset.column
+        : undefined;
+    const episodes = this.#episodes;
+    const scale = sparklineScale(episodes.flatMap(({ errors }) => errors?.worst || []));
     const columns = COLUMNS.filter(
-      ({ surveyed, value }) => surveyed || lines.some((line) => value(line) !== ''),
+      ({ isResult, value }) => isResult || episodes.some((row) => value(row) !== ''),
     );
-    const top = document.createElement('tr');
-    top.append(...columns.map((column) => this.#heading(column)), this.#scale(most));
-    this.#host.querySelector('thead').replaceChildren(top);
+    const headings = columns.map((column) =>
+      sortHeading(column, this.#sort, (sort) => this.#sortBy(sort), column.isResult),
+    );
+    this.#head.replaceChildren(create('tr', {}, ...headings, sparklineHeading(scale)));
     this.#rows = new Map(
-      lines.map((line, i) => [line.summary.index, this.#row(columns, line, most, i)]),
+      episodes.map((row, i) => [row.summary.index, this.#row(columns, row, scale, i)]),
     );
-    this.#host
-      .querySelector('tbody')
-      .replaceChildren(...[...this.#rows.values()].map(({ row }) => row));
-    if (focused) top.querySelector(`[data-column="${focused}"]`)?.focus();
-    this.#here();
-    this.#host.parentElement.scrollTop = 0;
-    // A list by index begins where one is; any other with its first.
-    const open = this.#rows.get(this.#store.state.episode);
-    if (open && this.#sort.name === 'index' && !this.#chosen) setTabStop(open.row, false);
+    this.#body.replaceChildren(...[...this.#rows.values()].map(({ row }) => row));
+    if (focused) html(`[data-column="${focused}"]`, this.#head).focus();
+    this.#markEpisode();
+    if (this.#table.parentElement) this.#table.parentElement.scrollTop = 0;
+    // The default order begins at the selected episode, any other one at its first row.
+    const current = this.#rows.get(episode);
+    if (current && this.#sort.name === 'index' && !this.#selectedSort)
+      setTabStop(current.row, false);
   }
 
-  #heading({ name, title, help, words, surveyed }) {
-    const cell = Object.assign(document.createElement('th'), {
-      scope: 'col',
-      className: words ? '' : 'number',
-    });
-    const sorted = this.#sort.name === name;
-    cell.ariaSort = sorted ? (this.#sort.down ? 'descending' : 'ascending') : 'none';
-    const button = Object.assign(document.createElement('button'), {
-      type: 'button',
-      className: 'quiet sort',
-      title: `${help}. Sort by it`,
-      textContent: title,
-    });
-    button.dataset.column = name;
-    button.addEventListener('click', () => {
-      // What tells bad episodes from good ones begins with the bad ones.
-      this.#chosen = { name, down: sorted ? !this.#sort.down : Boolean(surveyed) };
-      this.#draw();
-    });
-    cell.append(button);
-    return cell;
+  /** @param {Sort} sort */
+  #sortBy(sort) {
+    this.#selectedSort = sort;
+    this.#draw();
   }
 
-  #scale(most) {
-    const text = most ? `error over time, 0–${fixed(100 * most, 1)} cm` : 'error over time';
-    return Object.assign(document.createElement('th'), {
-      scope: 'col',
-      textContent: text,
-      title:
-        'Of the position, contact behind it; one scale for all, cut off above it. A click goes to that step',
-    });
-  }
-
-  #row(columns, line, most, i) {
-    const { index } = line.summary;
+  /**
+   * @param {EpisodeColumn[]} columns
+   * @param {EpisodeRow} episode
+   * @param {number} scale of the sparklines, m
+   * @param {number} i place in the table
+   */
+  #row(columns, episode, scale, i) {
+    const { index } = episode.summary;
     const row = document.createElement('tr');
-    const go = Object.assign(document.createElement('button'), {
+    const button = create('button', {
       type: 'button',
       className: 'title',
       textContent: String(index),
+      ariaLabel: `Episode ${index}`,
+      tabIndex: i ? -1 : 0,
     });
-    go.setAttribute('aria-label', `Episode ${index}`);
-    go.tabIndex = i ? -1 : 0;
-    go.addEventListener('click', () =>
-      this.#store.set({ episode: index, step: 0, playing: false }),
-    );
-    for (const column of columns) {
+    button.addEventListener('click', () => this.#open(index, 0));
+    for (const { name, number, content } of columns) {
       const cell = row.insertCell();
-      cell.className = column.words ? '' : 'number';
-      cell.append(column.name === 'index' ? go : column.shown(line));
+      cell.className = number ? 'number' : '';
+      cell.append(name === 'index' ? button : content(episode));
     }
     const cell = row.insertCell();
     cell.className = 'spark';
-    if (line.errors && most) cell.append(this.#spark(line.errors, most));
-    return { row, button: go };
+    if (episode.errors && scale)
+      cell.append(sparkline(episode.errors, scale, (step, time) => this.#open(index, step, time)));
+    return { row, button };
   }
 
-  /** The error over the episode, and a click that goes there. */
-  #spark({ index, steps, error, contact, worst, worst_step: at }, most) {
-    const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');
-    const parts = error.length;
-    svg.setAttribute('viewBox', `0 0 ${parts} ${HEIGHT}`);
-    svg.setAttribute('preserveAspectRatio', 'none');
-    svg.setAttribute('role', 'img');
-    svg.setAttribute(
-      'aria-label',
-      `Error over time, at most ${centimetres(worst)} cm, at step ${at}`,
-    );
-    const touched = contact.map((on, i) => (on ? `M${i} 0h1v${HEIGHT}h-1z` : '')).join('');
-    const y = (value) => (HEIGHT - 1 - (HEIGHT - 2) * Math.min(1, value / most)).toFixed(2);
-    const line = error
-      .map((value, i) =>
-        value === null ? '' : `${i && error[i - 1] !== null ? 'L' : 'M'}${i + 0.5} ${y(value)}`,
-      )
-      .join('');
-    for (const [kind, d] of [
-      ['contact', touched],
-      ['error', line],
-    ]) {
-      const path = document.createElementNS(svg.namespaceURI, 'path');
-      path.setAttribute('class', kind);
-      path.setAttribute('d', d || 'M0 0');
-      svg.append(path);
-    }
-    const title = document.createElementNS(svg.namespaceURI, 'title');
-    title.textContent = `At most ${centimetres(worst)} cm, at step ${at}`;
-    svg.append(title);
-    svg.addEventListener('click', (event) => {
-      const { left, width } = svg.getBoundingClientRect();
-      const step = Math.min(Math.floor((steps * (event.clientX - left)) / width), steps - 1);
-      this.#store.set(
-        { episode: index, step: Math.max(step, 0), playing: false },
-        { inputTime: event.timeStamp },
-      );
-    });
-    return svg;
+  /**
+   * @param {number} episode
+   * @param {number} step
+   * @param {number | null} [inputTime]
+   */
+  #open(episode, step, inputTime = null) {
+    this.#store.set({ episode, step, playing: false }, { inputTime });
   }
 
-  /** Which row is of the episode that is shown. */
-  #here() {
-    for (const [index, { row, button }] of this.#rows) {
-      const here = index === this.#store.state.episode;
-      row.classList.toggle('here', here);
-      if (here) button.setAttribute('aria-current', 'true');
-      else button.removeAttribute('aria-current');
-    }
+  /** Highlights the row of the selected episode. */
+  #markEpisode() {
+    const { episode } = this.#store.state;
+    for (const [index, { row, button }] of this.#rows) markRow(row, button, index === episode);
   }
 }
+
+/** @param {number} scale m */
+const sparklineHeading = (scale) =>
+  create('th', {
+    scope: 'col',
+    textContent: scale ? `error over time, 0–${fixed(100 * scale, 1)} cm` : 'error over time',
+    title:
+      'Position error; steps in contact are shaded. Same scale for all episodes; larger errors are cut off. Click a step to go there',
+  });

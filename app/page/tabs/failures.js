@@ -1,32 +1,42 @@
-/** Where the filter fails over the whole data set: events by rank, the worst first, or its episodes. The search is a job. */
+/** The Failures tab: a ranked list of failure events over a data set, or a table of its episodes. The search is a job. */
 
+/** @import { State, Store } from '../core/state.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Timeline } from '../timeline/timeline.js' */
+/** @import { Catalog, FailureEvent, FailureScore, Failures as Search, Job, JobReply } from '../types/server.js' */
+/** @import { Jobs, Pending } from '../widgets/jobs.js' */
+
+import { create, element, html, messageOf } from '../core/dom.js';
+import { fixed, percent, sentence, significant } from '../core/units.js';
 import * as api from '../data/api.js';
-import { copyText } from '../core/clipboard.js';
-import { Episodes } from './episodes.js';
-import { pending, jobSummary, isActive } from '../widgets/jobs.js';
+import { isActive, jobSummary, pending } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
-import { setTabStop, navigateRows } from '../widgets/row_navigation.js';
-import { DISPLAY_UNITS, fixed, percent, sentence, significant } from '../core/units.js';
+import { Episodes } from './episodes.js';
+import { EventTable } from './event_table.js';
+import { formatScore, scoreName, viewOf } from './failure_scores.js';
 
+/** @type {[string, string][]} */
 const LISTS = [
   ['events', 'Events'],
   ['episodes', 'Episodes'],
 ];
+/** @type {[string, string][]} */
 const AMONG = [
   ['held-out', 'held-out'],
   ['all', 'all'],
 ];
-const NAMES = { nees: 'NEES', ess: 'ESS' };
-const UNITS = { sigma: 'σ', x: '×' };
-const TOLD = 1500; // ms
-const LINK =
-  '<svg viewBox="0 0 16 16" aria-hidden="true"><path d="m6.3 9.7 3.4-3.4M7 4.6l1.4-1.3a2.9 2.9 0 0 1 4.2 4.1L11.2 8.8M9 11.4l-1.4 1.3a2.9 2.9 0 0 1-4.2-4.1L4.8 7.2"/></svg>';
-const KEPT = 8; // results
+/** Button of each state. @type {Record<string, string>} */
+const ACTIONS = {
+  absent: 'Search for failures',
+  ended: 'Try again',
+  error: 'Try again',
+  active: 'Cancel',
+};
+const MAX_RESULTS = 8; // in the cache
 
 /**
- * @typedef {object} Result what is known of one filter over one data set
- * @property {'loading' | 'ready' | 'absent' | 'active' | 'ended' | 'error' | 'waits'} state `waits`: for the end of a live run
- * @property {api.Failures} [found] @property {api.Job} [job] @property {string} [error]
+ * Result of the search for failures of a filter over a data set; `live`: available after the end of the live run.
+ * @typedef {Pending<Search> | {state: 'loading' | 'live'} | {state: 'error', error: string}} Result
  */
 
 export class Failures {
@@ -35,131 +45,131 @@ export class Failures {
   #jobs;
   #timeline;
   #episodes;
+  #table;
+  /** @type {Trace | null} */
   #trace = null;
   /** @type {Map<string, Result>} */
   #results = new Map();
   #loading = new AbortController();
-  #rows = []; // of the events, as they were listed last: {failure, row, button}
-  #last = -1; // place of the failure that was gone to last
-  #listed = ''; // what the rows are of
-  #sought = ''; // the key of what the worst failure is waited for
+  #last = -1; // index of the event opened last
+  #tableKey = ''; // of the listed events
+  #targetKey = ''; // of the result whose worst event is opened when it is available
 
   /**
-   * @param {HTMLElement} host @param {import('../core/state.js').Store} store @param {import('../widgets/jobs.js').Jobs} jobs
-   * @param {import('../timeline/timeline.js').Timeline} timeline that gets the marks @param {api.Catalog} catalog
+   * @param {HTMLElement} host
+   * @param {Store} store
+   * @param {Jobs} jobs
+   * @param {Timeline} timeline displays marks of the events
+   * @param {Catalog} catalog
    */
   constructor(host, store, jobs, timeline, catalog) {
-    [this.#host, this.#store, this.#jobs, this.#timeline] = [host, store, jobs, timeline];
-    this.#episodes = new Episodes(this.#part('.episodes'), store, catalog);
-    navigateRows(this.#part('.events tbody'));
-    jobs.listen((list) => this.#hear(list));
+    this.#host = host;
+    this.#store = store;
+    this.#jobs = jobs;
+    this.#timeline = timeline;
+    this.#episodes = new Episodes(element('.episodes', HTMLTableElement, host), store, catalog);
+    this.#table = new EventTable(element('.events', HTMLTableElement, host), (event, time) =>
+      this.#open(event, time),
+    );
+    jobs.listen((list) => this.#followJobs(list));
     this.load();
   }
 
-  /** @param {import('../data/trace.js').Trace | null} trace that the time line shows; null while there is none. */
+  /** @param {Trace | null} trace displayed in the timeline; null while there is none */
   show(trace) {
     this.#trace = trace;
-    if (!this.#live) return this.#mark();
-    this.#results.delete(this.#key); // another run may have its name by now
+    if (!this.#isLive) return this.#markTimeline();
+    this.#results.delete(this.#key); // a new live run can have the same name
     this.load();
   }
 
-  /** Marks the row at the cursor. */
+  /**
+   * Highlights the event at the cursor.
+   * @param {number} step
+   */
   move(step) {
     const { episode } = this.#store.state;
-    const at = (failure) => failure.episode === episode && failure.step === step;
-    const place = this.#events.findIndex(at);
-    if (place >= 0) this.#last = place;
-    if (this.#host.hidden) return;
-    this.#rows.forEach(({ failure, row, button }) => {
-      const here = at(failure);
-      if (here === row.classList.contains('here')) return;
-      row.classList.toggle('here', here);
-      if (here) button.setAttribute('aria-current', 'true');
-      else button.removeAttribute('aria-current');
-    });
+    /** @param {FailureEvent} event */
+    const isCurrent = (event) => event.episode === episode && event.step === step;
+    const index = this.#events.findIndex(isCurrent);
+    if (index >= 0) this.#last = index;
+    if (!this.#host.hidden) this.#table.mark(isCurrent);
   }
 
-  /** Another task, filter, data set or faults, or other episodes of it: asks what is known. */
+  /** Loads the result for the current selection. */
   async load() {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
     const key = this.#key;
     this.#last = -1;
-    if (this.#sought !== key) this.#sought = '';
-    if (this.#waiting) return this.draw();
-    if (!this.#results.has(key)) this.#keep(key, { state: 'loading' });
+    if (this.#targetKey !== key) this.#targetKey = '';
+    if (this.#liveState) return this.draw();
+    if (!this.#results.has(key)) this.#cache(key, { state: 'loading' });
     this.draw();
-    if (this.#results.get(key).state === 'ready') return;
+    if (this.#result.state === 'ready') return;
     try {
-      this.#keep(key, pending(await api.failures(this.#store.state, signal)));
+      this.#cache(key, pending(await api.failures(this.#store.state, signal)));
     } catch (error) {
-      if (error.name === 'AbortError') return;
-      this.#keep(key, { state: 'error', error: error.message });
+      if (signal.aborted) return;
+      this.#cache(key, { state: 'error', error: messageOf(error) });
     }
     this.draw();
-    this.#seek();
+    this.#openTarget();
   }
 
-  /** Goes to the next failure of the list, or the one before. @param {1 | -1} by */
-  go(by, inputTime) {
+  /**
+   * Opens the next or the previous event.
+   * @param {1 | -1} by
+   * @param {number | null} [inputTime]
+   */
+  go(by, inputTime = null) {
     const events = this.#events;
     if (!events.length) return this.#store.set({ tab: 'failures' });
     this.#last = Math.min(Math.max(this.#last + by, 0), events.length - 1);
     this.#open(events[this.#last], inputTime);
-    const table = this.#part('.events');
-    if (table.checkVisibility())
-      setTabStop(this.#rows[this.#last].row, table.contains(document.activeElement));
+    this.#table.point(this.#last);
   }
 
-  /** Goes to the worst failure of all as soon as it is known; has it looked for where nobody did. */
-  worst() {
-    this.#sought = this.#key;
-    this.#seek();
+  /** Opens the worst event once it is known; starts the search if necessary. */
+  goToWorst() {
+    this.#targetKey = this.#key;
+    this.#openTarget();
   }
 
-  #seek() {
-    if (this.#sought !== this.#key) return;
-    const { state } = this.#known;
-    if (state === 'absent') this.#look();
+  #openTarget() {
+    if (this.#targetKey !== this.#key) return;
+    const { state } = this.#result;
+    if (state === 'absent') this.#search();
     if (state !== 'ready') return;
-    [this.#sought, this.#last] = ['', -1];
+    this.#targetKey = '';
+    this.#last = -1;
     this.go(1);
   }
 
-  /** Writes all that is known, by the chosen measure; only marks it on the time line while another tab is shown. */
+  /** Shows the result for the selected score; only its marks in the timeline if the tab is not selected. */
   draw() {
-    this.#mark();
+    this.#markTimeline();
     if (this.#host.hidden) return;
     const { state } = this.#store;
-    const known = this.#known;
-    const set = (key) => (value) => this.#store.set({ [key]: value });
-    choice(this.#part('#list'), LISTS, state.list, set('list'));
-    choice(this.#part('#among'), this.#live ? [] : AMONG, state.among, set('among'));
-    this.#part('.events').hidden = state.list !== 'events';
-    this.#part('.episodes').hidden = state.list !== 'episodes';
-    this.#host.dataset.state = known.state;
-    this.#host.setAttribute(
-      'aria-busy',
-      String(known.state === 'loading' || known.state === 'active'),
-    );
-    this.#doing(known);
+    const result = this.#result;
     const score = this.#score;
-    this.#measures(known.result?.scores ?? []);
-    const line = score
-      ? score.why_not
-        ? `None by ${called(score)}: ${score.why_not}.`
-        : score.verdict
-      : said(known);
-    const verdict = this.#part('.verdict');
-    if (verdict.textContent !== line) verdict.textContent = verdict.title = line;
-    this.#phases(score);
-    this.#list(score);
-    this.#episodes.show(known.result ?? null, score && !score.why_not ? score : null);
-  }
-
-  #part(selector) {
-    return this.#host.querySelector(selector);
+    const failures = result.state === 'ready' ? result.result : undefined;
+    /** @param {'list' | 'among'} key */
+    const set = (key) => (/** @type {string} */ value) => this.#store.set({ [key]: value });
+    choice(html('#list', this.#host), LISTS, state.list, set('list'));
+    choice(html('#among', this.#host), this.#isLive ? [] : AMONG, state.among, set('among'));
+    html('.events', this.#host).hidden = state.list !== 'events';
+    html('.episodes', this.#host).hidden = state.list !== 'episodes';
+    this.#host.dataset.state = result.state;
+    this.#host.ariaBusy = String(result.state === 'loading' || result.state === 'active');
+    this.#drawButton(result);
+    this.#drawScores(failures?.scores ?? []);
+    const text = score ? scoreSummary(score) : statusText(result);
+    const verdict = html('.verdict', this.#host);
+    if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
+    this.#drawPhases(score);
+    this.#drawTable(failures, score);
+    this.#episodes.show(failures ?? null, score && !score.why_not ? score : null);
   }
 
   get #key() {
@@ -167,318 +177,211 @@ export class Failures {
     return JSON.stringify([task, filter, data, faults, among]);
   }
 
-  /** Whether it is of a live run: one episode. */
-  get #live() {
+  get #isLive() {
     return this.#store.state.data.startsWith('live:');
   }
 
-  /** How a live run is waited for of which not all steps are there; null of anything else. @returns {Result | null} */
-  get #waiting() {
-    if (!this.#live) return null;
+  /** State of a live run that is not complete; null for any other run. @returns {Result | null} */
+  get #liveState() {
+    if (!this.#isLive) return null;
     if (this.#trace?.selection.data !== this.#store.state.data) return { state: 'loading' };
-    return this.#trace.live?.state === 'running' ? { state: 'waits' } : null;
+    return this.#trace.live?.state === 'running' ? { state: 'live' } : null;
   }
 
   /** @returns {Result} */
-  get #known() {
-    return this.#waiting ?? this.#results.get(this.#key) ?? { state: 'loading' };
+  get #result() {
+    return this.#liveState ?? this.#results.get(this.#key) ?? { state: 'loading' };
   }
 
-  /** The chosen measure, or the first where the filter's task has no such. */
+  /** The selected score, or the first one if the task does not have it. @returns {FailureScore | undefined} */
   get #score() {
-    const scores = this.#known.result?.scores;
-    return scores?.find(({ name }) => name === this.#store.state.by) ?? scores?.[0];
+    const result = this.#result;
+    if (result.state !== 'ready') return undefined;
+    const { scores } = result.result;
+    return scores.find(({ name }) => name === this.#store.state.by) ?? scores[0];
   }
 
-  /** The events of the chosen measure and phase; of all phases where the measure has no such. */
+  /** The selected phase; undefined if the score does not have it. */
+  get #phase() {
+    return this.#score?.phases?.find(({ name }) => name === this.#store.state.phase);
+  }
+
+  /** Events of the score in the selected phase. */
   get #events() {
-    const score = this.#score;
-    const { phase } = this.#store.state;
-    if (!score?.events) return [];
-    return score.phases.some((g) => g.name === phase)
-      ? score.events.filter((m) => m.phase === phase)
-      : score.events;
+    const events = this.#score?.events ?? [];
+    const phase = this.#phase;
+    return phase ? events.filter((event) => event.phase === phase.name) : events;
   }
 
-  #keep(key, kept) {
+  /**
+   * @param {string} key
+   * @param {Result} result
+   */
+  #cache(key, result) {
     this.#results.delete(key);
-    this.#results.set(key, kept);
-    if (this.#results.size > KEPT) this.#results.delete(this.#results.keys().next().value);
+    this.#results.set(key, result);
+    const [oldest] = this.#results.keys();
+    if (this.#results.size > MAX_RESULTS) this.#results.delete(oldest);
   }
 
-  async #look() {
+  async #search() {
     const key = this.#key;
     try {
-      this.#keep(key, pending(await api.startFailureSearch(this.#store.state)));
+      const { job } = await api.startFailureSearch(this.#store.state);
+      this.#cache(key, jobResult(job));
     } catch (error) {
-      this.#keep(key, { state: 'error', error: error.message });
+      this.#cache(key, { state: 'error', error: messageOf(error) });
     }
     this.draw();
     this.#jobs.refresh();
   }
 
-  /** Jobs have changed: what is done is fetched. */
-  #hear(list) {
-    const byId = new Map(list.map((job) => [job.id, job]));
-    for (const [key, { job }] of [...this.#results]) {
-      if (!job) continue;
-      const now = byId.get(job.id);
-      if (now?.state === 'done') this.#results.delete(key);
-      else this.#keep(key, pending({ job: now ?? null }));
+  /**
+   * Updates the results; the result of a finished job is loaded.
+   * @param {Job[]} list
+   */
+  #followJobs(list) {
+    const jobs = new Map(list.map((job) => [job.id, job]));
+    for (const [key, result] of [...this.#results]) {
+      if (result.state !== 'active' && result.state !== 'ended') continue;
+      const job = jobs.get(result.job.id) ?? null;
+      if (job?.state === 'done') this.#results.delete(key);
+      else this.#cache(key, jobResult(job));
     }
     if (this.#results.has(this.#key)) this.draw();
     else this.load();
   }
 
-  /** The button that asks, tries again or cancels, and how far it is. */
-  #doing({ state, job }) {
-    const doing = this.#part('.doing');
-    const acts = {
-      unasked: 'Look for failures',
-      ended: 'Try again',
-      error: 'Try again',
-      working: 'Cancel',
-    }[state];
-    if (doing.dataset.acts !== (acts ?? '')) {
-      const focused = doing.contains(document.activeElement);
-      doing.dataset.acts = acts ?? '';
-      doing.replaceChildren(...(state === 'active' ? [document.createElement('progress')] : []));
-      if (acts)
-        doing.append(
-          button(acts, 'text', () =>
-            isActive(this.#known.job) ? this.#jobs.cancel(this.#known.job.id) : this.#look(),
-          ),
-        );
-      if (focused) (doing.querySelector('button') ?? this.#part('.scroll')).focus();
+  /**
+   * Shows the button that starts, repeats or cancels the search, and the progress.
+   * @param {Result} result
+   */
+  #drawButton(result) {
+    const host = html('.doing', this.#host);
+    const action = ACTIONS[result.state] ?? '';
+    if (host.dataset.action !== action) {
+      const hadFocus = host.contains(document.activeElement);
+      const button = create('button', { type: 'button', className: 'text', textContent: action });
+      button.addEventListener('click', () => this.#searchOrCancel());
+      const progress = create('progress', { ariaLabel: 'Progress of the search for failures' });
+      host.dataset.action = action;
+      host.replaceChildren(
+        ...(result.state === 'active' ? [progress] : []),
+        ...(action ? [button] : []),
+      );
+      if (hadFocus) (action ? button : html('.scroll', this.#host)).focus();
     }
-    const progress = doing.querySelector('progress');
-    if (!progress) return;
-    progress.setAttribute('aria-label', 'Progress of the search for failures');
-    progress.value = job.progress;
+    const progress = host.querySelector('progress');
+    if (progress && result.state === 'active') progress.value = result.job.progress;
   }
 
-  /** Those that the filter lacks can be chosen too: then it is said why. */
-  #measures(scores) {
-    const host = this.#part('#by');
+  #searchOrCancel() {
+    const result = this.#result;
+    if (result.state === 'active' && isActive(result.job)) this.#jobs.cancel(result.job.id);
+    else this.#search();
+  }
+
+  /**
+   * Shows all scores. An unavailable one can be selected as well, which shows the reason.
+   * @param {FailureScore[]} scores
+   */
+  #drawScores(scores) {
+    const host = html('#by', this.#host);
     choice(
       host,
-      scores.map((score) => [score.name, called(score)]),
-      this.#score?.name,
-      (by) => this.#store.set({ by, ...drawn(by, this.#trace) }),
+      scores.map((score) => [score.name, scoreName(score)]),
+      this.#score?.name ?? '',
+      (by) => this.#store.set({ by, ...viewOf(by, this.#trace) }),
     );
-    scores.forEach(({ title, why_not: why }, i) => {
-      host.children[i].title = why ? `${sentence(title)} None: ${why}.` : `Rank by ${title}`;
-      host.children[i].classList.toggle('lacking', Boolean(why));
+    scores.forEach(({ title, why_not: whyNot }, i) => {
+      const label = html(`label:nth-of-type(${i + 1})`, host);
+      label.title = whyNot ? `${sentence(title)} Not available: ${whyNot}.` : `Rank by ${title}`;
+      label.classList.toggle('unavailable', Boolean(whyNot));
     });
   }
 
-  #phases(score) {
-    const host = this.#part('#phase');
-    const phases = (score?.phases ?? []).filter((g) => g.events);
-    const chosen = phases.some((g) => g.name === this.#store.state.phase)
-      ? this.#store.state.phase
-      : '';
-    const options = [
-      ['', `all ${score?.total ?? ''}`],
-      ...phases.map((g) => [
-        g.name,
-        `${g.name} ${g.events}${g.over_represented ? ` · ${fixed(g.lift)}×` : ''}`,
-      ]),
-    ];
-    choice(host, options, chosen, (phase) => this.#store.set({ phase }));
+  /** @param {FailureScore | undefined} score */
+  #drawPhases(score) {
+    const host = html('#phase', this.#host);
+    const phases = (score?.phases ?? []).filter(({ events }) => events);
+    const selected = phases.find(({ name }) => name === this.#store.state.phase)?.name ?? '';
+    /** @type {[string, string][]} */
+    const options = phases.map(({ name, events, lift, over_represented: isOver }) => [
+      name,
+      `${name} ${events}${isOver ? ` · ${fixed(lift)}×` : ''}`,
+    ]);
+    choice(host, [['', `all ${score?.total ?? ''}`], ...options], selected, (phase) =>
+      this.#store.set({ phase }),
+    );
     host.hidden = !phases.length || this.#store.state.list !== 'events';
-    phases.forEach((g, i) => {
-      host.children[i + 1].classList.toggle('over-represented', g.over_represented);
-      host.children[i + 1].title =
-        `${percent(g.share)} of the steps, ${percent(g.event_share)} of the events: ${fixed(g.lift)} times its share. Chance gives so many in ${significant(100 * g.p_value)} %.`;
+    phases.forEach((phase, i) => {
+      const label = html(`label:nth-of-type(${i + 2})`, host);
+      label.classList.toggle('over-represented', phase.over_represented);
+      const shares = `${percent(phase.share)} of the steps, ${percent(phase.event_share)} of the events`;
+      label.title = `${shares}: lift ${fixed(phase.lift)}, p-value ${significant(phase.p_value)}`;
     });
   }
 
-  /** A row for each failure, made anew only when others are listed. */
-  #list(score) {
-    const { found } = this.#known;
+  /**
+   * @param {Search | undefined} failures
+   * @param {FailureScore | undefined} score
+   */
+  #drawTable(failures, score) {
     const events = this.#events;
-    const listed = found ? `${this.#key} ${score.name} ${this.#store.state.phase}` : '';
-    if (listed !== this.#listed) {
-      this.#listed = listed;
-      const columns = score?.events ? eventColumns(found, score) : [];
-      const top = document.createElement('tr');
-      top.append(
-        ...columns.map(({ title, help, number }) =>
-          Object.assign(document.createElement('th'), {
-            scope: 'col',
-            className: number ? 'number' : '',
-            textContent: title,
-            title: help ?? '',
-          }),
-        ),
-      );
-      if (columns.length)
-        top.append(
-          Object.assign(document.createElement('th'), { scope: 'col', ariaLabel: 'Link' }),
-        );
-      this.#part('.events thead').replaceChildren(...(columns.length ? [top] : []));
-      this.#rows = events.map((failure, i) => this.#row(columns, failure, score, i));
-      this.#part('.events tbody').replaceChildren(...this.#rows.map(({ row }) => row));
-      this.#part('.scroll').scrollTop = 0;
+    const key = failures && score ? `${this.#key} ${score.name} ${this.#store.state.phase}` : '';
+    if (key !== this.#tableKey) {
+      this.#tableKey = key;
+      this.#table.show(failures, score, events);
+      html('.scroll', this.#host).scrollTop = 0;
       this.#last = -1;
     }
-    const phase = score?.phases?.find((g) => g.name === this.#store.state.phase);
-    const all = phase ? phase.events : (score?.total ?? 0);
-    const left = `${events.length} of ${all} are listed: those among the worst ${score?.events?.length} of all.`;
-    this.#part('.rest').textContent = events.length < all ? left : '';
+    const total = this.#phase?.events ?? score?.total ?? 0;
+    const limit = `${events.length} of ${total} listed: those among the worst ${score?.events?.length} of all phases.`;
+    html('.rest', this.#host).textContent = events.length < total ? limit : '';
     this.move(this.#store.state.step);
   }
 
-  #row(columns, failure, score, i) {
-    const row = document.createElement('tr');
-    const go = button('', 'title', (event) => this.#open(failure, event.timeStamp));
-    const what = `${score.title} ${withUnit(failure.value, score.unit)}`;
-    go.setAttribute(
-      'aria-label',
-      `Episode ${failure.episode}, step ${failure.step}: ${what}, ${failure.phase}`,
-    );
-    columns.forEach(({ text, hint, number }, c) => {
-      const cell = row.insertCell();
-      if (number) cell.className = 'number';
-      if (hint) cell.title = hint(failure);
-      if (c) cell.textContent = text(failure);
-      else cell.append(go);
-    });
-    go.textContent = columns[0].text(failure);
-    const copy = button('', 'quiet link', async () => {
-      copy.textContent = (await copyText(new URL(failure.link, location.href).href))
-        ? '✓'
-        : 'not allowed';
-      setTimeout(() => (copy.innerHTML = LINK), TOLD);
-    });
-    copy.innerHTML = LINK;
-    copy.setAttribute(
-      'aria-label',
-      (copy.title = `Copy link to episode ${failure.episode}, step ${failure.step}`),
-    );
-    go.tabIndex = copy.tabIndex = i ? -1 : 0;
-    row.insertCell().append(copy);
-    return { failure, row, button: go };
-  }
-
+  /**
+   * @param {FailureEvent} event
+   * @param {number | null} inputTime
+   */
   #open({ episode, step }, inputTime) {
     this.#store.set({ episode, step, playing: false }, { inputTime });
   }
 
-  /** The listed events of the episode that is shown, on the time line. */
-  #mark() {
+  /** Marks the listed events of the displayed episode in the timeline. */
+  #markTimeline() {
     if (!this.#trace) return;
     const score = this.#score;
     const { episode } = this.#trace.selection;
-    const of = this.#events.filter((failure) => failure.episode === episode);
+    const events = score ? this.#events.filter((event) => event.episode === episode) : [];
     this.#timeline.mark(
-      of.map((m) => ({
-        step: m.step,
-        label: `${score.title} ${withUnit(m.value, score.unit)}, ${m.phase}`,
-        measure: score.title,
+      events.map(({ step, value, phase }) => ({
+        step,
+        label: score ? `${score.title} ${formatScore(score, value)}, ${phase}` : '',
+        measure: score?.title,
       })),
     );
   }
 }
 
-const called = ({ name }) => NAMES[name] ?? name.replaceAll('_', ' ');
+/**
+ * @param {Job | null} job
+ * @returns {Result}
+ */
+const jobResult = (job) => pending(/** @type {Search | JobReply} */ ({ job }));
 
-/** What the time line has to draw for a measure. */
-function drawn(by, trace) {
-  if (trace?.components.some(({ name }) => name === by)) return { component: by, track: 'error' };
-  return (
-    {
-      error: { track: 'error' },
-      nees: { track: 'nees' },
-      ess: { track: 'particles' },
-      regret: { weights: 'effective' },
-    }[by] ?? {}
-  );
-}
+/** @param {FailureScore} score */
+const scoreSummary = (score) =>
+  score.why_not ? `No ${scoreName(score)}: ${score.why_not}.` : (score.verdict ?? '');
 
-function said({ state, job, error }) {
-  if (state === 'error') return sentence(error);
-  if (state === 'active' || state === 'ended') return jobSummary(job);
-  if (state === 'waits')
-    return 'The run goes on. Its failures are looked for in all its steps once it has ended; that shows here by itself.';
-  if (state === 'absent')
-    return 'Nobody has looked yet. The filter has to run over all these episodes, so it is done only when asked for.';
+/** @param {Result} result */
+function statusText(result) {
+  if (result.state === 'error') return sentence(result.error);
+  if (result.state === 'active' || result.state === 'ended') return jobSummary(result.job);
+  if (result.state === 'live')
+    return 'The live run is in progress. Its failures are listed when it has ended.';
+  if (result.state === 'absent')
+    return 'No search yet. A search runs the filter over all these episodes.';
   return 'Loading …';
-}
-
-function shownUnit(unit) {
-  return DISPLAY_UNITS[unit] ?? { unit: UNITS[unit] ?? unit, scale: 1 };
-}
-
-function withUnit(value, name) {
-  const { unit, scale } = shownUnit(name);
-  return `${significant(scale * value)}${unit && ' '}${unit}`;
-}
-
-/** @param {api.Failures} found @param {object} score */
-function eventColumns(found, score) {
-  const { unit } = shownUnit(score.unit);
-  const own = shownUnit(score.unit).scale;
-  const number = true;
-  const columns = [
-    { title: 'episode', text: (m) => String(m.episode) },
-    {
-      title: 'step',
-      text: (m) => String(m.step),
-      number,
-      hint: (m) => `Of steps ${m.first} to ${m.last}, in which it stays high`,
-    },
-    {
-      title: unit ? `${score.title} ${unit}` : score.title,
-      text: (m) => significant(own * m.value),
-      number,
-    },
-    {
-      title: 'phase',
-      text: (m) => m.phase,
-      hint: (m) => [m.phase, ...m.other_phases].join(', '),
-    },
-  ];
-  const modalities = found.layers.slice(0, -1);
-  found.layers.forEach((layer, i) => {
-    if (layer === 'fused' && score.name === 'error') return;
-    const name = modalities.length > 1 ? layer : 'error';
-    if (modalities.length > 1 || layer === 'fused')
-      columns.push({
-        title: `${name} cm`,
-        text: (m) => fixed(100 * m.error[i], 2),
-        number,
-        help: 'Distance of its position from the truth',
-      });
-  });
-  if (score.name !== 'nees' && score.events[0]?.nees !== null)
-    columns.push({
-      title: 'NEES',
-      text: (m) => fixed(m.nees),
-      number,
-      help: 'Normalised squared error: mean 1 where the covariance is right',
-    });
-  if (modalities.length > 1 && score.events[0]?.effective_weights)
-    columns.push({
-      title: 'dominant',
-      text: (m) => leading(modalities, m.effective_weights),
-      help: 'The modality that decides most, with its share as it acted: the mean over the components',
-    });
-  return columns;
-}
-
-function leading(modalities, shares) {
-  const most = shares.indexOf(Math.max(...shares));
-  return `${modalities[most]} ${percent(shares[most])}`;
-}
-
-function button(text, kind, act) {
-  const made = Object.assign(document.createElement('button'), {
-    type: 'button',
-    className: kind,
-    textContent: text,
-  });
-  made.addEventListener('click', act);
-  return made;
 }

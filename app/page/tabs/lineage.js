@@ -1,106 +1,119 @@
-/** Which filter was made from which: the children of the workspace under their ancestors, with what each gained and lost. */
+/** The lineage of a task's filters: fine-tuned checkpoints below their base checkpoints, with their errors. */
 
-import * as api from '../data/api.js';
+/** @import { State, Store } from '../core/state.js' */
+/** @import { LineageMember } from '../types/server.js' */
+
+import { create } from '../core/dom.js';
 import { permalink } from '../core/state.js';
 import { fixed } from '../core/units.js';
+import * as api from '../data/api.js';
 
-export class Descent {
+export class Lineage {
   #host;
   #store;
 
-  /** @param {HTMLElement} host @param {import('../core/state.js').Store} store */
+  /**
+   * @param {HTMLElement} host hidden if the task has no fine-tuned checkpoint
+   * @param {Store} store
+   */
   constructor(host, store) {
-    [this.#host, this.#store] = [host, store];
+    this.#host = host;
+    this.#store = store;
     host.hidden = true;
   }
 
-  /** Asks anew, and shows the families that have children; nothing where there are none. */
+  /** @param {AbortSignal} signal */
   async load(signal) {
-    const { task } = this.#store.state;
-    const { members } = await api.lineage(task, signal);
-    const byHash = new Map(members.map((one) => [one.hash, one]));
-    const children = (hash) => members.filter(({ base }) => base === hash);
-    const roots = members.filter(
-      (one) => !byHash.has(one.base) && (one.base || children(one.hash).length),
+    const { members } = await api.lineage(this.#store.state.task, signal);
+    const hashes = new Set(members.map(({ hash }) => hash));
+    const bases = new Set(members.map(({ base }) => base));
+    const roots = members.filter(({ hash, base }) =>
+      base === null ? bases.has(hash) : !hashes.has(base),
     );
     this.#host.hidden = !roots.length;
-    const list = document.createElement('ul');
-    list.append(...roots.map((one) => this.#branch(one, null, children)));
-    this.#host.replaceChildren(
-      Object.assign(document.createElement('h4'), { textContent: 'Who was made from whom' }),
-      list,
-    );
+    const list = create('ul', {}, ...roots.map((root) => this.#branch(root, null, members)));
+    this.#host.replaceChildren(create('h4', { textContent: 'Lineage' }), list);
   }
 
-  #branch(one, parent, children) {
-    const item = document.createElement('li');
-    const line = document.createElement('div');
-    const name = Object.assign(document.createElement('b'), {
-      textContent: one.catalog_name ?? `${one.name} ${one.hash.slice(0, 6)}`,
-      title: one.hash,
-    });
-    line.append(name, ' ', ...told(one, parent), ...this.#links(one, parent));
-    item.append(line);
-    const below = children(one.hash);
-    if (below.length) {
-      const list = document.createElement('ul');
-      list.append(...below.map((child) => this.#branch(child, one, children)));
-      item.append(list);
-    }
-    return item;
+  /**
+   * Returns a checkpoint with the checkpoints that were fine-tuned from it.
+   * @param {LineageMember} member
+   * @param {LineageMember | null} base
+   * @param {LineageMember[]} members all checkpoints
+   * @returns {HTMLLIElement}
+   */
+  #branch(member, base, members) {
+    const title = member.catalog_name ?? `${member.name} ${member.hash.slice(0, 6)}`;
+    const name = create('b', { textContent: title, title: member.hash });
+    const summary = create('span', { textContent: errorSummary(member, base) });
+    const line = create('div', {}, name, ' ', summary, ...this.#links(member, base));
+    const finetuned = members.filter((other) => other.base === member.hash);
+    const branches = finetuned.map((other) => this.#branch(other, member, members));
+    return create('li', {}, line, ...(branches.length ? [create('ul', {}, ...branches)] : []));
   }
 
-  /** Ways to look at one; those of what is not on the shelf lead to its run, where it can be put there. */
-  #links(one, parent) {
+  /**
+   * @param {LineageMember} member
+   * @param {LineageMember | null} base
+   */
+  #links({ catalog_name: name, hash, run }, base) {
     const { state } = this.#store;
-    const own = { task: state.task, data: state.data };
-    const of = (text, patch, title) =>
+    const label = name ?? hash.slice(0, 6);
+    /**
+     * @param {string} text
+     * @param {Partial<State>} patch
+     * @param {string} title
+     */
+    const pageLink = (text, patch, title) =>
+      link(text, permalink({ ...state, run: '', ...patch }), `${title}: ${label}`);
+    const baseName = base?.catalog_name;
+    const comparison = name && baseName && { filter: name, against: `filter=${baseName}` };
+    return [
+      ...(name && name !== state.filter
+        ? [pageLink('open', { filter: name, against: '' }, 'Show its runs')]
+        : []),
+      ...(comparison
+        ? [
+            pageLink(
+              'compare',
+              { ...comparison, tab: 'compare' },
+              'Compare with its base checkpoint',
+            ),
+          ]
+        : []),
+      ...(run ? [pageLink('report', { run }, 'Changes made by fine-tuning')] : []),
       link(
-        text,
-        permalink({ ...state, ...patch, run: patch.run ?? '' }),
-        `${title}: ${one.catalog_name ?? one.hash.slice(0, 6)}`,
-      );
-    const links = [];
-    if (one.catalog_name && one.catalog_name !== state.filter)
-      links.push(of('open', { ...own, filter: one.catalog_name, against: '' }, 'Show its runs'));
-    if (one.catalog_name && parent?.catalog_name)
-      links.push(
-        of(
-          'compare',
-          { filter: one.catalog_name, against: `filter=${parent.catalog_name}`, tab: 'compare' },
-          'Beside its parent',
-        ),
-      );
-    if (one.run) links.push(of('report', { run: one.run }, 'What fine-tuning changed'));
-    const zip = link(
-      'export',
-      `/api/lineage/${encodeURIComponent(state.task)}/${one.hash}.zip`,
-      `With its ancestors, to hand on: ${one.catalog_name ?? one.hash.slice(0, 6)}`,
-    );
-    return [...links, zip];
+        'export',
+        `/api/lineage/${encodeURIComponent(state.task)}/${hash}.zip`,
+        `Download with its base checkpoints: ${label}`,
+      ),
+    ];
   }
 }
 
-/** What it learned, and its error before and after; of a root its error. */
-function told(one, parent) {
-  const number = ({ position_cm: cm } = {}) => fixed(cm, 2);
-  const muted = (text) => Object.assign(document.createElement('span'), { textContent: text });
-  if (!one.base) return one.rmse.position_cm === undefined ? [] : [muted(`${number(one.rmse)} cm`)];
-  const changes = Object.keys(one.after).map(
-    (slice) => `${slice} ${number(one.before[slice])} → ${number(one.after[slice])}`,
+/**
+ * Returns the error of a checkpoint; of a fine-tuned one the training data and the errors before and after.
+ * @param {LineageMember} member
+ * @param {LineageMember | null} base null if it is not available
+ */
+function errorSummary({ base: baseHash, rmse, before, after, train, learned }, base) {
+  if (baseHash === null) return rmse.position_cm === undefined ? '' : `${centimetres(rmse)} cm`;
+  const changes = Object.keys(after).map(
+    (slice) => `${slice} ${centimetres(before[slice])} → ${centimetres(after[slice])}`,
   );
-  const what = [one.train.join(', '), one.learned.length ? `on ${one.learned.join(' and ')}` : '']
-    .filter(Boolean)
-    .join(' ');
-  return [
-    muted(
-      `${what}${changes.length ? `: ${changes.join(', ')} cm` : ''}${parent ? '' : `; made from ${one.base.slice(0, 6)}, which is not here`}`,
-    ),
-  ];
+  const training = [train.join(', '), learned.length ? `on ${learned.join(' and ')}` : ''];
+  const text = training.filter(Boolean).join(' ');
+  const errors = changes.length ? `: ${changes.join(', ')} cm` : '';
+  return `${text}${errors}${base ? '' : `; base checkpoint ${baseHash.slice(0, 6)} is not available`}`;
 }
 
-function link(text, href, title) {
-  const made = Object.assign(document.createElement('a'), { href, textContent: text, title });
-  made.setAttribute('aria-label', `${text}: ${title}`);
-  return made;
-}
+/** @param {Record<string, number | null> | undefined} rmse */
+const centimetres = (rmse) => fixed(rmse?.position_cm, 2);
+
+/**
+ * @param {string} textContent
+ * @param {string} href
+ * @param {string} title
+ */
+const link = (textContent, href, title) =>
+  create('a', { href, textContent, title, ariaLabel: `${textContent}: ${title}` });

@@ -1,118 +1,160 @@
-/** The modules of a filter as a tree whose parts are thawed and frozen by check boxes, one for each at any depth. */
+/** Tree of the modules of a filter; a checkbox per module selects which ones are trained. */
 
+/** @import { ModuleInfo } from '../types/server.js' */
+
+import { create } from '../core/dom.js';
 import { significant } from '../core/units.js';
+
+/**
+ * @typedef {object} ModuleRow
+ * @property {ModuleInfo} module
+ * @property {string[]} parameters names of the parameters within the module
+ * @property {boolean} isLeaf whether it contains no other module
+ * @property {HTMLLIElement} row
+ * @property {HTMLInputElement} checkbox
+ * @property {HTMLButtonElement} toggle
+ */
 
 export class ModuleTree {
   #host;
-  #changed;
-  #rows = []; // {module, row, box, within: names of its parameters}
-  #closed = new Set();
-  #all = [];
+  #onChange;
+  /** @type {ModuleRow[]} */
+  #rows = [];
+  /** Names of the collapsed modules. @type {Set<string>} */
+  #collapsed = new Set();
+  /** Names of the trained parameters. @type {Set<string>} */
   #trained = new Set();
 
-  /** @param {HTMLElement} host @param {() => void} changed by hand */
-  constructor(host, changed) {
-    [this.#host, this.#changed] = [host, changed];
+  /**
+   * @param {HTMLElement} host a list
+   * @param {() => void} onChange called when a checkbox was changed
+   */
+  constructor(host, onChange) {
+    this.#host = host;
+    this.#onChange = onChange;
   }
 
-  /** @param {{name: string, kind: string, description: string, parameters: number, depth: number}[]} modules @param {string[]} parameters names of all */
+  /**
+   * @param {ModuleInfo[]} modules
+   * @param {string[]} parameters names of all parameters
+   */
   show(modules, parameters) {
-    this.#all = parameters;
-    const inside = (name) => parameters.filter((p) => p === name || p.startsWith(`${name}.`));
-    this.#rows = modules.map((module) =>
-      this.#row(
-        module,
-        inside(module.name),
-        modules.some((m) => m.name.startsWith(`${module.name}.`)),
-      ),
-    );
+    this.#rows = modules.map((module) => {
+      const within = parameters.filter((p) => p === module.name || contains(module.name, p));
+      const isLeaf = !modules.some(({ name }) => contains(module.name, name));
+      return this.#row(module, within, isLeaf);
+    });
     this.#host.replaceChildren(...this.#rows.map(({ row }) => row));
     this.#draw();
   }
 
-  /** Chooses these parameters and no others, and opens what is trained in part. @param {string[]} names */
+  /**
+   * Selects the parameters to train, and expands the modules that are trained in part.
+   * @param {string[]} names
+   */
   choose(names) {
     this.#trained = new Set(names);
-    const partly = ({ within }) =>
-      within.some((p) => this.#trained.has(p)) && !within.every((p) => this.#trained.has(p));
-    this.#closed = new Set(
-      this.#rows.filter((row) => !partly(row)).map(({ module }) => module.name),
-    );
+    const others = this.#rows.filter((row) => !this.#isPartlyTrained(row));
+    this.#collapsed = new Set(others.map(({ module }) => module.name));
     this.#draw();
   }
 
-  /** Names of what is trained: of parts that are trained as a whole, the outermost. @returns {string[]} */
+  /** Names of the outermost modules that are trained completely, and of the other trained parameters. */
   get trained() {
+    /** @type {string[]} */
     const names = [];
-    const told = (p) => names.some((name) => p === name || p.startsWith(`${name}.`));
-    for (const { module, within } of this.#rows)
-      if (!told(module.name) && within.every((p) => this.#trained.has(p))) names.push(module.name);
-    return [...names, ...[...this.#trained].filter((p) => !told(p))];
+    /** @param {string} name */
+    const isCovered = (name) => names.some((other) => other === name || contains(other, name));
+    for (const { module, parameters } of this.#rows)
+      if (!isCovered(module.name) && this.#trainedCount(parameters) === parameters.length)
+        names.push(module.name);
+    return [...names, ...[...this.#trained].filter((name) => !isCovered(name))];
   }
 
-  /** How many of how many numbers are trained. @returns {[number, number]} */
+  /** Number of trained parameters, and of all. @returns {[trained: number, total: number]} */
   get count() {
-    const leaves = this.#rows.filter(
-      ({ module }) => !this.#rows.some((other) => other.module.name.startsWith(`${module.name}.`)),
+    const leaves = this.#rows.filter(({ isLeaf }) => isLeaf);
+    const trained = leaves.filter(
+      (row) => this.#trainedCount(row.parameters) === row.parameters.length,
     );
-    const size = ({ module, within }) =>
-      within.every((p) => this.#trained.has(p)) ? module.parameters : 0;
-    return [
-      leaves.reduce((sum, row) => sum + size(row), 0),
-      leaves.reduce((sum, { module }) => sum + module.parameters, 0),
-    ];
+    /** @param {ModuleRow[]} rows */
+    const total = (rows) => rows.reduce((sum, { module }) => sum + module.parameters, 0);
+    return [total(trained), total(leaves)];
   }
 
-  #row(module, within, deeper) {
-    const row = document.createElement('li');
+  /** @param {string[]} parameters */
+  #trainedCount(parameters) {
+    return parameters.filter((name) => this.#trained.has(name)).length;
+  }
+
+  /** @param {ModuleRow} row */
+  #isPartlyTrained({ parameters }) {
+    const count = this.#trainedCount(parameters);
+    return count > 0 && count < parameters.length;
+  }
+
+  /**
+   * @param {ModuleInfo} module
+   * @param {string[]} parameters
+   * @param {boolean} isLeaf
+   * @returns {ModuleRow}
+   */
+  #row(module, parameters, isLeaf) {
+    const toggle = create('button', { type: 'button', className: 'quiet toggle' });
+    const checkbox = create('input', { type: 'checkbox', ariaLabel: `Train ${module.name}` });
+    const name = create('b', { textContent: module.name.split('.').at(-1) ?? '' });
+    const title = `${module.name} (${module.kind})`;
+    const text = [changeSummary(module), module.description || module.kind];
+    const description = text.filter(Boolean).join(' · ');
+    const row = create(
+      'li',
+      {},
+      toggle,
+      create('label', { title }, checkbox, ' ', name),
+      create('span', { className: 'number' }, module.parameters.toLocaleString('en')),
+      create('span', { className: 'description', title: description }, description),
+    );
     row.style.setProperty('--depth', String(module.depth - 1));
-    row.innerHTML = `<button type="button" class="quiet twist"></button><label><input type="checkbox"> <b></b></label><span class="number"></span><span class="description"></span>`;
-    const [twist, label, size, description] = row.children;
-    const box = label.firstElementChild;
-    label.querySelector('b').textContent = module.name.split('.').at(-1);
-    [label.title, size.textContent] = [
-      `${module.name} (${module.kind})`,
-      module.parameters.toLocaleString('en'),
-    ];
-    description.textContent = description.title = [
-      history(module),
-      module.description || module.kind,
-    ]
-      .filter(Boolean)
-      .join(' · ');
-    box.setAttribute('aria-label', `Train ${module.name}`);
-    twist.style.visibility = deeper ? '' : 'hidden';
-    twist.addEventListener('click', () => {
-      if (!this.#closed.delete(module.name)) this.#closed.add(module.name);
+    toggle.style.visibility = isLeaf ? 'hidden' : '';
+    toggle.addEventListener('click', () => {
+      if (!this.#collapsed.delete(module.name)) this.#collapsed.add(module.name);
       this.#draw();
     });
-    box.addEventListener('change', () => {
-      for (const p of within) this.#trained[box.checked ? 'add' : 'delete'](p);
+    checkbox.addEventListener('change', () => {
+      for (const parameter of parameters)
+        this.#trained[checkbox.checked ? 'add' : 'delete'](parameter);
       this.#draw();
-      this.#changed();
+      this.#onChange();
     });
-    return { module, row, box, twist, within };
+    return { module, parameters, isLeaf, row, checkbox, toggle };
   }
 
   #draw() {
-    for (const { module, row, box, twist, within } of this.#rows) {
-      const count = within.filter((p) => this.#trained.has(p)).length;
-      [box.checked, box.indeterminate] = [
-        count === within.length,
-        count > 0 && count < within.length,
-      ];
-      row.hidden = [...this.#closed].some((name) => module.name.startsWith(`${name}.`));
-      const closed = this.#closed.has(module.name);
-      twist.textContent = closed ? '▸' : '▾';
-      twist.setAttribute('aria-label', `${closed ? 'Show' : 'Hide'} what is in ${module.name}`);
-      twist.setAttribute('aria-expanded', String(!closed));
+    for (const item of this.#rows) {
+      const { module, parameters, row, checkbox, toggle } = item;
+      checkbox.checked = this.#trainedCount(parameters) === parameters.length;
+      checkbox.indeterminate = this.#isPartlyTrained(item);
+      row.hidden = [...this.#collapsed].some((name) => contains(name, module.name));
+      const isCollapsed = this.#collapsed.has(module.name);
+      toggle.textContent = isCollapsed ? '▸' : '▾';
+      toggle.ariaLabel = `${isCollapsed ? 'Expand' : 'Collapse'} ${module.name}`;
+      toggle.ariaExpanded = String(!isCollapsed);
     }
   }
 }
 
-/** What the fine-tuning that made the filter did to a module; nothing where there was none, or it was frozen. */
-function history({ gradient, change }) {
-  return gradient === undefined
-    ? ''
-    : `gradient ${significant(gradient)}, changed by ${significant(100 * change)} %`;
+/**
+ * Returns whether a module contains another module or a parameter.
+ * @param {string} module
+ * @param {string} name
+ */
+const contains = (module, name) => name.startsWith(`${module}.`);
+
+/**
+ * Returns how the fine-tuning that wrote the checkpoint changed a module; empty if it did not.
+ * @param {ModuleInfo} module
+ */
+function changeSummary({ gradient, change }) {
+  if (gradient === undefined || gradient === null) return '';
+  return `gradient ${significant(gradient)}, changed by ${significant(100 * Number(change))} %`;
 }

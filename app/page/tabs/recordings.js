@@ -25,6 +25,8 @@ import { Trash } from './trash.js';
 
 const POLL_INTERVAL = 4000; // ms; other clients may change the files
 const READING_INTERVAL = 700; // ms, while the server reads a new file
+const NO_RECORDINGS =
+  'No recordings yet. “Save .rrd” above writes the current run; “Add .rrd…” imports a file.';
 const READ_ONLY = 'Read-only server: nothing can be changed';
 
 const BODY = `
@@ -200,11 +202,8 @@ export class Recordings {
     const used = reports.reports.reduce((sum, { bytes }) => sum + bytes, recordings.bytes);
     html('.summary', this.#host).textContent =
       `${count} · ${formatBytes(used)} used, ${formatBytes(recordings.free)} free`;
-    html('.rest', this.#host).textContent = candidates.length
-      ? matches.length
-        ? ''
-        : 'No recording matches all words.'
-      : 'No recordings yet. “Save .rrd” above writes the current run; “Add .rrd…” imports a file.';
+    const hint = candidates.length ? 'No recording matches all words.' : NO_RECORDINGS;
+    html('.rest', this.#host).textContent = matches.length ? '' : hint;
     this.#drawAutomatic(this.#list.filter((file) => file.automatic && this.#matches(file)));
     this.#trash.show([
       ...recordings.deleted.map((file) => ({ ...file, kind: /** @type {const} */ ('recordings') })),
@@ -372,29 +371,15 @@ export class Recordings {
   #upload(files) {
     if (this.#readOnlyReason) return this.#status.show({ text: `${READ_ONLY}.`, failed: true });
     const names = new Set(this.#list.map(({ name }) => name));
-    /** @param {string} name */
-    const unusedName = (name) => {
-      const stem = name.replace(/\.rrd$/, '');
-      let candidate = `${stem}.rrd`;
-      for (let n = 2; names.has(candidate); n++) candidate = `${stem}-${n}.rrd`;
-      names.add(candidate);
-      return candidate;
-    };
-    this.#uploads.add(files, unusedName, this.#files?.recordings.largest ?? Infinity);
+    this.#uploads.add(files, names, this.#files?.recordings.largest ?? Infinity);
   }
 
   #bindControls() {
-    /**
-     * @param {string} selector
-     * @param {() => void} action
-     */
-    const onClick = (selector, action) =>
-      html(selector, this.#host).addEventListener('click', action);
     const picker = element('[type=file]', HTMLInputElement, this.#host);
     const add = element('.add', HTMLButtonElement, this.#host);
     if (this.#readOnlyReason) [add.disabled, add.title] = [true, this.#readOnlyReason];
-    onClick('.add', () => picker.click());
-    onClick('.automatic button', () => {
+    add.addEventListener('click', () => picker.click());
+    html('.automatic button', this.#host).addEventListener('click', () => {
       this.#showsAutomatic = !this.#showsAutomatic;
       this.#draw();
     });

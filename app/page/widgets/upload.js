@@ -21,20 +21,24 @@ export class Uploads {
 
   /**
    * @param {File[]} files
-   * @param {(name: string) => string} unusedName returns a similar name that is not in use
+   * @param {Set<string>} names names in use, which the new ones are added to
    * @param {number} limit bytes
    */
-  add(files, unusedName, limit) {
-    for (const file of files) this.#last = this.#upload(file, unusedName, limit, this.#last);
+  add(files, names, limit) {
+    for (const file of files) {
+      const name = unusedName(file.name, names);
+      names.add(name);
+      this.#last = this.#upload(file, name, limit, this.#last);
+    }
   }
 
   /**
    * @param {File} file
-   * @param {(name: string) => string} unusedName
+   * @param {string} name of the recording
    * @param {number} limit
    * @param {Promise<void>} previous upload
    */
-  async #upload(file, unusedName, limit, previous) {
+  async #upload(file, name, limit, previous) {
     const text = create('span', {
       textContent: `${file.name}, ${formatBytes(file.size)}: waiting`,
     });
@@ -56,7 +60,7 @@ export class Uploads {
         const [size, maximum] = [formatBytes(file.size), formatBytes(limit)];
         throw new Error(`it has ${size}; the limit is ${maximum}`);
       }
-      const recording = await send(request, file, unusedName(file.name), (share) => {
+      const recording = await send(request, file, name, (share) => {
         bar.value = share;
         text.textContent = `${file.name}: ${share < 1 ? percent(share) : 'checking'}`;
       });
@@ -69,6 +73,18 @@ export class Uploads {
       [button.textContent, button.ariaLabel] = ['×', 'Dismiss'];
     }
   }
+}
+
+/**
+ * Returns the name of a recording, with a number if it is in use.
+ * @param {string} name
+ * @param {Set<string>} names names in use
+ */
+function unusedName(name, names) {
+  const stem = name.replace(/\.rrd$/, '');
+  let candidate = `${stem}.rrd`;
+  for (let n = 2; names.has(candidate); n++) candidate = `${stem}-${n}.rrd`;
+  return candidate;
 }
 
 /**

@@ -21,6 +21,8 @@ from beliefscope.app.views.scene_comparison import dashed
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.traces.replay import Edit
 
+pytestmark = pytest.mark.slow
+
 ORIGIN = "http://localhost:8000"
 EPISODE = 9
 EDIT = "from=40&to=60&faults=blackout"

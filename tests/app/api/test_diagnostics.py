@@ -24,6 +24,8 @@ from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import VIEWS
 from beliefscope.inspect.trace import trace
 
+pytestmark = pytest.mark.slow
+
 ORIGIN = "http://localhost:8000"
 TIMEOUT = 90.0  # s, including the import of PyTorch by a job
 EPISODE = 9

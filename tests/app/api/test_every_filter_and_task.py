@@ -22,6 +22,8 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import save_checkpoint
 
+pytestmark = pytest.mark.slow
+
 Serve = Callable[[Task, str], TestClient]
 
 

@@ -20,6 +20,8 @@ from beliefscope.filters.external.load import load_external
 from beliefscope.inspect.trace import load_trace
 from beliefscope.recordings.read import read_recording
 
+pytestmark = pytest.mark.slow
+
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "04_own_filter.py"
 SPEC = f"{EXAMPLE}:build"
 FAILS = """
@@ -85,7 +87,7 @@ def test_server_needs_the_task(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(FAILS)
     code, _, err = run("serve", "--filter", f"{tmp_path}/own.py:Fails", "--workspace", tmp_path / "w")
     assert code == 2
-    assert err.endswith("does not say which task it is for: give it an attribute task, or name one with --task\n")
+    assert err.endswith("does not name its task: give it an attribute task, or use --task\n")
 
 
 @pytest.fixture

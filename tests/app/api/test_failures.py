@@ -17,6 +17,8 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.failures.events import survey_of
 
+pytestmark = pytest.mark.slow
+
 TIMEOUT = 90.0  # s, including the import of PyTorch by a job
 URL = "/api/failures/door/crossmodal-ekf"
 FAULTS = "blackout=0.5"

@@ -17,6 +17,8 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.filters.checkpoint import load_checkpoint
 
+pytestmark = pytest.mark.slow
+
 TIMEOUT = 120.0  # s, including the import of PyTorch by a job
 URL = "/api/finetune/door/crossmodal-ekf"
 SMALL = {"train": ["haptics-only"], "steps": 4, "check": 2, "length": 8, "windows": 2}

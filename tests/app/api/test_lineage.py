@@ -18,6 +18,8 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 
+pytestmark = pytest.mark.slow
+
 MIX = [{"slice": {"name": "haptics only"}, "share": 1.0}]
 ERRORS = {"haptics only": {"rmse": {"position_cm": 2.0}, "nll": 1.0}}
 

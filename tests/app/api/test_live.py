@@ -27,6 +27,8 @@ from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace, trace_
 from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter
 from beliefscope.recordings.read import read_recording
 
+pytestmark = pytest.mark.slow
+
 STEPS = 24
 TRACE = "/api/trace/door/{}/9?data=live:run"
 

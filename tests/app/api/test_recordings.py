@@ -29,6 +29,8 @@ from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.rerun_log.metadata import describe
 from beliefscope.recordings.write import write_recording
 
+pytestmark = pytest.mark.slow
+
 URL = "/api/recordings"
 TIMEOUT = 60.0  # s, including the import of Rerun by the reader
 
@@ -326,7 +328,10 @@ def test_deleted_files_expire(
 
 
 @IN_PROCESS
-def test_list_has_an_etag(client: TestClient, run_recording: bytes, folder: Path) -> None:
+def test_list_has_an_etag(
+    client: TestClient, run_recording: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recordings, "free_space", lambda _: 10**12)
     client.put(f"{URL}/a.rrd", content=run_recording)
     tag = client.get(URL).headers["etag"]
     assert client.get(URL, headers={"If-None-Match": tag}).status_code == 304

@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import parse_qs
 
 import numpy as np
+import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
@@ -17,6 +18,8 @@ from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.write import write_recording
+
+pytestmark = pytest.mark.slow
 
 TIMEOUT = 120.0  # s, including the import of PyTorch by a job
 

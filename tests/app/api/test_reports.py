@@ -6,11 +6,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
 from httpx import Response
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
+
+pytestmark = pytest.mark.slow
 
 ORIGIN = "http://localhost:8000"
 TIMEOUT = 120.0  # s, including the import of PyTorch by a job
@@ -48,7 +51,7 @@ def test_report_is_written_downloaded_deleted_and_restored(tmp_path: Path) -> No
         assert f"{ORIGIN}/?task=door&amp;filter=crossmodal-ekf&amp;data=sample&amp;episode=9&amp;step=" in page.text
         assert "faults=blackout%3D0.4" in page.text
         assert [f"episode=9&amp;step={step}" in page.text for step in (7, 40, 41)] == [True, True, False]
-        assert "--event=7 --event=40 --title &#x27;Two events&#x27; -o report" in page.text
+        assert "--event=7 --event=40 --title &#39;Two events&#39; -o report" in page.text
         assert request_report().json()["job"]["state"] == "done", "an existing report is not written again"
         (listed,) = client.get("/api/reports").json()["reports"]
         assert (f"/{job['link']}", "Two events", None) == (listed["url"], listed["title"], listed["pdf"])

@@ -11,6 +11,8 @@ from starlette.testclient import TestClient
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace import recordings as recording_files
 
+pytestmark = pytest.mark.slow
+
 URL = "/api/recordings"
 TIMEOUT = 120.0  # s, including the import of PyTorch by a job
 

@@ -23,6 +23,8 @@ from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.training.study import run_cell
 from beliefscope.recordings.study_figures import write_study
 
+pytestmark = pytest.mark.slow
+
 FILTER = "crossmodal-ekf"
 
 

@@ -17,6 +17,8 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.trace import load_trace
 
+pytestmark = pytest.mark.slow
+
 OpenClient = Callable[..., TestClient]
 
 

@@ -18,6 +18,8 @@ from beliefscope.app.server import main
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import PRETRAINED
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[[str], tuple[int, str, str]]
 
 

@@ -17,6 +17,8 @@ from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import sample_path
 
+pytestmark = pytest.mark.slow
+
 COMMAND = [sys.executable, "-m", "beliefscope"]
 INVALID_NAME = os.fsdecode(b"d\xff")  # not valid UTF-8
 

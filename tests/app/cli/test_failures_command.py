@@ -14,6 +14,8 @@ from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.simulation.door import DOOR
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 
 

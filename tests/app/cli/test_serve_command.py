@@ -28,6 +28,8 @@ from beliefscope.app.server import timeouts
 from beliefscope.app.server.main import create_app
 from beliefscope.app.server.timeouts import HTTPProtocol
 
+pytestmark = pytest.mark.slow
+
 TIMEOUT = 60.0  # s
 
 

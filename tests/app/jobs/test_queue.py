@@ -21,6 +21,8 @@ from beliefscope.app.jobs.queue import KINDS, Job, Jobs
 from beliefscope.app.runs.errors import QueueFull
 from beliefscope.datasets.errors import BadInput
 
+pytestmark = pytest.mark.slow
+
 TEST_KINDS = {name: f"job_functions:{name}" for name in ("add", "wait", "crash", "vanish", "refuse", "not_json")}
 TIMEOUT = 60.0  # s
 

@@ -16,6 +16,8 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import save_checkpoint
 
+pytestmark = pytest.mark.slow
+
 MIT_PUSH = Path(__file__).resolve().parents[4] / "shared" / "data" / "mit_push"
 
 

@@ -21,6 +21,8 @@ from beliefscope.app.runs.trace_worker import TraceWorker
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.trace import arrays_of, header_of
 
+pytestmark = pytest.mark.slow
+
 SELECTION = Selection("door", "crossmodal-pf", 1, data="mine")
 OTHER = Selection("door", "crossmodal-ekf", 0, data="mine")
 TIMEOUT = 60.0  # s

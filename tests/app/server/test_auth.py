@@ -28,6 +28,8 @@ from beliefscope.app.server.auth import (
 from beliefscope.app.server.main import create_app, serve
 from beliefscope.datasets.errors import BadInput
 
+pytestmark = pytest.mark.slow
+
 TOKEN = "k7-Zq0_a-token-for-these-tests"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 ORIGIN = {"Origin": "http://lab:8000"}

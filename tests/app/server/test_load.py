@@ -34,6 +34,8 @@ from beliefscope.app.workspace.recording_probe import RecordingInfo, RecordingPr
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 
+pytestmark = pytest.mark.slow
+
 TIMEOUT = 30.0  # s
 
 

@@ -16,6 +16,8 @@ from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.server import logs
 from beliefscope.app.server.logs import MAX_REFUSALS, RefusalLimit
 
+pytestmark = pytest.mark.slow
+
 log = logging.getLogger("beliefscope.app")
 
 

@@ -23,6 +23,8 @@ from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.vendor_files import RerunViewer, installed, without_names
 from beliefscope.datasets.errors import BadInput
 
+pytestmark = pytest.mark.slow
+
 # A module with a type section, a `name` section and another custom section.
 SECTIONS = {"type": b"\x01\x04\x01\x60\x00\x00", "name": b"\x00\x07\x04name\x01\x00", "other": b"\x00\x06\x05other"}
 PREAMBLE = b"\0asm\x01\0\0\0"

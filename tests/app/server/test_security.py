@@ -19,6 +19,8 @@ from beliefscope.app.server.auth import Access
 from beliefscope.app.server.main import create_app
 from beliefscope.app.server.security import MAX_BODY, Guard
 
+pytestmark = pytest.mark.slow
+
 JSON = {"content-type": "application/json"}
 
 

@@ -15,6 +15,8 @@ from starlette.types import Receive, Scope, Send
 from beliefscope.app.server import main, timeouts
 from beliefscope.app.server.timeouts import MAX_FRAMES, HTTPProtocol, WebSocketProtocol
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 20.0
 UPGRADE = (
     "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"

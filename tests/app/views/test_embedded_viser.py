@@ -27,6 +27,8 @@ from beliefscope.app.views.embedded_viser import MAX_CLIENTS, EmbeddedViser
 from beliefscope.app.views.registry import Views
 from beliefscope.datasets.errors import BadInput
 
+pytestmark = pytest.mark.slow
+
 PROTOCOL = f"viser-v{viser.__version__}"
 
 

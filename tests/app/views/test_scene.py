@@ -20,6 +20,8 @@ from beliefscope.inspect.diagnostics.plotting import colour_table
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace, trace
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def run() -> Trace:

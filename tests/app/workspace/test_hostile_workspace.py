@@ -19,6 +19,8 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace.json_files import content
 
+pytestmark = pytest.mark.slow
+
 TIMEOUT = 60.0  # s
 REPORT = "door-crossmodal-ekf-episode{}-0123abcd"
 RECORDS = (

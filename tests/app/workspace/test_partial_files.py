@@ -20,6 +20,8 @@ from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.write import write_recording
 
+pytestmark = pytest.mark.slow
+
 
 def aged(path: Path, seconds: float) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)

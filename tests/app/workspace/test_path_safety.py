@@ -20,6 +20,8 @@ from beliefscope.app.jobs.queue import Job
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace.paths import file_within
 
+pytestmark = pytest.mark.slow
+
 SECRET = "outside the workspace"
 UNSAFE_NAMES = (
     "..",

@@ -20,6 +20,8 @@ from beliefscope.datasets.readers.hdf5_guard import SAMPLES, open_hdf5, probe
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def valid(tmp_path: Path) -> Path:

@@ -16,6 +16,8 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.collect import collect
 from beliefscope.datasets.store import open_dataset
 
+pytestmark = pytest.mark.slow
+
 COLLECT = """
 import sys
 from beliefscope.datasets.simulation.collect import collect

@@ -24,6 +24,8 @@ from beliefscope.filters.finetuning.slices import CLEAN, Slice
 from beliefscope.filters.training import losses
 from beliefscope.filters.training.encoder_cache import cached_encoders, index_images
 
+pytestmark = pytest.mark.slow
+
 DARK = Slice("dark", Faults.parse("blackout=1"), only=("haptics",))
 TOUCH = Slice("touch", contact=True)
 SMALL = FineTune(

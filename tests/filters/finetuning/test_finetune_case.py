@@ -14,6 +14,8 @@ from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import Slice
 
+pytestmark = pytest.mark.slow
+
 BIAS = Slice("bias", Faults.parse("force_bias=5:y=5"), only=("haptics",))
 DARK = Slice("dark", Faults.parse("blackout=0.95"))
 DAMAGE = FineTune(train=("haptics-only",), mix=((BIAS, 1.0),), clean_weight=0.0, l2_sp=0.0, rate=1e-3, steps=300)

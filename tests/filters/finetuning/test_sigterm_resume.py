@@ -26,6 +26,8 @@ from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.training.plan import PLANS
 from beliefscope.filters.training.train import train
 
+pytestmark = pytest.mark.slow
+
 MAKE = """
 import sys, torch
 from pathlib import Path

@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy.stats import chi2
 
 from beliefscope.app.cli.main import main
 from beliefscope.datasets.catalog import find_task
@@ -36,6 +35,8 @@ from beliefscope.filters.training.plan import BLACKOUTS
 from beliefscope.filters.training.study import Cell, run_cell, run_ray
 from beliefscope.filters.training.study_table import TRIVIAL, Row, rows_of
 from beliefscope.recordings.study_figures import bar_styles, results
+
+pytestmark = pytest.mark.slow
 
 FILTERS = ("haptics-ekf", "lstm")
 NAMES = [f"door/{name}/seed{seed}" for seed in range(2) for name in FILTERS]
@@ -163,6 +164,8 @@ def test_tables_contain_the_results_of_the_cells(finished: Path) -> None:
             if key != "seconds":
                 assert f"{mean:.2f} ± {spread:.2f}" in markdown
         bounds = [row["nees_low"], row["nees_high"]]
+        from scipy.stats import chi2
+
         expected = [chi2.ppf(q, 6) / 6 for q in (0.025, 0.975)]  # 3 components, 2 test trajectories
         if row["filter"] == "lstm":
             assert bounds == ["", ""]

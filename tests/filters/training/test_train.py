@@ -22,6 +22,8 @@ from beliefscope.filters.training.plan import PLANS, Plan
 from beliefscope.filters.training.stages import ALL_PARAMETERS, IMAGES, Trainer, seed_name
 from beliefscope.filters.training.train import train
 
+pytestmark = pytest.mark.slow
+
 SMOKE = PLANS["smoke"]
 NAMES = tuple(filters_of(find_task("door")))
 KINDS = ("crossmodal-ekf", "crossmodal-pf", "crossmodal-ukf", "feature-pf", "lstm")

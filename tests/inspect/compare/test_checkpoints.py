@@ -31,6 +31,8 @@ from beliefscope.inspect.statistics.measures import position_error
 from beliefscope.inspect.trace import trace
 from beliefscope.inspect.traces.replay import Edit, Replay
 
+pytestmark = pytest.mark.slow
+
 EPISODES = (9, 19, 29, 39, 49, 59)
 """Held-out episodes, enough for intervals."""
 

@@ -16,6 +16,8 @@ from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 from beliefscope.inspect.compare.lineage import export, lineage_of
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[[str], tuple[int, str, str]]
 ROOT = shipped("door", "crossmodal-ekf")
 

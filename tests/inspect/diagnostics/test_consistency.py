@@ -10,9 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, kstest, norm
-from statsmodels.stats.diagnostic import acorr_ljungbox
-from uncertainty_toolbox.metrics_scoring_rule import crps_gaussian
 
 from beliefscope.inspect.diagnostics.consistency import Consistency, consistency
 from beliefscope.inspect.statistics.calibration import (
@@ -61,6 +58,8 @@ def test_nll_of_a_consistent_filter_is_the_entropy(exact: Consistency) -> None:
 
 @pytest.mark.parametrize(("scale", "prefix"), [(0.25, "Over"), (4.0, "Under")])
 def test_scaled_covariances_are_over_or_underconfident(exact: Consistency, scale: float, prefix: str) -> None:
+    from scipy.stats import chi2
+
     result = consistency(plant.simulated(scale=scale))
     assert re.match(rf"{prefix}confident by a factor of (1\.9|2|2\.1) ", result.verdict)
     for layer in result.layers:
@@ -156,6 +155,9 @@ def test_exact_particle_set_is_calibrated() -> None:
 
 
 def test_crps_of_a_gaussian() -> None:
+    from scipy.stats import norm
+    from uncertainty_toolbox.metrics_scoring_rule import crps_gaussian
+
     rng = np.random.default_rng(0)
     error, deviation = rng.normal(size=200), rng.uniform(0.2, 3.0, 200)
     theirs = crps_gaussian(np.zeros(200), deviation, -error)
@@ -170,6 +172,8 @@ def test_crps_of_a_gaussian() -> None:
 
 
 def test_crps_of_particles() -> None:
+    from scipy.stats import norm
+
     rng = np.random.default_rng(1)
     x, w = rng.normal(size=(4, 40)), rng.dirichlet(np.full(40, 0.3), 4)
     pairs = (w[:, :, None] * w[:, None] * np.abs(x[:, :, None] - x[:, None])).sum((1, 2))
@@ -189,6 +193,8 @@ def test_crps_of_particles() -> None:
 
 
 def test_levels_are_uniform_for_an_exact_distribution() -> None:
+    from scipy.stats import kstest
+
     rng = np.random.default_rng(2)
     covariance = np.diag(np.square(plant.SCALE))
     error = rng.multivariate_normal(np.zeros(3), covariance, 300)
@@ -201,6 +207,8 @@ def test_levels_are_uniform_for_an_exact_distribution() -> None:
 
 
 def test_ljung_box_is_that_of_statsmodels() -> None:
+    from statsmodels.stats.diagnostic import acorr_ljungbox
+
     rng = np.random.default_rng(4)
     series = np.stack([rng.normal(size=80), np.cumsum(rng.normal(size=80))], axis=1)
     statistic, correlation = ljung_box(series)

@@ -30,6 +30,8 @@ from beliefscope.recordings.report.page import mathml
 from beliefscope.recordings.report.sections import accuracy, event_table, worst_events
 from beliefscope.recordings.report.text import definitions, methods
 
+pytestmark = pytest.mark.slow
+
 EPISODE = 9
 TITLE = 'Doors <script>alert("1")</script> & 40 %'
 

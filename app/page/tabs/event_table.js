@@ -1,0 +1,215 @@
+/** Table of failure events, the worst first; each row moves the cursor, and has a permalink. */
+
+/** @import { FailureEvent, FailureScore, Failures } from '../types/server.js' */
+
+import { copyText } from '../core/clipboard.js';
+import { create, element } from '../core/dom.js';
+import { fixed, percent, significant } from '../core/units.js';
+import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
+import { displayUnit, formatScore } from './failure_scores.js';
+
+/**
+ * @typedef {object} EventColumn
+ * @property {string} title
+ * @property {string} [help]
+ * @property {boolean} [number]
+ * @property {(event: FailureEvent) => string} content
+ * @property {(event: FailureEvent) => string} [hint]
+ */
+/** @typedef {{event: FailureEvent, row: HTMLTableRowElement, button: HTMLButtonElement}} EventRow */
+
+const COPIED_TIME = 1500; // ms
+const LINK_ICON =
+  '<svg viewBox="0 0 16 16" aria-hidden="true"><path d="m6.3 9.7 3.4-3.4M7 4.6l1.4-1.3a2.9 2.9 0 0 1 4.2 4.1L11.2 8.8M9 11.4l-1.4 1.3a2.9 2.9 0 0 1-4.2-4.1L4.8 7.2"/></svg>';
+
+export class EventTable {
+  #table;
+  #open;
+  /** @type {EventRow[]} */
+  #rows = [];
+
+  /**
+   * @param {HTMLTableElement} table
+   * @param {(event: FailureEvent, inputTime: number) => void} open
+   */
+  constructor(table, open) {
+    this.#table = table;
+    this.#open = open;
+    navigateRows(element('tbody', HTMLTableSectionElement, table));
+  }
+
+  /**
+   * @param {Failures | undefined} failures
+   * @param {FailureScore | undefined} score
+   * @param {FailureEvent[]} events
+   */
+  show(failures, score, events) {
+    const columns = failures && score?.events ? eventColumns(failures, score, score.events) : [];
+    const headings = columns.map(({ title, help = '', number }) =>
+      create('th', {
+        scope: 'col',
+        className: number ? 'number' : '',
+        textContent: title,
+        title: help,
+      }),
+    );
+    const head = create('tr', {}, ...headings, create('th', { scope: 'col', ariaLabel: 'Link' }));
+    const section = element('thead', HTMLTableSectionElement, this.#table);
+    section.replaceChildren(...(columns.length ? [head] : []));
+    this.#rows = score ? events.map((event, i) => this.#row(columns, event, score, i)) : [];
+    const body = element('tbody', HTMLTableSectionElement, this.#table);
+    body.replaceChildren(...this.#rows.map(({ row }) => row));
+  }
+
+  /**
+   * Highlights the events at the cursor.
+   * @param {(event: FailureEvent) => boolean} isCurrent
+   */
+  mark(isCurrent) {
+    for (const { event, row, button } of this.#rows) {
+      const current = isCurrent(event);
+      if (current !== row.classList.contains('here')) markRow(row, button, current);
+    }
+  }
+
+  /**
+   * Scrolls to an event.
+   * @param {number} index
+   */
+  point(index) {
+    if (!this.#table.checkVisibility()) return;
+    setTabStop(this.#rows[index].row, this.#table.contains(document.activeElement));
+  }
+
+  /**
+   * @param {EventColumn[]} columns the first one contains the button
+   * @param {FailureEvent} event
+   * @param {FailureScore} score
+   * @param {number} i place in the table
+   * @returns {EventRow}
+   */
+  #row(columns, event, score, i) {
+    const { episode, step, phase } = event;
+    const row = document.createElement('tr');
+    const button = create('button', {
+      type: 'button',
+      className: 'title',
+      textContent: columns[0].content(event),
+      ariaLabel: `Episode ${episode}, step ${step}: ${score.title} ${formatScore(score, event.value)}, ${phase}`,
+    });
+    button.addEventListener('click', ({ timeStamp }) => this.#open(event, timeStamp));
+    columns.forEach(({ content, hint, number }, c) => {
+      const cell = row.insertCell();
+      if (number) cell.className = 'number';
+      if (hint) cell.title = hint(event);
+      cell.append(c ? content(event) : button);
+    });
+    const link = linkButton(event);
+    button.tabIndex = link.tabIndex = i ? -1 : 0;
+    row.insertCell().append(link);
+    return { event, row, button };
+  }
+}
+
+/**
+ * Highlights a row of a table, also for screen readers.
+ * @param {HTMLTableRowElement} row
+ * @param {HTMLButtonElement} button of the row
+ * @param {boolean} current
+ */
+export function markRow(row, button, current) {
+  row.classList.toggle('here', current);
+  if (current) button.setAttribute('aria-current', 'true');
+  else button.removeAttribute('aria-current');
+}
+
+/**
+ * Creates the button that copies the permalink of an event.
+ * @param {FailureEvent} event
+ */
+function linkButton({ episode, step, link }) {
+  const title = `Copy link to episode ${episode}, step ${step}`;
+  const button = create('button', {
+    type: 'button',
+    className: 'quiet link',
+    innerHTML: LINK_ICON,
+    title,
+    ariaLabel: title,
+  });
+  button.addEventListener('click', async () => {
+    const success = await copyText(new URL(link, location.href).href);
+    button.textContent = success ? '✓' : 'not permitted';
+    setTimeout(() => (button.innerHTML = LINK_ICON), COPIED_TIME);
+  });
+  return button;
+}
+
+/**
+ * @param {Failures} failures
+ * @param {FailureScore} score
+ * @param {FailureEvent[]} events all events of the score
+ * @returns {EventColumn[]}
+ */
+function eventColumns({ layers }, score, events) {
+  const { unit, scale } = displayUnit(score.unit);
+  const number = true;
+  /** @type {EventColumn[]} */
+  const columns = [
+    { title: 'episode', content: ({ episode }) => String(episode) },
+    {
+      title: 'step',
+      content: ({ step }) => String(step),
+      number,
+      hint: ({ first, last }) => `Worst of steps ${first} to ${last}`,
+    },
+    {
+      title: unit ? `${score.title} ${unit}` : score.title,
+      content: ({ value }) => significant(value === null ? null : scale * value),
+      number,
+    },
+    {
+      title: 'phase',
+      content: ({ phase }) => phase,
+      hint: ({ phase, other_phases: others }) => [phase, ...others].join(', '),
+    },
+  ];
+  const modalities = layers.slice(0, -1); // the last layer is the fused estimate
+  const fuses = modalities.length > 1;
+  layers.forEach((layer, i) => {
+    if (layer === 'fused' ? score.name === 'error' : !fuses) return;
+    columns.push({
+      title: `${fuses ? layer : 'error'} cm`,
+      content: ({ error }) => centimetres(error[i]),
+      number,
+      help: 'Position error',
+    });
+  });
+  if (score.name !== 'nees' && events[0]?.nees !== null)
+    columns.push({
+      title: 'NEES',
+      content: ({ nees }) => fixed(nees),
+      number,
+      help: 'Normalized estimation error squared: mean 1 if the covariance is consistent',
+    });
+  if (fuses && events[0]?.effective_weights)
+    columns.push({
+      title: 'dominant',
+      content: (event) => dominantModality(modalities, event),
+      help: 'Modality with the largest effective weight (mean over the components)',
+    });
+  return columns;
+}
+
+/** @param {number | null | undefined} metres */
+export const centimetres = (metres) =>
+  fixed(metres === null || metres === undefined ? null : 100 * metres, 2);
+
+/**
+ * @param {string[]} modalities
+ * @param {FailureEvent} event
+ */
+function dominantModality(modalities, { effective_weights: weights }) {
+  const values = (weights ?? []).map(Number);
+  const largest = values.indexOf(Math.max(...values));
+  return `${modalities[largest]} ${percent(values[largest])}`;
+}

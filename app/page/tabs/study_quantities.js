@@ -1,0 +1,76 @@
+/** Quantities of a study, and the failures that explain them. */
+
+/** @import { State } from '../core/state.js' */
+/** @import { StudyRow, Task } from '../types/server.js' */
+
+import { displayName, percent } from '../core/units.js';
+
+/**
+ * @typedef {object} Quantity
+ * @property {string} key of the study's metrics
+ * @property {string} component state component; empty for NEES
+ * @property {string} title
+ * @property {string} unit
+ * @property {string} description
+ */
+
+const POSITION = 'position_cm';
+
+/**
+ * Returns the quantities of a study for a task: the RMSE of the position and of other components, and NEES.
+ * @param {StudyRow[]} rows
+ * @param {Task} task
+ * @returns {Quantity[]}
+ */
+export function studyQuantities(rows, task) {
+  const keys = new Set(rows.flatMap((row) => Object.keys(row.mean)));
+  const errors = [...keys].flatMap((key) => {
+    const [, component, unit] = /^(.*)_(cm|deg)$/.exec(key) ?? [];
+    return component ? [{ key, component, unit: unit === 'deg' ? '°' : unit }] : [];
+  });
+  errors.sort((a, b) => Number(b.key === POSITION) - Number(a.key === POSITION));
+  const position = displayName(task.map.x).replace(/(^| )x$/, '') || 'position';
+  const quantities = errors.map((error) => {
+    const isPosition = error.key === POSITION;
+    const name = displayName(error.component);
+    return {
+      ...error,
+      title: isPosition ? position : name,
+      description: `RMSE of the ${isPosition ? 'position' : name}`,
+    };
+  });
+  if (rows.some((row) => typeof row.mean.nees === 'number'))
+    quantities.push({ key: 'nees', component: '', title: 'NEES', unit: '', description: 'NEES/n' });
+  return quantities;
+}
+
+/**
+ * Returns the changes of the state that list the failures of a filter at a share of image blackout.
+ * @param {State} state
+ * @param {Task} task
+ * @param {string} filter
+ * @param {number | null} blackout
+ * @param {Quantity} quantity ranks the failures
+ * @returns {Partial<State>}
+ */
+export function failuresOf(state, task, filter, blackout, { key, component }) {
+  const isAngle = task.components.some(({ name, unit }) => name === component && unit === 'rad');
+  const isNees = key === 'nees';
+  return {
+    task: task.name,
+    filter,
+    data: state.task === task.name ? state.data : task.data[0].name,
+    faults: blackout ? `blackout=${blackout}` : '',
+    against: '',
+    tab: 'failures',
+    list: 'events',
+    among: 'held-out',
+    by: isNees ? 'nees' : isAngle ? component : 'error',
+    phase: '',
+    component: isAngle ? component : task.map.x,
+    track: isNees ? 'nees' : 'error',
+  };
+}
+
+/** @param {number | null} share */
+export const blackoutLabel = (share) => `${percent(share)} blackout`;
