@@ -172,7 +172,7 @@ def serve(
             log.info("started", extra={"event": event})
             on_start(access.link(url))
 
-        # A response passes through several threads, each of which may wait this long for the GIL; the default is 5 ms.
+        # A response passes through several threads, which may each wait this long for the GIL; the default is 5 ms.
         sys.setswitchinterval(0.001)
         _Server(_uvicorn_config(app), started).run(sockets=[listener])
         log.info("stopped", extra={"event": {"url": url}})

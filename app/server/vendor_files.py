@@ -1,6 +1,6 @@
 """Browser code of other projects (Rerun's viewer and uPlot), served from their installed wheels.
 
-Rerun's viewer is 67 MB of WebAssembly, of which a third are function names for debuggers. It is served without them
+Rerun's viewer is 67 MB of WebAssembly, and a third of it are function names for debuggers. It is served without them
 and, once that is ready, brotli-compressed; both files are cached in the workspace.
 """
 

@@ -1,4 +1,4 @@
-"""Path checks for files that are addressed by a name from outside."""
+"""Path checks for files that are addressed by a name from requests."""
 
 from __future__ import annotations
 

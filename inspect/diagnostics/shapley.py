@@ -192,7 +192,7 @@ class Shapley(Diagnostic):
 
 
 def input_modalities(filter_: Filter) -> tuple[str, ...]:
-    """Input modalities of a filter, including those that share a model."""
+    """Input modalities of a filter, including modalities with a shared model."""
     return tuple(dict.fromkeys(modality for model in filter_.names for modality in model.split("+")))
 
 

@@ -23,7 +23,7 @@ class Mesh:
     Attributes:
         vertices: (V, 3) m.
         normals: (V, 3) outward unit normals.
-        faces: (F, 3) vertex indices, counter-clockwise from outside.
+        faces: (F, 3) vertex indices, counter-clockwise seen from the exterior.
         rgba: (4,) 0..1.
     """
 
@@ -49,7 +49,7 @@ def mesh_of(shape: Shape) -> Mesh:
 
 
 def hull_faces(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """(F, 3) faces of the convex hull of points (V, 3), counter-clockwise from outside."""
+    """(F, 3) faces of the convex hull of points (V, 3), counter-clockwise seen from the exterior."""
     hull = ConvexHull(points)
     a, b, c = np.moveaxis(points[hull.simplices], 1, 0)
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0.0

@@ -15,9 +15,9 @@ READY = "() => document.querySelector('#failures').dataset.state === 'ready'"
 def open_results(open_page: Any, parameters: str = "", **options: Any) -> Any:
     """The tab with results. The search is started unless an earlier test has done it."""
     page = open_page(TAB + parameters, **options)
-    page.until("() => ['unasked', 'ready'].includes(document.querySelector('#failures').dataset.state)")
-    if page.page.locator("#failures").get_attribute("data-state") == "unasked":
-        page.page.get_by_role("button", name="Look for failures").click()
+    page.until("() => ['absent', 'ready'].includes(document.querySelector('#failures').dataset.state)")
+    if page.page.locator("#failures").get_attribute("data-state") == "absent":
+        page.page.get_by_role("button", name="Search for failures").click()
     page.until(READY)
     return page
 
@@ -50,7 +50,7 @@ def test_event_is_opened_and_shared_by_permalink(open_page: Any) -> None:
     wait_for_step(page, second["episode"], second["step"])
     page.page.keyboard.press("b")
     wait_for_step(page, worst["episode"], worst["step"])
-    page.page.get_by_text("angle", exact=True).first.click()  # another measure, which the timeline shows as well
+    page.page.get_by_text("angle", exact=True).first.click()  # another score, which the timeline shows as well
     page.until("() => location.search.includes('by=angle')")
     assert page.state["component"] == "angle"
     assert rows.count() == scores["angle"]["total"]
@@ -109,10 +109,10 @@ def test_episodes_are_sorted_and_opened(open_page: Any) -> None:
 
 def test_episodes_are_listed_before_the_search(open_page: Any) -> None:
     page = open_page("?tab=failures&list=episodes&filter=image-ekf&among=all")
-    page.until("() => document.querySelector('#failures').dataset.state === 'unasked'")
+    page.until("() => document.querySelector('#failures').dataset.state === 'absent'")
     catalog = page.page.request.get(f"{page.url}api/catalog").json()
     (door,) = (task for task in catalog["tasks"] if task["name"] == "door")
     assert column(page, "episode") == [str(episode["index"]) for episode in door["data"][0]["episodes"]]
     assert set(column(page, "worst cm")) == {"\N{EN DASH}"}
     page.page.keyboard.press("n")  # without events the key opens the search
-    assert page.page.get_by_role("button", name="Look for failures").is_visible()
+    assert page.page.get_by_role("button", name="Search for failures").is_visible()

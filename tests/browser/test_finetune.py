@@ -1,4 +1,4 @@
-"""Fine-tune tab: a short run, its results, promotion to the default and rollback."""
+"""Fine-tune tab: a short run, its results, promotion to the default, and removal."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ def test_filter_is_finetuned_promoted_and_discarded(open_page: Any, start_server
     page.until("() => document.querySelectorAll('#finetune .tree li').length > 20")
     assert "26,054 of 449,097" in panel.locator(".count").text_content()
     panel.get_by_label("Train virtual_sensors.haptics", exact=True).uncheck()
-    assert panel.locator("select[name=preset]").input_value() == "own"
+    assert panel.locator("select[name=preset]").input_value() == "custom"
     panel.get_by_role("button", name="Fine-tune").click()
     assert "nothing to train" in panel.locator(".error").text_content()
-    panel.get_by_label("Show what is in virtual_sensors.haptics", exact=True).click()
+    panel.get_by_label("Expand virtual_sensors.haptics", exact=True).click()
     panel.get_by_label("Train virtual_sensors.haptics.state", exact=True).check()
-    panel.locator("select[name=slice]").select_option("haptics alone")
+    panel.locator("select[name=slice]").select_option("haptics only")
     for name, value in (("steps", "3"), ("length", "8")):
         panel.locator(f"input[name={name}]").fill(value)
     page.screenshot("finetune-form")
     panel.get_by_role("button", name="Fine-tune").click()
     page.until(f"() => {STATE} === 'ready'", 180.0)  # training, and evaluation of both filters on all held-out episodes
     assert page.state["run"]
-    assert "; damages " in panel.locator(".verdict").text_content()
-    assert panel.locator("h3").text_content() == "crossmodal-ekf: virtual_sensors.haptics.state on haptics alone"
+    assert "; regressed" in panel.locator(".verdict").text_content()
+    assert panel.locator("h3").text_content() == "crossmodal-ekf: virtual_sensors.haptics.state on haptics only"
     assert "virtual sensors.image" in panel.get_by_label("Modules", exact=True).last.text_content()
     page.until("() => document.querySelectorAll('#finetune .live canvas').length === 2")
     page.screenshot("finetune")
 
     before = page.page.evaluate(FILTERS)
     with page.page.expect_navigation():
-        panel.get_by_role("button", name="Accept").click()
+        panel.get_by_role("button", name="Promote to default").click()
     page.until(f"{SELECTED} !== 'crossmodal-ekf'")
     finetuned = page.state["filter"]
     assert page.page.evaluate(FILTERS) == [finetuned, *before]
     with page.page.expect_navigation():
-        panel.get_by_role("button", name="Roll back").click()
+        panel.get_by_role("button", name="Discard").click()
     page.until(f"{SELECTED} === 'crossmodal-ekf'")
     assert page.page.evaluate(FILTERS) == before

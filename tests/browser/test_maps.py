@@ -113,7 +113,7 @@ def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
     page = open_page(LINK)
     plain = page.maps()
     page.page.locator("#maps-view").click()
-    for option, value in [("scale", "log"), ("range", "same"), ("axes", "world"), ("cloud", "images")]:
+    for option, value in [("scale", "log"), ("range", "same"), ("axes", "world"), ("cloud", "shown")]:
         before = page.maps()
         page.page.locator(f"#maps-{option} label", has=page.page.locator(f"[value={value}]")).click()
         page.until(f"() => location.search.includes('{option}={value}')")

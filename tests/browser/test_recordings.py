@@ -96,19 +96,19 @@ def test_recordings_are_renamed_searched_restored_and_compared(open_page: Callab
 
     for name in ("best run.rrd", other):
         tab.row(name).get_by_role("checkbox").check()
-    page.get_by_role("button", name="Compare the runs").click()
+    page.get_by_role("button", name="Compare runs").click()
     tab.page.until("() => document.querySelector('#compare .verdict')?.textContent.includes('image-ekf')")
     state = tab.page.state
     assert (state["task"], state["filter"], state["against"]) == ("push", "crossmodal-ekf", "filter=image-ekf")
 
     page.keyboard.press("r")
-    page.get_by_role("button", name="Both in Rerun").click()
+    page.get_by_role("button", name="Open both in Rerun").click()
     tab.page.until("() => document.querySelector('#rerun').dataset.state === 'ready'")
     tab.page.until("async () => (await beliefscope.rerun.getState()).recordings.length === 2")
     for theme in ("light", "dark"):
         page.emulate_media(color_scheme=theme)
         assert tab.page.violations() == [], f"Rerun tab, {theme}"
-    page.get_by_role("button", name="Back to the run").click()
+    page.get_by_role("button", name="Back to the current run").click()
     tab.page.until("async () => (await beliefscope.rerun.getState()).recordings.length === 1", RECORDING_TIMEOUT)
     page.keyboard.press("r")
     page.locator("#recordings .automatic").wait_for()

@@ -18,14 +18,14 @@ def test_bar_opens_the_largest_error(open_page: Any) -> None:
     labels = panel.locator(".chart a").evaluate_all(LABELS)
     assert len(labels) == len(rows) - 1  # the training mean is a line
     for label, linked in labels:
-        name, black = label.split(": ")[0].split(", ")
-        row = rows[name, int(black.split()[0]) / 100]
-        each = ", ".join(f"seed {seed} {numbers['position_cm']:.2f}" for seed, numbers in row["each"].items())
-        assert f": {row['mean']['position_cm']:.2f} ± {row['spread']['position_cm']:.2f} cm ({each}); " in label
+        name, share = label.split(": ")[0].split(", ")
+        row = rows[name, int(share.split()[0]) / 100]
+        seeds = ", ".join(f"seed {seed} {numbers['position_cm']:.2f}" for seed, numbers in row["by_seed"].items())
+        assert f": {row['mean']['position_cm']:.2f} ± {row['spread']['position_cm']:.2f} cm ({seeds}); " in label
         assert linked == (name not in ("crossmodal-ukf", "lstm")) == label.endswith("opens the worst events of seed 0")
 
     head = panel.locator("thead button")
-    head.get_by_text("80 % black").click()
+    head.get_by_text("80 % blackout").click()
     sorted_ = panel.locator("tbody tr th").all_text_contents()
     means = [rows[name, 0.8]["mean"]["position_cm"] for name in sorted_[:-1]]
     assert (means, sorted_[-1]) == (sorted(means), "training mean")
@@ -38,7 +38,7 @@ def test_bar_opens_the_largest_error(open_page: Any) -> None:
     first.focus()
     page.page.keyboard.press("ArrowDown")  # the same filter with 40 % image blackout
     focused = page.page.evaluate("() => document.activeElement.getAttribute('aria-label')")
-    assert focused.startswith("crossmodal-ekf, 40 % black")
+    assert focused.startswith("crossmodal-ekf, 40 % blackout")
     page.page.keyboard.press("Enter")
     page.until("() => document.querySelector('#failures').dataset.state === 'ready'", 120.0)
     address = f"{page.url}api/failures/door/crossmodal-ekf?faults=blackout%3D0.4&among=held-out"

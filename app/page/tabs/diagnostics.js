@@ -178,7 +178,7 @@ export class Diagnostics {
   }
 
   /**
-   * Updates the states of jobs, and requests the results of those that are done.
+   * Updates the states of jobs, and requests the results of finished jobs.
    * @param {Job[]} jobs
    */
   #updateJobs(jobs) {

@@ -66,3 +66,37 @@ export interface JobReply {
 export interface StartedJob {
   job: Job;
 }
+
+/** Settings of a fine-tuning. mix: data slices to train on. train: presets and modules; events: episodes and steps. */
+export interface FineTuneSettings {
+  train: string[];
+  clean_weight: number;
+  steps: number;
+  length: number;
+  rate: number;
+  l2_sp: number;
+  seed: number;
+  mix: { slice: Pick<api.SliceInfo, 'name'>; share: number }[];
+  events: string[];
+}
+
+export interface FineTuneRunInfo extends Omit<api.FineTuneRunInfo, 'settings' | 'job'> {
+  settings: FineTuneSettings;
+  job: Job | null;
+}
+
+export interface FineTuneOffer extends Omit<api.FineTuneOffer, 'settings' | 'runs'> {
+  settings: FineTuneSettings;
+  runs: FineTuneRunInfo[];
+}
+
+export interface FineTuneProgress extends Omit<api.FineTuneProgress, 'validations'> {
+  validations: (Omit<api.ValidationInfo, 'slices'> & {
+    slices: Record<string, { rmse: Record<string, number | null> }>;
+  })[];
+}
+
+export interface FineTuneDetails extends FineTuneRunInfo {
+  progress: FineTuneProgress | null;
+  result: api.FineTuneResult | null;
+}

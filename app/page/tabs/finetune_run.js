@@ -1,0 +1,207 @@
+/** A fine-tuning run: progress, verdict, decision about the checkpoint, and the changes in detail. */
+
+/** @import { Store } from '../core/state.js' */
+/** @import { Catalog, FineTuneDetails, FineTuneProgress, Job, Plot, RegressionEvent, ResultViews, Task } from '../types/server.js' */
+
+import { create, element, html } from '../core/dom.js';
+import { displayName, fixed } from '../core/units.js';
+import { Figures } from '../widgets/figures.js';
+import { isActive, jobSummary } from '../widgets/jobs.js';
+import { trainingData } from './finetune_form.js';
+
+/** @typedef {'promote' | 'save' | 'discard'} Decision */
+
+const SAVED_AS = {
+  saved: 'The fine-tuned checkpoint is in the catalog, next to its base checkpoint.',
+  default: 'The fine-tuned checkpoint is in the catalog, as the default filter of this server.',
+};
+const RESUMES = 'It resumes from its last validation.';
+
+const BODY = `
+  <div class="row"><button type="button" class="text quiet back">‹ New run</button><h3></h3></div>
+  <p class="verdict" aria-live="polite"></p>
+  <div class="row doing"><progress aria-label="Progress of the fine-tuning" max="1"></progress><button type="button" class="text">Pause</button></div>
+  <div class="row decide"></div>
+  <div class="figures live"></div>
+  <section class="events" hidden><h4>Events that regressed (cm)</h4><ol></ol></section>
+  <div class="figures report"></div>`;
+
+export class FinetuneRun {
+  #host;
+  #catalog;
+  #handlers;
+  #progress;
+  #report;
+
+  /**
+   * @param {HTMLElement} host
+   * @param {Catalog} catalog
+   * @param {Store} store
+   * @param {{back: () => void, pauseOrResume: () => void, decide: (decision: Decision, link?: string) => void}} handlers
+   *   link: to be opened afterwards
+   */
+  constructor(host, catalog, store, handlers) {
+    this.#host = host;
+    this.#catalog = catalog;
+    this.#handlers = handlers;
+    host.innerHTML = BODY;
+    this.#progress = new Figures(html('.live', host), store);
+    this.#report = new Figures(html('.report', host), store);
+    html('.back', host).addEventListener('click', handlers.back);
+    html('.doing button', host).addEventListener('click', handlers.pauseOrResume);
+  }
+
+  redraw() {
+    this.#progress.redraw();
+    this.#report.redraw();
+  }
+
+  /** @param {FineTuneDetails | null} run null hides the panel */
+  show(run) {
+    this.#host.hidden = !run;
+    if (!run) return;
+    const { job, result, progress, settings } = run;
+    const active = isActive(job);
+    const modules = settings.train.map((name) => name.replace('-only', '')).join(', ');
+    html('h3', this.#host).textContent =
+      `${run.filter}: ${modules || 'all'} on ${trainingData(run)}`;
+    this.showVerdict(result ? result.comparison.verdict : stateText(job));
+    const isPaused = job?.state === 'cancelled';
+    this.#host.dataset.state = result ? 'ready' : active || isPaused ? 'active' : 'ended';
+    const controls = html('.doing', this.#host);
+    controls.hidden = Boolean(result);
+    const bar = element('progress', HTMLProgressElement, controls);
+    bar.hidden = !active;
+    bar.value = job?.progress ?? 0;
+    const button = html('button', controls);
+    button.textContent = active ? 'Pause' : 'Resume';
+    button.title = active ? RESUMES : '';
+    this.#drawDecision(run);
+    const task = this.#catalog.tasks.find(({ name }) => name === run.task);
+    this.#progress.show(progress && task ? progressFigures(progress, task) : null, null);
+    this.#report.show(result?.comparison ?? null, null);
+    this.#drawEvents(run, result?.events ?? []);
+  }
+
+  /** @param {string} text */
+  showVerdict(text) {
+    html('.verdict', this.#host).textContent = text;
+  }
+
+  /** @param {FineTuneDetails} run */
+  #drawDecision({ finetuned: name, saved_as: place, result }) {
+    const host = html('.decide', this.#host);
+    host.hidden = !result;
+    if (!result) return;
+    const { best_step: best, steps, seconds } = result.finetuned;
+    const text = place
+      ? SAVED_AS[place]
+      : `${name}: step ${best} of ${steps}, trained in ${fixed(seconds, 0)} s. The base checkpoint is unchanged.`;
+    host.replaceChildren(
+      this.#decisionButton(
+        'promote',
+        'Promote to default',
+        'Use it as the default filter of this server',
+        place === 'default',
+      ),
+      this.#decisionButton('save', 'Save', 'Add it to the catalog', place === 'saved'),
+      this.#decisionButton('discard', 'Discard', 'Remove it from the catalog', place === null),
+      create('span', { textContent: text }),
+    );
+  }
+
+  /**
+   * @param {Decision} decision
+   * @param {string} textContent
+   * @param {string} title
+   * @param {boolean} disabled
+   */
+  #decisionButton(decision, textContent, title, disabled) {
+    const properties = { textContent, title, disabled };
+    const button = create('button', { type: 'button', className: 'text', ...properties });
+    button.addEventListener('click', () => this.#handlers.decide(decision));
+    return button;
+  }
+
+  /**
+   * @param {FineTuneDetails} run
+   * @param {RegressionEvent[]} events
+   */
+  #drawEvents(run, events) {
+    const host = html('.events', this.#host);
+    host.hidden = !events.length;
+    html('ol', host).replaceChildren(
+      ...events.map((event) => {
+        const { episode, step, only, slice, contact, before, after } = event;
+        const comparison = only.length ? `${only.join(' + ')} only` : 'the base checkpoint';
+        const link = create('a', {
+          href: `/${event.link}`,
+          textContent: `episode ${episode}, step ${step}`,
+          title: `Open with the fine-tuned checkpoint, compared with ${comparison}`,
+        });
+        link.addEventListener('click', (click) => {
+          if (run.saved_as) return;
+          click.preventDefault();
+          this.#handlers.decide('save', link.href); // the link needs it in the catalog
+        });
+        const errors = [before, after].map((error) =>
+          fixed(error === null ? null : 100 * error, 2),
+        );
+        const text = ` ${slice}${contact ? ', contact' : ''}: ${errors.join(' → ')}`;
+        return create('li', {}, link, text);
+      }),
+    );
+  }
+}
+
+/** @param {Job | null} job */
+function stateText(job) {
+  if (!job) return `The job was removed. ${RESUMES}`;
+  return job.state === 'cancelled' ? `Paused. ${RESUMES}` : jobSummary(job);
+}
+
+/**
+ * Returns plots of the training loss and of the validation error of each slice.
+ * @param {FineTuneProgress} progress
+ * @param {Task} task
+ * @returns {ResultViews}
+ */
+function progressFigures({ losses, validations }, task) {
+  const position = displayName(task.map.x).replace(/(^| )x$/, '') || 'position';
+  const slices = validations.length ? Object.keys(validations[0].slices) : [];
+  const loss = { name: '', layer: '', x: losses.map(([step]) => step), y: losses.map((l) => l[1]) };
+  const errors = slices.map((name) => ({
+    name,
+    layer: '',
+    x: validations.map(({ step }) => step),
+    y: validations.map((validation) => validation.slices[name].rmse.position_cm),
+  }));
+  const plots = [
+    linePlot('Loss', '', losses.length ? [loss] : []),
+    linePlot('Validation', `RMSE of the ${position} (cm)`, errors),
+  ];
+  return {
+    verdict: '',
+    curves: [],
+    bands: {},
+    tables: [],
+    images: [],
+    plots: plots.filter(({ lines }) => lines.length),
+  };
+}
+
+/**
+ * @param {string} title
+ * @param {string} label of the y axis
+ * @param {Plot['lines']} lines
+ * @returns {Plot}
+ */
+const linePlot = (title, label, lines) => ({
+  title,
+  x_label: 'step',
+  y_label: label,
+  kind: 'line',
+  diagonal: false,
+  names: [],
+  lines,
+});
