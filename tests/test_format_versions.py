@@ -124,7 +124,7 @@ def test_a_workspace_of_a_later_version_is_readable_and_kept(
         assert responses["jobs"].json() == []
         assert responses["finetune/door/crossmodal-ekf"].json()["runs"] == []
         (problem,) = responses["studies"].json()["problems"]
-        assert "my-study/study.json' does not hold a study's results" in problem
+        assert "my-study/study.json' does not contain the results of a study" in problem
         assert [(run["name"], run["state"]) for run in responses["live"].json()["runs"]] == [("a", "damaged")]
         assert [file["name"] for file in responses["recordings"].json()["recordings"]] == ["a.rrd"]
         store = client.app.state.store  # type: ignore[attr-defined]

@@ -117,12 +117,12 @@ def test_a_table_is_copied_as_csv(open_page: Any) -> None:
 
 def test_slow_diagnostic_survives_a_reload(open_page: Any) -> None:
     page = open_page(f"{TAB}&diagnostic=maps&filter=crossmodal-ekf")
-    page.until("() => document.querySelector('#diagnostics article').dataset.state === 'unasked'")
+    page.until("() => document.querySelector('#diagnostics article').dataset.state === 'absent'")
     page.page.locator(".options input").fill("21")
     page.page.locator(".options input").press("Enter")
     compute = page.page.locator("#diagnostics article").get_by_role("button", name="Compute: Likelihood maps")
     compute.click()
-    page.until("() => document.querySelector('#diagnostics article').dataset.state !== 'unasked'")
+    page.until("() => document.querySelector('#diagnostics article').dataset.state !== 'absent'")
     page.until("() => location.search.includes('options=size%3D21')")
     page.page.reload()
     page.until("() => window.beliefscope?.stats.maps")
@@ -149,7 +149,7 @@ def test_held_out_diagnostic_is_a_job_that_can_be_cancelled(open_page: Any) -> N
     page.until(READY)
     assert page.page.locator(".curves figure").count() > 0
     page.page.get_by_text("all held-out").click()
-    page.until("() => document.querySelector('#diagnostics article').dataset.state === 'unasked'")
+    page.until("() => document.querySelector('#diagnostics article').dataset.state === 'absent'")
     page.until("() => location.search.includes('over=held-out')")
     article = page.page.locator("#diagnostics article")
     article.get_by_role("button", name="Compute").click()

@@ -44,7 +44,7 @@ def test_missing_outputs_are_explained(open_page: Any, start_server: Any, tmp_pa
 
     text("#filter").select_option("mine-EstimateOnly")
     page.until("() => document.querySelector('#heatmaps').dataset.state === 'empty'")
-    assert "does not say how likely others are" in text("#heatmaps .note").text_content()
+    assert "reports no covariance" in text("#heatmaps .note").text_content()
     assert text("#step-summary").text_content().endswith("no predicted standard deviation.")
 
     text("#filter").select_option("mine-Weighted")

@@ -11,9 +11,8 @@ FILTERS = "() => [...document.querySelector('#filter').options].map((option) => 
 
 
 def test_filter_is_finetuned_promoted_and_discarded(open_page: Any, start_server: Callable[..., Any]) -> None:
-    page = open_page(
-        "?tab=finetune&filter=crossmodal-ekf", start_server().url
-    )  # separate server: the test changes the default filter
+    # A separate server, as the test changes the default filter.
+    page = open_page("?tab=finetune&filter=crossmodal-ekf", start_server().url)
     panel = page.page.locator("#finetune")
     page.until("() => document.querySelectorAll('#finetune .tree li').length > 20")
     assert "26,054 of 449,097" in panel.locator(".count").text_content()

@@ -51,9 +51,9 @@ def test_page_follows_a_live_run(open_page: Any, running: Any) -> None:
     page.page.keyboard.press("l")
     page.until(f"() => beliefscope.state().follow && beliefscope.state().step === {NEWEST} && {NEWEST} > {left}")
     page.page.click("#tab-diagnostics")
-    page.until("() => /once it has ended/.test(document.querySelector('#diagnostics .note').textContent)")
+    page.until("() => /when it has ended/.test(document.querySelector('#diagnostics .note').textContent)")
     page.page.click("#tab-failures")
-    page.until("() => document.querySelector('#failures').dataset.state === 'waits'")
+    page.until("() => document.querySelector('#failures').dataset.state === 'live'")
     assert page.page.locator("#failures .doing button").count() == 0
 
     running.kill()

@@ -145,5 +145,5 @@ def test_report_is_created_and_opened(open_page: Callable[..., Any]) -> None:
     report = opened.value
     report.wait_for_load_state()
     assert report.title() == "crossmodal-pf on door"
-    report.get_by_role("link", name="Open this moment in the dashboard").first.click()
+    report.get_by_role("link", name="Open this event in the dashboard").first.click()
     report.wait_for_url("**/?task=door&filter=crossmodal-pf*")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 # Each layer's checkbox, or null where the scene has no such layer.
-BOXES = """() => Object.fromEntries([...document.querySelectorAll('#scene-options > div:not(.places)')].map((row) => {
+BOXES = """() => Object.fromEntries([...document.querySelectorAll('#scene-options > div:not(.viewpoints)')].map((row) => {
   const box = row.querySelector('label > input[type=checkbox]');
   return [box.value, row.hidden ? null : box.checked];
 }))"""
@@ -37,5 +37,5 @@ def test_layers_belong_to_a_view_and_its_permalink(open_page: Any) -> None:
         assert page.page.evaluate("() => document.querySelector('#messages').textContent") == ""
     click(first, "#tab-scene")
     click(first, "#scene-layers")
-    click(first, "#scene-options .places button:nth-of-type(2)")
+    click(first, "#scene-options .viewpoints button:nth-of-type(2)")
     first.screenshot("scene-layers")

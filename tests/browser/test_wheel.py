@@ -46,7 +46,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(environment, with_pip=False, symlinks=True)
     command = [*PIP, f"--python={environment / 'bin' / 'python'}", "install", "--no-deps", "--no-compile", wheel]
     subprocess.run(command, check=True, timeout=120)
-    # .pth files in folders that a .pth file adds are not read: the editable installation of this environment is invisible.
+    # .pth files in a folder added by a .pth file are not read, so the editable installation is invisible.
     (site,) = environment.glob("lib/python3*/site-packages")
     (site / "dependencies.pth").write_text(f"{Path(pytest.__file__).parents[1]}\n")
     return environment / "bin" / "beliefscope"
