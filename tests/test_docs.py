@@ -1,13 +1,16 @@
-"""The documentation says what is so: links lead somewhere, examples run, lists are complete."""
+"""Documentation: links resolve, examples run, lists are complete."""
 
 from __future__ import annotations
 
 import re
 import tomllib
 from html import unescape
+from itertools import chain
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from beliefscope.filters.checkpoint import shipped
 from beliefscope.inspect.palette import COLOURS
@@ -17,16 +20,16 @@ PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_resolve(page: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
     assert not missing
 
 
-def test_files_named_in_the_architecture_exist() -> None:
-    named = re.findall(r"`((?:app|bench|datasets|filters|inspect|recordings|tests)/[\w/.]*)`", architecture())
-    assert len(named) > 10
-    assert not [path for path in named if not (ROOT / path).exists()]
+def test_files_in_the_architecture_exist() -> None:
+    paths = re.findall(r"`((?:app|bench|datasets|filters|inspect|recordings|tests)/[\w/.]*)`", architecture())
+    assert len(paths) > 10
+    assert not [path for path in paths if not (ROOT / path).exists()]
 
 
 def architecture() -> str:
@@ -35,18 +38,15 @@ def architecture() -> str:
 
 def test_every_dependency_is_explained_and_pinned() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = [
-        *project["dependencies"],
-        *(name for extra in project["optional-dependencies"].values() for name in extra),
-    ]
-    names = {re.split(r"[<>=!~\[; ]", requirement)[0] for requirement in wanted} - {"beliefscope"}
+    requirements = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    names = {Requirement(text).name for text in requirements} - {"beliefscope"}  # extras include other extras
     rows = re.findall(r"^\| ([a-z][\w, -]*) \|", (ROOT / "docs" / "dependencies.md").read_text(), re.MULTILINE)
     assert names == {name.strip() for row in rows for name in row.split(",")} - {"package"}
     pinned = re.findall(r"^([\w.-]+)==[\w.]+$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
-    assert not {name.lower() for name in names} - {name.lower() for name in pinned}
+    assert not set(map(canonicalize_name, names)) - set(map(canonicalize_name, pinned))
 
 
-def test_colours_are_the_palette() -> None:
+def test_documented_colours_match_the_palette() -> None:
     table = re.findall(r"^\| (\w+) \| `(#\w{6})` \|$", (ROOT / "docs" / "conventions.md").read_text(), re.MULTILINE)
     assert dict(table) == COLOURS
 
@@ -60,13 +60,13 @@ def test_readme_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert "'fused'" in capsys.readouterr().out
 
 
-def test_the_sheet_of_keys_has_every_key() -> None:
+def test_key_help_is_complete() -> None:
     page = ROOT / "app" / "page"
     (table,) = re.findall(r"  bindKeys\(\{\n(.*?)\n  \}\);", (page / "core" / "controls.js").read_text(), re.DOTALL)
-    does = {key.strip("'") for key in re.findall(r"^    ('.+?'|\w+):", table, re.MULTILINE)}
-    (sheet,) = re.findall(r'<dialog id="keys".*?</dialog>', (page / "index.html").read_text(), re.DOTALL)
-    said = {unescape(key) for key in re.findall(r"<kbd>(.*?)</kbd>", sheet)}
-    called = {
+    keys = {key.strip("'") for key in re.findall(r"^    ('.+?'|\w+):", table, re.MULTILINE)}
+    (dialog,) = re.findall(r'<dialog id="keys".*?</dialog>', (page / "index.html").read_text(), re.DOTALL)
+    documented = {unescape(key) for key in re.findall(r"<kbd>(.*?)</kbd>", dialog)}
+    labels = {
         " ": "space",
         "ArrowLeft": "←",
         "ArrowRight": "→",
@@ -74,5 +74,5 @@ def test_the_sheet_of_keys_has_every_key() -> None:
         "PageDown": "page ↓",
         "-": "\N{MINUS SIGN}",
     }
-    called |= {"Home": "home", "End": "end", "=": "+", "ctrl+z": "ctrl z", "ctrl+y": "ctrl z", "ctrl+shift+z": "shift"}
-    assert {called.get(key, key) for key in does} | {"shift"} == said
+    labels |= {"Home": "home", "End": "end", "=": "+", "ctrl+z": "ctrl z", "ctrl+y": "ctrl z", "ctrl+shift+z": "shift"}
+    assert {labels.get(key, key) for key in keys} | {"shift"} == documented

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 # Each layer's checkbox, or null where the scene has no such layer.
-BOXES = """() => Object.fromEntries([...document.querySelectorAll('#scene-options > div:not(.viewpoints)')].map((row) => {
-  const box = row.querySelector('label > input[type=checkbox]');
-  return [box.value, row.hidden ? null : box.checked];
+BOXES = """() => Object.fromEntries([...document.querySelectorAll('#scene-options input[type=checkbox]')].map((box) => {
+  return [box.value, box.closest('div').hidden ? null : box.checked];
 }))"""
 SELECTED = "() => [...document.querySelectorAll('#scene-options input[type=radio]:checked')].map((e) => e.value)"
 

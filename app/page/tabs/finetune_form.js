@@ -76,7 +76,9 @@ export class FinetuneForm {
     this.#form = form;
     this.#catalog = catalog;
     this.#store = store;
-    form.insertAdjacentHTML('afterbegin', BODY);
+    const body = document.createElement('template');
+    body.innerHTML = BODY;
+    form.prepend(body.content);
     this.#tree = new ModuleTree(html('.tree', form), () => {
       this.#select('preset').value = CUSTOM;
       this.#showCount();

@@ -128,6 +128,7 @@ def test_invalid_results_are_refused(tmp_path: Path, text: str) -> None:
         Study("mine", tmp_path, has_checkpoints=True).read()
 
 
+@pytest.mark.long
 def test_job_trains_unfinished_cells(
     settings: Settings, tmp_path: Path, open_client: Callable[..., TestClient]
 ) -> None:

@@ -116,6 +116,7 @@ def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("beliefscope.recordings.study_figures.write_results", lambda rows, folder: [])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_figures")
 def test_killed_study_resumes_to_the_same_results(data: Path, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "study"

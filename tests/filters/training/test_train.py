@@ -185,6 +185,7 @@ def test_invalid_checkpoint_files(tmp_path: Path) -> None:
         load_checkpoint(other)
 
 
+@pytest.mark.long
 def test_interrupted_training_resumes_to_the_same_weights(episodes: list[Episode], tmp_path: Path) -> None:
     """Interrupted once in each stage, with shared modules, or with an unusable partial file: identical weights."""
     partial = tmp_path / "x.partial"
