@@ -16,6 +16,8 @@ import typer.main
 
 from beliefscope.app.cli.main import COMMANDS, cli, main
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
 OPTIONS = {

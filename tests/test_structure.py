@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("datasets", "filters", "inspect", "recordings", "app")
 MAX_FILE_LINES = 400

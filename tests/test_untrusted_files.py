@@ -24,6 +24,8 @@ from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import load_trace, save_trace, trace
 from beliefscope.recordings.read import read_recording
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 
 READERS: dict[str, Callable[[Path], Any]] = {

@@ -18,6 +18,8 @@ from beliefscope.datasets.readers.hdf5_guard import mark_readable, probe
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
+pytestmark = pytest.mark.slow
+
 STEPS = 7
 
 

@@ -15,6 +15,8 @@ from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint, load_checkpoi
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.trace import trace
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def held_out() -> list[Episode]:

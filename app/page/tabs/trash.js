@@ -12,7 +12,7 @@ const BODY = `
   <summary>Trash</summary>
   <ul></ul>
   <p>
-    <button type="button" class="text empty"></button>
+    <button type="button" class="text empty">Empty trash</button>
     <span class="confirmation" hidden>Delete permanently?
       <button type="button" class="text yes">Delete permanently</button>
       <button type="button" class="text no">Cancel</button>

@@ -67,7 +67,7 @@ export function drawPlot(parent, plot) {
           ...(plot.kind === 'bars' && xs.every(Number.isInteger)
             ? { incrs: [1, 2, 5, 10, 20, 50, 100, 1000] }
             : {}),
-          ...(plot.names.length ? namedTicks(plot.names) : {}),
+          ...(plot.names?.length ? namedTicks(plot.names) : {}),
         },
         {
           ...axisStyle(),

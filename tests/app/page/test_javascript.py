@@ -12,6 +12,8 @@ import pytest
 from beliefscope.app.protocol import page_constants
 from beliefscope.inspect.palette import COLOURS, SPARE_COLOURS
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[3]
 NODE = shutil.which("node")
 

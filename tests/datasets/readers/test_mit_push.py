@@ -33,6 +33,8 @@ from beliefscope.datasets.readers.push_real_task import (
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.store import open_dataset, write_dataset
 
+pytestmark = pytest.mark.slow
+
 REAL = Path(__file__).parents[4] / "shared" / "data" / "mit_push"
 NAME = "motion_surface=plywood_shape={}_a=0_v=100_i=0.000_s=0.500_t={:.3f}.json"
 

@@ -14,6 +14,8 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.readers.hdf5_guard import mark_readable
 from beliefscope.datasets.store import open_dataset, write_dataset
 
+pytestmark = pytest.mark.slow
+
 Arrays = dict[str, np.ndarray]
 
 

@@ -14,6 +14,8 @@ from beliefscope.datasets.simulation.camera import Camera, Image, RayCaster
 from beliefscope.datasets.simulation.door import CAMERA, door_model
 from beliefscope.datasets.simulation.door_physics import DoorPhysics
 
+pytestmark = pytest.mark.slow
+
 SNAPSHOT = """
 import hashlib, mujoco
 from beliefscope.datasets.simulation.camera import RayCaster

@@ -22,6 +22,8 @@ from beliefscope.filters.finetuning.module_selection import (
     select_parameters,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def door(name: str = "crossmodal-ekf") -> Filter:
     return build(architecture("door", name))

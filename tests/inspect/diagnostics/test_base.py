@@ -24,6 +24,8 @@ from beliefscope.inspect.trace import Trace
 sys.path.insert(0, str(Path(__file__).parent))
 import planted_traces as plant
 
+pytestmark = pytest.mark.slow
+
 OF_TRACES = [entry for entry in DIAGNOSTICS.values() if entry.needs == "trace"]
 
 

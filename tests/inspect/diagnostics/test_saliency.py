@@ -26,6 +26,8 @@ from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
 from beliefscope.inspect.traces.replay import Edit, Replay
 
+pytestmark = pytest.mark.slow
+
 BLACK, VISIBLE = 15, 20
 """A step with image blackout and one without, both in contact."""
 

@@ -19,6 +19,8 @@ from beliefscope.inspect.figures import paper
 from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.trace import Trace, trace
 
+pytestmark = pytest.mark.slow
+
 SIZE = 21
 
 

@@ -20,6 +20,8 @@ from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, save_trace, trace, trace_from_arrays
 from beliefscope.inspect.traces.live_file import MARKER, LiveFileReader, LiveFileWriter, load_live
 
+pytestmark = pytest.mark.slow
+
 
 def cut(run: Trace, first: int, last: int) -> Trace:
     """Steps ``first`` to ``last - 1`` of a trace."""

@@ -31,6 +31,8 @@ from beliefscope.recordings.rerun_log.diagnostics import diagnostic_tab, log_dia
 from beliefscope.recordings.schema import SCHEMA, STEP, TIME
 from beliefscope.recordings.write import write_recording
 
+pytestmark = pytest.mark.slow
+
 Chunks = dict[str, dict[str, list[Any]]]
 
 
