@@ -144,6 +144,7 @@ def test_slow_diagnostic_survives_a_reload(open_page: Any) -> None:
     assert page.page.locator(".curves figure").count() >= 2
 
 
+@pytest.mark.long
 def test_held_out_diagnostic_is_a_job_that_can_be_cancelled(open_page: Any) -> None:
     page = open_page(f"{TAB}&diagnostic=weights")
     page.until(READY)

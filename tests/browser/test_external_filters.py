@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "04_own_filter.py"
 FILTERS = """
 import torch
@@ -26,6 +28,7 @@ class Weighted(EstimateOnly):
 """
 
 
+@pytest.mark.long
 def test_missing_outputs_are_explained(open_page: Any, start_server: Any, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(FILTERS)
     filters = [f"{EXAMPLE}:build", f"{tmp_path}/mine.py:EstimateOnly", f"{tmp_path}/mine.py:Weighted"]

@@ -84,6 +84,7 @@ def test_dragging_scrubs(open_page: Any, record_property: Any) -> None:
     assert delays[len(delays) // 2] < 1000  # detects a stalled page; bench/ measures performance
 
 
+@pytest.mark.long
 def test_wheel_zooms_and_double_click_resets(open_page: Any) -> None:
     page = open_page("?step=20")
     box = page.page.locator("#tracks").bounding_box()
@@ -133,6 +134,7 @@ def test_cross_section_angle_changes_the_maps(open_page: Any) -> None:
     page.until("() => beliefscope.state().angle === null")
 
 
+@pytest.mark.long
 def test_image_blackout_is_labelled(open_page: Any) -> None:
     page = open_page("?step=20")
     assert not page.page.locator("#blackout-key").is_visible()
@@ -163,6 +165,7 @@ def test_fault_preset_is_applied_and_removed(open_page: Any) -> None:
     page.until("() => !location.search.includes('faults')")
 
 
+@pytest.mark.long
 def test_custom_faults_are_validated(open_page: Any) -> None:
     custom = "blackout=0.5,force_bias:x=5:from=20"
     page = open_page("?step=40&faults=image_occluded%3D16%3Ax%3D0%3Ay%3D0")

@@ -70,6 +70,7 @@ class RecordingsTab:
         )
 
 
+@pytest.mark.long
 def test_recordings_are_renamed_searched_restored_and_compared(open_page: Callable[..., Any], runs: list[Path]) -> None:
     tab = RecordingsTab(open_page("?tab=recordings"))
     page = tab.page.page

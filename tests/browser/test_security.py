@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import pytest
 
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import shipped
@@ -14,6 +15,7 @@ from beliefscope.filters.checkpoint import shipped
 MARKUP = "<img src=x onerror=window.hacked=1>"
 
 
+@pytest.mark.long
 def test_access_link_opens_a_read_only_page_with_names_as_text(
     browser: Any, start_server: Any, open_page: Any, tmp_path: Path
 ) -> None:
