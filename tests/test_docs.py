@@ -51,6 +51,7 @@ def test_documented_colours_match_the_palette() -> None:
     assert dict(table) == COLOURS
 
 
+@pytest.mark.slow
 def test_readme_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert shipped("door", "crossmodal-pf").is_file()
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
