@@ -2,6 +2,7 @@
 
 /** @import { State } from '../core/state.js' */
 
+import { isAbort } from '../core/dom.js';
 import { loadLiveTrace } from './live_stream.js';
 import { ServerError } from './server_error.js';
 import { Trace } from './trace.js';
@@ -51,7 +52,7 @@ async function request(url, options) {
   try {
     response = await fetch(url, options);
   } catch (error) {
-    if (error instanceof Error && error.name === 'AbortError') throw error;
+    if (isAbort(error)) throw error;
     throw new ServerError('The server does not respond. Is `beliefscope serve` still running?');
   }
   if (response.ok) return response;

@@ -5,7 +5,7 @@
 /** @import { Catalog, Comparison } from '../data/api.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
-import { element, html, messageOf } from '../core/dom.js';
+import { element, html, isAbort, messageOf } from '../core/dom.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
 import { setPanelState } from '../widgets/panel_state.js';
@@ -117,7 +117,7 @@ export class ComparisonTab {
       this.#show(result);
       setPanelState(this.#result, 'ready');
     } catch (error) {
-      if (error instanceof Error && error.name === 'AbortError') return;
+      if (isAbort(error)) return;
       if (!(error instanceof api.ServerError)) console.error(error);
       setPanelState(this.#result, 'error', messageOf(error));
     }

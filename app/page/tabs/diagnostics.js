@@ -5,7 +5,7 @@
 /** @import { DiagnosticResult, Job, TraceDiagnosticInfo } from '../types/server.js' */
 /** @import { Jobs, Pending } from '../widgets/jobs.js' */
 
-import { create, element, html, messageOf } from '../core/dom.js';
+import { create, element, html, isAbort, messageOf } from '../core/dom.js';
 import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
@@ -382,9 +382,6 @@ export class Diagnostics {
     return button;
   }
 }
-
-/** @param {unknown} error */
-const isAbort = (error) => error instanceof Error && error.name === 'AbortError';
 
 /**
  * Returns the state of a result in a sentence.
