@@ -32,7 +32,9 @@ test('a permalink restores every key', () => {
     '&list=episodes&among=all&axes=world&regions=hidden&zoom=4&cloud=shown&beside=gain&angle=0.5236';
   const { state, problems } = parsePermalink(search, CATALOG);
   assert.deepEqual(problems, []);
-  const [expected, written] = [search, permalink(state)].map((text) => [...new URLSearchParams(text)]);
+  const [expected, written] = [search, permalink(state)].map((text) => [
+    ...new URLSearchParams(text),
+  ]);
   assert.deepEqual(new Map(written), new Map(expected));
   assert.deepEqual(stateOf(permalink(state)), state);
 });
