@@ -18,7 +18,7 @@ PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_F
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve test test-fast coverage lint lint-page api-types check check-all bench lock licences audit clean
+.PHONY: help install serve test test-fast coverage lint lint-page api-types check check-all claims bench lock licences audit clean
 
 help:
 	@echo "make serve      install what is missing and serve the page on http://127.0.0.1:8000"
@@ -31,6 +31,7 @@ help:
 	@echo "make lint-page  check the page's JavaScript (skipped without Node.js and npm)"
 	@echo "make api-types  regenerate the page's types and constants from the server's"
 	@echo "make coverage   run the tests and print the coverage of each module"
+	@echo "make claims     run the commands named beside the numbers of the documentation and compare (ARGS=--all: long ones too)"
 	@echo "make bench      measure filters, maps, recordings and the page"
 	@echo "make lock       pin every package with its hashes in requirements.lock"
 	@echo "make licences   list the licences of all packages; fail if one is not allowed"
@@ -84,20 +85,23 @@ node_modules: package.json package-lock.json
 lint-page: install
 	@if command -v node >/dev/null && command -v npm >/dev/null; then \
 	  $(MAKE) --no-print-directory node_modules && npm run --silent check && \
-	  $(BIN)/python -m beliefscope.app.protocol.page_constants --check && \
-	  $(BIN)/python -m beliefscope.app.server.openapi --models > $(VENV)/openapi.json && \
+	  $(BIN)/python tools/page_constants.py --check && \
+	  $(BIN)/python tools/openapi.py --models > $(VENV)/openapi.json && \
 	  npm run --silent api-types -- --check; \
 	else echo "lint-page skipped: Node.js and npm are not installed."; fi
 
 api-types: install node_modules
-	@$(BIN)/python -m beliefscope.app.protocol.page_constants
-	@$(BIN)/python -m beliefscope.app.server.openapi --models > $(VENV)/openapi.json
+	@$(BIN)/python tools/page_constants.py
+	@$(BIN)/python tools/openapi.py --models > $(VENV)/openapi.json
 	@npm run --silent api-types
 
 check: lint test
 
 check-all: lint
 	@$(PYTEST) -m "" $(ARGS)
+
+claims: install
+	@$(BIN)/python tools/claims.py $(ARGS)
 
 bench: install
 	@$(BIN)/python bench/run.py $(ARGS)

@@ -1,45 +1,40 @@
-"""Speed of every filter in evaluation and training, compared with the paper's published code; memory; tracing overhead.
+"""Speed of every filter in evaluation and training; memory; tracing overhead; with --reference, the published code.
 
-Speed is per CPU-second of one thread, with noise images, random weights and the shapes of the door task: 100 steps
-of one trajectory and of 20 at a time (300 particles), and a training step, forward and backward (16 steps of 32
-trajectories, 30 particles). The best of several repetitions counts, because other load only adds time.
+    python bench/filters.py                  speed and multiple of the arithmetic floor
+    python bench/filters.py --count          weights and operations of the crossmodal filters' networks
+    python bench/filters.py --reference DIR  the crossmodal filters and the paper's published ones, alternately
+
+Speed is CPU time of one thread, with noise images, random weights and the shapes of the door task: 100 steps of one
+trajectory, 25 of 20 at a time (300 particles), and a training step, forward and backward (16 steps of 32 trajectories,
+30 particles). Each figure is a median over repetitions, in brackets the least and the greatest value.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import replace
+import argparse
+import json
+from functools import partial
 from itertools import accumulate
+from pathlib import Path
+from statistics import median
 
+import reference
 import subject
 import torch
+from arithmetic import count, cpu_seconds, measure_rate, spread
+from reference import Workload
 from subject import NAMES, STEPS, Row
 from torch.profiler import ProfilerActivity, profile
 
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.filters.batch import Batch, Steps
-from beliefscope.filters.catalog import build, filters_of
+from beliefscope.filters.catalog import NETWORKS, architecture, build, filters_of
 from beliefscope.filters.evaluate import run
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import rollout, start_at_truth
 from beliefscope.inspect.trace import trace
 
-Range = tuple[float, float]
-PUBLISHED: dict[str, tuple[Range, Range, Range]] = {
-    "feature-pf": ((101, 106), (235, 277), (1.8, 2.3)),
-    "crossmodal-pf": ((55, 64), (182, 218), (3.4, 4.2)),
-    "unimodal-pf": ((95, 117), (252, 276), (2.0, 2.2)),
-    "feature-ekf": ((96, 107), (639, 740), (1.7, 2.1)),
-    "crossmodal-ekf": ((64, 67), (286, 287), (4.0, 4.1)),
-    "unimodal-ekf": ((61, 64), (516, 516), (2.4, 2.4)),
-    "lstm": ((563, 563), (362, 362), (2.9, 2.9)),
-}
-"""The published code on one thread of two shared cores: steps a CPU-second at N = 1 and N = 20, CPU-seconds of a
-training step; lowest and highest of several runs. Ratios are to the middle."""
-
-BARS = {2: "6 x, 5 x, 4 x", 1: "3 x, 2 x, 1.5 x"}
-"""Required ratios at N = 1, at N = 20 and in training, by stride of the first convolution; published: 1."""
+REPETITIONS = 5
 
 SIZES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "steps": ((16, 32, 30), (32, 32, 30), (64, 32, 30)),
@@ -50,26 +45,47 @@ SIZES: dict[str, tuple[tuple[int, int, int], ...]] = {
 
 
 def measure() -> list[Row]:
-    return [*speed(), *memory(), *tracing()]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    rows = [*speed(), *memory()]
+    torch.set_num_threads(threads)
+    return [*rows, *tracing()]
+
+
+def workloads() -> list[Workload]:
+    return [
+        Workload("N = 1", noise(100, 1), forward, reference.published_forward),
+        Workload("N = 20", noise(25, 20), forward, reference.published_forward),
+        Workload("training", noise(16, 32), backward, reference.published_backward),
+    ]
 
 
 def speed() -> list[Row]:
+    """CPU time and multiple of the floor of every filter, with both sets of networks."""
     rows: list[Row] = []
-    single, batch, windows = noise(100, 1), noise(100, 20), noise(16, 32)
-    for stride, bar in BARS.items():
-        for name, architecture in filters_of(DOOR).items():
-            filter_ = build(replace(architecture, image_stride=stride))
-            single_rate = 100 / cpu_seconds(lambda f=filter_: forward(f, single), 5)
-            batch_rate = 2000 / cpu_seconds(lambda f=filter_: forward(f, batch), 2)
-            training = cpu_seconds(lambda f=filter_: backward(f, windows), 3)
-            published = PUBLISHED.get(name)
-            figures = (f"{single_rate:.0f}/s", f"{batch_rate:.0f}/s", f"{training:.2f} s")
-            if published is not None:
-                single_mean, batch_mean, training_mean = (sum(limits) / 2 for limits in published)
-                ratios = (single_rate / single_mean, batch_rate / batch_mean, training_mean / training)
-                figures = tuple(f"{f} {r:.1f} x" for f, r in zip(figures, ratios, strict=True))  # type: ignore[assignment]
-            rows.append((f"{name}, stride {stride}", ", ".join(figures), bar if published else ""))
+    for networks in NETWORKS:
+        for name in filters_of(DOOR):
+            filter_ = build(architecture("door", name, networks))
+            for workload in workloads():
+                call = partial(workload.ours, filter_, workload.batch)
+                flops, seconds, multiples = count(call), [], []
+                for _ in range(REPETITIONS):
+                    rate = measure_rate()
+                    seconds.append(cpu_seconds(call))
+                    multiples.append(seconds[-1] / rate.seconds(flops))
+                figures = f"{1e3 * median(seconds) / workload.steps:.3g} ms, {spread(multiples)} x floor"
+                rows.append((f"{name}, {networks} networks, {workload.name}, a step", figures, ""))
     return rows
+
+
+def counts(name: str) -> dict[str, dict[str, int]]:
+    """Weights and biases of a filter, and operations of its networks with one input each, by set of networks."""
+    result = {}
+    for networks in NETWORKS:
+        filter_ = build(architecture("door", name, networks))
+        flops = reference.networks_flops(filter_, noise(1, 1))
+        result[networks] = {"weights": reference.trained_values(filter_), "operations": flops.total}
+    return result
 
 
 def noise(steps: int, trajectories: int) -> Batch:
@@ -98,16 +114,6 @@ def backward(filter_: Filter, batch: Batch, particles: int = 30) -> None:
     if filter_.has_covariance:
         loss = loss + estimate.covariance.square().mean()
     loss.backward()
-
-
-def cpu_seconds(function: Callable[[], None], repetitions: int) -> float:
-    function()
-    best = float("inf")
-    for _ in range(repetitions):
-        began = time.process_time()
-        function()
-        best = min(best, time.process_time() - began)
-    return best
 
 
 def memory() -> list[Row]:
@@ -150,3 +156,26 @@ def tracing() -> list[Row]:
             (f"{name}, traced / untraced", f"{ratio:.2f} x", "<= 1.3 x"),
         ]
     return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--reference", type=Path, metavar="DIR", help="folder with clones of the published code")
+    parser.add_argument("--count", action="store_true", help="weights and operations of the networks as JSON, no times")
+    options = parser.parse_args()
+    folder = options.reference
+    if options.count:
+        print(json.dumps({name: counts(name) for name in NAMES}, indent=1))
+        return
+    torch.set_num_threads(1)
+    subject.print_machine()
+    if folder is None:
+        subject.print_table("filters", subject.COLUMNS, measure())
+        return
+    for name, published in reference.published_filters(folder).items():
+        rows = reference.compare(name, published, workloads())
+        subject.print_table(name, ("quantity", "published", "authors networks", "default networks"), rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -7,9 +7,6 @@ Nothing is asserted.
 from __future__ import annotations
 
 import argparse
-import os
-import platform
-import sys
 
 import collect
 import filters
@@ -19,9 +16,7 @@ import loading
 import maps
 import page
 import recordings
-import torch
-from rich.console import Console
-from rich.table import Table
+import subject
 
 PARTS = {
     "collect": collect.measure,
@@ -42,17 +37,9 @@ def main() -> None:
     unknown = set(parts) - PARTS.keys()
     if unknown:
         parser.error(f"part {min(unknown)!r} does not exist. Available: {', '.join(PARTS)}")
-    console = Console(width=100)
-    console.print(
-        f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, "
-        f"Python {platform.python_version()}, torch {torch.__version__} on {torch.get_num_threads()} threads"
-    )
+    subject.print_machine()
     for part in parts:
-        table = Table("quantity", "measured", "required", title=part, title_justify="left", min_width=90)
-        for quantity, measured, bar in PARTS[part]():
-            table.add_row(quantity, measured, bar)
-        console.print(table)
-        sys.stdout.flush()
+        subject.print_table(part, subject.COLUMNS, PARTS[part]())
 
 
 if __name__ == "__main__":

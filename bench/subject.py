@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from statistics import median
+
+import torch
+from rich.console import Console
+from rich.table import Table
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
@@ -17,6 +24,23 @@ NAMES = ("crossmodal-ekf", "crossmodal-pf")
 
 Row = tuple[str, str, str]
 """Quantity, measured value, requirement."""
+
+COLUMNS = ("quantity", "measured", "required")
+
+
+def print_machine() -> None:
+    print(
+        f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, "
+        f"Python {platform.python_version()}, torch {torch.__version__} on {torch.get_num_threads()} threads"
+    )
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    table = Table(*columns, title=title, title_justify="left", min_width=90)
+    for row in rows:
+        table.add_row(*row)
+    Console(width=120).print(table)
+    sys.stdout.flush()
 
 
 @cache

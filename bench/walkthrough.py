@@ -52,6 +52,7 @@ SHOTS = (
     Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Look for failures"),
     Shot("walkthrough-moment", {"tab": "scene"}, "#maps-pairs"),
     Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, READY),
+    Shot("walkthrough-standalone", {"tab": "diagnostics", "diagnostic": "standalone"}, READY, "Compute"),
     Shot("walkthrough-shapley", {"tab": "diagnostics", "diagnostic": "shapley"}, READY, "Compute"),
     Shot(
         "walkthrough-saliency",

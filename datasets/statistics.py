@@ -14,6 +14,8 @@ from beliefscope.datasets.task import Task
 Statistics = Mapping[str, float | list[float]]
 """Name with unit -> number, or one number for each of the axes x, y, z. For the names see ``statistics``."""
 
+UNITS = ("cm", "mm", "deg", "N", "Nm")
+
 
 @dataclass(frozen=True)
 class ReferenceData:
@@ -63,6 +65,25 @@ def default_size(task_name: str) -> tuple[int, int]:
     """Default number of episodes and steps of a collection: those of the paper, else 100 and 200."""
     reference = PAPER_DATA.get(task_name)
     return (100, 200) if reference is None else (reference.episodes, reference.steps)
+
+
+def comparison_rows(ours: Statistics, reference: Statistics) -> list[list[str]]:
+    """Name, values of two datasets and their ratio, one text each with a number for each axis."""
+
+    def axes(value: float | list[float]) -> list[float]:
+        return value if isinstance(value, list) else [value]
+
+    def label(name: str) -> str:
+        words, _, unit = name.replace("_", " ").rpartition(" ")
+        return f"{words}, {unit}" if unit in UNITS else f"{words} {unit}"
+
+    rows = []
+    for name, value in ours.items():
+        left, right = axes(value), axes(reference.get(name, []))
+        ratios = [a / b for a, b in zip(left, right, strict=False)]
+        texts = [" ".join(f"{number:.3g}" for number in numbers) for numbers in (left, right)]
+        rows.append([label(name), *texts, " ".join(f"{ratio:.2f}" for ratio in ratios)])
+    return rows
 
 
 def statistics(task: Task, episodes: Iterable[Episode]) -> Statistics:

@@ -53,6 +53,11 @@ def sample_path(task_name: str) -> Path:
     return path
 
 
+def has_sample(task_name: str) -> bool:
+    """Whether the task has a sample dataset."""
+    return (SAMPLES / f"{find_task(task_name).name}.h5").exists()
+
+
 def open_dataset(path: str | Path, task: Task | None = None, skip_bad: bool = False) -> Dataset:
     """Open a dataset for reading; the format is detected.
 

@@ -61,6 +61,9 @@ class Task:
         replay: builds the ``mujoco.MjModel`` for the ``qpos`` of an episode; None without replay.
         outline: states (..., n) -> ``Outline`` of the object; None if it cannot be drawn.
         camera: camera of the images; None if unknown.
+        ridge_direction: states (..., n) -> (...,) rad from the x axis of the map: direction along which the vectors
+            (haptics) in contact do not determine the position, so that their likelihood has a ridge; None if there is
+            no such direction.
         simulate: (seed, index, steps) -> episode ``index`` of the collection with this seed; None for recorded tasks.
     """
 
@@ -76,6 +79,7 @@ class Task:
     replay: Callable[[Episode], Any] | None = None
     outline: Callable[[ArrayLike], Outline] | None = None
     camera: Camera | None = None
+    ridge_direction: Callable[[ArrayLike], Array] | None = None
     simulate: Callable[[int, int, int], Episode] | None = None
 
     def index(self, component: str) -> int:

@@ -52,6 +52,12 @@ def moments(states: Tensor, log_weights: Tensor) -> Gaussian:
     return Gaussian(mean.squeeze(-2), covariance)
 
 
+def reweighted(particles: Particles, log_likelihood: Tensor) -> Gaussian:
+    """Moments (N, K, n), (N, K, n, n) of the particles updated with each of K log-likelihoods (N, K, M)."""
+    log_weights = torch.log_softmax(particles.log_weights.unsqueeze(1) + log_likelihood, dim=-1)
+    return moments(particles.states.unsqueeze(1), log_weights)
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Encoded observations and controls, computed once for all T x N before the time recursion.
@@ -90,7 +96,10 @@ class Evidence:
         )
 
     def only(self, k: int) -> Evidence:
-        """The same evidence with beta one-hot on measurement model k: the filter with only that modality."""
+        """The same evidence with beta one-hot on measurement model k; unchanged without a weight model.
+
+        For training. ``select_models`` excludes models of every filter.
+        """
         if self.log_weights is None:
             return self
         log_weights = torch.full_like(self.log_weights, -torch.inf)
@@ -127,7 +136,7 @@ class StepTrace:
         posterior: fused belief after the observation and, for a PF, before resampling. EKF, UKF: Gaussian (N, n).
         estimate: Gaussian (N, n), (N, n, n): mean and covariance of the posterior, the filter's output. LSTM: the
             covariance is NaN.
-        modality: EKF, UKF only: each unimodal filter's posterior, Gaussian (N, K, n).
+        modality: EKF, UKF only: posterior of the bank's filters, each updated with one modality; Gaussian (N, K, n).
         log_likelihood: PF only: (N, K, M) of each predicted particle, unnormalised.
         ancestors: PF only: (N, M) int64, index of each resampled particle's ancestor.
     """
@@ -138,3 +147,16 @@ class StepTrace:
     modality: Gaussian | None = None
     log_likelihood: Tensor | None = None
     ancestors: Tensor | None = None
+
+    @property
+    def updates(self) -> Gaussian | None:
+        """Single-modality updates, Gaussian (N, K, n): the step's prior after the update with one modality only.
+
+        The prior is that of the fused filter, which has used all modalities in earlier steps, so an update is more
+        accurate than the standalone filter of its modality (``filters/subsets.py``). The two are equal only in a bank
+        without feedback. PF: the predicted particles weighted by one likelihood. None without measurement models.
+        """
+        if self.modality is not None or self.log_likelihood is None:
+            return self.modality
+        assert isinstance(self.predicted, Particles)
+        return reweighted(self.predicted, self.log_likelihood)

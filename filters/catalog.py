@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -57,12 +57,19 @@ def filters_of(task: Task) -> dict[str, Architecture]:
     }
 
 
-def architecture(task: str, name: str) -> Architecture:
+NETWORKS: dict[str, dict[str, Any]] = {"default": {}, "authors": {"networks": "authors", "image_stride": 1}}
+"""Name of a set of networks -> fields of the architecture. ``authors``: layers, parameters and image resolution of the
+paper's published networks for the door task."""
+
+
+def architecture(task: str, name: str, networks: str = "default") -> Architecture:
     """The named filter's architecture for a task. Raises BadInput for an unknown name."""
     filters = filters_of(find_task(task))
     if name not in filters:
         raise unknown_name("filter", name, filters)
-    return filters[name]
+    if networks not in NETWORKS:
+        raise unknown_name("set of networks", networks, NETWORKS)
+    return replace(filters[name], **NETWORKS[networks])
 
 
 def build(architecture: Architecture, seed: int = 0) -> Filter:

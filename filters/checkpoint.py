@@ -1,6 +1,7 @@
 """Checkpoints: safetensors files with one JSON document in the header. Pickle is never used.
 
-The header's key ``beliefscope`` holds ``{"format", "name", "architecture", "record"}``; the tensors are the
+The header's key ``beliefscope`` holds ``{"format", "name", "architecture", "record"}`` and, if it was measured,
+``"healthy_profile"``; the tensors are the
 filter's state dictionary, including the statistics of the training set. A checkpoint's hash is the SHA-256 of its file.
 """
 
@@ -39,12 +40,14 @@ class Checkpoint:
         filter: in evaluation mode, on the CPU. name: of the filter, such as ``crossmodal-pf``. hash: SHA-256 of the
             file.
         record: JSON: training command, seed, data hash, metrics, versions; keys of earlier versions are renamed.
+        healthy_profile: JSON of ``beliefscope.inspect.diagnostics.healthy_profile``, or None.
     """
 
     filter: Filter
     name: str
     hash: str
     record: Mapping[str, Any]
+    healthy_profile: Mapping[str, Any] | None = None
 
     @property
     def task(self) -> Task:
@@ -55,7 +58,13 @@ class Checkpoint:
         return self.filter.architecture.kind
 
 
-def save_checkpoint(filter_: Filter, name: str, record: Mapping[str, Any], path: Path) -> str:
+def save_checkpoint(
+    filter_: Filter,
+    name: str,
+    record: Mapping[str, Any],
+    path: Path,
+    healthy_profile: Mapping[str, Any] | None = None,
+) -> str:
     """Writes the checkpoint atomically and returns its hash. Raises BadInput if the folder does not exist."""
     header = {
         "format": FORMAT,
@@ -63,6 +72,8 @@ def save_checkpoint(filter_: Filter, name: str, record: Mapping[str, Any], path:
         "architecture": filter_.architecture.to_json(),
         "record": dict(record),
     }
+    if healthy_profile is not None:
+        header["healthy_profile"] = dict(healthy_profile)
     tensors = {key: value.detach().cpu().contiguous() for key, value in filter_.state_dict().items()}
     data = save(tensors, metadata={"beliefscope": json.dumps(header, sort_keys=True)})
     write_atomically(path, data)
@@ -98,7 +109,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
     filter_.load_state_dict(tensors)
     filter_.eval().requires_grad_(False)
     return Checkpoint(
-        filter_, header["name"], hashlib.sha256(path.read_bytes()).hexdigest(), training_record(header["record"])
+        filter_,
+        header["name"],
+        hashlib.sha256(path.read_bytes()).hexdigest(),
+        training_record(header["record"]),
+        header.get("healthy_profile"),
     )
 
 
@@ -138,9 +153,13 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 def shipped(task: str, name: str) -> Path:
     """Path of the pretrained checkpoint of a task and filter. Raises BadInput if there is none."""
     filters = filters_of(find_task(task))
+    paths = {known: PRETRAINED / f"{task}-{known}.safetensors" for known in filters}
+    available = [known for known, path in paths.items() if path.is_file()]
     if name not in filters:
-        raise unknown_name("filter", name, filters)
-    path = PRETRAINED / f"{task}-{name}.safetensors"
-    if not path.is_file():
-        raise BadInput(f"no pretrained {name!r} for task {task!r}; train one: beliefscope train {task} --filter {name}")
-    return path
+        raise unknown_name("filter", name, available)
+    if name not in available:
+        raise BadInput(
+            f"no pretrained {name!r} for task {task!r}; train one: beliefscope train {task} --filter {name}. "
+            f"Available: {', '.join(available) or 'none'}."
+        )
+    return paths[name]

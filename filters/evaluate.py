@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.special import chdtri
 from torch import Tensor
 
@@ -17,15 +18,30 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
+from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start, shifted
+from beliefscope.filters.start_offset import UNITS as UNITS
+from beliefscope.filters.subsets import input_modalities, standalone_evidence
 
 WARMUP = 30
 """First steps of each trajectory, which are excluded from metrics, as in the paper's evaluation."""
 
-UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / math.pi)}
-"""Internal unit -> unit of reported values, and the conversion factor."""
+FILTER, STAY, DYNAMICS = "filter", "stay", "dynamics"
+UPDATE, STANDALONE = "{}-only update", "{} standalone"
+
+BASELINES = {
+    STAY: "the start as the estimate of all steps",
+    DYNAMICS: "the same filter with all observations masked",
+}
+"""Estimators that every filter must beat: name -> meaning."""
+
+FloatArray64 = NDArray[np.float64]
+
+Run = tuple[Tensor, Tensor]
+"""Errors (T, N, n) and covariances (T, N, n, n) in SI units, on the CPU; of one trajectory without N."""
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815, 4: 9.488}
 """95 % quantiles of the chi-square distribution by degrees of freedom."""
@@ -33,25 +49,47 @@ CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815, 4: 9.488}
 
 @dataclass(frozen=True)
 class Metrics:
-    """Metrics over all evaluated steps of all episodes.
+    """Metrics over the evaluated steps of all episodes: those from step ``WARMUP``, unless stated otherwise.
 
     Attributes:
         rmse: ``hinge_x_cm``, ``angle_deg``, ... and ``position_cm``, the root mean square distance on the map.
         nll: mean negative log-likelihood of the true state under the posterior Gaussian, in nats, m and rad.
         nees: mean normalised estimation error squared over n: 1 if consistent, more if overconfident.
         coverage95: share of steps whose true state lies in the 95 % ellipsoid.
+        rmse_from_step_0: as ``rmse``, over all steps.
+        baselines: name in ``BASELINES`` -> its metrics; None for a filter that cannot run without observations.
+        updates: modality -> metrics of its single-modality updates, which start at every step from the fused prior.
+        standalone: modality -> metrics of the filter with the observations of this modality only.
+        squares: (R, 1 + keys of ``rmse``) of each episode: number of evaluated steps, sums of squared errors.
 
-    The last three are NaN, and null in JSON, for an estimator without a covariance.
+    ``nll``, ``nees`` and ``coverage95`` are NaN, and null in JSON, for an estimator without a covariance.
     """
 
     rmse: dict[str, float]
     nll: float
     nees: float
     coverage95: float
+    rmse_from_step_0: dict[str, float] = field(default_factory=dict)
+    baselines: Mapping[str, Metrics | None] = field(default_factory=dict)
+    updates: Mapping[str, Metrics] = field(default_factory=dict)
+    standalone: Mapping[str, Metrics] = field(default_factory=dict)
+    squares: FloatArray64 = field(default_factory=lambda: np.zeros((0, 0)))
 
     def to_dict(self) -> dict[str, Any]:
         consistency = {"nll": self.nll, "nees": self.nees, "coverage95": self.coverage95}
-        return {"rmse": self.rmse} | {k: None if math.isnan(value) else value for k, value in consistency.items()}
+        document: dict[str, Any] = {"rmse": self.rmse}
+        document |= {k: None if math.isnan(value) else value for k, value in consistency.items()}
+        if self.rmse_from_step_0:
+            document["rmse_from_step_0"] = self.rmse_from_step_0
+        if self.baselines:
+            document["baselines"] = {name: result and result._errors() for name, result in self.baselines.items()}
+        for key, by_modality in (("updates", self.updates), ("standalone", self.standalone)):
+            if by_modality:
+                document[key] = {name: result._errors() for name, result in by_modality.items()}
+        return document
+
+    def _errors(self) -> dict[str, Any]:
+        return {"rmse": self.rmse, "rmse_from_step_0": self.rmse_from_step_0}
 
 
 def evaluate(
@@ -62,69 +100,144 @@ def evaluate(
     only: str | None = None,
     particles: int = 300,
     seed: int = 0,
+    start_offset: StartOffset = NO_OFFSET,
+    baselines: bool = False,
+    modalities: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Metrics:
     """Runs the filter over whole episodes, each from the true state with covariance 0.1 I (standardised).
 
     Args:
-        faults: to inject into the sensors. only: name of a modality, whose beta is set one-hot.
-        particles: number of particles; an external filter uses its own. seed: of the filter and of the faults.
+        faults: to inject into the sensors. only: name of a modality: its standalone filter.
+        particles: number of particles; an external filter uses its own. seed: of filter, faults and start offsets.
+        start_offset: of the first belief from the true state; its covariance matches the offset.
+        baselines: whether to evaluate ``BASELINES`` as well, with the same starts, faults and random numbers.
+        modalities: whether to evaluate the single-modality updates and standalone filters as well, in the same way.
+            None of an external filter.
 
     Raises:
         BadInput: there is no episode, or episodes, faults or modality do not fit the filter's task.
     """
     if isinstance(filter_, ExternalFilter) and only is not None:
-        raise BadInput(f"only {only!r}: {filter_.source} is an external filter, whose weights cannot be set")
+        raise BadInput(f"only {only!r}: {filter_.source} is an external filter, whose observations cannot be masked")
     device = torch.device("cpu") if isinstance(filter_, ExternalFilter) else next(filter_.parameters()).device
+    offsets = torch.from_numpy(start_offset.vectors(filter_.task, episodes, seed)).to(device)
+    variances = torch.from_numpy(start_offset.variances(filter_.task)).to(device)
     episodes = [faults.apply(episode, seed) for episode in episodes]
     steps = Steps.from_episodes(filter_.task, episodes, device)
     groups: dict[int, list[int]] = {}
     for number, length in enumerate(steps.length.tolist()):
         groups.setdefault(length, []).append(number)
-    errors, covariances = [], []
+    runs: dict[str, dict[int, Run]] = {}
     for done, (length, members) in enumerate(sorted(groups.items()), 1):
         if isinstance(filter_, ExternalFilter):
-            error, covariance = _run_external(filter_, [episodes[number] for number in members], seed)
+            results = _external_runs(filter_, [episodes[i] for i in members], seed, offsets[members], variances)
         else:
-            error, covariance = run(filter_, steps.windows(steps.first[members], length), only, particles, seed)
-        first = min(WARMUP, length - 1)
-        errors.append(error[first:].flatten(0, 1))
-        covariances.append(covariance[first:].flatten(0, 1))
+            batch = steps.windows(steps.first[members], length)
+            start = offset_start(filter_, batch, offsets[members], variances)
+            results = _filter_runs(filter_, batch, start, only, particles, seed, baselines, modalities)
+        for name, (error, covariance) in results.items():
+            by_episode = runs.setdefault(name, {})
+            by_episode |= {number: (error[:, i], covariance[:, i]) for i, number in enumerate(members)}
         if progress is not None:
             progress(done / len(groups))
-    return metrics(filter_.task, torch.cat(errors), torch.cat(covariances))
+    pooled = {name: _pool(filter_.task, [by[i] for i in range(len(by))]) for name, by in runs.items()}
+    names = () if isinstance(filter_, ExternalFilter) else input_modalities(filter_)
+    return replace(
+        pooled[FILTER],
+        baselines={name: pooled.get(name) for name in BASELINES} if baselines else {},
+        updates={name: pooled[UPDATE.format(name)] for name in names if UPDATE.format(name) in pooled},
+        standalone={name: pooled[STANDALONE.format(name)] for name in names if STANDALONE.format(name) in pooled},
+    )
+
+
+def run(filter_: Filter, batch: Batch, only: str | None, particles: int, seed: int) -> Run:
+    """Errors and covariances of a run from the true state."""
+    return _filter_runs(filter_, batch, start_at_truth(filter_, batch), only, particles, seed)[FILTER]
 
 
 @torch.no_grad()
-def run(filter_: Filter, batch: Batch, only: str | None, particles: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Errors (T, N, n) and covariances (T, N, n, n) in SI units, on the CPU."""
-    device = batch.states.device
+def _filter_runs(
+    filter_: Filter,
+    batch: Batch,
+    start: Gaussian,
+    only: str | None,
+    particles: int,
+    seed: int,
+    baselines: bool = False,
+    modalities: bool = False,
+) -> dict[str, Run]:
+    """The runs of the filter and, if requested, of its baselines and modalities, from the same start."""
     evidence = filter_.encode(batch)
-    if only is not None:
-        evidence = evidence.only(filter_.index(only))
-    generator = torch.Generator(device).manual_seed(seed)
-    estimate = rollout(filter_, evidence, start_at_truth(filter_, batch), generator, particles).estimate
-    mean = filter_.statistics.state_to_si(estimate.mean)
-    return (mean - batch.states).cpu(), filter_.statistics.covariance_to_si(estimate.covariance).cpu()
+    by_name = {FILTER: evidence if only is None else standalone_evidence(filter_, batch, evidence, only)}
+    for name in input_modalities(filter_) if modalities else ():
+        by_name[STANDALONE.format(name)] = standalone_evidence(filter_, batch, evidence, name)
+    if baselines and filter_.architecture.kind != "lstm":
+        by_name[DYNAMICS] = evidence.select_models(torch.zeros_like(evidence.observation[..., 0], dtype=torch.bool))
+    runs = {}
+    for name, selected in by_name.items():
+        generator = torch.Generator(batch.states.device).manual_seed(seed)
+        result = rollout(filter_, selected, start, generator, particles, updates=modalities and name == FILTER)
+        runs[name] = _si_run(filter_, batch, result.estimate)
+        if result.updates is not None:
+            updates = zip(result.updates.mean.unbind(2), result.updates.covariance.unbind(2), strict=True)
+            for model, moments in zip(filter_.names, updates, strict=True):
+                runs[UPDATE.format(model)] = _si_run(filter_, batch, Gaussian(*moments))
+    mean = filter_.statistics.state_to_si(start.mean)
+    return runs | {STAY: _stay(mean.cpu(), batch.states.cpu())}
 
 
-def _run_external(external: ExternalFilter, episodes: Sequence[Episode], seed: int) -> tuple[Tensor, Tensor]:
-    """As ``run``; covariances are NaN where the filter gives none."""
-    values, _ = external.run(episodes, seed)
+def _si_run(filter_: Filter, batch: Batch, estimate: Gaussian) -> Run:
+    """Errors and covariances of standardised estimates (T, N, n), (T, N, n, n)."""
+    si = filter_.statistics
+    return (si.state_to_si(estimate.mean) - batch.states).cpu(), si.covariance_to_si(estimate.covariance).cpu()
+
+
+def _external_runs(
+    external: ExternalFilter, episodes: Sequence[Episode], seed: int, offsets: Tensor, variances: Tensor
+) -> dict[str, Run]:
+    """As ``_filter_runs``; covariances are NaN where the filter gives none."""
+    start = external.start(episodes)
+    start = shifted(start, offsets, variances)
+    values, _ = external.run(episodes, seed, start=start)
     mean = values["estimate_mean"]
     truth = torch.from_numpy(np.stack([episode.states for episode in episodes], axis=1))
     unknown = torch.full((*mean.shape, mean.shape[-1]), torch.nan)
-    return mean - truth, values.get("estimate_covariance", unknown)
+    return {FILTER: (mean - truth, values.get("estimate_covariance", unknown)), STAY: _stay(start.mean, truth)}
+
+
+def _stay(mean: Tensor, states: Tensor) -> Run:
+    """The run of an estimator that keeps the start (N, n) as its estimate of the states (T, N, n)."""
+    return mean - states, torch.full((*states.shape, states.shape[-1]), torch.nan)
+
+
+def _pool(task: Task, trajectories: Sequence[Run]) -> Metrics:
+    """Metrics of errors (T, n) and covariances (T, n, n), SI units, of each trajectory."""
+    late = [(e[first:], c[first:]) for e, c in trajectories for first in [min(WARMUP, len(e) - 1)]]
+    result = metrics(task, torch.cat([e for e, _ in late]), torch.cat([c for _, c in late]))
+    sums = [[float(len(e)), *(float(values.sum()) for values in _squares(task, e).values())] for e, _ in late]
+    everything = _squares(task, torch.cat([e for e, _ in trajectories]))
+    return replace(result, rmse_from_step_0=_root_mean(everything), squares=np.array(sums))
+
+
+def _squares(task: Task, error: Tensor) -> dict[str, Tensor]:
+    """Squares (S,) of errors (S, n) in SI units, by key of ``Metrics.rmse`` and in its units."""
+    error = error.double()
+    squares = {}
+    for i, component in enumerate(task.components):
+        unit, factor = UNITS[component.unit]
+        squares[f"{component.name}_{unit}"] = (factor * error[:, i]).square()
+    return squares | {"position_cm": (100.0 * error[:, list(task.map_indices)]).square().sum(-1)}
+
+
+def _root_mean(squares: Mapping[str, Tensor]) -> dict[str, float]:
+    return {key: float(values.mean().sqrt()) for key, values in squares.items()}
 
 
 def metrics(task: Task, error: Tensor, covariance: Tensor) -> Metrics:
     """Metrics of errors (S, n) with covariances (S, n, n), SI units; covariances are all NaN if there are none."""
     error, covariance = error.double(), covariance.double()
-    rmse = {}
-    for i, component in enumerate(task.components):
-        unit, factor = UNITS[component.unit]
-        rmse[f"{component.name}_{unit}"] = factor * float(error[:, i].square().mean().sqrt())
-    rmse["position_cm"] = 100.0 * float(error[:, list(task.map_indices)].square().sum(-1).mean().sqrt())
+    rmse = _root_mean(_squares(task, error))
     if covariance.isnan().all():
         return Metrics(rmse, math.nan, math.nan, math.nan)
     n = error.shape[-1]

@@ -17,7 +17,7 @@ from beliefscope.filters.batch import Batch, Statistics
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import CovarianceRule
-from beliefscope.filters.models.networks import Encoders, Pooling, Residual, Stack
+from beliefscope.filters.models.networks import Encoders, Networks, Pooling, Residual, Stack
 from beliefscope.filters.models.resampling import Resampling
 
 Kind = Literal["ekf", "ukf", "pf", "lstm"]
@@ -38,6 +38,7 @@ class Architecture:
             (product of experts for an EKF, sum of likelihoods for a PF), or ``none`` (one model).
         models: for each measurement model its modalities, joined by ``+``.
         units: width of all fully connected layers. image_stride: of the first convolution.
+        networks: ``default``, or ``authors``: the layers of the paper's published code, see docs/filters.md.
         pooling: between the last convolution and the first fully connected layer.
         covariance: EKF, UKF: rule of the fused covariance. feedback: EKF, UKF: whether every unimodal
             filter continues from the fused belief (independent in the paper's text).
@@ -53,6 +54,7 @@ class Architecture:
     models: tuple[str, ...] = ("image", "haptics")
     units: int = 64
     image_stride: int = 2
+    networks: Networks = "default"
     pooling: Pooling = "flatten"
     covariance: CovarianceRule = "paper"
     feedback: bool = False
@@ -155,7 +157,21 @@ def encoders(task: Task, modalities: Iterable[str], architecture: Architecture) 
                 f"Modality {modality!r} is not in task {task.name!r}. Available: {', '.join(task.modalities)}."
             )
         shapes[modality] = modality_shape(task, modality)
-    return Encoders(shapes, architecture.units, architecture.image_stride, architecture.pooling)
+    a = architecture
+    vectors = [m for m, shape in shapes.items() if len(shape) == 1 and a.networks == "authors"]
+    groups = {modality: vector_groups(task, modality) for modality in vectors}
+    return Encoders(shapes, a.units, a.image_stride, a.pooling, a.networks, groups)
+
+
+def vector_groups(task: Task, modality: str) -> list[list[int]]:
+    """Entries of a modality's vector that are positions, and the others, without empty groups."""
+    groups: dict[bool, list[int]] = {True: [], False: []}
+    start = 0
+    for key in task.modalities[modality]:
+        size = task.observations[key][0]
+        groups[key in task.positions] += range(start, start + size)
+        start += size
+    return [group for group in groups.values() if group]
 
 
 def modality_shape(task: Task, modality: str) -> tuple[int, ...]:
@@ -181,7 +197,10 @@ class WeightModel(nn.Module):
         self.shape = (len(models), width)
         modalities = dict.fromkeys(m for model in models for m in model.split("+"))
         self.encoders = encoders(task, modalities, architecture)
-        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), Residual(units))
+        # The published weight models: one residual block where there is a weight per component, three for a scalar.
+        blocks = 3 if architecture.networks == "authors" and width == 1 else 1
+        residuals = (Residual(units) for _ in range(blocks))
+        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), *residuals)
         self.output = nn.Linear(units, len(models) * width)
         nn.init.normal_(self.output.weight, std=1e-2)
         nn.init.zeros_(self.output.bias)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,10 +17,14 @@ START_VARIANCE = 0.1
 
 @dataclass(frozen=True)
 class Rollout:
-    """estimate: Gaussian (T, N, n), (T, N, n, n), standardised. steps: the T step traces, if kept."""
+    """estimate: Gaussian (T, N, n), (T, N, n, n), standardised. steps: the T step traces, if kept.
+
+    updates: single-modality updates, Gaussian (T, N, K, n), if requested; None for a filter without any.
+    """
 
     estimate: Gaussian
     steps: list[StepTrace]
+    updates: Gaussian | None = None
 
 
 def start_at_truth(filter_: Filter, batch: Batch) -> Gaussian:
@@ -37,17 +41,24 @@ def rollout(
     generator: torch.Generator,
     particles: int = 300,
     keep: bool = False,
+    updates: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Rollout:
-    """Runs all T steps of ``evidence``. ``keep`` (the step traces) does not affect the results."""
+    """Runs all T steps of ``evidence``. ``keep`` (the step traces) and ``updates`` do not affect the estimates."""
     belief = filter_.start(start, particles, generator)
     estimates: list[Gaussian] = []
     steps: list[StepTrace] = []
+    single: list[Gaussian] = []
     for t, trace in enumerate(filter_.steps(belief, evidence, generator)):
         estimates.append(trace.estimate)
         if keep:
             steps.append(trace)
+        if updates and (update := trace.updates) is not None:
+            single.append(update)
         if progress is not None:
             progress((t + 1) / len(evidence))
-    mean = torch.stack([e.mean for e in estimates])
-    return Rollout(Gaussian(mean, torch.stack([e.covariance for e in estimates])), steps)
+    return Rollout(_stacked(estimates), steps, _stacked(single) if single else None)
+
+
+def _stacked(beliefs: Sequence[Gaussian]) -> Gaussian:
+    return Gaussian(torch.stack([b.mean for b in beliefs]), torch.stack([b.covariance for b in beliefs]))

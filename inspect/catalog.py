@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import (
     consistency,
@@ -9,6 +12,7 @@ from beliefscope.inspect.diagnostics import (
     particle_health,
     saliency,
     shapley,
+    standalone_modalities,
     weight_audit,
 )
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
@@ -17,6 +21,7 @@ from beliefscope.inspect.trace import Trace
 ENTRIES: tuple[Entry, ...] = (
     likelihood_maps.ENTRY,
     weight_audit.ENTRY,
+    standalone_modalities.ENTRY,
     consistency.ENTRY,
     particle_health.ENTRY,
     shapley.ENTRY,
@@ -25,6 +30,38 @@ ENTRIES: tuple[Entry, ...] = (
 
 DIAGNOSTICS: dict[str, Entry] = {entry.name: entry for entry in ENTRIES}
 """Entries by name, in display order."""
+
+
+def run_diagnostics(
+    traces: Sequence[Trace],
+    checkpoint: Checkpoint | None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    slow: bool = False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[dict[str, Diagnostic], dict[str, str]]:
+    """Run diagnostics on traces of one filter.
+
+    Args:
+        options: names of the diagnostics -> their options; default: all. slow: whether to run slow ones.
+
+    Returns:
+        Results by name, and the reason for each diagnostic that was not run.
+    """
+    options = {name: {} for name in DIAGNOSTICS} if options is None else options
+    results: dict[str, Diagnostic] = {}
+    reasons: dict[str, str] = {}
+    for index, (name, values) in enumerate(options.items()):
+        entry = DIAGNOSTICS[name]
+        reason = next(filter(None, (entry.refusal(trace, checkpoint) for trace in traces)), None)
+        if reason is None and entry.slow and not slow:
+            reason = "slow diagnostic; include it with --all"
+        if reason is not None:
+            reasons[name] = reason
+        else:
+            share = {"progress": lambda part, index=index: progress((index + part) / len(options))}
+            results[name] = entry(traces, checkpoint, **values, **(share if entry.takes_progress else {}))
+        progress((index + 1) / len(options))
+    return results, reasons
 
 
 def quick(trace: Trace, checkpoint: Checkpoint | None = None) -> dict[str, Diagnostic]:

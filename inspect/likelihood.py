@@ -1,4 +1,4 @@
-"""Likelihood maps: likelihood of every position of the map square given each modality, at one step."""
+"""Likelihood maps: likelihood or posterior of every position of the map square, by modality, at one step."""
 
 from __future__ import annotations
 
@@ -9,19 +9,31 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.fusion import mixture
 from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.inspect.maps.fusion_rules import fuse_sensors, fusion_rule
 from beliefscope.inspect.maps.grid import GridEvaluator, one_thread
-from beliefscope.inspect.maps.likelihood_map import Array, LikelihoodMap
+from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, Quantity
+from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.statistics.measures import wrapped
 from beliefscope.inspect.trace import Trace
 
-__all__ = ["COARSE", "FINE", "LARGEST", "LikelihoodMap", "MapEngine", "no_maps"]
+__all__ = [
+    "COARSE",
+    "FINE",
+    "LARGEST",
+    "QUANTITIES",
+    "LikelihoodMap",
+    "MapEngine",
+    "Quantity",
+    "missing_quantities",
+    "no_maps",
+]
 
 COARSE, FINE = 41, 135
 """Cells per side: maps during scrubbing and of all steps; maps of a single step."""
@@ -30,16 +42,20 @@ LARGEST = 1024
 """Maximum number of cells per side."""
 
 
-def no_maps(checkpoint: Checkpoint, trace: Trace | None = None) -> str | None:
-    """One-line reason why a filter has no likelihood maps, or None.
+def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quantity | None = None) -> str | None:
+    """One-line reason why a filter has no maps of a quantity, or None.
 
     Args:
         trace: a trace of the filter; required for an external filter, whose maps are computed from its Gaussians.
+        quantity: by default either.
     """
-    task, subject = checkpoint.task, "has no likelihood maps"
+    task, subject = checkpoint.task, "has no likelihood maps" if quantity != "posterior" else "has no posterior maps"
+    if trace is not None and (only := trace.settings.get("standalone")):
+        return f"a standalone run of {only} {subject}: those of the run with all modalities include {only}"
     if isinstance(checkpoint, ExternalFilter):
-        if why := _no_gaussians(trace):
-            return f"filter {checkpoint.name!r} {subject}: {why}"
+        reasons = [_no_gaussians(trace, each) for each in ((quantity,) if quantity else QUANTITIES)]
+        if None not in reasons:
+            return f"filter {checkpoint.name!r} {subject}: {reasons[-1]}"
     elif not checkpoint.filter.has_covariance:
         kind = checkpoint.kind.upper()
         return f"filter {checkpoint.name!r} {subject}: an {kind} has no likelihood and no covariance"
@@ -49,16 +65,27 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None) -> str | None:
     return None
 
 
-def _no_gaussians(trace: Trace | None) -> str | None:
-    """Reason why an external filter has no Gaussians to draw, or None."""
+def missing_quantities(checkpoint: Checkpoint, trace: Trace) -> dict[Quantity, str]:
+    """Quantities without maps of this filter, with the reasons (``no_maps``)."""
+    reasons = {quantity: no_maps(checkpoint, trace, quantity) for quantity in QUANTITIES}
+    return {quantity: reason for quantity, reason in reasons.items() if reason is not None}
+
+
+def _no_gaussians(trace: Trace | None, quantity: Quantity) -> str | None:
+    """Reason why an external filter has no Gaussians of a quantity to draw, or None."""
     if trace is None or not trace.has_covariance:
         return "it reports no covariance"
     if trace.log_likelihood is not None or trace.particles is not None:
         return "its measurement model is known only at its particles"
-    if trace.modalities and not trace.modalities_with_posterior:
-        return "it reports no unimodal posteriors"
-    both = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
-    degenerate = np.linalg.eigvalsh(both.astype(np.float64)).min(axis=(1, 2)) <= 0.0
+    if quantity == "likelihood":
+        if trace.observation_mean is None or trace.observation_covariance is None:
+            return "it reports no virtual observations (observation_mean and observation_covariance)"
+        covariances = trace.observation_covariance
+    else:
+        if trace.modalities and not trace.modalities_with_posterior:
+            return "it reports no single-modality updates"
+        covariances = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
+    degenerate = np.linalg.eigvalsh(covariances.astype(np.float64)).min(axis=(1, 2)) <= 0.0
     return f"a covariance of step {int(degenerate.argmax())} is not positive definite" if degenerate.any() else None
 
 
@@ -84,6 +111,8 @@ class MapEngine:
         self.fixed = off_map[0] if off_map else None
         self._grid = self._grid_evaluator()
         self._anchors = trace.anchors
+        missing = missing_quantities(checkpoint, trace)
+        self.quantities = tuple(quantity for quantity in QUANTITIES if quantity not in missing)
 
     @torch.no_grad()
     def _encode(self) -> Evidence | None:
@@ -101,16 +130,24 @@ class MapEngine:
         return GridEvaluator(models, self.task.map_indices, filter_.statistics.mean_std("state")[1])
 
     @torch.no_grad()
-    def map(self, step: int, angle: float | None = None, size: int = FINE) -> LikelihoodMap:
+    def map(
+        self, step: int, angle: float | None = None, size: int = FINE, quantity: Quantity | None = None
+    ) -> LikelihoodMap:
         """Compute the maps of one step.
 
         Args:
             angle: rad, value of the component that is not on the map; by default the true value.
             size: cells per side, S.
+            quantity: by default the likelihood, or the posterior for a filter that reports only that (``quantities``).
 
         Raises:
-            BadInput: step, angle or size out of range.
+            BadInput: step, angle or size out of range, or the filter does not have the quantity.
         """
+        quantity = quantity or self.quantities[0]
+        if quantity not in QUANTITIES:
+            raise unknown_name("quantity of a map", quantity, QUANTITIES)
+        if quantity not in self.quantities:
+            raise BadInput(no_maps(self.checkpoint, self.trace, quantity) or "")
         trace = self.trace
         if not 0 <= step < len(trace):
             raise BadInput(f"step {step} is not in this episode: it has steps 0 to {len(trace) - 1}")
@@ -123,7 +160,8 @@ class MapEngine:
         if self.fixed is not None and angle is not None:
             middle[self.fixed] = angle
         with one_thread():
-            values = (self._particle_filter if self.evidence is not None else self._gaussians)(step, size, middle)
+            evaluate = self._particle_filter if self.evidence is not None else self._gaussians
+            values = evaluate(step, size, middle, quantity)
         return LikelihoodMap(
             step=step,
             angle=math.nan if self.fixed is None else float(middle[self.fixed]),
@@ -132,14 +170,20 @@ class MapEngine:
             offsets_y=self._offsets(size),
             centre=centre,
             log_likelihood=values,
+            quantity=quantity,
+            rule=fusion_rule(self.checkpoint, trace.modalities, quantity),
         )
 
     def maps(
-        self, steps: Sequence[int], size: int = FINE, progress: Callable[[float], None] | None = None
+        self,
+        steps: Sequence[int],
+        size: int = FINE,
+        progress: Callable[[float], None] | None = None,
+        quantity: Quantity | None = None,
     ) -> Iterator[LikelihoodMap]:
         """Maps of several steps, at the true angle. ``progress`` is called with the completed fraction, 0..1."""
         for count, step in enumerate(steps, start=1):
-            yield self.map(step, size=size)
+            yield self.map(step, size=size, quantity=quantity)
             if progress is not None:
                 progress(count / len(steps))
 
@@ -148,8 +192,12 @@ class MapEngine:
         offsets = ((np.arange(size) + 0.5) / size * 2.0 - 1.0) * self.task.map_half_width
         return offsets.astype(np.float32)
 
-    def _particle_filter(self, step: int, size: int, middle: NDArray[np.float64]) -> Array:
-        """(K + 1, S, S) log-likelihoods of the measurement models and of the fused mixture."""
+    def _particle_filter(self, step: int, size: int, middle: NDArray[np.float64], quantity: Quantity) -> Array:
+        """(K + 1, S, S) log-likelihoods of the measurement models and of the fused mixture, or log posteriors.
+
+        The posterior is ``p(x) p(z | x) / p(z)``: the prior p(x) is the density of the predicted particles, and the
+        evidence p(z) the mean likelihood of the particles under their prior weights.
+        """
         filter_, trace = self.checkpoint.filter, self.trace
         assert isinstance(filter_, ParticleFilter)
         assert self.evidence is not None
@@ -168,17 +216,38 @@ class MapEngine:
         # The trace's weights: they may have been edited.
         log_weights = None if trace.weights is None else torch.from_numpy(trace.weights[step]).log()
         values = torch.cat([unimodal, mixture(unimodal - scale, log_weights).unsqueeze(0)])
+        if quantity == "posterior":
+            assert trace.particles is not None
+            at_particles = torch.from_numpy(particle_likelihood)
+            at_particles = torch.cat([at_particles, mixture(at_particles - scale, log_weights).unsqueeze(0)])
+            evidence_ = torch.logsumexp(torch.from_numpy(prior) + at_particles, dim=1, keepdim=True)
+            density = ParticleDensity(self.task, trace.particles[step], prior)
+            log_prior = density.log_density(middle, self._offsets(size).astype(np.float64)).astype(np.float32)
+            values = values - evidence_ + torch.from_numpy(log_prior).flatten()
         return values.unflatten(1, (size, size)).numpy()
 
-    def _gaussians(self, step: int, size: int, middle: NDArray[np.float64]) -> Array:
-        """(K + 1, S, S) log densities of the unimodal posteriors and of the fused posterior.
+    def _moments(self, step: int, quantity: Quantity) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Means (K + 1, n) and covariances (K + 1, n, n) of the sensors or posteriors, the fused one last."""
+        trace = self.trace
+        if quantity == "posterior":
+            mean = np.concatenate([trace.modality_mean[step], trace.estimate_mean[step][None]])
+            covariance = np.concatenate([trace.modality_covariance[step], trace.estimate_covariance[step][None]])
+            return mean.astype(np.float64), covariance.astype(np.float64)
+        assert trace.observation_mean is not None
+        assert trace.observation_covariance is not None
+        sensors, noise = trace.observation_mean[step], trace.observation_covariance[step]
+        z, r = sensors.astype(np.float64), noise.astype(np.float64)
+        fused = fuse_sensors(self.checkpoint, z, r, None if trace.weights is None else trace.weights[step])
+        return np.concatenate([z, fused[0][None]]), np.concatenate([r, fused[1][None]])
+
+    def _gaussians(self, step: int, size: int, middle: NDArray[np.float64], quantity: Quantity) -> Array:
+        """(K + 1, S, S) log densities of the modalities' Gaussians and of the fused Gaussian (``_moments``).
 
         The squared Mahalanobis distance is a sum of a term by column, a term by row and their product.
         """
-        trace, (ix, iy) = self.trace, self.task.map_indices
-        mean = np.concatenate([trace.modality_mean[step], trace.estimate_mean[step][None]]).astype(np.float64)
-        covariance = np.concatenate([trace.modality_covariance[step], trace.estimate_covariance[step][None]])
-        factor = np.linalg.cholesky(covariance.astype(np.float64))
+        ix, iy = self.task.map_indices
+        mean, covariance = self._moments(step, quantity)
+        factor = np.linalg.cholesky(covariance)
         whiten = np.linalg.inv(factor)
         precision = whiten.swapaxes(-1, -2) @ whiten
         from_mean = wrapped(self.task, middle - mean)

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
 
 COLOURS: dict[str, str] = {
     "truth": "#009E73",
@@ -23,3 +27,12 @@ def colour(source: str, modalities: Sequence[str]) -> str:
         return COLOURS[source]
     unnamed = [modality for modality in modalities if modality not in COLOURS]
     return SPARE_COLOURS[unnamed.index(source) % len(SPARE_COLOURS)]
+
+
+@cache
+def colour_table(name: str) -> NDArray[np.uint8]:
+    """(256, 3) RGB values of a matplotlib colour map."""
+    from matplotlib import colormaps
+
+    colours = np.asarray(colormaps[name](np.linspace(0.0, 1.0, 256)))
+    return np.rint(255.0 * colours[:, :3]).astype(np.uint8)

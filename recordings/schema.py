@@ -43,8 +43,9 @@ class Entity:
     """One row of the schema.
 
     Attributes:
-        path: with placeholders ``{component}`` of the state, ``{modality}``, ``{source}`` (``fused`` or a modality),
-            ``{key}`` of an observation, ``{layer}`` of a likelihood map, ``{diagnostic}`` and names of its parts.
+        path: with placeholders ``{component}`` of the state, ``{modality}``, ``{source}`` (``fused``, or a modality for
+            its single-modality update), ``{key}`` of an observation, ``{layer}`` of a likelihood map, ``{diagnostic}``
+            and names of its parts.
         archetype: of Rerun, or ``Trace`` for arrays that no Rerun view displays.
         shape: per step; T steps, K modalities, n components, M particles, c controls, S cells per side of a map,
             W weights per modality, B bounds.
@@ -84,8 +85,8 @@ SCHEMA: tuple[Entity, ...] = (
         "always",
         "fused posterior covariance; NaN without one",
     ),
-    Entity("trace/modality_mean", "Trace", "(K, n)", "m, rad", "modalities", "mean of the single-modality update"),
-    Entity("trace/modality_covariance", "Trace", "(K, n, n)", "m, rad", "modalities", "covariance of the update"),
+    Entity("trace/modality_mean", "Trace", "(K, n)", "m, rad", "modalities", "mean of each single-modality update"),
+    Entity("trace/modality_covariance", "Trace", "(K, n, n)", "m, rad", "modalities", "covariance of each update"),
     Entity("trace/start_mean", "Trace", "(n,), static", "m, rad", "always", "mean before step 0"),
     Entity("trace/start_covariance", "Trace", "(n, n), static", "m, rad", "always", "covariance before step 0"),
     Entity("trace/weights", "Trace", "(K, W)", "1", "weights", "fusion weights beta from the network"),
@@ -194,8 +195,9 @@ SCHEMA: tuple[Entity, ...] = (
         "image with its colour scale",
     ),
     # Likelihood maps, at the steps for which they were computed.
-    Entity("maps/{layer}", "DepthImage", "(S, S)", "u8", "maps", "255 x likelihood / its maximum; top row: largest y"),
-    Entity("maps/{layer}/log_peak", "Scalars", "()", "log", "maps", "log-likelihood of the maximum"),
+    Entity("maps/title", "TextDocument", "static", "text", "maps", "likelihood or posterior, and the fusion rule"),
+    Entity("maps/{layer}", "DepthImage", "(S, S)", "u8", "maps", "255 x quantity / its maximum; top row: largest y"),
+    Entity("maps/{layer}/log_peak", "Scalars", "()", "log", "maps", "log of the quantity at the maximum"),
     Entity("maps/{layer}/truth", "Boxes2D", "(1, 2)", "cells", "maps", "true position on the map"),
     Entity("maps/{layer}/estimate", "Boxes2D", "(1, 2)", "cells", "maps", "estimate of the layer on the map"),
     Entity("about", "TextDocument", "static", "text", "always", "description of the recording"),

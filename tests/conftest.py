@@ -28,11 +28,12 @@ def chromium() -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the browser tests and moves them to the front: they take longest, so parallel processes finish together."""
-    browser_tests = [item for item in items if item.path.parent.name == "browser"]
-    for item in browser_tests:
-        item.add_marker("browser")
-    items[:] = browser_tests + [item for item in items if item.path.parent.name != "browser"]
+    """Marks the browser tests and orders the files: browser, slow, others. Parallel processes then finish together."""
+    for item in items:
+        if item.path.parent.name == "browser":
+            item.add_marker("browser")
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: 0 if item.get_closest_marker("browser") else 1 if item.path in slow else 2)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -27,7 +27,7 @@ def test_links_resolve(page: Path) -> None:
 
 
 def test_files_in_the_architecture_exist() -> None:
-    paths = re.findall(r"`((?:app|bench|datasets|filters|inspect|recordings|tests)/[\w/.]*)`", architecture())
+    paths = re.findall(r"`((?:app|bench|datasets|filters|inspect|recordings|tests|tools)/[\w/.]*)`", architecture())
     assert len(paths) > 10
     assert not [path for path in paths if not (ROOT / path).exists()]
 

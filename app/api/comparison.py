@@ -39,6 +39,8 @@ def _names(run: Selection, other: Selection) -> tuple[str, str]:
     """Names of the two runs that state their difference."""
     if other.edit is not None:
         return "original", "edited"
+    if other.only:
+        return "all modalities", f"{other.only} standalone"
     fault_names = [str(selection.faults) or "as recorded" for selection in (run, other)]
     if run.filter == other.filter:
         return fault_names[0], fault_names[1]

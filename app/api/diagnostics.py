@@ -5,20 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, HTTPException, Request
-from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.responses import JSONResponse, Response
 
-from beliefscope.app.api.jobs import job_pending
+from beliefscope.app.api.jobs import result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
 from beliefscope.app.api.models.results import DiagnosticInfo, DiagnosticResult, TraceDiagnosticInfo
 from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, in_progress
 from beliefscope.app.jobs.queue import Jobs
-from beliefscope.app.protocol.diagnostic_options import describe_entry, parse_options
+from beliefscope.app.protocol.diagnostic_options import parse_options
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
@@ -26,7 +25,6 @@ from beliefscope.datasets.errors import unknown_name
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.base import Entry
 
-RESULTS_IN_MEMORY = 64
 RUN_PARAMETERS = ("faults", "data", "episodes")
 """Query parameters that are not options of the diagnostic."""
 
@@ -49,11 +47,11 @@ Episodes = Literal["held-out"] | None
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     """Create the router."""
     router = APIRouter()
-    cache = _ResultCache()
+    computing = threading.Lock()  # one fast diagnostic at a time
 
     @router.get("/api/diagnostics", response_model=list[DiagnosticInfo])
     def list_diagnostics() -> list[dict[str, Any]]:
-        return [describe_entry(entry) for entry in DIAGNOSTICS.values()]
+        return [entry.to_json() for entry in DIAGNOSTICS.values()]
 
     @router.get(
         "/api/diagnostics/{task}/{filter}/{episode}",
@@ -66,7 +64,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             return response
         entries = DIAGNOSTICS.values()
         return JSONResponse(
-            [describe_entry(entry) | {"why_not": entry.refusal(run.trace, run.checkpoint)} for entry in entries]
+            [entry.to_json() | {"why_not": entry.refusal(run.trace, run.checkpoint)} for entry in entries]
         )
 
     @router.get(
@@ -82,16 +80,14 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             return response
         _check(entry, run)
         if not (entry.slow or episodes):
-            return Response(cache.result(entry, run, options), media_type="application/json")
-        job = jobs.find("diagnostic", _key(store, entry, _selections(store, selection, episodes), options))
-        if path := jobs.finished_result(job):
-            return FileResponse(path, media_type="application/json")
-        return job_pending(job)
+            with computing:
+                return Response(_result(entry, run, options), media_type="application/json")
+        return result_or_job(jobs, "diagnostic", _key(store, entry, _selections(store, selection, episodes), options))
 
-    @router.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202, response_model=JobReply)
+    @router.post("/api/diagnostics/{name}/{task}/{filter}/{episode}", status_code=202)
     def compute(
         entry: RequestedEntry, selection: RequestedRun, options: Options, episodes: Episodes = None
-    ) -> Response:
+    ) -> JobReply:
         _check(entry, store.request(selection))
         selections = _selections(store, selection, episodes)
         arguments = {
@@ -104,28 +100,18 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         parts = [f"{entry.title} of {selection.filter}", f"{selection.task} {scope}", str(selection.faults)]
         key = _key(store, entry, selections, options)
         link = _link(entry, selection, options, episodes)
-        return job_pending(jobs.submit("diagnostic", ", ".join(filter(None, parts)), arguments, key, link))
+        return JobReply(job=jobs.submit("diagnostic", ", ".join(filter(None, parts)), arguments, key, link))
 
     return router
 
 
-class _ResultCache:
-    """Most recent results of fast diagnostics, as JSON; computes missing ones one at a time."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._results: OrderedDict[str, bytes] = OrderedDict()
-
-    def result(self, entry: Entry, run: TracedRun, options: Mapping[str, Any]) -> bytes:
-        key = repr((entry.name, run.key, sorted(options.items())))
-        with self._lock:
-            if key not in self._results:
-                views = entry([run.trace], run.checkpoint, **options).views()
-                self._results[key] = json.dumps({"trajectories": 1, **views}, allow_nan=False).encode()
-            self._results.move_to_end(key)
-            while len(self._results) > RESULTS_IN_MEMORY:
-                self._results.popitem(last=False)
-            return self._results[key]
+def _result(entry: Entry, run: TracedRun, options: Mapping[str, Any]) -> bytes:
+    """Result of a fast diagnostic as JSON, kept with the run."""
+    key = repr((entry.name, sorted(options.items())))
+    if key not in run.diagnostics:
+        views = entry([run.trace], run.checkpoint, **options).views()
+        run.diagnostics[key] = json.dumps({"trajectories": 1, **views}, allow_nan=False).encode()
+    return run.diagnostics[key]
 
 
 def _check(entry: Entry, run: TracedRun) -> None:

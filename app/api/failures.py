@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends
-from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.responses import JSONResponse, Response
 
-from beliefscope.app.api.jobs import job_pending
+from beliefscope.app.api.jobs import result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
 from beliefscope.app.api.models.results import Failures
 from beliefscope.app.api.traces import in_progress
@@ -54,20 +54,17 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def get_failures(request: RequestedSurvey) -> Response:
         if request.data.startswith(LIVE_PREFIX):
             return _live_failures(store, request)
-        job = jobs.find("failures", _key(store, _arguments(store, request)))
-        if path := jobs.finished_result(job):
-            return FileResponse(path, media_type="application/json")
-        return job_pending(job)
+        return result_or_job(jobs, "failures", _key(store, _arguments(store, request)))
 
-    @router.post("/api/failures/{task}/{filter}", status_code=202, response_model=JobReply)
-    def find_failures(request: RequestedSurvey) -> Response:
+    @router.post("/api/failures/{task}/{filter}", status_code=202)
+    def find_failures(request: RequestedSurvey) -> JobReply:
         arguments = _arguments(store, request)
         count, faults = len(arguments["episodes"]), arguments["faults"]
         scope = f"all {count} episodes" if request.among == "all" else f"{count} held-out episodes"
         title = ", ".join(filter(None, [f"Failures of {request.filter}", f"{request.task} {scope}", faults]))
         query = {name: arguments[name] for name in ("task", "filter", "data", "among", "faults") if arguments[name]}
         link = "?" + urlencode(query | {"tab": "failures"})
-        return job_pending(jobs.submit("failures", title, arguments, _key(store, arguments), link))
+        return JobReply(job=jobs.submit("failures", title, arguments, _key(store, arguments), link))
 
     return router
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -16,17 +17,9 @@ from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, remove_filter, save_filter
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRun, FineTuneRuns
-from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.finetuning.module_selection import (
-    module_change,
-    module_tree,
-    presets,
-    select_parameters,
-    within,
-)
+from beliefscope.filters.finetuning.choices import choices
+from beliefscope.filters.finetuning.module_selection import select_parameters
 from beliefscope.filters.finetuning.settings import FineTune
-from beliefscope.filters.finetuning.slices import CLEAN, standard_slices
 
 Action = Literal["promote", "save", "discard"]
 
@@ -36,10 +29,10 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     router = APIRouter()
     runs = FineTuneRuns(store.settings.workspace)
 
-    @router.get("/api/finetune/{task}/{filter}", response_model=FineTuneOffer, response_model_exclude_unset=True)
-    def get_options(task: str, filter: str) -> dict[str, Any]:
-        checkpoint = store.checkpoint(task, filter)
-        return _options(checkpoint) | {"runs": [info(run) for run in runs.list_runs() if run.task == task]}
+    @router.get("/api/finetune/{task}/{filter}")
+    def get_options(task: str, filter: str) -> FineTuneOffer:
+        options = choices(store.checkpoint(task, filter))
+        return FineTuneOffer(**vars(options), runs=[info(run) for run in runs.list_runs() if run.task == task])
 
     @router.post("/api/finetune/{task}/{filter}", status_code=202)
     def start(task: str, filter: str, settings: Annotated[dict[str, Any], Body()], data: str = "") -> FineTuneRunInfo:
@@ -65,7 +58,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         # Not the job's result: a saved filter outlasts its job.
         result = runs.read(run, "result.json") if current.finetuned else None
         progress = runs.read(run, "progress.json")
-        return JSONResponse(current.model_dump() | {"progress": progress, "result": result})
+        return JSONResponse(asdict(current) | {"progress": progress, "result": result})
 
     @router.post("/api/tuned/{run}/{action}")
     def decide(run: str, action: Action) -> FineTuneRunInfo:
@@ -73,6 +66,10 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         name = finetuned_name(record)
         if name is None:
             raise HTTPException(409, f"Run {run!r} has no checkpoint yet to {action}.")
+        result = runs.read(run, "result.json")
+        reason = result["finetuned"].get("no_change", "") if result else ""
+        if reason and action != "discard":
+            raise HTTPException(409, f"Run {run!r} cannot be used as a new filter. {reason}")
         if action == "discard":
             remove_filter(store, record.task, name)
         else:
@@ -98,28 +95,3 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         )
 
     return router
-
-
-def _options(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Modules, presets and slices for fine-tuning a filter."""
-    if isinstance(checkpoint, ExternalFilter):
-        reason = "External filters cannot be fine-tuned here."
-        return {"why_not": reason, "modules": [], "presets": [], "slices": [], "settings": FineTune().to_json()}
-    filter_ = checkpoint.filter
-    changes = checkpoint.record.get("parts", {})  # of the fine-tuning that wrote this checkpoint
-    modules = [
-        {"name": n.name, "kind": n.kind, "description": n.description, "parameters": n.parameters, "depth": n.depth}
-        | (module_change(n.name, changes) if any(within(key, n.name) for key in changes) else {})
-        for n in module_tree(filter_)
-        if n.name and n.parameters
-    ]
-    parameters = [name for name, _ in filter_.named_parameters()]
-    trained = {name: set(select_parameters(filter_, [name])) for name in presets(filter_)}
-    slices = [s for s in standard_slices(checkpoint.task) if s != CLEAN and set(s.only) <= set(filter_.names)]
-    return {
-        "why_not": None,
-        "modules": modules,
-        "presets": [{"name": n, "trains": [p for p in parameters if p in names]} for n, names in trained.items()],
-        "slices": [slice_.to_json() | {"text": str(slice_)} for slice_ in slices],
-        "settings": FineTune().to_json(),
-    }

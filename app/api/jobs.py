@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 from fastapi import APIRouter, HTTPException
-from fastapi.responses import FileResponse, JSONResponse
+from fastapi.responses import FileResponse, JSONResponse, Response
 
 from beliefscope.app.jobs.queue import Job, Jobs
 
@@ -50,6 +50,9 @@ def routes(jobs: Jobs) -> APIRouter:
     return router
 
 
-def job_pending(job: Job | None) -> JSONResponse:
-    """The response 202 while a result does not exist yet."""
+def result_or_job(jobs: Jobs, kind: str, key: str) -> Response:
+    """The result of a finished job; else the response 202 with the job, or without one if it was not requested."""
+    job = jobs.find(kind, key)
+    if path := jobs.finished_result(job):
+        return FileResponse(path, media_type="application/json")
     return JSONResponse({"job": None if job is None else asdict(job)}, status_code=202)

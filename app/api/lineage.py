@@ -6,29 +6,28 @@ import io
 import tempfile
 import zipfile
 from pathlib import Path
-from typing import Any
 
 from fastapi import APIRouter, HTTPException
 from fastapi.responses import Response
 
 from beliefscope import __version__
 from beliefscope.app.api.models.training import Lineage as LineageReply
+from beliefscope.app.api.models.training import LineageMember
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.compare.lineage import Ancestor, Lineage, export, lineage_of
-from beliefscope.inspect.diagnostics.views import as_json
 
 
 def routes(store: TraceStore) -> APIRouter:
     """Create the router."""
     router = APIRouter()
 
-    @router.get("/api/lineage/{task}", response_model=LineageReply)
-    def lineage(task: str) -> dict[str, Any]:
+    @router.get("/api/lineage/{task}")
+    def lineage(task: str) -> LineageReply:
         names = {checkpoint.hash: name for name, checkpoint in store.filters(task).items()}
         members = _lineage(store, task).members.values()
-        return {"members": [_member(member, names, store) for member in members if member.task == task]}
+        return LineageReply(members=[_member(member, names, store) for member in members if member.task == task])
 
     @router.get("/api/lineage/{task}/{hash}.zip", response_class=Response)
     def archive(task: str, hash: str) -> Response:
@@ -59,25 +58,17 @@ def _lineage(store: TraceStore, task: str) -> Lineage:
         return Lineage({}, ())
 
 
-def _member(checkpoint: Ancestor, names: dict[str, str], store: TraceStore) -> dict[str, Any]:
-    slices = [part["slice"]["name"] for part in checkpoint.settings.get("mix", [])]
-    held_out = checkpoint.record.get("held_out", {})
-    rmse = {
-        when: {name: measures.get("rmse") for name, measures in held_out.get(when, {}).items()}
-        for when in ("before", "after")
-    }
+def _member(checkpoint: Ancestor, names: dict[str, str], store: TraceStore) -> LineageMember:
     is_own = FineTuneRuns(store.settings.workspace).is_own(checkpoint.path)
-    member: dict[str, Any] = as_json(
-        {
-            "hash": checkpoint.hash,
-            "name": checkpoint.name,
-            "catalog_name": names.get(checkpoint.hash),
-            "base": checkpoint.base,
-            "run": checkpoint.path.parent.name if is_own else None,
-            "train": checkpoint.settings.get("train", []),
-            "learned": slices,
-            "rmse": checkpoint.rmse,
-            **rmse,
-        }
+    return LineageMember(
+        hash=checkpoint.hash,
+        name=checkpoint.name,
+        catalog_name=names.get(checkpoint.hash),
+        base=checkpoint.base,
+        run=checkpoint.path.parent.name if is_own else None,
+        train=checkpoint.settings.get("train", []),
+        learned=checkpoint.learned,
+        rmse=checkpoint.rmse,
+        before=checkpoint.held_out("before"),
+        after=checkpoint.held_out("after"),
     )
-    return member

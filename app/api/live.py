@@ -20,11 +20,13 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 from beliefscope.app.api.models.traces import LiveList
 from beliefscope.app.protocol.messages import close_reason, describe_error
 from beliefscope.app.protocol.trace_format import camera_images, columns
-from beliefscope.app.runs.live_runs import LiveRun, LiveRuns, UnavailableFilter, resolve_filter
+from beliefscope.app.runs.live_runs import LiveRuns, describe, resolve_filter
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.filters.external.load import UnavailableFilter
+from beliefscope.inspect.traces.live_run import LiveRun
 
 MAX_BLOCK = 1 << 22  # bytes of the run's file per message
 POLL_INTERVAL = 0.02  # s between checks of a file
@@ -79,7 +81,7 @@ def routes(store: TraceStore) -> APIRouter:
                 filter_name, checkpoint = resolve_filter(run, store.filters(run.task.name))
                 unavailable = isinstance(checkpoint, UnavailableFilter) and bool(run.template.checkpoint_hash)
                 entry = {"filter": filter_name, "available": not unavailable, "kind": run.template.kind}
-                entries.append(run.to_json() | entry)
+                entries.append(describe(run) | entry)
             except BadInput as error:
                 entries.append({"name": name, "state": "damaged", "message": str(error)})
         tasks = {entry["task"] for entry in entries if "task" in entry}

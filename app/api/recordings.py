@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import threading
 import time
 from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, NonNegativeInt
 from starlette.requests import ClientDisconnect
 
 from beliefscope import __version__
@@ -31,12 +29,14 @@ from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, display_name
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.workspace.recording_probe import RecordingInfo
 from beliefscope.app.workspace.recordings import ENDING, Recording, RecordingFolder, free_space
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.traces.live_file import SUFFIX
+from beliefscope.recordings.probe import RecordingInfo
 
 MAX_UPLOAD = 2 * 10**9  # bytes
 RESERVED_SPACE = 2 * 10**8  # bytes that uploads leave free on the disk
@@ -46,11 +46,7 @@ FREE_ROUNDING = 10**7  # bytes; keeps the ETag of the list stable
 
 
 class RecordingRequest(BaseModel):
-    """Body of ``POST /api/recordings``.
-
-    Attributes:
-        maps: steps between likelihood maps; 0 for none. automatic: for display only; may be deleted later.
-    """
+    """Body of ``POST /api/recordings``. maps: steps between maps of ``quantity``; 0 for none."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     task: str
@@ -58,17 +54,15 @@ class RecordingRequest(BaseModel):
     episode: int
     faults: str = ""
     data: str = ""
-    maps: Annotated[int, Field(ge=0)] = 0
-    automatic: bool = False
+    maps: NonNegativeInt = 0
+    quantity: Quantity = "likelihood"
 
 
-class ChangeRequest(BaseModel):
-    """Body of ``PATCH /api/recordings/{name}.rrd``: the properties to change."""
+class NewName(BaseModel):
+    """Body of ``PATCH /api/recordings/{name}.rrd``."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
-    name: str | None = None
-    tags: list[str] | None = None
-    automatic: Literal[False] | None = None
+    name: str
 
 
 def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
@@ -81,16 +75,15 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
         await asyncio.to_thread(writer.shutdown, cancel_futures=True)
 
     router = APIRouter(lifespan=lifespan)
-    lock = threading.Lock()
     matcher = RunMatcher(store)
 
     @router.get("/api/recordings", response_model=RecordingList)
     def list_recordings(request: Request) -> Response:
-        recordings, tasks = files.list_recordings(), matcher.tasks()
+        recordings = files.list_recordings()
         free = free_space(files.folder) // FREE_ROUNDING * FREE_ROUNDING
         reply = RecordingList(
-            recordings=[_entry(recording, *matcher.match(recording.info, tasks)) for recording in recordings],
-            deleted=files.list_deleted(),
+            recordings=[matcher.entry(recording) for recording in recordings],
+            deleted=files.trash.list_deleted(),
             bytes=sum(recording.bytes for recording in recordings),
             free=free,
             largest=max(0, min(MAX_UPLOAD, free - RESERVED_SPACE)),
@@ -105,32 +98,27 @@ def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
         # A growing run gets no maps: the job that computes them would see more steps than requested.
         stride = 0 if run.growing or run.no_maps else body.maps
         # The name covers everything that the file depends on.
-        content = f"{run.key} maps {stride} diagnostics version {__version__}"
-        name = f"{selection.file_stem}-{hashlib.sha256(content.encode()).hexdigest()[:8]}{ENDING}"
-        with lock:
-            path = files.find_generated(name)
-            existed = path is not None
-            if path is None and request.app.state.read_only:
+        content = f"{run.key} maps {stride} {body.quantity} diagnostics version {__version__}"
+        path = files.folder / f"{selection.file_stem}-{hashlib.sha256(content.encode()).hexdigest()[:8]}{ENDING}"
+        existed = path.is_file()
+        if not existed:
+            if request.app.state.read_only:
                 raise HTTPException(403, f"{READ_ONLY} There is no recording of this run.")
-            if path is None and not stride:
-                path = writer.submit(write, files, run, name, body.automatic).result()
-        if path is None:
-            response.status_code = 202
-            target = files.unused_path(name).name
-            arguments = {
-                "settings": store.settings.to_json(),
-                "selection": selection.to_json(),
-                "folder": str(files.folder),
-                "name": name,
-                "maps": stride,
-                "automatic": body.automatic,
-            }
-            title, link = f"Recording of {selection.description}", _url(target).lstrip("/")
-            return JobReply(job=jobs.submit("recording", title, arguments, target, link, output_exists=False))
-        if existed:
+            if stride:
+                response.status_code = 202
+                arguments = {
+                    "settings": store.settings.to_json(),
+                    "selection": selection.to_json(),
+                    "path": str(path),
+                    "maps": stride,
+                    "quantity": body.quantity,
+                }
+                title, link = f"Recording of {selection.description}", _url(path.name).lstrip("/")
+                job = jobs.submit("recording", title, arguments, path.name, link, output_exists=False)
+                return JobReply(job=job)
+            writer.submit(write, files, run, path).result()
+        else:
             response.status_code = 200
-            if not (body.automatic or request.app.state.read_only):
-                files.keep(path.name)
         seconds = None if existed else time.perf_counter() - start
         return WrittenRecording(name=path.name, url=_url(path.name), bytes=path.stat().st_size, seconds=seconds)
 
@@ -161,9 +149,6 @@ def _open_run(store: TraceStore, files: RecordingFolder, jobs: Jobs, name: str) 
 def _add_file_routes(router: APIRouter, files: RecordingFolder, matcher: RunMatcher) -> None:
     """Routes that do not need the runs."""
 
-    def entry(recording: Recording) -> RecordingEntry:
-        return _entry(recording, *matcher.match(recording.info, matcher.tasks()))
-
     @router.get("/api/recordings/{name}.rrd", response_class=Response)
     def download(name: str) -> FileResponse:
         path = files.path(name)
@@ -181,20 +166,13 @@ def _add_file_routes(router: APIRouter, files: RecordingFolder, matcher: RunMatc
             await _receive(request, part, limit)
             info = await asyncio.wrap_future(files.examine(part))
             recording = await asyncio.to_thread(files.add, part, name, info)
-            return await asyncio.to_thread(entry, recording)
+            return await asyncio.to_thread(matcher.entry, recording)
         finally:
             part.unlink(missing_ok=True)
 
     @router.patch("/api/recordings/{name}.rrd")
-    def change(name: str, body: ChangeRequest) -> RecordingEntry:
-        recording = files.get(name)
-        if body.tags is not None:
-            recording = files.tag(name, body.tags)
-        if body.name is not None:
-            recording = files.rename(name, body.name)
-        if body.automatic is not None:
-            recording = files.keep(recording.name)
-        return entry(recording)
+    def rename(name: str, body: NewName) -> RecordingEntry:
+        return matcher.entry(files.rename(name, body.name))
 
     @router.delete("/api/recordings/{name}.rrd")
     def delete(name: str) -> DeletedId:
@@ -202,13 +180,11 @@ def _add_file_routes(router: APIRouter, files: RecordingFolder, matcher: RunMatc
 
     @router.post("/api/recordings/deleted/{id}")
     def restore(id: str) -> RecordingEntry:
-        return entry(files.restore(id))
+        return matcher.entry(files.restore(id))
 
     @router.delete("/api/recordings/deleted")
     def empty_trash() -> Freed:
-        freed = sum(file.bytes for file in files.list_deleted())
-        files.empty_trash()
-        return Freed(freed=freed)
+        return Freed(freed=files.trash.empty())
 
 
 class RunMatcher:
@@ -218,61 +194,55 @@ class RunMatcher:
         self._store = store
         self._data_names: dict[tuple[str, int, str], str | None] = {}
 
-    def tasks(self) -> dict[str, Any]:
-        """The catalog's tasks by name."""
-        return {task["name"]: task for task in self._store.catalog()["tasks"]}
+    def entry(self, recording: Recording) -> RecordingEntry:
+        """The list entry of a recording."""
+        run, why_not = self._match(recording.info)
+        return RecordingEntry(
+            name=recording.name,
+            url=_url(recording.name),
+            bytes=recording.bytes,
+            modified=datetime.fromtimestamp(recording.modified, UTC).isoformat(timespec="seconds"),
+            reading=recording.info is None,
+            **vars(recording.info or RecordingInfo()),
+            run=run,
+            why_not=why_not,
+        )
 
-    def match(self, info: RecordingInfo | None, tasks: Mapping[str, Any]) -> tuple[RunNames | None, str]:
-        """Names of the run's filter and data set, or None and the reason. tasks: see ``tasks``."""
+    def _match(self, info: RecordingInfo | None) -> tuple[RunNames | None, str]:
+        """Names of the run's filter and data set, or None and the reason."""
         if info is None or info.problem:
             return None, "" if info is None else info.problem
-        assert info.task is not None
-        assert info.episode is not None
-        filters = tasks[info.task]["filters"] if info.task in tasks else ()
-        filter_ = next((f["name"] for f in filters if f["checkpoint_hash"] == info.checkpoint_hash), None)
-        settings = self._store.settings
+        task, episode, settings = str(info.task), int(info.episode or 0), self._store.settings
+        filters: Mapping[str, Checkpoint] = {}
+        with suppress(BadInput):  # a task that this server does not have
+            filters = self._store.filters(task)
+        filter_ = next((name for name, filter_ in filters.items() if filter_.hash == info.checkpoint_hash), None)
         if filter_ is None:
             short = info.checkpoint_hash[:8]
-            reason = f"Filter {info.filter} of {info.task} with checkpoint {short} is not served here."
+            reason = f"Filter {info.filter} of {task} with checkpoint {short} is not served here."
         elif info.edited:
             reason = "The run has interventions; reproduce it in the Compare tab."
         elif info.seed != settings.seed:
             reason = f"The run has seed {info.seed}; this server uses seed {settings.seed}."
         elif info.particles not in (None, settings.particles):
             reason = f"The run has {info.particles} particles; this server uses {settings.particles}."
-        elif (data := self._find_data(tasks[info.task], info.episode, info.data_hash)) is None:
-            reason = f"No data set of this server contains its episode {info.episode}, {info.data_hash[:8]}."
+        elif (data := self._find_data(task, episode, info.data_hash)) is None:
+            reason = f"No data set of this server contains its episode {episode}, {info.data_hash[:8]}."
         else:
             return RunNames(filter=filter_, data=data), ""
         return None, reason
 
-    def _find_data(self, task: Mapping[str, Any], index: int, digest: str) -> str | None:
+    def _find_data(self, task: str, index: int, digest: str) -> str | None:
         """Name of the data set with this episode; cached, since data sets do not change."""
-        key = task["name"], index, digest
+        key = task, index, digest
         if key not in self._data_names:
             self._data_names[key] = None
-            for data in task["data"]:
+            for name, episodes in self._store.datasets(task).items():
                 with suppress(BadInput):  # unreadable episodes do not match
-                    _, episodes = self._store.dataset(task["name"], data["name"])
                     if 0 <= index < len(episodes) and episodes[index].digest() == digest:
-                        self._data_names[key] = data["name"]
+                        self._data_names[key] = name
                         break
         return self._data_names[key]
-
-
-def _entry(recording: Recording, run: RunNames | None, why_not: str) -> RecordingEntry:
-    return RecordingEntry(
-        name=recording.name,
-        url=_url(recording.name),
-        bytes=recording.bytes,
-        modified=datetime.fromtimestamp(recording.modified, UTC).isoformat(timespec="seconds"),
-        automatic=recording.automatic,
-        tags=list(recording.tags),
-        reading=recording.info is None,
-        **asdict(recording.info or RecordingInfo()),
-        run=run,
-        why_not=why_not,
-    )
 
 
 def _url(name: str) -> str:

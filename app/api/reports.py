@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Request
@@ -19,6 +18,7 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.reports import ReportFolder
 from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.recordings.report.pdf import browser
 
 PAGE_POLICY = (
@@ -34,6 +34,7 @@ class ReportRequest(BaseModel):
 
     Attributes:
         events: steps to show instead of the three worst. slow: include slow diagnostics. pdf: also write a PDF.
+        quantity: of the maps; the other one if the filter does not have it.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -41,6 +42,7 @@ class ReportRequest(BaseModel):
     slow: bool = False
     pdf: bool = False
     title: Annotated[str, Field(max_length=MAX_TITLE)] = ""
+    quantity: Quantity = "likelihood"
 
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
@@ -50,8 +52,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.get("/api/reports", response_model=ReportList)
     def list_reports(request: Request) -> Response:
-        deleted = [asdict(file) for file in reports.list_deleted()]
-        return tagged_json(request, {"reports": reports.list_reports(), "deleted": deleted})
+        reply = ReportList(reports=reports.list_reports(), deleted=reports.trash.list_deleted())
+        return tagged_json(request, reply.model_dump())
 
     @router.post("/api/reports/{task}/{filter}/{episode}", status_code=202)
     def write_report(
@@ -90,17 +92,15 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.delete("/api/reports/{name}.html")
     def delete(name: str) -> DeletedId:
-        return DeletedId(deleted=reports.delete(name))
+        return DeletedId(deleted=reports.trash.put(reports.page(name).parent))
 
     @router.post("/api/reports/deleted/{id}")
     def restore(id: str) -> Name:
-        return Name(name=reports.restore(id))
+        return Name(name=reports.trash.restore(id).name)
 
     @router.delete("/api/reports/deleted")
     def empty_trash() -> Freed:
-        freed = sum(file.bytes for file in reports.list_deleted())
-        reports.empty_trash()
-        return Freed(freed=freed)
+        return Freed(freed=reports.trash.empty())
 
     return router
 

@@ -16,7 +16,6 @@ from beliefscope.app.api.models.training import (
     StudyFilter,
     StudyInfo,
     StudyList,
-    StudyRow,
     StudyTask,
     TrainedSeed,
 )
@@ -132,7 +131,7 @@ def _tasks(study: Study, results: Results, names: CatalogNames) -> list[StudyTas
                 name=task,
                 data=results.tasks.get(task, {}).get("data", ""),
                 filters=[StudyFilter(name=name, trained=list(trained(task, name))) for name in filters],
-                rows=[StudyRow(**row.model_dump(exclude={"task"})) for row in rows],
+                rows=rows,
             )
         )
     return tasks
@@ -144,13 +143,13 @@ def _job_arguments(study: Study, results: Results, store: TraceStore) -> dict[st
         raise BadInput("the built-in study cannot be continued; create one with beliefscope study")
     if results.preset not in PLANS:
         raise unknown_name("preset", results.preset, PLANS)
-    settings, catalog = store.settings, {task["name"]: task for task in store.catalog()["tasks"]}
+    settings = store.settings
     sources = {load_task(source).name: source for source in settings.tasks}
     files: dict[str, tuple[str, str]] = {}
     for task, info in results.tasks.items():
         data_hash = info.get("data_hash", "")
-        names = [data["name"] for data in catalog[task]["data"]] if task in catalog else []
-        name = next((name for name in names if store.data_hash(task, name) == data_hash), None)
+        served = store.datasets(task) if task in store.tasks() else {}
+        name = next((name for name, data in served.items() if data.hash == data_hash), None)
         if name is None:
             data = f"{info.get('data', 'its data set')} ({data_hash[:8]})"
             raise BadInput(f"this server does not have {data}, the training data of {task}: serve it with --data")
@@ -172,5 +171,5 @@ def _key(study: Study, results: Results) -> str:
 
 
 def _catalog_names(store: TraceStore) -> CatalogNames:
-    tasks = store.catalog()["tasks"]
-    return {(task["name"], f["checkpoint_hash"]): f["name"] for task in tasks for f in task["filters"]}
+    filters = {task: store.filters(task) for task in store.tasks()}
+    return {(task, filter_.hash): name for task in filters for name, filter_ in filters[task].items()}

@@ -6,7 +6,6 @@ has failed.
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import os
 import platform
@@ -27,8 +26,8 @@ from packaging.specifiers import SpecifierSet
 
 from beliefscope import __version__
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.checksums import changed_files, read_sums
 
-SUMS = "SHA256SUMS"  # in the format of sha256sum
 DISK_WARNING, DISK_FAILURE = 2e9, 2e8  # bytes of free disk space
 EXTRAS = {
     "ray": "studies on a cluster: pip install 'beliefscope[ray]'",
@@ -125,8 +124,9 @@ def page(_: Place) -> Finding:
     """Check that all files of the dashboard exist, including those of other packages."""
     from beliefscope.app.server.main import PAGE
     from beliefscope.app.server.static_files import page_files
-    from beliefscope.app.server.vendor_files import UPLOT_FILES, installed
+    from beliefscope.app.server.vendor_files import UPLOT_FILES
     from beliefscope.app.views.embedded_viser import client_page
+    from beliefscope.recordings.web_viewer import installed
 
     static = installed("rerun_notebook") / "static"
     files = [
@@ -231,23 +231,6 @@ def report(findings: Mapping[str, Finding]) -> dict[str, Any]:
         "checks": {name: asdict(finding) for name, finding in findings.items()},
         "packages": dict(sorted(installed.items(), key=lambda item: item[0].lower())),
     }
-
-
-def read_sums(folder: Path) -> dict[str, str]:
-    """File name -> SHA-256 in the folder's list."""
-    lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
-    return {name: digest for digest, name in (line.split(maxsplit=1) for line in lines)}
-
-
-def changed_files(folder: Path) -> list[str]:
-    """Names of the listed files that are missing or whose hash differs."""
-
-    def digest(name: str) -> str:
-        with suppress(OSError):
-            return hashlib.sha256((folder / name).read_bytes()).hexdigest()
-        return ""
-
-    return [name for name, expected in read_sums(folder).items() if digest(name) != expected]
 
 
 def _version(name: str) -> str | None:

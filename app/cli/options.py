@@ -1,19 +1,19 @@
-"""Shared command-line options, and functions that resolve their values to checkpoints, episodes and traces."""
+"""Command-line options shared by several commands, and functions that open checkpoints, episodes and traces."""
 
 from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import typer
 
 from beliefscope.app.cli import output as console
-from beliefscope.app.runs.command_lines import is_code, is_path
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, unknown_name
 
 if TYPE_CHECKING:
     from beliefscope.datasets.dataset import Dataset
@@ -40,93 +40,219 @@ def integer(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
     return parse
 
 
+Quantity = Literal["likelihood", "posterior"]
+
+
+def _parse_quantity(text: str) -> str:
+    if text not in get_args(Quantity):
+        raise unknown_name("quantity of maps", text, get_args(Quantity))
+    return text
+
+
+def check_output(path: Path | None, *suffixes: str) -> Path | None:
+    """The path of an output file. Raises BadInput if it cannot be written, or has not one of the suffixes."""
+    if path is None:
+        return None
+    if path.is_dir():
+        raise BadInput(f"output {str(path)!r} is a folder; give the name of a file in it")
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise BadInput(f"output {str(path)!r} must end in {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise BadInput(f"folder {str(path.parent)!r} does not exist, so {path.name!r} cannot be written in it")
+    if not os.access(path.parent, os.W_OK):
+        raise BadInput(f"folder {str(path.parent)!r} is not writable")
+    return path
+
+
 def _check_json(value: str | None) -> str | None:
     if value not in (None, "-"):
         raise BadInput(f"--json {value!r}: JSON is printed to standard output only; write --json -")
     return value
 
 
-TaskName = Annotated[
-    str, typer.Argument(metavar="TASK", help="Task: door, push, push-real, a variant, or your own (docs/data.md).")
-]
-FilterName = Annotated[
-    str,
-    typer.Option(
-        "--filter",
-        metavar="NAME|CHECKPOINT|MODULE:BUILD",
-        help="Built-in filter such as crossmodal-pf, path of a .safetensors file, or external filter given by its "
+def option(metavar: str, description: str, *names: str, **settings: Any) -> Any:
+    """An option with a value. names: default: ``--`` and the parameter's name. settings: of ``typer.Option``."""
+    return typer.Option(*names, metavar=metavar, help=description, **settings)
+
+
+def argument(metavar: str, description: str) -> Any:
+    """A positional argument."""
+    return typer.Argument(metavar=metavar, help=description)
+
+
+def flag(description: str, *names: str) -> Any:
+    """An option without a value."""
+    return typer.Option(*names, help=description)
+
+
+def output_file(metavar: str, description: str, *suffixes: str, names: tuple[str, ...] = ("-o", "--output")) -> Any:
+    """An option for a file to write, by default ``-o``, checked before the command runs: another suffix is refused."""
+
+    def check(path: Path | None) -> Path | None:
+        return check_output(path, *suffixes)
+
+    return option(metavar, description, *names, callback=check)
+
+
+DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5")
+CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors")
+TRACE = output_file("RUN.trace", "Output trace file.", ".trace")
+FIGURE = output_file("FIGURE", "Output figure: .svg, .pdf or .png.")
+TRACE_FILTER = option(
+    "NAME|CHECKPOINT",
+    "Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",
+)
+
+OPTIONS: dict[str, Any] = {
+    "task": argument("TASK", "Task: door, push, push-real, a variant, or your own (docs/data.md)."),
+    "filter": option(
+        "NAME|CHECKPOINT|MODULE:BUILD",
+        "Built-in filter such as crossmodal-pf, path of a .safetensors file, or external filter given by its "
         "build function: package.module:build or path/to/file.py:build (docs/own_filter.md).",
     ),
-]
-TraceFilter = Annotated[
-    str,
-    typer.Option(
-        "--filter",
-        metavar="NAME|CHECKPOINT",
-        help="Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",
-    ),
-]
-DataPath = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE.h5|DIR",
-        help="Episodes: a Beliefscope HDF5 file or a supported external format (docs/data.md). "
+    "data": option(
+        "FILE.h5|DIR",
+        "Episodes: a Beliefscope HDF5 file or a supported external format (docs/data.md). "
         "Default: the built-in sample dataset.",
     ),
-]
-SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Skip unusable trajectories and report the reasons.")]
-EpisodeIndex = Annotated[
-    int | None,
-    typer.Option(
-        parser=integer(0), metavar="I", help="Index of the episode in the dataset. Default: the first held-out one."
-    ),
-]
-FaultsText = Annotated[
-    str,
-    typer.Option(
-        "--faults",
-        metavar="FAULTS",
-        help="Sensor faults to inject, such as blackout=0.4,force_bias:x=5:from=20; also JSON or a .json file. "
+    "skip_bad": flag("Skip unusable trajectories and report the reasons.", "--skip-bad"),
+    "episode": option("I", "Index of the episode in the dataset. Default: the first held-out one.", parser=integer(0)),
+    "faults": option(
+        "FAULTS",
+        "Sensor faults to inject, such as blackout=0.4,force_bias:x=5:from=20; also JSON or a .json file. "
         "List them with: beliefscope faults.",
     ),
-]
-SliceTexts = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--slice",
-        metavar="SLICE",
-        help="Data slice: 'contact', 'free motion', 'blackout 0.8', 'haptics only', or a custom one, "
+    "slices": option(
+        "SLICE",
+        "Data slice: 'contact', 'free motion', 'blackout 0.8', 'haptics only', or a custom one, "
         "NAME:faults=FAULTS:contact=yes:only=MODALITY. Repeatable.",
+        "--slice",
     ),
-]
-Particles = Annotated[int, typer.Option(parser=integer(1), metavar="M", help="Number of particles (particle filters).")]
-Seed = Annotated[int, typer.Option(parser=integer(0), metavar="S", help="Random seed.")]
-Workspace = Annotated[
-    Path, typer.Option(metavar="DIR", help="Workspace folder for recordings and traces; created if missing.")
-]
-LogFolder = Annotated[Path | None, typer.Option("--log", metavar="DIR", help="Folder for TensorBoard logs.")]
-FigurePath = Annotated[
-    Path, typer.Option("-o", "--output", metavar="FIGURE", help="Output figure: .svg, .pdf or .png.")
-]
-CheckpointPath = Annotated[Path, typer.Option("-o", "--output", metavar="CHECKPOINT", help="Output .safetensors file.")]
-DatasetPath = Annotated[Path, typer.Option("-o", "--output", metavar="FILE.h5", help="Output HDF5 file.")]
-TracePath = Annotated[Path, typer.Option("-o", "--output", metavar="TRACE", help="Output trace file.")]
-Json = Annotated[
-    str | None,
-    typer.Option(metavar="-", callback=_check_json, help="Print one JSON document instead of text: --json -"),
-]
+    "quantity": option(
+        "likelihood|posterior",
+        "Quantity of the maps: likelihood of each observation, or posterior of the state. Default: likelihood, or "
+        "posterior for an external filter that reports no virtual observations.",
+        "--map",
+        parser=_parse_quantity,
+    ),
+    "particles": option("M", "Number of particles (particle filters).", parser=integer(1)),
+    "seed": option("S", "Random seed.", parser=integer(0)),
+    "train": option(
+        "PRESET|PATTERN",
+        "Train only these modules: haptics-only, image-only, weights-only, noise-only, dynamics-only, heads-only, "
+        "all, or patterns. Repeatable. Default: all modules that are not frozen.",
+    ),
+    "freeze": option("PATTERN", "Freeze these modules: dotted names, * matches any text. Repeatable."),
+    "workspace": option("DIR", "Workspace folder for recordings and traces; created if missing."),
+    "log": option("DIR", "Folder for TensorBoard logs."),
+    "align": flag("Move data of another frame by the constant offset that explains the difference.", "--align"),
+    "json": option("-", "Print one JSON document instead of text: --json -", callback=_check_json),
+}
+"""Parameter of a command -> its description; ``with_options`` adds those of a single command."""
 
 
-def check_output(path: Path | None) -> None:
-    """Raise BadInput early if the output file cannot be written."""
-    if path is None:
-        return
-    if path.is_dir():
-        raise BadInput(f"output {str(path)!r} is a folder; give the name of a file in it")
-    if not path.parent.is_dir():
-        raise BadInput(f"folder {str(path.parent)!r} does not exist, so {path.name!r} cannot be written in it")
-    if not os.access(path.parent, os.W_OK):
-        raise BadInput(f"folder {str(path.parent)!r} is not writable")
+def with_options(**own: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Describe the parameters of a command: by ``own``, else by ``OPTIONS``.
+
+    A parameter whose type is a dataclass, such as ``Run``, stands for an option for each of its fields.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        descriptions, hints = OPTIONS | own, get_type_hints(command)
+        groups: dict[str, Any] = {name: type_ for name, type_ in hints.items() if is_dataclass(type_)}
+        parameters: list[inspect.Parameter] = []
+        for name, parameter in inspect.signature(command).parameters.items():
+            group = groups.get(name)
+            parameters += inspect.signature(group).parameters.values() if group else [parameter]
+            hints |= get_type_hints(group) if group else {}
+        annotations = {p.name: Annotated[hints[p.name], descriptions[p.name]] for p in parameters}
+
+        @wraps(command)
+        def run(**values: Any) -> None:
+            for name, group in groups.items():
+                values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+            command(**values)
+
+        run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+            [p.replace(kind=p.KEYWORD_ONLY, annotation=annotations[p.name]) for p in parameters]
+        )
+        run.__annotations__ = annotations
+        return run
+
+    return decorate
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Options of a command that runs a filter over the episodes of a dataset."""
+
+    task: str
+    filter: str
+    data: Path | None = None
+    skip_bad: bool = False
+    faults: str = ""
+    particles: int = 300
+    seed: int = 0
+
+    def open(self) -> tuple[Checkpoint, Faults]:
+        """The filter, and the faults to inject."""
+        from beliefscope.datasets.faults.injection import read_faults
+        from beliefscope.filters.open_filter import open_filter
+
+        checkpoint = open_filter(self.task, self.filter)
+        return checkpoint, read_faults(self.faults, checkpoint.task)
+
+    def episodes(self, task: Task) -> Dataset:
+        """The dataset."""
+        return open_episodes(task, self.data, self.skip_bad)
+
+    def check(self, checkpoint: Checkpoint, episodes: list[Episode], align: bool) -> list[Episode]:
+        """Warn if the episodes differ from the training data; with ``align``, the episodes in its frame."""
+        from beliefscope.filters.alignment import align as move
+        from beliefscope.filters.data_check import data_warning
+
+        if align:
+            episodes, alignment = move(checkpoint, episodes, self.particles, self.seed)
+            console.note(f"aligned: {alignment}" if alignment else "aligned: the positions need no offset")
+        if warning := data_warning(checkpoint, episodes):
+            console.note(f"Warning: {warning}")
+        return episodes
+
+
+@dataclass(frozen=True)
+class Run(Runs):
+    """Options of a command that runs a filter over one episode."""
+
+    episode: int | None = None
+
+    def read_episode(self, task: Task) -> tuple[Episode, int]:
+        """The selected episode, or the first held-out one; and its index."""
+        with self.episodes(task) as episodes:
+            index = episodes.held_out()[0] if self.episode is None else self.episode
+            return episodes[index], index
+
+    def trace(self, align: bool = False) -> tuple[Checkpoint, Trace]:
+        """Run the filter with a progress bar; its checkpoint and the trace."""
+        from beliefscope.inspect.trace import trace
+
+        checkpoint, faults = self.open()
+        episode, index = self.read_episode(checkpoint.task)
+        (episode,) = self.check(checkpoint, [episode], align)
+        with console.progress("Filtering") as advance:
+            return checkpoint, trace(checkpoint, episode, index, self.seed, self.particles, faults, advance)
+
+
+def key_values(texts: Iterable[str], name: str, example: str) -> dict[str, str]:
+    """Values by key of texts such as ``step=68``. name: of the option. Raises BadInput for other texts."""
+    values: dict[str, str] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key or not value:
+            raise BadInput(f"{name} {text!r} is not {example}")
+        if key in values:
+            raise BadInput(f"{name} is given twice for {key!r}")
+        values[key] = value
+    return values
 
 
 def check_folder(path: Path | None, option: str) -> None:
@@ -156,26 +282,10 @@ def open_episodes(task: Task, path: Path | None, skip_bad: bool = False) -> Data
     return data
 
 
-def open_checkpoint(task: str, name_or_path: str) -> Checkpoint:
-    """Load a built-in filter by name, a checkpoint by path, or an external filter by ``module:build``."""
-    from beliefscope.datasets.catalog import load_task
-    from beliefscope.filters.checkpoint import load_checkpoint, shipped
-
-    name = load_task(task).name
-    if is_code(name_or_path):
-        from beliefscope.filters.external.load import load_external
-
-        return load_external(name_or_path, name)
-    checkpoint = load_checkpoint(Path(name_or_path) if is_path(name_or_path) else shipped(name, name_or_path))
-    if checkpoint.task.name != name:
-        raise BadInput(f"filter {name_or_path!r} is for task {checkpoint.task.name!r}, not for {name!r}")
-    return checkpoint
-
-
 def open_recording(path: Path) -> Trace:
     """Read the trace in a recording or a live file. A separate process checks the recording first (it may crash)."""
-    from beliefscope.app.workspace.recording_probe import RecordingProbe
     from beliefscope.inspect.traces.live_file import SUFFIX, load_live
+    from beliefscope.recordings.probe import RecordingProbe
     from beliefscope.recordings.read import read_recording
 
     if path.suffix == SUFFIX:
@@ -195,118 +305,18 @@ def open_trace(path: Path) -> Trace:
 
 
 def open_traces(paths: Sequence[Path], filter_: str) -> tuple[list[Trace], Checkpoint | None]:
-    """Read traces of one filter, and its checkpoint if available.
-
-    Args:
-        filter_: name or path of the filter; if empty, the built-in filter with the traces' checkpoint hash.
-
-    Raises:
-        BadInput: the traces are of different checkpoints, or not of the given filter.
-    """
-    from beliefscope.datasets.catalog import find_task
-    from beliefscope.filters.checkpoint import load_checkpoint, shipped
+    """Read traces of one filter, and its checkpoint if available; see ``checkpoint_of``."""
+    from beliefscope.inspect.traces.provenance import checkpoint_of
 
     traces = [open_trace(path) for path in paths]
-    first = traces[0]
-    for path, trace in zip(paths, traces, strict=True):
-        if trace.checkpoint_hash != first.checkpoint_hash:
-            raise BadInput(f"{path} and {paths[0]} are from different checkpoints; give traces of one filter")
-    if filter_:
-        checkpoint = open_checkpoint(find_task(first.episode.task).name, filter_)
-        if checkpoint.hash != first.checkpoint_hash:
-            raise BadInput(f"{paths[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}")
-        return traces, checkpoint
-    try:
-        checkpoint = load_checkpoint(shipped(first.episode.task, first.filter))
-    except BadInput:
-        return traces, None
-    return traces, checkpoint if checkpoint.hash == first.checkpoint_hash else None
-
-
-def read_faults(text: str) -> str:
-    """The contents of a faults file if the text is a path (ends in .json or has a separator), else the text itself."""
-    if text.lstrip().startswith(("{", "[")) or not (text.endswith(".json") or os.sep in text):
-        return text
-    try:
-        return Path(text).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise BadInput(f"faults {text!r} is not a readable file") from None
-
-
-def parse_faults(text: str, task: Task) -> Faults:
-    """Parse the value of --faults. Raises BadInput for faults that do not apply to the task."""
-    from beliefscope.datasets.faults.injection import Faults
-
-    faults = Faults.parse(read_faults(text))
-    faults.check(task)
-    return faults
-
-
-def select_episode(task: Task, data: Path | None, skip_bad: bool, index: int | None) -> tuple[Episode, int]:
-    """The episode with this index, or the first held-out one; and its index."""
-    with open_episodes(task, data, skip_bad) as episodes:
-        index = episodes.held_out()[0] if index is None else index
-        return episodes[index], index
-
-
-def run_filter(
-    task: TaskName,
-    filter_: FilterName,
-    data: DataPath = None,
-    skip_bad: SkipBad = False,
-    episode: EpisodeIndex = None,
-    faults_: FaultsText = "",
-    particles: Particles = 300,
-    seed: Seed = 0,
-) -> tuple[Checkpoint, Trace]:
-    """Run a filter over one episode with a progress bar; returns its checkpoint and the trace."""
-    from beliefscope.inspect.trace import trace
-
-    checkpoint = open_checkpoint(task, filter_)
-    faults = parse_faults(faults_, checkpoint.task)
-    recorded, index = select_episode(checkpoint.task, data, skip_bad, episode)
-    with console.progress("Filtering") as advance:
-        return checkpoint, trace(checkpoint, recorded, index, seed, particles, faults, advance)
-
-
-def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Prepend the options of ``run_filter`` to those of a command.
-
-    The command receives the checkpoint, the trace and its own options; ``output`` is checked before the run.
-    """
-    signatures = [inspect.signature(function) for function in (run_filter, command)]
-    shared, other = (list(signature.parameters.values()) for signature in signatures)
-    # The two classes are imported only when a command runs.
-    names = {"Checkpoint": Any, "Trace": Any}
-    hints = {
-        k: v for f in (run_filter, command) for k, v in get_type_hints(f, None, names, include_extras=True).items()
-    }
-    options = [p.replace(kind=p.KEYWORD_ONLY, annotation=hints[p.name]) for p in (*shared, *other[2:])]
-
-    @wraps(command)
-    def run(**values: Any) -> None:
-        check_output(values["output"])
-        command(*run_filter(**{p.name: values.pop(p.name) for p in shared}), **values)
-
-    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
-    run.__annotations__ = {p.name: p.annotation for p in options}
-    return run
+    return traces, checkpoint_of(traces, paths, filter_)
 
 
 def print_trace(trace: Trace, path: Path, json: str | None, **extra: Any) -> None:
     """Print the description of a file created from a trace. extra: additional values of the JSON document."""
-    document = {
-        "task": trace.episode.task,
-        "filter": trace.filter,
-        "episode": trace.episode_index,
-        "steps": len(trace),
-        "faults": trace.faults.to_json(),
-        "seed": trace.seed,
-        "checkpoint_hash": trace.checkpoint_hash,
-        "data_hash": trace.data_hash,
-        "path": str(path),
-        "bytes": path.stat().st_size,
-    }
+    from beliefscope.inspect.traces.provenance import describe
+
+    document = describe(trace) | {"path": str(path), "bytes": path.stat().st_size}
     run = f"{trace.filter} over {len(trace)} steps of {trace.episode.task} episode {trace.episode_index}"
     text = f"{path_and_size(path)}: {run}" + (f" with {trace.faults}" if trace.faults else "")
     console.result(document | extra, text, json)

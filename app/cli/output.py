@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from beliefscope.inspect.diagnostics.views import Table
 
 
@@ -39,49 +37,21 @@ def note(line: str) -> None:
 
 def result(document: Mapping[str, Any], text: str, destination: str | None) -> None:
     """Print the result of a command: the text, or the JSON document if ``destination`` is ``-``."""
-    print(text if destination is None else json.dumps(_finite(document), indent=2, allow_nan=False))
+    from beliefscope.inspect.diagnostics.views import as_json
 
-
-def _finite(value: Any) -> Any:
-    """Replace infinite and NaN values by None, because JSON has neither."""
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    print(text if destination is None else json.dumps(as_json(document), indent=2, allow_nan=False))
 
 
 def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int | float | None]]) -> str:
-    """Format a table with a title; numbers are right-aligned with three digits, None is ``-``."""
+    """Format a table with a title."""
+    from beliefscope.inspect.diagnostics.views import format_table
 
-    def text(value: str | int | float | None) -> str:
-        return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
-
-    cells = [list(columns), *([text(value) for value in row] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    alignments = [
-        ">" if rows and not any(isinstance(row[i], str) for row in rows) else "<" for i in range(len(columns))
-    ]
-    lines = [
-        "  ".join(f"{cell:{align}{width}}" for cell, width, align in zip(row, widths, alignments, strict=True))
-        for row in cells
-    ]
-    return "\n".join([title, *(f"  {line.rstrip()}" for line in lines)])
+    return format_table(title, columns, rows)
 
 
 def grids(tables: Iterable[Table]) -> list[str]:
     """Format several tables."""
     return [grid(table.title, table.columns, table.rows) for table in tables]
-
-
-def render(*items: RenderableType) -> str:
-    """Render rich tables or trees as plain text without a width limit."""
-    from rich.console import Console
-
-    console = Console(width=1000, color_system=None)
-    with console.capture() as capture:
-        console.print(*items, sep="\n")
-    return "\n".join(line.rstrip() for line in capture.get().splitlines()).strip("\n")
 
 
 @contextmanager
@@ -95,12 +65,20 @@ def progress(label: str) -> Iterator[Callable[[float], None]]:
 def bars() -> Iterator[Callable[[str, float, str], None]]:
     """Show progress bars on standard error; yields (label, completed fraction, note) -> None.
 
-    A bar appears with its first update.
+    A bar appears with its first update. If standard error is not a terminal, lines are printed instead.
     """
+    if not sys.stderr.isatty():
+        yield _progress_lines()
+        return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(elapsed_when_finished=True),
+    )
     view = Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
     tasks: dict[str, TaskID] = {}
 
@@ -116,3 +94,20 @@ def bars() -> Iterator[Callable[[str, float, str], None]]:
         # Stopping a view that was never started prints an empty line.
         if tasks:
             view.stop()
+
+
+def _progress_lines() -> Callable[[str, float, str], None]:
+    """(label, completed fraction, note) -> None; prints a line at every tenth, at most one per second, and at 1."""
+    began = last = time.monotonic()
+    tenths: dict[str, int] = {}
+
+    def update(label: str, fraction: float, text: str) -> None:
+        nonlocal last
+        tenth, now = int(10 * fraction + 1e-9), time.monotonic()
+        if tenth <= tenths.get(label, 0) or (tenth < 10 and now - last < 1):
+            return
+        tenths[label], last = tenth, now
+        left = f", {(now - began) * (1 / fraction - 1):.0f} s left" if tenth < 10 else ""
+        note(f"{label}: {10 * tenth} %, {now - began:.0f} s{left}" + (f", {text}" if text else ""))
+
+    return update

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from typing import Any
 
 from beliefscope.app.jobs.worker import Report
-from beliefscope.app.protocol.diagnostic_options import takes_progress
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
@@ -21,9 +21,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     entry = DIAGNOSTICS[arguments["diagnostic"]]
     selections = [Selection.from_json(values) for values in arguments["selections"]]
     count = len(selections)
-    store = TraceStore(Settings.from_json(arguments["settings"]))
     traces: list[Trace] = []
-    try:
+    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
         for i, selection in enumerate(selections):
             traced = store.request(selection)
             while not traced.ready(POLL_INTERVAL):
@@ -32,8 +31,6 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             report(0.5 * (i + 1) / count, f"{i + 1} of {count} episodes filtered")
         message = f"evaluating {count} episodes" if count > 1 else f"evaluating episode {selections[0].episode}"
         report(0.5, message)
-        callback = {"progress": lambda share: report(0.5 + 0.5 * share, message)} if takes_progress(entry) else {}
+        callback = {"progress": lambda share: report(0.5 + 0.5 * share, message)} if entry.takes_progress else {}
         result = entry(traces, traced.checkpoint, **arguments["options"], **callback)
         return {"trajectories": count, **result.views()}
-    finally:
-        store.close()

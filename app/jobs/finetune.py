@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping
-from pathlib import Path
+from contextlib import closing
 from typing import Any
 
 from beliefscope.app.jobs.worker import Report
@@ -17,15 +16,15 @@ from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from beliefscope.filters.finetuning.finetune import finetune
 from beliefscope.filters.finetuning.loop import Validation
-from beliefscope.filters.finetuning.report import curve_values, error_summary
+from beliefscope.filters.finetuning.report import curve_values, no_change
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compare_checkpoints
+from beliefscope.inspect.compare.progress_log import ProgressLog
 from beliefscope.inspect.diagnostics.views import as_json
+from beliefscope.inspect.healthy import measure_profile
 
 TRAINING_SHARE = 0.8
 """Share of the progress for training; the rest is for the comparison."""
-
-WRITE_INTERVAL = 0.3  # s between writes of the progress
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -36,12 +35,11 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     tuning = FineTune.from_json(arguments["settings"])
     folder = FineTuneRuns(settings.workspace).folder(arguments["run"])
     path = folder / "finetuned.safetensors"
-    store = TraceStore(settings)
-    try:
+    with closing(TraceStore(settings)) as store:
         base = store.checkpoint(arguments["task"], arguments["filter"])
         data_name, data = store.dataset(arguments["task"], arguments["data"])
         with log_curves(folder / "log") as write:
-            log = ProgressLog(FineTuneRuns(settings.workspace), arguments["run"], tuning.steps)
+            log = ProgressLog(folder / "progress.json", tuning.steps)
 
             def on_validation(validation: Validation) -> None:
                 log.add_validation(validation)
@@ -51,9 +49,10 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 log.add_step(step, loss)
                 report(TRAINING_SHARE * step / steps, f"step {step} of {steps}, loss {loss:.3g}; {log.errors}")
 
+            episodes = list(data)
             result = finetune(
                 base,
-                list(data),
+                episodes,
                 data_hash=store.data_hash(arguments["task"], data_name),
                 settings=tuning,
                 command=f"fine-tuned on the page from {arguments['filter']}",
@@ -64,7 +63,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             )
             log.write()
         assert result is not None, "finetune returns None only if it is stopped"
-        save_checkpoint(result.filter, base.name, result.record, path)
+        profile = measure_profile(result.filter, base.name, episodes, f"held-out episodes of {data_name}")
+        save_checkpoint(result.filter, base.name, result.record, path, profile)
         finetuned = load_checkpoint(path)
         comparison = compare_checkpoints(
             base,
@@ -77,8 +77,6 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
                 TRAINING_SHARE + (1.0 - TRAINING_SHARE) * share, "comparing the result with its base"
             ),
         )
-    finally:
-        store.close()
     document = as_json(_result(comparison, finetuned, arguments["filter"], data_name))
     write_atomically(folder / "result.json", json.dumps(document, allow_nan=False).encode())
     return {"verdict": comparison.verdict}
@@ -95,49 +93,15 @@ def _result(comparison: CheckpointComparison, finetuned: Checkpoint, base: str, 
     """The result document; each event has a permalink that opens it with the base as comparison run."""
     name = catalog_name(base, finetuned.hash)
     views, event_table = comparison.views(), comparison.event_table().title
-    weighted = finetuned.filter.architecture.fusion == "crossmodal"
     events = []
     for event in comparison.events:
         link = permalink(finetuned.task, name, data, event.episode, event.step, event.faults)
-        events.append(as_json(event) | {"link": comparison_permalink(link, event, base, weighted)})
+        events.append(as_json(event) | {"link": comparison_permalink(link, event, base)})
     record = {key: finetuned.record[key] for key in ("best_step", "steps", "seconds")}
+    record["no_change"] = no_change(finetuned.record)
     return {
         "finetuned": {"name": name, "hash": finetuned.hash} | record,
         "comparison": views | {"tables": [table for table in views["tables"] if table["title"] != event_table]},
         "frozen": comparison.frozen,
         "events": events,
     }
-
-
-class ProgressLog:
-    """Writes the loss of each step and all validations to ``progress.json``, which the server reads."""
-
-    def __init__(self, runs: FineTuneRuns, run: str, steps: int) -> None:
-        self._path: Path = runs.folder(run) / "progress.json"
-        self._steps, self._written = steps, 0.0
-        self._interrupted_losses = (runs.read(run, "progress.json") or {}).get("losses", [])
-        self._losses: list[tuple[int, float]] = []
-        self._validations: list[Validation] = []
-
-    @property
-    def errors(self) -> str:
-        """Summary of the errors in the first and the last validation."""
-        return error_summary(self._validations[0], self._validations[-1]) if self._validations else ""
-
-    def resume(self, step: int) -> None:
-        """Keep the losses up to this step of the interrupted run."""
-        self._losses = [(at, loss) for at, loss in self._interrupted_losses if at <= step]
-
-    def add_validation(self, validation: Validation) -> None:
-        self._validations.append(validation)
-        self.write()
-
-    def add_step(self, step: int, loss: float) -> None:
-        self._losses.append((step, loss))
-        if time.monotonic() - self._written > WRITE_INTERVAL:
-            self.write()
-
-    def write(self) -> None:
-        self._written = time.monotonic()
-        document = {"steps": self._steps, "losses": self._losses, "validations": self._validations}
-        write_atomically(self._path, json.dumps(as_json(document)).encode())

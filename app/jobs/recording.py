@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,35 +12,35 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
-from beliefscope.app.workspace.recording_probe import RecordingInfo
 from beliefscope.app.workspace.recordings import RecordingFolder
 from beliefscope.inspect.catalog import quick
-from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter
+from beliefscope.inspect.likelihood import LikelihoodMap, Quantity
+from beliefscope.inspect.traces.live_file import SUFFIX, write_live
+from beliefscope.recordings.probe import RecordingInfo
 
 
 def record(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Record a run with likelihood maps; a stored trace is reused."""
-    store, files = TraceStore(Settings.from_json(arguments["settings"])), RecordingFolder(Path(arguments["folder"]))
-    try:
+    path = Path(arguments["path"])
+    with (
+        closing(TraceStore(Settings.from_json(arguments["settings"]))) as store,
+        closing(RecordingFolder(path.parent)) as files,
+    ):
         report(0.0, "running the filter")
         run = store.request(Selection.from_json(arguments["selection"]))
-        path = write(files, run, arguments["name"], arguments["automatic"], arguments["maps"], report)
+        write(files, run, path, arguments["maps"], report, arguments["quantity"])
         return {"name": path.name}
-    finally:
-        files.close()
-        store.close()
 
 
 def write(
     files: RecordingFolder,
     run: TracedRun,
-    name: str,
-    automatic: bool,
+    path: Path,
     stride: int = 0,
     report: Report = lambda share, message: None,
-) -> Path:
-    """Write a new recording; its path. stride: steps between likelihood maps, 0 for none."""
+    quantity: Quantity = "likelihood",
+) -> None:
+    """Write a recording. stride: steps between maps of the quantity, 0 for none."""
     from beliefscope.recordings.rerun_log.metadata import describe  # imports Rerun, which takes a second
     from beliefscope.recordings.write import write_recording
 
@@ -47,14 +48,14 @@ def write(
     steps = range(0, len(trace), stride) if stride else range(0)
 
     def maps() -> Iterator[LikelihoodMap]:
-        for count, likelihood_map in enumerate(run.maps(steps), start=1):
+        for count, likelihood_map in enumerate(run.maps(steps, quantity), start=1):
             report(count / len(steps), f"likelihood maps, {count} of {len(steps)}")
             yield likelihood_map
 
     part = files.partial_path()
     try:
         write_recording(trace, part, maps(), diagnostics=quick(trace, run.checkpoint))
-        return files.publish(part, RecordingInfo.from_json(describe(part), part), name, automatic)
+        files.publish(part, path, RecordingInfo.from_json(describe(part), part))
     finally:
         part.unlink(missing_ok=True)
 
@@ -67,14 +68,5 @@ def open_run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     trace, path = read_recording(arguments["recording"]), Path(arguments["run"])
     report(0.5, "writing its steps")
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    part.unlink(missing_ok=True)
-    writer = LiveFileWriter(part, trace, len(trace))
-    try:
-        writer.append(trace)
-        writer.finish()
-        part.replace(path)
-    finally:
-        writer.close()
-        part.unlink(missing_ok=True)
+    write_live(trace, path)
     return {"run": path.name.removesuffix(SUFFIX), "steps": len(trace)}

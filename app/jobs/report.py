@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from beliefscope.app.jobs.worker import Report
 from beliefscope.app.protocol.permalinks import permalink
-from beliefscope.app.runs.command_lines import report_command, serve_command, trace_command
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.inspect.likelihood import missing_quantities
+from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 from beliefscope.recordings.report.pdf import browser, print_page
 
 
@@ -20,9 +22,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     from beliefscope.recordings.report.compose import compose, write_report  # imports Rerun
 
     options = arguments["options"]
-    events, slow, title = options["events"], options["slow"], options["title"]
-    store = TraceStore(Settings.from_json(arguments["settings"]))
-    try:
+    events, slow, title, quantity = (options[name] for name in ("events", "slow", "title", "quantity"))
+    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
         selection = Selection.from_json(arguments["selection"])
         report(0.0, "running the filter")
         traced = store.request(selection)
@@ -30,6 +31,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         settings = store.settings
         checkpoint, data = settings.checkpoints.get(selection.filter), settings.data.get(selection.data)
         path = str(checkpoint) if isinstance(checkpoint, Path) else ""
+        shown = [] if quantity == "likelihood" else ["--map", quantity]
+        quantity = None if quantity in missing_quantities(traced.checkpoint, trace) else quantity
         serve = serve_command(filter(None, [path]), data, settings.seed)
 
         def link(index: int, step: int) -> str:
@@ -47,8 +50,9 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             links_note=f"Permalinks work while this command runs: {serve}.",
             commands=(
                 trace_command(trace, "run.trace", path, data),
-                report_command(["run.trace"], events, slow, title),
+                report_command(["run.trace"], events, slow, title, *shown),
             ),
+            quantity=quantity,
             progress=lambda share: report(0.1 + 0.4 * share, "computing diagnostics"),
         )
         folder = Path(arguments["folder"])
@@ -57,5 +61,3 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         to_pdf = None if chromium is None else lambda page, pdf: print_page(chromium, page, pdf)
         document = write_report(composed, folder, to_pdf, lambda share: report(0.5 + 0.5 * share, "drawing figures"))
         return {"folder": str(folder), "files": document["files"]}
-    finally:
-        store.close()

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.maps.statistics import measure_maps
+from beliefscope.inspect.maps.shape import SHAPES
+from beliefscope.inspect.maps.statistics import measure_maps, particle_cloud
 from beliefscope.inspect.trace import Trace
 
 LOG_RANGE = 64.0
@@ -29,7 +30,10 @@ NUMBERS = (
     "area95",
     "axis",
     "elongation",
-    "off_line",
+    "deviation",
+    "ring_centre",
+    "ring_radius",
+    "ring_coverage",
     "divergence",
     "overlap",
 )
@@ -67,13 +71,15 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
     """
     effector = trace.episode.observations.get("effector_position")
     cells, log_max, log_range = quantise(maps.log_likelihood)
-    cloud = particles(trace, index, task)
+    cloud = particle_cloud(trace, index, task)
     statistics = measure_maps([replace(maps, step=index)], trace)
     # Without a true state the maps are centered on the estimate, whose log-likelihood is not the one at the truth.
     unknown = {"truth": [None] * len(maps.layers)} if np.isnan(trace.episode.states[index]).any() else {}
     description = {
         "step": maps.step,
         "size": len(maps.offsets_x),
+        "quantity": maps.quantity,
+        "rule": maps.rule,
         "angle": None if math.isnan(maps.angle) else float(maps.angle),
         "layers": list(maps.layers),
         "half_width": float(-maps.offsets_x[0] + 0.5 * (maps.offsets_x[1] - maps.offsets_x[0])),
@@ -84,6 +90,8 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
         "log_range": _json(log_range),
         "peak": maps.peaks().tolist(),
         "effector": None if effector is None else effector[index, :2].tolist(),
+        "expected": _json(statistics.expected[0]),
+        "shape": [SHAPES[shape] for shape in statistics.shape[0]],
         "numbers": {name: _json(getattr(statistics, name)[0]) for name in NUMBERS} | unknown,
         "particles": 0 if cloud is None else len(cloud[0]),
     }
@@ -103,22 +111,6 @@ def quantise(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.f
     return q, top[:, 0, 0], span[:, 0, 0]
 
 
-def particles(trace: Trace, step: int, task: Task) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Positions (M, 2) of the predicted particles on the map, m, and their weights (L, M) by layer, which sum to 1.
-
-    None for a filter without particles or without weights by layer.
-    """
-    if trace.particles is None or trace.log_likelihood is None or trace.prior_log_weights is None:
-        return None
-    assert trace.log_weights is not None
-    unimodal = trace.prior_log_weights[step] + trace.log_likelihood[step]
-    log = np.concatenate([unimodal, trace.log_weights[step][None]])
-    weights = np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True))
-    return trace.particles[step][:, list(task.map_indices)], weights
-
-
 def _json(array: NDArray[Any]) -> Any:
     """Nested lists, with None for NaN and infinity, which JSON does not have."""
-    if array.ndim == 0:
-        return float(array) if np.isfinite(array) else None
-    return [_json(part) for part in array]
+    return np.where(np.isfinite(array), array.astype(object), np.array(None)).tolist()

@@ -9,6 +9,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeI
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.inspect.maps.likelihood_map import Quantity
 
 MAX_ANGLE = 1e3  # rad: beyond the turns of any door
 READ_ONLY = "This server is read-only."
@@ -41,7 +42,8 @@ class Cursor(_Message):
         serial: counter of the page's cursors. data: name of the data set; empty for the task's first.
         faults: injected faults. scene: whether the 3D scene is updated, or only the maps.
         against: differences of the comparison run (``Selection.against``), whose estimate the scene shows; empty
-            without one. comparison_maps: whether its maps are sent, too.
+            without one. comparison_maps: whether its maps are sent, too. quantity: of the maps; the other one if the
+            filter does not have it.
     """
 
     serial: NonNegativeInt
@@ -56,6 +58,7 @@ class Cursor(_Message):
     data: str = ""
     against: str = ""
     comparison_maps: bool = False
+    quantity: Quantity = "likelihood"
 
 
 class SceneLayers(_Message):

@@ -37,12 +37,10 @@ def permalink(task: Task, filter_: str, data: str, episode: int, step: int, faul
     return "?" + urlencode(query, safe="*").replace("~", "%7E")
 
 
-def comparison_permalink(link: str, event: Regression, filter_: str, weighted: bool) -> str:
+def comparison_permalink(link: str, event: Regression, filter_: str) -> str:
     """A permalink that adds a comparison run: the one of ``filter_``, which was better at this event.
 
-    An event with a single modality is compared with the same filter restricted to it, if the filter is ``weighted``.
+    An event with a single modality is compared with the standalone filter of this modality.
     """
-    against: dict[str, str | int] = {"filter": filter_}
-    if weighted and len(event.only) == 1:
-        against = {"from": 0, "to": event.last + 1, "weights": f"{event.only[0]}=1"}
+    against = {"only": event.only[0]} if len(event.only) == 1 else {"filter": filter_}
     return f"{link}&{urlencode({'against': urlencode(against)})}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
 from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import nees_bounds
+from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import innovations
 from beliefscope.inspect.trace import Trace
@@ -72,8 +74,18 @@ def scene_layers(task: Task, trace: Trace, no_maps: str | None) -> list[SceneLay
     return [layer for layer in LAYERS if present[layer]]
 
 
-def header(trace: Trace, column_descriptions: list[dict[str, Any]], task: Task, no_maps: str | None) -> dict[str, Any]:
-    """Metadata of a trace, as in ``responses.TraceHeader``. no_maps: why there are no likelihood maps, or None."""
+def header(
+    trace: Trace,
+    column_descriptions: list[dict[str, Any]],
+    task: Task,
+    no_maps: str | None,
+    missing: Mapping[Quantity, str],
+) -> dict[str, Any]:
+    """Metadata of a trace, as in ``responses.TraceHeader``.
+
+    Args:
+        no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
+    """
     images = camera_images(trace)
     components = [{"name": c.name, "unit": c.unit} for c in task.components]
     return {
@@ -92,6 +104,7 @@ def header(trace: Trace, column_descriptions: list[dict[str, Any]], task: Task, 
         "settings": dict(trace.settings),
         "nees_bounds": nees_bounds(len(components), 1) if trace.has_covariance else None,
         "no_maps": no_maps,
+        "missing_quantities": dict(missing),
         "image_size": None if images is None else list(images.shape[1:]),
         "columns": column_descriptions,
         "scene": scene_layers(task, trace, no_maps),

@@ -5,9 +5,7 @@ A run is the only episode of the data set ``live:NAME``. The filter and its view
 
 from __future__ import annotations
 
-import hashlib
 import threading
-import time
 from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import suppress
@@ -20,145 +18,22 @@ import numpy as np
 
 from beliefscope.app.protocol.trace_format import header
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.traced_run import TracedRun
+from beliefscope.app.runs.traced_run import TracedRun, compute_map
 from beliefscope.app.workspace.json_files import is_text
 from beliefscope.app.workspace.paths import file_within
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS
-from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, no_maps
+from beliefscope.filters.external.load import UnavailableFilter
+from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileReader
+from beliefscope.inspect.traces.live_file import SUFFIX
+from beliefscope.inspect.traces.live_run import LiveRun
 
 LIVE_PREFIX = "live:"
 LISTED_RUNS = 30  # most recent ones
-LIVENESS_INTERVAL = 0.25  # s between checks of a writer that adds no steps
 COMPLETE_IN_MEMORY = 4  # runs
-
-
-class UnavailableFilter(ExternalFilter):
-    """Stands for the filter of a live run that this server does not have. It can be drawn, but not run."""
-
-    def __init__(self, trace: Trace, task: Task) -> None:
-        values = {"name": trace.filter, "record": {}, "hash": trace.checkpoint_hash, "source": trace.filter}
-        for key, value in (values | {"_task": task}).items():
-            object.__setattr__(self, key, value)  # checkpoints are frozen
-
-    def run(self, *_: Any, **__: Any) -> Any:
-        """Raises BadInput."""
-        raise BadInput(f"this server has only a live run of filter {self.name!r}; add the filter with --filter")
-
-
-class LiveRun:
-    """One live file. Methods may be called from any thread.
-
-    Attributes:
-        name: without ``live:``.
-        template: the trace without its steps.
-        task: of the run.
-        reader: of the file.
-        inode: distinguishes the file from a later one with the same name.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Raises BadInput if the file is not a live run or its task is unknown."""
-        self.name = path.name.removesuffix(SUFFIX)
-        self.inode = path.stat().st_ino
-        self.reader = LiveFileReader(path)
-        try:
-            self.template = self.reader.part(0, 0)
-            self.task = find_task(self.template.episode.task)
-        except BadInput:
-            self.reader.close()
-            raise
-        self._damage = ""
-        self._ended = False
-        self._polled, self._polled_size = 0.0, -1
-        self._newest: GrowingRun | None = None
-        self._lock = threading.Lock()
-
-    def poll(self) -> int:
-        """Read new steps; return their total number. A damaged file ends before the damage."""
-        with self._lock:
-            if not self._ended:
-                self._polled, self._polled_size = time.monotonic(), self._file_size
-                alive = self.reader.alive  # checked first, so that the last steps of an ended run are read
-                try:
-                    self.reader.poll()
-                except BadInput as error:
-                    self._damage = str(error)
-                self._ended = bool(self._damage) or not alive
-            return self.reader.steps
-
-    @property
-    def may_have_grown(self) -> bool:
-        """Whether ``poll`` may return news: the file has grown, or the writer's state was not checked recently."""
-        return self._file_size != self._polled_size or time.monotonic() > self._polled + LIVENESS_INTERVAL
-
-    @property
-    def _file_size(self) -> int:
-        try:
-            return self.reader.path.stat().st_size
-        except OSError:
-            return -1
-
-    @property
-    def state(self) -> str:
-        """At the last poll: ``running``, ``ended``, ``died`` (without an end marker) or ``damaged``."""
-        if not self._ended:
-            return "running"
-        return "damaged" if self._damage else "ended" if self.reader.finished else "died"
-
-    @property
-    def message(self) -> str:
-        """Explanation of the state, if it needs one."""
-        if self.state == "died":
-            where = f"at step {self.reader.steps - 1}" if self.reader.steps else "before its first step"
-            return f"Live run {self.name!r} stopped {where}: its process has exited without closing the file."
-        return f"Live run {self.name!r}: {self._damage}." if self._damage else ""
-
-    @property
-    def key(self) -> str:
-        """Hash that identifies the steps read so far."""
-        parts = (self.name, self.reader.started, self.reader.pid, self.reader.steps)
-        return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-    def growing(self, checkpoint: Checkpoint) -> GrowingRun:
-        """The steps read so far."""
-        with self._lock:
-            if self._newest is None or len(self._newest) != self.reader.steps:
-                self._newest = GrowingRun(self, checkpoint)
-            return self._newest
-
-    def complete(self, checkpoint: Checkpoint) -> TracedRun:
-        """The trace of a run that has ended."""
-        self._newest = None
-        run = TracedRun(self.key, checkpoint)
-        run.future.set_result(self.reader.part(0))
-        return run
-
-    def to_json(self) -> dict[str, Any]:
-        """The run in the page's list."""
-        return {
-            "name": self.name,
-            "data": f"{LIVE_PREFIX}{self.name}",
-            "task": self.task.name,
-            "episode": self.template.episode_index,
-            "faults": str(self.template.faults),
-            "steps": self.reader.steps,
-            "expected": self.reader.expected,
-            "started": self.reader.started,
-            "state": self.state,
-            "message": self.message,
-        }
-
-    def close(self) -> None:
-        """Close the file."""
-        self.reader.close()
 
 
 class GrowingRun(TracedRun):
@@ -197,14 +72,15 @@ class GrowingRun(TracedRun):
     def no_maps(self) -> str | None:
         return no_maps(self.checkpoint, self._last)
 
-    def map(self, step: int, angle: float | None, size: int) -> LikelihoodMap:
+    def map(self, step: int, angle: float | None, size: int, quantity: Quantity = "likelihood") -> LikelihoodMap:
         """Compute the map from this step alone, without encoding the images of all earlier steps."""
-        return replace(MapEngine(self.checkpoint, self.at(step)[0]).map(0, angle=angle, size=size), step=step)
+        return replace(compute_map(MapEngine(self.checkpoint, self.at(step)[0]), 0, angle, size, quantity), step=step)
 
     def header(self) -> dict[str, Any]:
         """Description of the run for the page. Each block of steps describes its own columns."""
-        description = header(self._last, [], self._run.task, self.no_maps)
-        return description | {"steps": self._steps, "live": self._run.to_json()}
+        missing = missing_quantities(self.checkpoint, self._last)
+        description = header(self._last, [], self._run.task, self.no_maps, missing)
+        return description | {"steps": self._steps, "live": describe(self._run)}
 
 
 class LiveRuns:
@@ -213,6 +89,7 @@ class LiveRuns:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._runs: dict[str, LiveRun] = {}
+        self._growing: dict[str, GrowingRun] = {}  # the newest state of each running run
         self._complete: OrderedDict[str, TracedRun] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -260,14 +137,19 @@ class LiveRuns:
                 f"live run {run.name!r} is of task {run.task.name!r}, episode {run.template.episode_index}, "
                 f"not of {selection.task!r}, episode {selection.episode}"
             )
-        if (selection.filter, selection.faults, selection.edit) != (name, NO_FAULTS, None):
+        if (selection.filter, selection.faults, selection.edit, selection.only) != (name, NO_FAULTS, None, ""):
             return None
-        if run.state == "running":
-            return run.growing(checkpoint)
         with self._lock:
+            if run.state == "running":
+                newest = self._growing.get(run.name)
+                if newest is None or newest.key != run.key:
+                    newest = self._growing[run.name] = GrowingRun(run, checkpoint)
+                return newest
+            self._growing.pop(run.name, None)
             key = run.key
             if key not in self._complete:
-                self._complete[key] = run.complete(checkpoint)
+                self._complete[key] = TracedRun(key, checkpoint)
+                self._complete[key].future.set_result(run.reader.part(0))
             self._complete.move_to_end(key)
             while len(self._complete) > COMPLETE_IN_MEMORY:
                 self._complete.popitem(last=False)
@@ -296,13 +178,30 @@ class LiveRuns:
             self._runs.clear()
 
 
+def describe(run: LiveRun) -> dict[str, Any]:
+    """A live run in the page's list."""
+    return {
+        "name": run.name,
+        "data": f"{LIVE_PREFIX}{run.name}",
+        "task": run.task.name,
+        "episode": run.template.episode_index,
+        "faults": str(run.template.faults),
+        "steps": run.reader.steps,
+        "expected": run.reader.expected,
+        "started": run.reader.started,
+        "state": run.state,
+        "message": run.message,
+    }
+
+
 def resolve_filter(run: LiveRun, filters: Mapping[str, Checkpoint]) -> tuple[str, Checkpoint]:
     """Displayed name and checkpoint of a run's filter, found among its task's filters by its hash."""
     hash_ = run.template.checkpoint_hash
     name = display_name(run.template.filter, hash_, filters)
     checkpoint = filters.get(name)
-    available = checkpoint is not None and checkpoint.hash == hash_
-    return name, checkpoint if checkpoint is not None and available else UnavailableFilter(run.template, run.task)
+    if checkpoint is not None and checkpoint.hash == hash_:
+        return name, checkpoint
+    return name, UnavailableFilter(run.template.filter, hash_, run.task)
 
 
 def display_name(name: str, hash_: str, filters: Mapping[str, Checkpoint]) -> str:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pydantic import TypeAdapter
 
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.workspace.json_files import read_record
+from beliefscope.app.workspace.json_files import read_record, write_record
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.filters.checkpoint import load_checkpoint
 
 FILE = "kept.json"
@@ -83,6 +80,5 @@ def _read(workspace: Path) -> list[SavedFilter]:
         ) from None
 
 
-def _write(workspace: Path, filters: Sequence[SavedFilter]) -> None:
-    workspace.mkdir(parents=True, exist_ok=True)
-    write_atomically(workspace / FILE, json.dumps([asdict(saved) for saved in filters], indent=2).encode())
+def _write(workspace: Path, filters: list[SavedFilter]) -> None:
+    write_record(filters, workspace / FILE)

@@ -25,6 +25,7 @@ class Selection:
         faults: injected sensor faults.
         data: name of the data set; empty for the first data set of the task.
         edit: intervention on some steps of the run.
+        only: the only modality that a standalone run uses; empty for all modalities.
     """
 
     task: str
@@ -33,6 +34,7 @@ class Selection:
     faults: Faults = NO_FAULTS
     data: str = ""
     edit: Edit | None = None
+    only: str = ""
 
     @property
     def description(self) -> str:
@@ -60,8 +62,9 @@ class Selection:
         """The comparison run that ``text`` describes by its differences from this run.
 
         Args:
-            text: ``filter=NAME``, ``faults=FAULTS`` (empty for clean sensors) or both; or an intervention,
-                ``from=20&to=40`` with ``faults=FAULTS``, ``weights=MODALITY=BETA`` or both.
+            text: ``filter=NAME``, ``faults=FAULTS`` (empty for clean sensors) or both; or ``only=MODALITY``, the
+                standalone filter of a modality (``inspect/standalone.py``); or an intervention, ``from=20&to=40`` with
+                ``faults=FAULTS``, ``weights=MODALITY=BETA`` or both.
 
         Raises:
             BadInput: the text has another part or describes the same run.
@@ -69,9 +72,15 @@ class Selection:
         parts = dict(parse_qsl(text, keep_blank_values=True))
         if parts.keys() & {"from", "to", "weights"}:
             return replace(self, edit=Edit.parse(text))
+        if "only" in parts:
+            if len(parts) > 1 or not parts["only"]:
+                raise BadInput(f"{text!r} is not only=MODALITY, without other parts of the comparison run")
+            return replace(self, only=parts["only"])
         for key in parts:
             if key not in ("filter", "faults"):
-                raise unknown_name("part of the comparison run", key, ("filter", "faults", "from", "to", "weights"))
+                raise unknown_name(
+                    "part of the comparison run", key, ("filter", "faults", "only", "from", "to", "weights")
+                )
         faults = Faults.parse(parts["faults"]) if "faults" in parts else self.faults
         other = replace(self, filter=parts.get("filter", self.filter), faults=faults)
         if other == self:

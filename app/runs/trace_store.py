@@ -16,17 +16,18 @@ from weakref import WeakValueDictionary
 
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
 from beliefscope.app.runs.errors import QueueFull
-from beliefscope.app.runs.filter_runner import FilterRunner, RunRequest
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
-from beliefscope.app.runs.trace_worker import TraceWorker
+from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.standalone import check_standalone
+from beliefscope.inspect.stored_runs import StoredRuns
 from beliefscope.inspect.trace import Trace, load_trace
 
 TRACES_IN_MEMORY = 8  # most recent traces, in addition to those in use
@@ -45,12 +46,10 @@ class TraceStore:
         self._worker = worker
         self._lock = threading.RLock()
         self._keys: OrderedDict[Selection, str] = OrderedDict()
-        self._hash_lock = threading.Lock()
-        self._data_hashes: dict[tuple[str, str], str] = {}
         self._recent: OrderedDict[str, TracedRun] = OrderedDict()
         self._in_use: WeakValueDictionary[str, TracedRun] = WeakValueDictionary()  # includes runs that only views hold
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="tracing")
-        self._runner = FilterRunner()  # used by the executor's thread only
+        self._runs = StoredRuns()  # used by the executor's thread only
         self._waiting = 0  # runs submitted to the executor and not started
         self._closing = False
 
@@ -69,6 +68,11 @@ class TraceStore:
             catalogs, problems = self._catalogs
             tasks = [catalog.to_json() for catalog in catalogs.values() if not catalog.problem]
             return {"tasks": tasks, "problems": problems}
+
+    def tasks(self) -> list[str]:
+        """Names of the tasks that can be displayed."""
+        with self._lock:
+            return [name for name, catalog in self._catalogs[0].items() if not catalog.problem]
 
     def describe_task(self, task: str) -> dict[str, Any]:
         """The catalog entry of a task, whether or not it has filters and data."""
@@ -128,6 +132,8 @@ class TraceStore:
                 parts = [checkpoint.hash, episode.digest(), seed, particles, str(selection.faults)]
                 if selection.edit is not None:
                     parts.append(selection.edit.to_json())
+                if selection.only:
+                    parts.append(f"only {selection.only}")
                 self._keys[selection] = hashlib.sha256(repr(tuple(parts)).encode()).hexdigest()
                 while len(self._keys) > MAX_KEYS:
                     self._keys.popitem(last=False)
@@ -145,6 +151,11 @@ class TraceStore:
         with self._lock:
             return self._catalog(task).filters
 
+    def datasets(self, task: str) -> dict[str, Dataset]:
+        """The data sets of a task by name. Raises BadInput for an unknown task."""
+        with self._lock:
+            return self._catalog(task).data
+
     def checkpoint(self, task: str, filter_: str) -> Checkpoint:
         """Raises BadInput for an unknown name."""
         with self._lock:
@@ -159,11 +170,8 @@ class TraceStore:
             return name or next(iter(catalog.data)), catalog.dataset(name)
 
     def data_hash(self, task: str, name: str) -> str:
-        """Hash of a data set, cached because some formats have to read every episode for it."""
-        with self._hash_lock:  # not the main lock, because reading may take long
-            if (task, name) not in self._data_hashes:
-                self._data_hashes[task, name] = self.dataset(task, name)[1].hash
-            return self._data_hashes[task, name]
+        """Hash of a data set. Not under the lock: some formats have to read every episode once."""
+        return self.dataset(task, name)[1].hash
 
     def add_filter(self, task: str, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
         """Add a filter to the catalog and the settings, so that jobs find it by its name."""
@@ -209,6 +217,8 @@ class TraceStore:
         selection.faults.check(checkpoint.task)
         if selection.edit is not None:
             selection.edit.faults.check(checkpoint.task)
+        if selection.only:
+            check_standalone(checkpoint, selection.only)
         return checkpoint, episode
 
     def _remember(self, run: TracedRun) -> None:
@@ -233,7 +243,7 @@ class TraceStore:
             if self._worker is not None and self._worker.started:
                 result = _run_in_worker(self._worker, request, progress)
             else:
-                result = self._runner.run(request, run.checkpoint, episode, progress)
+                result = self._runs.run(run.checkpoint, episode, progress=progress, **request.settings())
             run.future.set_result(result)
         except BaseException as error:
             run.future.set_exception(error)
@@ -250,14 +260,14 @@ class TraceStore:
                 source, external_task = checkpoint.source, checkpoint.task.name
             else:
                 source, external_task = str(catalog.paths[selection.filter]), ""
-            original = str(self._trace_file(replace(selection, edit=None)))
+            original = str(self._trace_file(replace(selection, edit=None, only="")))
             return RunRequest(
                 selection,
                 checkpoint=source,
                 external_task=external_task,
                 data=str(data),
                 original=original,
-                output=original if selection.edit is None else str(self._trace_file(selection)),
+                output=str(self._trace_file(selection)),
                 seed=self.settings.seed,
                 particles=self.settings.particles,
                 user_tasks=self.settings.tasks,
@@ -278,5 +288,5 @@ def _run_in_worker(worker: TraceWorker, request: RunRequest, progress: Callable[
     try:
         return load_trace(path)
     finally:
-        if request.output != request.original:  # traces of interventions are not kept
+        if request.output != request.original:  # traces of interventions and standalone runs are not kept
             path.unlink(missing_ok=True)

@@ -13,12 +13,14 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, TextIO
 
-from beliefscope.app.runs.filter_runner import FilterRunner, Progress, RunRequest
+from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.subprocesses import NICENESS, REPORT_INTERVAL, exit_description, redirect_stdout
 from beliefscope.datasets.catalog import find_task, load_task
 from beliefscope.datasets.dataset import Dataset
@@ -27,8 +29,57 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
 from beliefscope.filters.external.load import load_external
+from beliefscope.inspect.stored_runs import Progress, StoredRuns
 from beliefscope.inspect.trace import save_trace
 from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileReader
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """A filter run in terms of files, so that another process can carry it out.
+
+    Attributes:
+        selection: the run.
+        checkpoint: checkpoint file, or the source of an external filter.
+        external_task: task of an external filter; empty for a checkpoint file.
+        data: file or folder of episodes, or the file of a live run.
+        original: trace file of the run without intervention.
+        output: trace file of the run.
+        seed, particles: settings of the filter.
+        user_tasks: user-defined tasks to register first.
+    """
+
+    selection: Selection
+    checkpoint: str
+    external_task: str
+    data: str
+    original: str
+    output: str
+    seed: int
+    particles: int
+    user_tasks: tuple[str, ...] = ()
+
+    def settings(self) -> dict[str, Any]:
+        """Arguments of ``StoredRuns.run``."""
+        selection = self.selection
+        return {
+            "path": Path(self.original),
+            "edit": selection.edit,
+            "only": selection.only,
+            "episode_index": selection.episode,
+            "seed": self.seed,
+            "particles": self.particles,
+            "faults": selection.faults,
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """The request as JSON values."""
+        return {**vars(self), "selection": self.selection.to_json()}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> RunRequest:
+        """Inverse of ``to_json``."""
+        return cls(**{**values, "selection": Selection.from_json(values["selection"])})
 
 
 class TraceWorker:
@@ -124,7 +175,7 @@ def _episode(request: RunRequest) -> Episode:
     return _dataset(request.data, request.selection.task)[request.selection.episode]
 
 
-def _execute(request: RunRequest, runner: FilterRunner, output: TextIO) -> None:
+def _execute(request: RunRequest, runs: StoredRuns, output: TextIO) -> None:
     last_report = time.monotonic()
 
     def progress(fraction: float) -> None:
@@ -135,7 +186,8 @@ def _execute(request: RunRequest, runner: FilterRunner, output: TextIO) -> None:
 
     for task in request.user_tasks:
         _load_user_task(task)
-    trace = runner.run(request, _checkpoint(request.checkpoint, request.external_task), _episode(request), progress)
+    checkpoint = _checkpoint(request.checkpoint, request.external_task)
+    trace = runs.run(checkpoint, _episode(request), progress=progress, **request.settings())
     if request.output != request.original:
         save_trace(trace, Path(request.output))
 
@@ -143,11 +195,11 @@ def _execute(request: RunRequest, runner: FilterRunner, output: TextIO) -> None:
 def main() -> None:
     """Carry out requests until standard input ends."""
     os.nice(NICENESS)
-    output, runner = redirect_stdout(), FilterRunner()
+    output, runs = redirect_stdout(), StoredRuns()
     for line in sys.stdin:
         outcome: dict[str, Any] = {"error": None, "bad_input": False}
         try:
-            _execute(RunRequest.from_json(json.loads(line)), runner, output)
+            _execute(RunRequest.from_json(json.loads(line)), runs, output)
         except BadInput as error:
             outcome = {"error": str(error), "bad_input": True}
         except Exception as error:

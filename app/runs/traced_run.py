@@ -14,7 +14,8 @@ from beliefscope.app.protocol.map_format import EncodedMaps, encode_maps
 from beliefscope.app.protocol.messages import MAP_SIZES
 from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, no_maps
+from beliefscope.filters.data_check import data_warning
+from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
 from beliefscope.inspect.trace import Trace, arrays_of
 
 COARSE, FINE = MAP_SIZES
@@ -30,6 +31,7 @@ class TracedRun:
         future: the trace, or the error that ended its computation.
         progress: completed fraction, 0..1.
         scene_key: identifies what a 3D scene draws; equal for all states of a live run.
+        diagnostics: results of fast diagnostics, as JSON; kept by ``app/api/diagnostics.py``.
         growing: whether the run is live and may get more steps (``app/runs/live_runs.py``).
     """
 
@@ -41,9 +43,10 @@ class TracedRun:
         self.future: Future[Trace] = Future()
         self.future.set_running_or_notify_cancel()  # a client that stops waiting must not cancel it
         self.progress = 0.0
+        self.diagnostics: dict[str, bytes] = {}
         self._engine_lock = threading.Lock()
         self._cache_lock = threading.Lock()
-        self._cache: OrderedDict[tuple[int, float | None, int], EncodedMaps] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, float | None, int, Quantity], EncodedMaps] = OrderedDict()
         self._cache_bytes = 0
 
     def result(self, timeout: float | None = None) -> Trace:
@@ -76,32 +79,39 @@ class TracedRun:
         """Reason why the run has no likelihood maps; None if it has."""
         return no_maps(self.checkpoint, self.trace)
 
+    @cached_property
+    def data_warning(self) -> str | None:
+        """How the episode differs from the filter's training data, in one line; None if it does not."""
+        return data_warning(self.checkpoint, [self.trace.episode], self.trace.faults)
+
     def header(self) -> dict[str, Any]:
         """Description of the trace for the page."""
-        return header(self.trace, self.columns[0], self.checkpoint.task, self.no_maps)
+        missing = missing_quantities(self.checkpoint, self.trace)
+        description = header(self.trace, self.columns[0], self.checkpoint.task, self.no_maps, missing)
+        return description | {"data_warning": self.data_warning}
 
     @cached_property
     def columns(self) -> tuple[list[dict[str, Any]], bytes]:
         """Time series of the trace for the page: descriptions and one buffer."""
         return columns(self.trace)
 
-    def map(self, step: int, angle: float | None, size: int) -> LikelihoodMap:
-        """Compute one likelihood map. The map engine keeps caches, so it computes one map at a time."""
+    def map(self, step: int, angle: float | None, size: int, quantity: Quantity = "likelihood") -> LikelihoodMap:
+        """Compute one map. The map engine keeps caches, so it computes one map at a time."""
         with self._engine_lock:
-            return self._engine.map(step, angle=angle, size=size)
+            return compute_map(self._engine, step, angle, size, quantity)
 
-    def maps(self, steps: Iterable[int]) -> Iterator[LikelihoodMap]:
+    def maps(self, steps: Iterable[int], quantity: Quantity = "likelihood") -> Iterator[LikelihoodMap]:
         """Compute fine maps of several steps. Other threads get their maps in between."""
-        return (self.map(step, None, FINE) for step in steps)
+        return (self.map(step, None, FINE, quantity) for step in steps)
 
-    def encoded_maps(self, step: int, angle: float | None, size: int) -> EncodedMaps:
-        """One likelihood map in its binary encoding. The most recent ones are cached for all views of the run."""
-        key = step, angle, size
+    def encoded_maps(self, step: int, angle: float | None, size: int, quantity: Quantity = "likelihood") -> EncodedMaps:
+        """One map in its binary encoding. The most recent ones are cached for all views of the run."""
+        key = step, angle, size, quantity
         with self._cache_lock:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
-        maps = encode_maps(self.checkpoint.task, *self.at(step), self.map(step, angle, size))
+        maps = encode_maps(self.checkpoint.task, *self.at(step), self.map(step, angle, size, quantity))
         with self._cache_lock:
             if key not in self._cache:
                 self._cache[key] = maps
@@ -110,12 +120,12 @@ class TracedRun:
                 self._cache_bytes -= self._cache.popitem(last=False)[1].nbytes
         return maps
 
-    def missing_maps(self, step: int, angle: float | None, count: int) -> list[int]:
+    def missing_maps(self, step: int, angle: float | None, count: int, quantity: Quantity = "likelihood") -> list[int]:
         """Of the ``count`` steps nearest to ``step``, those whose coarse map is not cached; the nearest first."""
         near = range(max(0, step - count), min(len(self), step + count + 1))
         nearest = sorted(near, key=lambda index: abs(index - step))[:count]
         with self._cache_lock:
-            return [index for index in nearest if (index, angle, COARSE) not in self._cache]
+            return [index for index in nearest if (index, angle, COARSE, quantity) not in self._cache]
 
     @property
     def nbytes(self) -> int:
@@ -130,3 +140,8 @@ class TracedRun:
     @cached_property
     def _engine(self) -> MapEngine:
         return MapEngine(self.checkpoint, self.trace)
+
+
+def compute_map(engine: MapEngine, step: int, angle: float | None, size: int, quantity: Quantity) -> LikelihoodMap:
+    """Compute one map of a quantity, or of the other one if the filter does not have it."""
+    return engine.map(step, angle=angle, size=size, quantity=quantity if quantity in engine.quantities else None)

@@ -48,13 +48,14 @@ from beliefscope.app.server.logs import is_relevant
 from beliefscope.app.server.security import Guard
 from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.timeouts import MAX_HEAD, UNREAD_TIMEOUT, HTTPProtocol, WebSocketProtocol
-from beliefscope.app.server.vendor_files import UPLOT_FILES, RerunViewer, installed
+from beliefscope.app.server.vendor_files import UPLOT_FILES, viewer_wasm
 from beliefscope.app.views.memory import freeze_heap, limit_malloc_arenas
 from beliefscope.app.views.registry import Views
 from beliefscope.app.workspace.partial_files import delete_abandoned_parts
 from beliefscope.app.workspace.recordings import RecordingFolder
 from beliefscope.app.workspace.trash import NameTaken, NotFound
 from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.web_viewer import WebViewer, installed
 
 __all__ = ["Settings", "create_app", "serve"]
 
@@ -76,7 +77,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     store = TraceStore(with_saved_filters(settings), TraceWorker() if subprocess else None)
     views = Views(store, settings.views)
     jobs = Jobs(settings.workspace / "jobs")
-    viewer = RerunViewer(settings.workspace / "cache")
+    viewer = WebViewer(settings.workspace / "cache")
     files = RecordingFolder(settings.workspace / "recordings")
 
     @contextlib.asynccontextmanager
@@ -224,7 +225,7 @@ class _Server(uvicorn.Server):
                 signal.signal(signal.SIGHUP, previous)
 
 
-def _add_files(app: FastAPI, viewer: RerunViewer) -> None:
+def _add_files(app: FastAPI, viewer: WebViewer) -> None:
     uplot = installed("uplot") / "static"
     files = PageFiles(PAGE, [uplot / name for name in UPLOT_FILES])
 
@@ -243,11 +244,11 @@ def _add_files(app: FastAPI, viewer: RerunViewer) -> None:
 
     @app.get("/vendor/rerun/viewer.wasm")
     @app.get("/vendor/rerun/re_viewer_bg.wasm")  # the name that viewer.js requests
-    def viewer_wasm(request: Request) -> Response:
-        return viewer.wasm(request)
+    def viewer_module(request: Request) -> Response:
+        return viewer_wasm(viewer, request)
 
 
-def _warm(store: TraceStore, viewer: RerunViewer, stopping: threading.Event) -> None:
+def _warm(store: TraceStore, viewer: WebViewer, stopping: threading.Event) -> None:
     """Prepare what the first page requests. Errors are only logged; the page's own request reports them."""
     for prepare in (
         lambda: store.request(store.default_selection()),  # starts the run in another thread

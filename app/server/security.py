@@ -8,7 +8,6 @@ the use of responses. If others can reach the server, requests must also be auth
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import re
 import secrets
@@ -16,7 +15,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
 
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from beliefscope.app.protocol.messages import READ_ONLY
@@ -59,25 +60,16 @@ SCENE_POLICY = (
 # For data, scripts and files: displayed as a page, they are inert.
 DATA_POLICY = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; sandbox"
 UNUSED_FEATURES = (
-    "accelerometer",
-    "camera",
-    "display-capture",
-    "geolocation",
-    "gyroscope",
-    "hid",
-    "magnetometer",
-    "microphone",
+    "accelerometer camera display-capture geolocation gyroscope hid magnetometer microphone midi payment serial usb"
 )
 HEADERS = {
-    b"x-content-type-options": b"nosniff",
-    b"referrer-policy": b"no-referrer",
-    b"cross-origin-opener-policy": b"same-origin",
-    b"cross-origin-resource-policy": b"same-origin",
-    b"origin-agent-cluster": b"?1",
-    b"permissions-policy": ", ".join(
-        f"{name}=()" for name in (*UNUSED_FEATURES, "midi", "payment", "serial", "usb")
-    ).encode(),
-    b"cache-control": b"no-cache",  # revalidate by ETag; responses may override this
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "origin-agent-cluster": "?1",
+    "permissions-policy": ", ".join(f"{name}=()" for name in UNUSED_FEATURES.split()),
+    "cache-control": "no-cache",  # revalidate by ETag; responses may override this
 }
 log = logging.getLogger("beliefscope.app")
 
@@ -131,8 +123,8 @@ class Guard:
 
     def reply(self, scope: Scope) -> Reply | None:
         """The response to a refused request, or None if it is allowed."""
-        headers = [(name.lower(), value.decode("latin-1").strip()) for name, value in scope["headers"]]
-        hosts = [value.lower() for name, value in headers if name == b"host"]
+        headers = Headers(scope=scope)
+        hosts = [value.lower() for value in headers.getlist("host")]
         if len(hosts) != 1:
             return Reply(403, "The request must have one Host header.")
         host = hosts[0]
@@ -141,15 +133,14 @@ class Guard:
             return Reply(403, f"Host {host!r} is not allowed. Allowed: {allowed} (any port).")
         if scope["type"] == "http" and _is_cross_site(headers):
             return Reply(403, "The request comes from a page of another site.")
-        bearer = next(filter(None, (_bearer(value) for name, value in headers if name == b"authorization")), "")
+        bearer = next(filter(None, map(_bearer, headers.getlist("authorization"))), "")
         if self.sign_in and scope["path"] not in WITHOUT_TOKEN:
-            cookies = "; ".join(value for name, value in headers if name == b"cookie")
-            reply = self._authenticate(self.sign_in, scope, host, bearer, cookies)
+            reply = self._authenticate(self.sign_in, scope, host, bearer, "; ".join(headers.getlist("cookie")))
             if reply is not None:
                 return reply
         if scope["type"] == "http" and scope["method"] in SAFE_METHODS:
             return None
-        origins = [value.lower() for name, value in headers if name == b"origin"]
+        origins = [value.lower() for value in headers.getlist("origin")]
         # Browsers do not send Authorization by themselves, so this request comes from a script.
         is_script = self.sign_in is not None and bearer and not origins
         if origins not in ([f"http://{host}"], [f"https://{host}"]) and not is_script:
@@ -202,15 +193,14 @@ def _name(host: str) -> str:
     return match["name"] if match else host
 
 
-def _is_cross_site(headers: Iterable[tuple[bytes, str]]) -> bool:
+def _is_cross_site(headers: Headers) -> bool:
     """Whether a page of another site or port sends the request, other than a link that the user follows.
 
     Such a page cannot read the response, but the request would still consume resources. Browsers send these headers on
     the loopback interface and over https; elsewhere the SameSite cookie protects.
     """
-    values = dict(headers)
-    is_link = (values.get(b"sec-fetch-mode"), values.get(b"sec-fetch-dest")) == ("navigate", "document")
-    return values.get(b"sec-fetch-site") in ("cross-site", "same-site") and not is_link
+    is_link = (headers.get("sec-fetch-mode"), headers.get("sec-fetch-dest")) == ("navigate", "document")
+    return headers.get("sec-fetch-site") in ("cross-site", "same-site") and not is_link
 
 
 def _bracketed(host: str) -> str:
@@ -247,31 +237,29 @@ class _Response:
         self.started = False
         self._send = send
         scene = scope["path"].startswith("/scene/")
-        policy = SCENE_POLICY if scene else PAGE_POLICY if scope["path"] == "/" else DATA_POLICY
-        framed = b"SAMEORIGIN" if scene else b"DENY"
-        self._extra = HEADERS | {b"content-security-policy": policy.encode(), b"x-frame-options": framed}
+        self._extra = HEADERS | {
+            "content-security-policy": SCENE_POLICY if scene else PAGE_POLICY if scope["path"] == "/" else DATA_POLICY,
+            "x-frame-options": "SAMEORIGIN" if scene else "DENY",
+        }
 
     async def send(self, message: Message) -> None:
         self.started = True
         if message["type"] in ("http.response.start", "websocket.http.response.start"):
-            present = list(message.get("headers", ()))
-            names = {name.lower() for name, _ in present}
-            message["headers"] = present + [(n, v) for n, v in self._extra.items() if n not in names]
+            headers = MutableHeaders(scope=message)
+            for name, value in self._extra.items():
+                headers.setdefault(name, value)
         await self._send(message)
 
 
 async def _send_reply(scope: Scope, receive: Receive, send: Send, reply: Reply) -> None:
-    body = reply.page.encode() if reply.page else json.dumps({"error": reply.reason}).encode()
-    kind = "text/html; charset=utf-8" if reply.page else "application/json"
-    values = {"content-type": kind, "content-length": str(len(body)), **reply.headers}
-    headers = [(name.encode(), value.encode("latin-1")) for name, value in values.items()]
-    prefix = ""
     if scope["type"] == "websocket":
         await receive()
         if "websocket.http.response" not in scope.get("extensions", {}):
             reason = reply.reason or HTTPStatus(reply.status).phrase
             await send({"type": "websocket.close", "code": 1008, "reason": reason[:120]})
             return
-        prefix = "websocket."
-    await send({"type": f"{prefix}http.response.start", "status": reply.status, "headers": headers})
-    await send({"type": f"{prefix}http.response.body", "body": b"" if scope.get("method") == "HEAD" else body})
+    if reply.page:
+        response: Response = HTMLResponse(reply.page, reply.status, reply.headers)
+    else:
+        response = JSONResponse({"error": reply.reason}, reply.status, reply.headers)
+    await response(scope, receive, send)

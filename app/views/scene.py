@@ -11,8 +11,7 @@ from viser import GuiEvent, GuiSliderHandle
 from beliefscope.app.protocol.messages import SceneLayers, Viewpoint
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.embedded_viser import EmbeddedViser
-from beliefscope.app.views.scene_belief import BeliefScene
-from beliefscope.app.views.scene_comparison import ComparisonEstimate
+from beliefscope.app.views.scene_belief import BeliefScene, ComparisonEstimate
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from io import BytesIO
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -16,28 +15,19 @@ from viser.transforms import SO3
 from beliefscope.app.protocol.messages import SceneLayers
 from beliefscope.app.protocol.trace_format import camera_images
 from beliefscope.datasets.simulation.replay import Replay
-from beliefscope.datasets.simulation.shapes import Shape, shapes
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.diagnostics.plotting import colour_table
-from beliefscope.inspect.figures.meshes import mesh_of
-from beliefscope.inspect.likelihood import COARSE, LikelihoodMap
-from beliefscope.inspect.palette import colour
+from beliefscope.inspect.figures.scene_belief import camera_axis, rgb
+from beliefscope.inspect.figures.scene_shapes import RGB, Array, framed, grid, map_pixels, movable_meshes
+from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
-Array = NDArray[Any]
-RGB = tuple[int, int, int]
-
-UP = np.array([0.0, 0.0, 1.0])
 SMALL_LABEL: dict[str, Any] = {"font_screen_scale": 0.7, "depth_test": False}
 FORCE_SCALE = 0.004  # m per N
 MAX_ARROW_LENGTH = 0.30  # m
-LOG_RANGE = 40.0  # nats below the peak at the lower end of a map's colors, as on the page
 IMAGE_DISTANCE = 0.2  # of the way from the camera to its target
 IMAGE_SCALE = 4  # enlargement, so that the browser's smoothing keeps pixels distinguishable
 TRANSLUCENT_OPACITY = 0.35
 TRANSLUCENT_GRAY = 150  # minimum of each color channel; darker surfaces would vanish against a dark background
-GRID_CELLS = (0.05, 0.1, 0.25, 1.0)  # m, candidate cell sizes of the grid below a belief without replay
-MAX_GRID_CELLS = 14  # per side
 
 MUJOCO_PLANE = 0  # mjtGeom.mjGEOM_PLANE
 GRAY = (125, 125, 125)
@@ -45,12 +35,6 @@ _TICKS = np.arange(-1.0, 1.01, 0.25)
 FLOOR_LINES = np.array(
     [[(-1.0, a, 0.0), (1.0, a, 0.0)] for a in _TICKS] + [[(a, -1.0, 0.0), (a, 1.0, 0.0)] for a in _TICKS], np.float32
 )
-
-
-def rgb(source: str, trace: Trace) -> RGB:
-    """Color of ``truth``, ``fused``, ``contact`` or a modality."""
-    color = colour(source, trace.modalities)
-    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
 
 
 def set_png(handle: Any, prop: str, pixels: NDArray[np.uint8]) -> None:
@@ -84,35 +68,16 @@ class FloorMap:
             return
         self._displayed = maps, layers
         layer = maps.layers.index(layers.ground) if layers.ground in maps.layers else len(maps.layers) - 1
-        size = len(maps.offsets_x)
-        rim = max(1, size // COARSE)
-        cells = np.full((size + 2 * rim, size + 2 * rim, 3), rgb(maps.layers[layer], self._trace), np.uint8)
-        cells[rim:-rim, rim:-rim] = map_pixels(maps, layer, layers)
+        pixels = map_pixels(maps, layer, layers.colours, layers.scale == "log", layers.range == "same")
+        cells = framed(pixels, rgb(maps.layers[layer], self._trace))
         # viser's images have their top row at the smallest y, as maps have.
         set_png(self._image, "_data", cells)
         self._image.render_width = self._image.render_height = len(cells) * float(maps.offsets_x[1] - maps.offsets_x[0])
         self._image.position = (*map(float, maps.centre), self._heights[layers.height])
 
 
-def map_pixels(maps: LikelihoodMap, layer: int, layers: SceneLayers) -> NDArray[np.uint8]:
-    """(S, S, 3) one map layer in the page's colors; row 0 has the smallest y offset."""
-    log = maps.log_likelihood
-    color_range = log if layers.range == "same" else log[layer]
-    peak = color_range.max()
-    if layers.scale == "normalised":
-        intensity = np.exp(log[layer] - peak)
-    else:
-        low = max(color_range.min(), peak - LOG_RANGE)
-        intensity = np.clip((log[layer] - low) / max(peak - low, 1e-6), 0.0, 1.0)
-    return colour_table(layers.colours)[np.rint(255.0 * intensity).astype(np.uint8)]
-
-
 class CameraView:
-    """The frustum of the task's camera, with the image that the filter received.
-
-    Attributes:
-        position, target: (3,) m, world: the camera and the point that it faces.
-    """
+    """The frustum of the task's camera, with the image that the filter received."""
 
     def __init__(self, server: ViserServer, task: Task, trace: Trace) -> None:
         camera = task.camera
@@ -134,10 +99,9 @@ class CameraView:
             cast_shadow=False,
             receive_shadow=False,
         )
-        # The target is on the floor if the camera faces down, else at a distance of 1 m.
-        distance = camera.position[2] / -forward[2] if forward[2] < -0.1 else 1.0
-        self._frustum.scale = IMAGE_DISTANCE * distance / self._frustum.compute_canonical_frustum_size()[2]
-        self.position, self.target = np.array(camera.position), camera.position + distance * forward
+        position, target = camera_axis(camera)
+        size = self._frustum.compute_canonical_frustum_size()[2]
+        self._frustum.scale = IMAGE_DISTANCE * np.linalg.norm(target - position) / size
 
     def set_trace(self, trace: Trace) -> None:
         """Use the images of this trace in ``show``."""
@@ -219,26 +183,17 @@ class RobotScene:
 
     def _add_translucent_bodies(self, server: ViserServer, model: Any) -> None:
         """Add meshes of the hand and the objects, and hide these bodies in the ``mujoco.MjModel``."""
-        bodies = object_bodies(model) | hand_bodies(model)
-        parts = sorted((shape for shape in shapes(model) if bodies[shape.body]), key=_body_and_color)
+        parts = movable_meshes(model)
         self._frames = {
             body: server.scene.add_frame(f"/bodies/{name or body}", show_axes=False)
-            for body, name in {(part.body, part.name) for part in parts}
+            for body, name in {part.body: part.name for part in parts}.items()
         }
         self._meshes: list[tuple[Any, RGB]] = []
-        for i, ((body, rgba), group) in enumerate(groupby(parts, key=_body_and_color)):
-            solids = [mesh_of(shape) for shape in group]
-            offsets = np.cumsum([0, *(len(part.vertices) for part in solids)])
-            red, green, blue = (round(255.0 * channel) for channel in rgba[:3])
-            mesh = server.scene.add_mesh_simple(
-                f"{self._frames[body].name}/{i}",
-                np.concatenate([part.vertices for part in solids]),
-                np.concatenate([part.faces + offset for part, offset in zip(solids, offsets, strict=False)]),
-                color=(red, green, blue),
-                cast_shadow=False,
-            )
-            self._meshes.append((mesh, (red, green, blue)))
-        model.geom_rgba[bodies[model.geom_bodyid], 3] = 0.0
+        for i, part in enumerate(parts):
+            path = f"{self._frames[part.body].name}/{i}"
+            mesh = server.scene.add_mesh_simple(path, part.vertices, part.faces, color=part.color, cast_shadow=False)
+            self._meshes.append((mesh, part.color))
+        model.geom_rgba[np.isin(model.geom_bodyid, list(self._frames)), 3] = 0.0
 
     def move(self, positions: Array, rotations: Array) -> None:
         """Move all bodies: (B, 3) m and (B, 3, 3), one step of ``Replay``."""
@@ -253,48 +208,11 @@ class RobotScene:
             mesh.color = tuple(max(TRANSLUCENT_GRAY, channel) for channel in color) if translucent else color
 
 
-def object_bodies(model: Any) -> NDArray[np.bool_]:
-    """(B,) bodies of a ``mujoco.MjModel`` that belong neither to the robot nor to the world."""
-    return ~_robot_bodies(model) & (np.arange(model.nbody) > 0)
-
-
-def hand_bodies(model: Any) -> NDArray[np.bool_]:
-    """(B,) end of a robot: bodies without children, such as fingers, and bodies with only such children."""
-    children = np.bincount(model.body_parentid[1:], minlength=model.nbody)
-    leaves = _robot_bodies(model) & (children == 0)
-    leaf_children = np.bincount(model.body_parentid[leaves], minlength=model.nbody)
-    return leaves | (_robot_bodies(model) & (leaf_children > 0) & (leaf_children == children))
-
-
-def _robot_bodies(model: Any) -> NDArray[np.bool_]:
-    """(B,) the kinematic tree with the most joints."""
-    joints = np.bincount(model.body_rootid[model.jnt_bodyid], minlength=model.nbody)
-    bodies: NDArray[np.bool_] = model.body_rootid == joints.argmax()
-    return bodies
-
-
-def _body_and_color(shape: Shape) -> tuple[int, tuple[float, ...]]:
-    return shape.body, tuple(shape.rgba)
-
-
 def add_grid(server: ViserServer, task: Task, trace: Trace) -> None:
     """For tasks without replay: a grid under the belief and the axes of the two map components."""
-    low, high, cell = extent(task, trace)
-    ticks = [np.arange(a, b + cell / 2, cell) for a, b in zip(low, high, strict=True)]
-    lines = [((x, low[1], 0), (x, high[1], 0)) for x in ticks[0]]
-    lines += [((low[0], y, 0), (high[0], y, 0)) for y in ticks[1]]
-    server.scene.add_line_segments("/plane", np.array(lines, np.float32), GRAY, thickness=1.0, thickness_units="screen")
-    ends = np.array([(high[0], low[1], 0.0), (low[0], high[1], 0.0)])
-    axes = np.array([((*low, 0.0), end) for end in ends], np.float32)
-    server.scene.add_line_segments("/plane/axes", axes, GRAY, thickness=3.0, thickness_units="screen")
-    for name, end, edge in zip(task.map_components, ends, high, strict=True):
+    floor = grid(task, trace)
+    for path, lines, thickness in (("/plane", floor.lines, 1.0), ("/plane/axes", floor.axes, 3.0)):
+        server.scene.add_line_segments(path, lines, GRAY, thickness=thickness, thickness_units="screen")
+    for name, axis, edge in zip(task.map_components, floor.axes, floor.high, strict=True):
         text = f"{name.replace('_', ' ')} {100 * edge:.0f} cm"
-        server.scene.add_label(f"/plane/{name}", text, position=end, **SMALL_LABEL)
-
-
-def extent(task: Task, trace: Trace) -> tuple[Array, Array, float]:
-    """Lower and upper corner (2,), m, of the grid cells that contain the truth and its maps; and the cell size, m."""
-    truth = trace.anchors[:, list(task.map_indices)]
-    low, high = truth.min(axis=0) - task.map_half_width, truth.max(axis=0) + task.map_half_width
-    cell = next((size for size in GRID_CELLS if (high - low).max() <= MAX_GRID_CELLS * size), GRID_CELLS[-1])
-    return np.floor(low / cell) * cell, np.ceil(high / cell) * cell, cell
+        server.scene.add_label(f"/plane/{name}", text, position=axis[1], **SMALL_LABEL)

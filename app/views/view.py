@@ -186,14 +186,14 @@ class View:
                 continue
             cursor, run = self._prefetch_center
             with contextlib.suppress(Exception):  # reported when the page requests the step
-                for step in run.missing_maps(cursor.step, cursor.angle, PREFETCH_STEPS):
-                    compute = partial(run.encoded_maps, step, cursor.angle, COARSE)
+                for step in run.missing_maps(cursor.step, cursor.angle, PREFETCH_STEPS, cursor.quantity):
+                    compute = partial(run.encoded_maps, step, cursor.angle, COARSE, cursor.quantity)
                     await self._executor.run(compute, PREFETCH_DEADLINE, frozenset({run, COARSE}))
                     if self._maps_sent.is_set():
                         break
 
     async def _maps(self, cursor: Cursor, run: TracedRun) -> EncodedMaps:
-        compute = partial(run.encoded_maps, cursor.step, cursor.angle, cursor.size)
+        compute = partial(run.encoded_maps, cursor.step, cursor.angle, cursor.size, cursor.quantity)
         if cursor.size == FINE:  # one at a time, so that threads remain available for coarse maps
             return await self._executor.run(compute, FINE_DEADLINE, frozenset({run, FINE}))
         return await self._executor.run(compute, COARSE_DEADLINE, frozenset({run}))

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AliasChoices, Field, TypeAdapter
 
-from beliefscope.app.workspace.json_files import content, read_record
+from beliefscope.app.workspace.json_files import content, read_record, write_record
 from beliefscope.app.workspace.trash import NotFound
-from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.legacy_names import rename_keys
@@ -51,8 +49,7 @@ class FineTuneRuns:
     def add(self, run: str, task: str, filter_: str, data: str, settings: FineTune) -> FineTuneRun:
         """Record a run, which may exist."""
         record = FineTuneRun(run, task, filter_, data, settings.to_json(), time.time())
-        self.folder(run).mkdir(parents=True, exist_ok=True)
-        write_atomically(self.folder(run) / "run.json", json.dumps(asdict(record)).encode())
+        write_record(record, self.folder(run) / "run.json")
         return record
 
     def list_runs(self) -> list[FineTuneRun]:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
 from pydantic import TypeAdapter
 
+from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 
 T = TypeVar("T")
@@ -36,3 +39,32 @@ def read_record(adapter: TypeAdapter[T], path: Path) -> T:
     data = content(path)
     read_json(data)  # rejects NaN and infinities, which pydantic accepts
     return adapter.validate_json(data, strict=True)
+
+
+def write_record(record: Any, path: Path) -> None:
+    """Write a dataclass or model, or a list of them, as JSON; creates the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, TypeAdapter(type(record)).dump_json(record))
+
+
+class RecordCache(Generic[T]):
+    """Records of files; a file is read again only if it has changed. Not thread-safe."""
+
+    def __init__(self, read: Callable[[Path], T]) -> None:
+        """read: path -> record; raises OSError or ValueError for an invalid file."""
+        self._read = read
+        self._records: dict[Path, tuple[int, T]] = {}  # with the time of the file in ns
+
+    def get(self, path: Path) -> T | None:
+        """The record of a file; None if the file is missing or invalid."""
+        with suppress(OSError, ValueError):
+            modified = path.stat().st_mtime_ns
+            if path not in self._records or self._records[path][0] != modified:
+                self._records[path] = modified, self._read(path)
+            return self._records[path][1]
+        return None
+
+    def put(self, path: Path, record: T) -> None:
+        """Write a record."""
+        write_record(record, path)
+        self._records.pop(path, None)

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from beliefscope.app.protocol.messages import describe_error
 from beliefscope.app.workspace.json_files import content
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.filters.legacy_names import rename_keys
+from beliefscope.filters.training.study_table import Row
 
 SHIPPED = "shipped"
 """Name of the built-in study. The weights of its first seed are built in, too."""
@@ -19,24 +22,16 @@ SHIPPED = "shipped"
 FILE = "study.json"
 FINISHED = "finished"
 
-Numbers = Mapping[str, FiniteFloat | None]
 CellName = Annotated[str, Field(pattern=r"^[\w.+-]+/[\w.+-]+/seed\d+$")]
 """TASK/FILTER/seedK."""
 
 
-class Row(BaseModel):
-    """A row of the table (``filters.training.study_table.Row``). Aliases are field names of earlier versions."""
+OLD_KEYS = {"asked": "requested", "each": "by_seed"}
+"""Keys of rows in files of earlier versions."""
 
-    task: str
-    filter: str
-    blackout: FiniteFloat | None
-    seeds: int
-    requested: Annotated[int, Field(validation_alias=AliasChoices("requested", "asked"))]
-    failed: int
-    mean: Numbers
-    spread: Numbers
-    bounds: tuple[FiniteFloat, FiniteFloat] | None = None
-    by_seed: Annotated[Mapping[str, Numbers], Field(validation_alias=AliasChoices("by_seed", "each"))] = {}
+
+def _rename(row: Any) -> Any:
+    return rename_keys(row, OLD_KEYS) if isinstance(row, Mapping) else row
 
 
 class Results(BaseModel):
@@ -49,7 +44,7 @@ class Results(BaseModel):
     preset: str
     tasks: Mapping[str, Mapping[str, str]]
     seeds: Annotated[int, Field(ge=1)]
-    rows: list[Row]
+    rows: list[Annotated[Row, BeforeValidator(_rename)]]
     checkpoints: Mapping[str, str] = {}
     cells: Mapping[CellName, str] = {}
 
@@ -71,11 +66,12 @@ class Study:
         """The current results. Raises BadInput if there are none or they are invalid."""
         path = self.folder / FILE
         try:
-            return Results.model_validate_json(content(path))
+            return Results.model_validate(read_json(content(path)))
         except OSError:
             raise BadInput(f"{str(self.folder)!r} is not a study: it has no {FILE}") from None
-        except ValidationError as error:
-            raise BadInput(f"{str(path)!r} does not contain the results of a study: {describe_error(error)}") from None
+        except ValueError as error:
+            reason = describe_error(error) if isinstance(error, ValidationError) else error
+            raise BadInput(f"{str(path)!r} does not contain the results of a study: {reason}") from None
 
     def checkpoint(self, cell: str) -> Path:
         """Path of a cell's checkpoint."""

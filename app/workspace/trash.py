@@ -6,6 +6,7 @@ import os
 import re
 import secrets
 import shutil
+import threading
 import time
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ RETENTION_DAYS = 14
 
 ID = re.compile(r"(?P<milliseconds>[0-9a-f]{1,16})-[0-9a-f]{8}")
 METADATA = ".about"
-"""Name under which the metadata of a deleted file is stored."""
+"""Name under which earlier versions stored the metadata of a deleted file."""
 
 
 class NotFound(BadInput):
@@ -39,56 +40,58 @@ class DeletedFile:
 
 
 class Trash:
-    """The deleted files of one folder. Not thread-safe."""
+    """The deleted files of one folder. Methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
+        self._target = folder
         self._folder = folder / ".deleted"
+        self._lock = threading.Lock()
 
-    def put(self, path: Path, metadata: Path | None = None) -> str:
-        """Move a file or folder and its metadata into the trash; return an id. Raises NotFound."""
+    def put(self, path: Path) -> str:
+        """Move a file or folder into the trash; return an id. Raises NotFound."""
         id = f"{time.time_ns() // 10**6:x}-{secrets.token_hex(4)}"
         entry = self._folder / id
-        entry.mkdir(parents=True)
-        try:
-            os.rename(path, entry / path.name)
-        except FileNotFoundError:
-            entry.rmdir()
-            raise NotFound(f"{path.name!r} does not exist any more.") from None
-        if metadata is not None:
-            with suppress(FileNotFoundError):
-                os.rename(metadata, entry / METADATA)
+        with self._lock:
+            entry.mkdir(parents=True)
+            try:
+                os.rename(path, entry / path.name)
+            except FileNotFoundError:
+                entry.rmdir()
+                raise NotFound(f"{path.name!r} does not exist any more.") from None
         return id
 
-    def restore(self, id: str, folder: Path, metadata_folder: Path | None = None) -> Path:
-        """Move a file back into ``folder``, and its metadata into the other one. Raises NotFound or NameTaken."""
-        path = self._path(id)
-        if path is None:
-            raise NotFound(f"Deleted file {id!r} does not exist any more.")
-        target = folder / path.name
-        if os.path.lexists(target):
-            raise NameTaken(f"A file {path.name!r} already exists: rename it first.")
-        if metadata_folder is not None:
-            with suppress(FileNotFoundError):
-                os.replace(path.parent / METADATA, metadata_folder / f"{path.name}.json")
-        os.rename(path, target)
-        shutil.rmtree(path.parent, ignore_errors=True)
-        return target
+    def restore(self, id: str) -> Path:
+        """Move a file back to its folder. Raises NotFound or NameTaken."""
+        with self._lock:
+            path = self._path(id)
+            if path is None:
+                raise NotFound(f"Deleted file {id!r} does not exist any more.")
+            target = self._target / path.name
+            if os.path.lexists(target):
+                raise NameTaken(f"A file {path.name!r} already exists: rename it first.")
+            os.rename(path, target)
+            self._delete(id)
+            return target
 
     def list_deleted(self) -> list[DeletedFile]:
         """The files in the trash, most recent first. Deletes expired ones."""
         files = []
-        for id in self._ids():
-            deleted, path = int(id.partition("-")[0], 16) / 1e3, self._path(id)
-            if path is None or deleted < time.time() - RETENTION_DAYS * 86400:
-                self._delete(id)
-            else:
-                files.append(DeletedFile(id, path.name, disk_usage(path), deleted))
+        with self._lock:
+            for id in self._ids():
+                deleted, path = int(id.partition("-")[0], 16) / 1e3, self._path(id)
+                if path is None or deleted < time.time() - RETENTION_DAYS * 86400:
+                    self._delete(id)
+                else:
+                    files.append(DeletedFile(id, path.name, disk_usage(path), deleted))
         return sorted(files, key=lambda file: -file.deleted)
 
-    def empty(self) -> None:
-        """Delete all files permanently."""
-        for id in self._ids():
-            self._delete(id)
+    def empty(self) -> int:
+        """Delete all files permanently; return their size in bytes."""
+        freed = sum(file.bytes for file in self.list_deleted())
+        with self._lock:
+            for id in self._ids():
+                self._delete(id)
+        return freed
 
     def _ids(self) -> list[str]:
         with suppress(FileNotFoundError):

@@ -157,9 +157,17 @@ class Blackout(Fault):
 
     name, sensor = "blackout", "image"
     probability: float = _number(1.0, "fraction", "probability of a blackout at a step", 0, 1)
+    gray: int | None = _parameter(
+        None,
+        int,
+        "gray levels",
+        "level of all pixels; default: 0; the paper's code has mid-gray, 128",
+        minimum=0,
+        maximum=255,
+    )
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return _choose(rng.random(len(readings)) < self.probability, np.zeros_like(readings), readings)
+        return _choose(rng.random(len(readings)) < self.probability, np.full_like(readings, self.gray or 0), readings)
 
 
 @dataclass(frozen=True)

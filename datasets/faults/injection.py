@@ -7,9 +7,11 @@ its first parameter, the other parameters are named, and commas separate faults.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -134,6 +136,21 @@ def available_presets(task: Task) -> dict[str, str]:
         return False
 
     return {name: text for name, text in FAULT_PRESETS.items() if fits(text)}
+
+
+def read_faults(text: str, task: Task) -> Faults:
+    """Faults from text, JSON, or the path of a JSON file (ends in .json or has a separator).
+
+    Raises BadInput for an unreadable file and for faults that do not apply to the task.
+    """
+    if not text.lstrip().startswith(("{", "[")) and (text.endswith(".json") or os.sep in text):
+        try:
+            text = Path(text).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError):
+            raise BadInput(f"faults {text!r} is not a readable file") from None
+    faults = Faults.parse(text)
+    faults.check(task)
+    return faults
 
 
 def fault_catalog() -> list[dict[str, Any]]:

@@ -10,14 +10,16 @@ import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 
 import beliefscope
 from beliefscope.datasets.catalog import load_task
+from beliefscope.datasets.dataset import SPLITS
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.readers.hdf5_guard import probe
 from beliefscope.datasets.store import open_dataset, write_dataset
@@ -33,6 +35,7 @@ def collect(
     workers: int | None,
     path: str | Path,
     progress: Progress | None = None,
+    split: str | None = None,
 ) -> None:
     """Simulate ``episodes`` trajectories of ``steps`` steps into the HDF5 file ``path``.
 
@@ -45,9 +48,11 @@ def collect(
         seed: not negative.
         workers: number of processes; None: one per core.
         progress: called with (finished episodes, all episodes) at the start and after each episode.
+        split: of all episodes. None: by their number, 8 of 10 ``train``, 1 ``val``, 1 ``test``.
 
     Raises:
-        BadInput: for an unknown or recorded task, a count that is too small, or a path that cannot be written.
+        BadInput: for an unknown or recorded task, an unknown split, a count that is too small, or a path that cannot
+            be written.
     """
     path = Path(path)
     if load_task(task).simulate is None:
@@ -56,7 +61,9 @@ def collect(
     for (name, value), minimum in zip(counts.items(), (1, 2, 0, 1), strict=True):
         if value < minimum:
             raise BadInput(f"{name} is {value}, expected at least {minimum}.")
-    parts = _PartialCollection(path, task, steps, seed)
+    if split not in (None, *SPLITS):
+        raise unknown_name("split", str(split), SPLITS)
+    parts = _PartialCollection(path, task, steps, seed, split)
     missing = [i for i in range(episodes) if not parts.contains(i)]
     done = episodes - len(missing)
     report = progress or (lambda done, count: None)
@@ -72,8 +79,8 @@ def collect(
 class _PartialCollection:
     """Folder of finished episodes, one file each. File names contain everything the episode depends on."""
 
-    def __init__(self, path: Path, task: str, steps: int, seed: int) -> None:
-        self.task, self.steps, self.seed = task, steps, seed
+    def __init__(self, path: Path, task: str, steps: int, seed: int, split: str | None) -> None:
+        self.task, self.steps, self.seed, self.split = task, steps, seed, split
         self._path, self._folder = path, path.with_name(path.name + ".partial")
         if path.is_dir():
             raise BadInput(f"{path} is a folder, expected a file to write.")
@@ -99,7 +106,8 @@ class _PartialCollection:
         """Simulate an episode and store it."""
         task = load_task(self.task)
         assert task.simulate is not None
-        write_dataset(self._part(index), task, [task.simulate(self.seed, index, self.steps)])
+        episode = task.simulate(self.seed, index, self.steps)
+        write_dataset(self._part(index), task, [replace(episode, split=self.split or episode.split)])
 
     def join(self, episodes: int) -> None:
         """Write the dataset and remove the folder. Temporary files stay inside the folder if interrupted."""
@@ -110,7 +118,7 @@ class _PartialCollection:
         shutil.rmtree(self._folder)
 
     def _part(self, index: int) -> Path:
-        versions = f"{beliefscope.__version__}-mujoco{mujoco.__version__}"
+        versions = f"{self.split or 'all'}-{beliefscope.__version__}-mujoco{mujoco.__version__}"
         return self._folder / f"{load_task(self.task).name}-seed{self.seed}-steps{self.steps}-{index}-{versions}.h5"
 
     def _read(self, index: int) -> Episode:

@@ -26,7 +26,7 @@ from beliefscope.datasets.simulation.panda import ROBOT_BIT, STIFF, WORLD_BIT, a
 from beliefscope.datasets.simulation.panda_meshes import add_visual_meshes
 from beliefscope.datasets.simulation.sensors import add_touch
 from beliefscope.datasets.simulation.simulate import DT, POSITION_BITS, Scene, episode_rng, quantise, simulate
-from beliefscope.datasets.task import Component, Outline, Task
+from beliefscope.datasets.task import Array, Component, Outline, Task
 
 PANEL_SIZE = (0.04, 0.5, 0.86)  # thickness, width, height; m
 PANEL_BOTTOM = 0.02  # m above the floor
@@ -51,6 +51,15 @@ def panel_outline(states: ArrayLike) -> Outline:
         size=PANEL_SIZE,
         anchor=np.stack([x, y, np.full_like(x, PANEL_BOTTOM + PANEL_SIZE[2])], -1),
     )
+
+
+def panel_direction(states: ArrayLike) -> Array:
+    """(...,) rad from the x axis: direction from the hinge along the panel, for states (..., 3).
+
+    The gripper holds the bar, which is parallel to the panel, at an unknown distance from the hinge: haptics determines
+    the hinge across the panel, not along it.
+    """
+    return np.asarray(states, float)[..., 2] + np.pi / 2.0
 
 
 def door_model(physics: DoorPhysics, visual: bool = False) -> mujoco.MjModel:
@@ -190,5 +199,6 @@ DOOR = Task(
     replay=_replay,
     outline=panel_outline,
     camera=CAMERA,
+    ridge_direction=panel_direction,
     simulate=simulate_door,
 )

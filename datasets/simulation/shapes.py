@@ -77,3 +77,23 @@ def _points(model: Any, geom: int, kind: int) -> tuple[Array, NDArray[np.int32] 
         return _BALL * size, None
     end = size[0] * (_RIM if kind == types.mjGEOM_CYLINDER else _BALL[_BALL[:, 2] >= 0.0]) + size[1] * _UP
     return np.concatenate([end, -end]), None
+
+
+def object_bodies(model: Any) -> NDArray[np.bool_]:
+    """(B,) bodies of a ``mujoco.MjModel`` that belong neither to the robot nor to the world."""
+    return ~_robot_bodies(model) & (np.arange(model.nbody) > 0)
+
+
+def hand_bodies(model: Any) -> NDArray[np.bool_]:
+    """(B,) end of a robot: bodies without children, such as fingers, and bodies with only such children."""
+    children = np.bincount(model.body_parentid[1:], minlength=model.nbody)
+    leaves = _robot_bodies(model) & (children == 0)
+    leaf_children = np.bincount(model.body_parentid[leaves], minlength=model.nbody)
+    return leaves | (_robot_bodies(model) & (leaf_children > 0) & (leaf_children == children))
+
+
+def _robot_bodies(model: Any) -> NDArray[np.bool_]:
+    """(B,) the kinematic tree with the most joints."""
+    joints = np.bincount(model.body_rootid[model.jnt_bodyid], minlength=model.nbody)
+    bodies: NDArray[np.bool_] = model.body_rootid == joints.argmax()
+    return bodies

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -89,13 +89,19 @@ class ExternalFilter(Checkpoint):
         return Gaussian(mean, torch.diag(START_VARIANCE * std.float() ** 2).expand(len(mean), -1, -1))
 
     def run(
-        self, episodes: Sequence[Episode], seed: int = 0, progress: Callable[[float], None] | None = None
+        self,
+        episodes: Sequence[Episode],
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        start: Gaussian | None = None,
     ) -> tuple[Values, tuple[str, ...]]:
-        """Filters N episodes of equal length at once, from the true state. Removes all hooks from the module.
+        """Filters N episodes of equal length at once. Removes all hooks from the module.
 
         Args:
             seed: of torch's global generator, whose state is restored.
             progress: called with the completed fraction, 0..1.
+            start: first belief, as returned by ``start``, the default. A module that processes all steps at once
+                does not use it.
 
         Returns:
             The values of each step, (T, N, ...) by the names of ``Trace``, SI units, float32; and the K names of the
@@ -111,7 +117,7 @@ class ExternalFilter(Checkpoint):
             torch.manual_seed(seed)
             if self._stepwise:
                 steps: list[Values] = []
-                for values, models in self._steps(observations, controls, self.start(episodes)):  # noqa: B007
+                for values, models in self._steps(observations, controls, start or self.start(episodes)):  # noqa: B007
                     steps.append(values)
                     if progress is not None:
                         progress(len(steps) / len(controls))
@@ -186,6 +192,19 @@ class ExternalFilter(Checkpoint):
 
     def _names(self, values: Values, models: tuple[int, ...]) -> tuple[str, ...]:
         return model_names(values, 2, self.adapter.modalities, self._task, models, self.source)
+
+
+class UnavailableFilter(ExternalFilter):
+    """Stands for the filter of a live run that this server does not have. It can be drawn, but not run."""
+
+    def __init__(self, name: str, hash_: str, task: Task) -> None:
+        values = {"name": name, "record": {}, "hash": hash_, "source": name}
+        for key, value in (values | {"_task": task}).items():
+            object.__setattr__(self, key, value)  # checkpoints are frozen
+
+    def run(self, *_: Any, **__: Any) -> Any:
+        """Raises BadInput."""
+        raise BadInput(f"this server has only a live run of filter {self.name!r}; add the filter with --filter")
 
 
 def model_names(

@@ -18,6 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.batch_mix import Mix
+from beliefscope.filters.finetuning.calibration import calibrate_noise, noise_parameters
 from beliefscope.filters.finetuning.loop import FineTuneLoop, Validation, validate
 from beliefscope.filters.finetuning.module_selection import digest, freeze, select_parameters
 from beliefscope.filters.finetuning.settings import FineTune, StepRange
@@ -84,6 +85,8 @@ def finetune(
     began = time.monotonic()
     filter_ = copy.deepcopy(base.filter).to(device)
     trained = select_parameters(filter_, settings.train, settings.freeze)
+    if settings.calibrate and not {id(p) for p in noise_parameters(filter_)} <= {id(p) for p in trained.values()}:
+        raise BadInput("calibrate needs the noise of dynamics and sensors to be trained; add noise-only to --train")
     frozen = freeze(filter_, trained)
     frozen_digest = digest(filter_, frozen)
     groups, events = _split(episodes, settings.events)
@@ -98,6 +101,9 @@ def finetune(
         if seconds is None:
             return None
         loop.restore_best()
+        noise_factor = (
+            calibrate_noise(filter_, lambda: _nees(filter_, mixes["val"], settings)) if settings.calibrate else 1.0
+        )
         after = validate(filter_, mixes["test"], loop.best_step, 0.0, settings)
     assert digest(filter_, frozen) == frozen_digest, "a frozen parameter changed"
     filter_.eval().requires_grad_(False)
@@ -109,6 +115,7 @@ def finetune(
         "episodes": {name: len(members) for name, members in groups.items()},
         "steps": loop.done,
         "best_step": loop.best_step,
+        "noise_factor": noise_factor,
         "validations": [asdict(validation) for validation in loop.validations],
         "held_out": {"before": before.slices, "after": after.slices},
         "frozen": {"tensors": len(frozen), "before": frozen_digest, "after": digest(filter_, frozen)},
@@ -117,11 +124,18 @@ def finetune(
         "versions": versions(),
         "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
         "threads": torch.get_num_threads(),
+        **{key: base.record[key] for key in ("data_summary",) if key in base.record},
         "metrics": {"0": {"fused": evaluate(filter_, groups["test"]).to_dict()}},
     }
     if state is not None:
         state.drop()
     return FineTuned(filter_.cpu(), record)
+
+
+def _nees(filter_: Filter, mix: Mix, settings: FineTune) -> float:
+    """Mean NEES / n over the slices, weighted as in the loss."""
+    slices = validate(filter_, mix, 0, None, settings).slices
+    return sum(share * float(slices[slice_.name]["nees"]) for slice_, share in settings.shares().items())
 
 
 def _mixes(

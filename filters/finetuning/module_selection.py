@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from itertools import accumulate
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -85,6 +86,11 @@ class Node:
     parameters: int
     buffers: int
     trained: int
+
+    def to_json(self) -> dict[str, Any]:
+        """All attributes; the kind is named ``class``."""
+        values = asdict(self)
+        return {"name": values.pop("name"), "class": values.pop("kind"), **values, "state": self.state}
 
     @property
     def depth(self) -> int:

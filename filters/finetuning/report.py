@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from beliefscope.filters.finetuning.loop import Validation
+from beliefscope.filters.finetuning.settings import FineTune
 
 
 def curve_values(validation: Validation) -> dict[str, float]:
@@ -21,3 +25,47 @@ def error_summary(first: Validation, last: Validation) -> str:
         before, after = first.slices[name]["rmse"]["position_cm"], metrics["rmse"]["position_cm"]
         parts.append(f"{name} {before:.2f} cm" if before == after else f"{name} {before:.2f} -> {after:.2f} cm")
     return ", ".join(parts)
+
+
+def held_out_rows(record: Mapping[str, Any]) -> list[list[str | float | None]]:
+    """Errors on held-out episodes in a training record, one row per slice and measure.
+
+    Returns:
+        ``[name, before, after, change]``: the change in percent for errors, as a difference for nll and nees.
+    """
+    before, after = (
+        {name: {**metrics["rmse"], **metrics} for name, metrics in record["held_out"][state].items()}
+        for state in ("before", "after")
+    )
+    keys = [*next(iter(before.values()))["rmse"], "nll", "nees"]
+    return [
+        [f"{name}: {key}", values[key], after[name][key], _difference(values[key], after[name][key], key)]
+        for name, values in before.items()
+        for key in keys
+    ]
+
+
+def _difference(before: float | None, after: float | None, key: str) -> str | None:
+    if before is None or after is None:
+        return None
+    return f"{after - before:+.2f}" if key in ("nll", "nees") or not before else f"{100 * (after / before - 1):+.0f} %"
+
+
+def training_summary(record: Mapping[str, Any]) -> str:
+    """Base checkpoint, best step and time, and whether the weights have changed."""
+    text = (
+        f"{record['base']['name']}, fine-tuned from {record['base']['hash'][:12]}, best validation at step "
+        f"{record['best_step']} of {record['steps']}, {record['seconds']:.0f} s"
+    )
+    return "\n".join(filter(None, (text, no_change(record))))
+
+
+def no_change(record: Mapping[str, Any]) -> str:
+    """Advice if no validation improved on the base checkpoint, whose weights are kept then; else an empty text."""
+    if record["best_step"] or record.get("noise_factor", 1.0) != 1.0:
+        return ""
+    rate = float(FineTune.from_json(record["base"]["settings"]).rate)
+    return (
+        "No change: the base checkpoint was best. Try a data slice on which this filter fails (beliefscope failures), "
+        f"other modules (noise-only, heads-only, all), or a learning rate other than {rate:g}."
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -51,6 +51,8 @@ class FineTune:
         l2_sp: strength of the decay towards the base checkpoint's weights. check: steps between two validations.
             patience: validations without improvement that end the run.
         particles, likelihood_weight: as in training (``Plan``). seed: of all random numbers.
+        calibrate: whether process and measurement noise are scaled at the end such that NEES / n is 1 on the validation
+            episodes (``calibration.py``).
     """
 
     train: tuple[str, ...] = ()
@@ -69,6 +71,7 @@ class FineTune:
     particles: int = 30
     likelihood_weight: float = 0.05
     seed: int = 0
+    calibrate: bool = False
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of its range."""
@@ -129,6 +132,22 @@ class FineTune:
         return cls(**arguments)
 
 
+def parse_rates(texts: Iterable[str]) -> tuple[float, tuple[tuple[str, float], ...]]:
+    """Default rate, and rates of patterns, from texts such as ``0.001`` and ``weight_model=0.0001``."""
+    default, rates = FineTune.rate, []
+    for text in texts:
+        pattern, _, number = text.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            raise BadInput(f"--rate {text!r} is neither a number nor PATTERN=NUMBER") from None
+        if pattern:
+            rates.append((pattern, value))
+        else:
+            default = value
+    return default, tuple(rates)
+
+
 def _names(value: Any) -> tuple[str, ...]:
     if isinstance(value, str) or not all(isinstance(name, str) for name in value):
         raise TypeError
@@ -147,7 +166,14 @@ def _integer(value: Any) -> int:
     return int(value)
 
 
+def _boolean(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError
+    return value
+
+
 _READERS: dict[Any, Callable[[Any], Any]] = {
+    "bool": _boolean,
     "tuple[str, ...]": _names,
     "tuple[tuple[Slice, float], ...]": lambda v: tuple((Slice.from_json(e["slice"]), _number(e["share"])) for e in v),
     "tuple[StepRange, ...]": lambda v: tuple(StepRange.parse(text) for text in v),

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults, read_faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters import legacy_names
 from beliefscope.filters.batch import Batch
@@ -154,6 +154,15 @@ def standard_slices(task: Task) -> tuple[Slice, ...]:
     if len(task.modalities) > 1:
         slices += [Slice(f"{modality} only", only=(modality,)) for modality in task.modalities]
     return tuple(slice_ for slice_ in slices if _fits(slice_, task))
+
+
+def parse_slices(texts: Iterable[str], fault_sets: Iterable[str], task: Task) -> list[Slice]:
+    """Slices from their text, and slices of all steps with faults, given as text or file."""
+    slices = [Slice.parse(text, standard_slices(task)) for text in texts]
+    for text in fault_sets:
+        faults = read_faults(text, task)
+        slices.append(Slice(str(faults).replace("=", " ").replace(":", " "), faults))
+    return slices
 
 
 def _fits(slice_: Slice, task: Task) -> bool:

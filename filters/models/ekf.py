@@ -45,20 +45,35 @@ def update(belief: Gaussian, observation: Tensor, noise: Tensor) -> Gaussian:
 
 
 class VirtualSensor(nn.Module):
-    """Observations of one measurement model to a virtual observation of the state and its standard deviations."""
+    """Observations of one measurement model to a virtual observation of the state and its standard deviations.
+
+    With ``authors`` networks, each output has its own half of the trunk's features and a first layer of n units.
+    """
 
     def __init__(self, task: Task, model: str, architecture: Architecture) -> None:
         super().__init__()
         n, units = len(task.components), architecture.units
         self.encoders = encoders(task, model.split("+"), architecture)
-        self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), Residual(units))
-        self.state = nn.Linear(units, n)
-        self.log_noise = nn.Sequential(nn.Linear(units, units), nn.ReLU(), nn.Linear(units, n))
+        self.state: nn.Module
+        self.log_noise: nn.Sequential
+        self.halves = architecture.networks == "authors"
+        if self.halves:
+            width = 2 * units
+            first = (nn.Linear(self.encoders.size, width), nn.ReLU(inplace=True))
+            self.trunk = Stack(*first, Residual(width), Residual(width))
+            self.state, self.log_noise = (
+                Stack(nn.Linear(units, n), nn.ReLU(inplace=True), Residual(n), nn.Linear(n, n)) for _ in range(2)
+            )
+        else:
+            self.trunk = Stack(nn.Linear(self.encoders.size, units), nn.ReLU(inplace=True), Residual(units))
+            self.state = nn.Linear(units, n)
+            self.log_noise = nn.Sequential(nn.Linear(units, units), nn.ReLU(), nn.Linear(units, n))
 
     def forward(self, observations: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """z (T, N, n) and the square root of R's diagonal (T, N, n)."""
         features = self.trunk(self.encoders(observations))
-        return self.state(features), self.log_noise(features).clamp(-5.0, 3.0).exp()
+        first, second = features.chunk(2, dim=-1) if self.halves else (features, features)
+        return self.state(first), self.log_noise(second).clamp(-5.0, 3.0).exp()
 
 
 class ExtendedKalmanFilter(Filter):

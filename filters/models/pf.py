@@ -34,7 +34,8 @@ class MeasurementModel(nn.Module):
         self.join_observation = nn.Linear(self.encoders.size, units)
         self.state_encoder = vector_stack(len(task.components), units)
         self.join_state = nn.Linear(units, units, bias=False)
-        self.head = Stack(nn.ReLU(inplace=True), Residual(units), nn.Linear(units, 1))
+        residuals = (Residual(units) for _ in range(2 if architecture.networks == "authors" else 1))
+        self.head = Stack(nn.ReLU(inplace=True), *residuals, nn.Linear(units, 1))
 
     def observation_part(self, observations: Mapping[str, Tensor]) -> Tensor:
         """(T, N, units)."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from beliefscope.datasets.errors import BadInput
+
 Report = Callable[[str, int, int, float], None]
 """Progress callback, called with the stage's name, steps done, total steps, and the loss."""
 
@@ -64,3 +66,16 @@ PLANS = {
         dynamics=2, images=2, models=2, single=1, weights=1, together=(1,), fine=1, lengths=(4,), window=4, batch=4
     ),
 }
+
+
+def parse_blackouts(text: str) -> tuple[float, ...]:
+    """Probabilities of image blackout from a text such as ``0,0.4,0.8``. Raises BadInput for other values."""
+    values = []
+    for part in text.split(","):
+        try:
+            values.append(float(part))
+        except ValueError:
+            values.append(-1.0)
+        if not 0.0 <= values[-1] <= 1.0:
+            raise BadInput(f"--blackouts {text!r}: {part!r} is not a probability from 0 to 1")
+    return tuple(values)

@@ -17,16 +17,17 @@ from typing import Any
 
 import torch
 
-from beliefscope.datasets.catalog import find_task, load_task
+from beliefscope.datasets.catalog import TASKS, find_task, load_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
-from beliefscope.datasets.store import open_dataset
+from beliefscope.datasets.store import has_sample, open_dataset, sample_path
 from beliefscope.filters import legacy_names
-from beliefscope.filters.catalog import architecture
+from beliefscope.filters.catalog import architecture, filters_of
 from beliefscope.filters.checkpoint import save_checkpoint
 from beliefscope.filters.evaluate import WARMUP, metrics
+from beliefscope.filters.filter import Architecture
 from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Report
 from beliefscope.filters.training.study_table import Document, Row, rows_of, to_csv, to_markdown
 from beliefscope.filters.training.train import train, versions
@@ -75,6 +76,7 @@ class Cell:
         """The document of the finished or failed cell; None if it is missing, incomplete or of other inputs."""
         try:
             document = read_json(self.path(folder).read_bytes())
+            document["architecture"] = Architecture.from_json(document["architecture"]).to_json()
             document["plan"] = legacy_names.rename_keys(document["plan"], legacy_names.PLAN)
             if any(document.get(key) != value for key, value in self.inputs().items()):
                 return None
@@ -91,6 +93,51 @@ class Cell:
         """The document of the finished cell, else None."""
         document = self.document(folder)
         return None if document is None or "error" in document else document
+
+
+def study_cells(
+    preset: str,
+    tasks: Sequence[str],
+    filters: Sequence[str],
+    seeds: int,
+    files: Mapping[str, Path],
+    skip_bad: bool = False,
+    note: Callable[[str], None] = lambda text: None,
+) -> list[Cell]:
+    """All cells by task, then seed, then filter, so that a table of all filters is available early.
+
+    Args:
+        tasks: names or ``path/to/file.py:NAME``; empty for all with data. filters: names; empty for all of each task.
+        files: data of tasks without a sample dataset, or in its place. note: receives each skipped trajectory.
+
+    Raises BadInput for unknown names and unusable data.
+    """
+    if preset not in PLANS:
+        raise unknown_name("preset", preset, PLANS)
+    sources = list(dict.fromkeys(tasks or [*(name for name in TASKS if name in files or has_sample(name)), *files]))
+    available = {name for source in sources for name in filters_of(load_task(source))}
+    for name in filters:
+        if name not in available:
+            raise unknown_name("filter", name, sorted(available))
+    cells = []
+    for source in sources:
+        task = load_task(source)
+        path = (files[source] if source in files else sample_path(task.name)).resolve()
+        with open_dataset(path, task, skip_bad) as episodes:
+            if episodes.task.name != task.name:
+                raise BadInput(f"{str(path)!r} contains episodes of task {episodes.task.name!r}, not of {task.name!r}")
+            data_hash, splits = episodes.hash, {summary.split for summary in episodes.summaries}
+            for line in episodes.skipped:
+                note(f"skipped: {line}")
+        if "train" not in splits or splits == {"train"}:
+            raise BadInput(f"{path} has episodes of {', '.join(sorted(splits))}; a study needs train and test or val")
+        cells += [
+            Cell(task.name, name, seed, preset, source, path, data_hash, skip_bad)
+            for seed in range(seeds)
+            for name in filters_of(task)
+            if not filters or name in filters
+        ]
+    return cells
 
 
 def run_cell(cell: Cell, folder: Path, report: Report | None = None, wait: bool = True) -> Document | None:

@@ -46,8 +46,9 @@ class Row:
             ``coverage95``, ``seconds`` of training. The spread is the standard deviation (n - 1). None if a seed lacks
             the quantity, and for the spread of one seed.
         bounds: of ``nees``, see ``nees_bounds``. None without a covariance.
-        standalone: modality -> mean RMSE over the seeds of the same filter with only that modality; crossmodal filters
-            only. by_seed: seed -> quantity -> value.
+        updates: modality -> mean RMSE over the seeds of its single-modality updates, which start from the fused prior;
+            empty for studies of earlier versions. standalone: the same for the filter with only that modality. Both for
+            filters of several models only. by_seed: seed -> quantity -> value.
     """
 
     task: str
@@ -60,6 +61,7 @@ class Row:
     spread: Numbers
     bounds: tuple[float, float] | None = None
     standalone: Mapping[str, Numbers] = field(default_factory=dict)
+    updates: Mapping[str, Numbers] = field(default_factory=dict)
     by_seed: Mapping[str, Numbers] = field(default_factory=dict)
 
 
@@ -90,9 +92,11 @@ def _filter_rows(task: str, name: str, documents: Sequence[Document | None]) -> 
         if mean.get("nees") is not None:
             trajectories = finished[0]["episodes"]["test"] or finished[0]["episodes"]["val"]
             bounds = nees_bounds(len(find_task(task).components), trajectories)
-        standalone = _standalone([d["metrics"][f"{blackout:g}"] for d in finished])
+        metrics = [d["metrics"][f"{blackout:g}"] for d in finished]
+        standalone = _over_modalities([{k: m for k, m in by_name.items() if k != "fused"} for by_name in metrics])
+        updates = _over_modalities([by_name["fused"].get("updates", {}) for by_name in metrics])
         counts = len(finished), len(documents), failed
-        rows.append(Row(task, name, blackout, *counts, mean, spread, bounds, standalone, by_seed))
+        rows.append(Row(task, name, blackout, *counts, mean, spread, bounds, standalone, updates, by_seed))
     return rows
 
 
@@ -103,8 +107,9 @@ def _numbers(document: Document, blackout: float) -> dict[str, float | None]:
     return rmse | consistency | {"seconds": document["seconds"]}
 
 
-def _standalone(metrics: Sequence[Document]) -> dict[str, dict[str, float | None]]:
-    names = [name for name in (metrics[0] if metrics else ()) if name != "fused"]
+def _over_modalities(metrics: Sequence[Document]) -> dict[str, dict[str, float | None]]:
+    """Mean RMSE over the seeds by modality; a modality that a seed lacks is omitted."""
+    names = [name for name in (metrics[0] if metrics else ()) if all(name in by_name for by_name in metrics)]
     return {name: _over_seeds([by_name[name]["rmse"] for by_name in metrics])[0] for name in names}
 
 
@@ -167,6 +172,28 @@ def _task_table(task: str, rows: Sequence[Row]) -> str:
         elif not row.seeds:
             values = ["failed" if row.failed == row.requested else "missing"] + [""] * (len(values) - 1)
         lines.append(f"| {row.filter} | {blackout} | {seeds} | {' | '.join(values)} |")
+    return "\n".join(lines) + "\n" + _modality_table(rows)
+
+
+def _modality_table(rows: Sequence[Row]) -> str:
+    """Position RMSE of the updates and of the standalone filter of every modality; empty without any."""
+    names = dict.fromkeys(name for row in rows for name in row.standalone)
+    if not names:
+        return ""
+    heads = [head for name in names for head in (f"{name}-only update", f"{name} standalone")]
+    lines = [
+        "\nPosition (cm) by modality: an update starts at every step from the fused prior, a standalone filter never "
+        "uses the other modalities.\n",
+        f"| filter | image blackout | fused | {' | '.join(heads)} |",
+        "| --- |" + " ---: |" * (len(heads) + 2),
+    ]
+    for row in rows:
+        if row.standalone:
+            by_modality = (
+                part.get(name, {}).get("position_cm") for name in names for part in (row.updates, row.standalone)
+            )
+            values = ["" if v is None else f"{v:.2f}" for v in (row.mean.get("position_cm"), *by_modality)]
+            lines.append(f"| {row.filter} | {row.blackout:.0%} | {' | '.join(values)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -17,6 +17,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build
+from beliefscope.filters.data_check import summarise
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.filter import Architecture, Filter
 from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Plan, Report
@@ -100,6 +101,7 @@ def train(
         "episodes": {split: len(members) for split, members in splits.items()},
         "seconds": round(seconds, 1),
         "threads": torch.get_num_threads(),
+        "data_summary": summarise(filter_.statistics, filter_.task, splits["train"]),
         "metrics": measure(filter_, held_out) if held_out else {},
     }
     if state is not None:
@@ -133,16 +135,16 @@ def versions() -> dict[str, str]:
 
 
 def measure(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Metrics by probability of an image blackout (``"0"``, ``"0.4"``, ``"0.8"``), fused and of single modalities."""
-    names: list[str | None] = [None]
-    if filter_.architecture.fusion == "crossmodal":
-        names += filter_.names
-    return {
-        f"{blackout:g}": {
-            name or "fused": evaluate(
-                filter_, episodes, faults=Faults.parse(f"blackout={blackout}"), only=name
-            ).to_dict()
-            for name in names
-        }
+    """Metrics by probability of an image blackout (``"0"``, ``"0.4"``, ``"0.8"``).
+
+    ``fused``: of the filter, with its single-modality ``updates``; a modality's name: of its standalone filter.
+    """
+    several = len(filter_.names) > 1
+    results = {
+        f"{blackout:g}": evaluate(filter_, episodes, faults=Faults.parse(f"blackout={blackout}"), modalities=several)
         for blackout in BLACKOUTS
+    }
+    return {
+        blackout: {"fused": result.to_dict()} | {name: alone.to_dict() for name, alone in result.standalone.items()}
+        for blackout, result in results.items()
     }

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
@@ -20,10 +24,13 @@ from beliefscope.inspect.compare.lineage import base_of
 from beliefscope.inspect.compare.modules import ModuleChange, module_changes
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Line, Plot, Table, Value
-from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES
 from beliefscope.inspect.statistics.calibration import LEVELS
 from beliefscope.inspect.statistics.episode_sums import calibration, measures_of, sample_steps, sum_episodes
+from beliefscope.inspect.statistics.intervals import too_few
 from beliefscope.inspect.statistics.measures import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MAX_ROWS = 20
 """Maximum number of rows in the tables of improvements and regressions."""
@@ -95,8 +102,8 @@ class CheckpointComparison(Diagnostic):
     def verdict(self) -> str:
         if self.hashes[0] == self.hashes[1] or not any(d.effect for d in self.differences):
             return f"{self.filters[1]} is identical to {self.filters[0]} in all measures."
-        if len(self.episodes) < MIN_TRAJECTORIES:
-            return f"No verdict from {len(self.episodes)} episodes: intervals need at least {MIN_TRAJECTORIES}."
+        if why := too_few(len(self.episodes)):
+            return f"No verdict: {why}."
         errors = [d for d in self.differences if d.is_error]
         improved = _summary("Improved", self.improvements(), errors, -1.0)
         return f"{improved}; {_summary('regressed', self.regressions(), errors, 1.0)}."
@@ -200,7 +207,7 @@ def compare_checkpoints(
 ) -> CheckpointComparison:
     """Compare two checkpoints of one task with equal modalities.
 
-    Both run with the same sensor faults and random numbers. Intervals resample episodes, paired between checkpoints.
+    Both run with the same sensor faults and random numbers. Intervals are over episodes, paired between checkpoints.
 
     Args:
         episodes: indices in ``data``; by default the held-out episodes of a ``Dataset``, otherwise all.
@@ -350,3 +357,13 @@ def _module_row(m: ModuleChange) -> tuple[Value, ...]:
     gradient = None if math.isnan(m.gradient) else m.gradient
     hashes = m.hashes[0][:12] if m.unchanged else " -> ".join(digest[:12] for digest in m.hashes)
     return m.name, m.kind, m.parameters, gradient, changed, drift, "yes" if m.unchanged else "", hashes
+
+
+def write_comparison(folder: Path, document: Mapping[str, Any], text: str, figure: Figure) -> None:
+    """Write a comparison into a new folder as JSON, figure and Markdown."""
+    from beliefscope.inspect.diagnostics.plotting import write_figure  # matplotlib is slow to import
+
+    folder.mkdir()
+    write_figure(figure, folder / "change.svg")
+    write_atomically(folder / "change.md", f"```\n{text}\n```\n".encode())
+    write_atomically(folder / "change.json", (json.dumps(document, indent=2) + "\n").encode())

@@ -17,6 +17,7 @@ from beliefscope.inspect.statistics.measures import (
     covariances,
     display_units,
     errors,
+    layer_label,
     means,
     position_error,
     task_of,
@@ -44,7 +45,7 @@ class Counterfactual(Diagnostic):
         first, to: first edited step, and first step after the edit.
         truth, original, edited: (T, n) true states and the fused estimates of both runs.
         distance: (T,) m, distance between the fused position estimates.
-        modality_distance: (T, K) m, distance between the unimodal position estimates.
+        modality_distance: (T, K) m, distance between the positions of the single-modality updates.
         sigmas: (T,) ``sqrt(d^T S^-1 d / n)`` for the difference d of the estimates and the covariance S of the original
             run; without a covariance, S is the mean squared error by component.
         divergence: (T,) nats, Kullback-Leibler divergence of the original posterior from the edited one, as Gaussians;
@@ -161,7 +162,7 @@ class Counterfactual(Diagnostic):
         return tables
 
     def _modality_table(self) -> Table:
-        columns: tuple[str, ...] = ("modality", "change of unimodal estimate, cm")
+        columns: tuple[str, ...] = ("modality", "change of its update, cm")
         change = 100 * self.modality_distance[self.during].mean(0)
         rows: list[tuple[Value, ...]] = [(m, float(change[k])) for k, m in enumerate(self.modalities)]
         if self.effective_weights is not None and self.edited_weights is not None:
@@ -174,7 +175,7 @@ class Counterfactual(Diagnostic):
         chart = "Distance between original and edited estimates"
         curves = [Curve("fused", 100 * self.distance, chart, "cm", "fused")]
         for k, m in enumerate(self.modalities if len(self.modalities) > 1 else ()):
-            curves.append(Curve(f"{m} only", 100 * self.modality_distance[:, k], chart, "cm", m))
+            curves.append(Curve(layer_label(m), 100 * self.modality_distance[:, k], chart, "cm", m))
         curves.append(
             Curve(
                 "fused", self.sigmas, "Distance in standard deviations of the original", "", "fused", (0.0, RECOVERED)

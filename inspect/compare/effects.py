@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,8 +14,8 @@ from beliefscope.filters.evaluate import UNITS, WARMUP
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.inspect.failures.events import event_spans
 from beliefscope.inspect.failures.step_scores import RECENT
-from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES, resample_sums
 from beliefscope.inspect.statistics.episode_sums import EpisodeSums, Measure, condition
+from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.statistics.measures import Array
 
 HIGH = 0.95
@@ -41,7 +42,7 @@ class Difference:
         effect: natural logarithm of the factor of deterioration; negative is better. Errors: log ratio. NLL: increase
             over n, equivalent to scaling all errors and standard deviations. NEES: factor by which standard deviations
             are wrong. Coverage and calibration: increase of the deviation from the ideal, a share.
-        low, high: 95 % bootstrap interval of the effect over episodes; NaN below ``MIN_TRAJECTORIES`` episodes.
+        low, high: 95 % interval of the effect over episodes; NaN below ``MIN_TRAJECTORIES`` episodes.
     """
 
     slice: str
@@ -108,21 +109,23 @@ def differences(sums: Array, slices: Sequence[str], measures: Sequence[Measure])
         sums: (E, 2, S, Q), see ``EpisodeSums``.
     """
     total = sums.sum(0)
-    resamples = resample_sums(sums) if len(sums) >= MIN_TRAJECTORIES else None
     rows = []
     for s, name in enumerate(slices):
+        with_steps = sums[sums[:, 0, s, 0] > 0.0, :, s]
         for measure in measures:
             before, after = (float(value) for value in measure.value(total[:, s]))
             if not (math.isfinite(before) and math.isfinite(after)):
                 continue
-            effect = float(np.subtract(*measure.loss(np.array([after, before]))))
-            low = high = math.nan
-            if resamples is not None:
-                loss = measure.loss(measure.value(resamples[:, :, s]))
-                # NaN: resample without a step of the slice.
-                low, high = (float(x) for x in np.nanpercentile(loss[:, 1] - loss[:, 0], [2.5, 97.5]))
+            effect, low, high = map(float, jackknife(with_steps, partial(_effect, measure)))
             rows.append(Difference(name, measure.name, measure.unit, before, after, effect, low, high))
     return tuple(rows)
+
+
+def _effect(measure: Measure, sums: Array) -> Array:
+    """Sums (..., 2, Q) to (...): increase of the loss."""
+    loss = measure.loss(measure.value(sums))
+    difference: Array = loss[..., 1] - loss[..., 0]
+    return difference
 
 
 def find_regressions(

@@ -7,10 +7,10 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
@@ -92,6 +92,25 @@ class Ancestor:
             return {}
         return {name: rmse[name] for name in sorted(rmse, key=lambda name: name != "position_cm")}
 
+    @property
+    def summary(self) -> list[str]:
+        """Lines of text: file and hash, errors with the data they are of, and the command."""
+        errors = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in self.rmse.items())
+        data = self.record.get("data_hash")  # errors on different data are not comparable
+        lines = [f"{self.path} {self.hash[:12]} {self.task} {self.name}"]
+        lines += [f"RMSE {errors}{f', data {data[:12]}' if data else ''}"] if errors else []
+        return lines + ([self.command] if self.command else [])
+
+    @property
+    def learned(self) -> list[str]:
+        """Names of the slices that it was fine-tuned on."""
+        return [part["slice"]["name"] for part in self.settings.get("mix", [])]
+
+    def held_out(self, when: Literal["before", "after"]) -> dict[str, Mapping[str, float]]:
+        """Slice -> RMSE by component on the test episodes, before or after its fine-tuning; empty without one."""
+        measures = self.record.get("held_out", {}).get(when, {})
+        return {name: values.get("rmse") for name, values in measures.items()}
+
 
 @dataclass(frozen=True)
 class Lineage:
@@ -128,6 +147,20 @@ class Lineage:
                 raise BadInput(f"checkpoint {name!r} is ambiguous: {', '.join(available)}")
             raise unknown_name("checkpoint", name, available)
         return matches[0]
+
+    def __str__(self) -> str:
+        """One tree per root; fine-tuned checkpoints are indented below their base."""
+
+        def lines(member: Ancestor, indent: str) -> Iterator[str]:
+            orphan = member.base is not None and member.base not in self.members
+            note = [f"fine-tuned from {str(member.base)[:12]}, which is not in these folders"] if orphan else []
+            first, *others = [*member.summary, *note]
+            yield indent + first
+            yield from (f"{indent}  {line}" for line in others)
+            for other in self.finetuned(member.hash):
+                yield from lines(other, f"{indent}    ")
+
+        return "\n".join(line for root in self.roots for line in lines(root, ""))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values; each member lists the hashes of checkpoints fine-tuned from it."""

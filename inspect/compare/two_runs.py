@@ -23,6 +23,7 @@ from beliefscope.inspect.statistics.measures import (
     covariances,
     display_units,
     errors,
+    layer_label,
     means,
     nees,
     phases,
@@ -60,7 +61,7 @@ class Comparison(Diagnostic):
         nll: (S, 2) mean negative log density of the true state, nats in m and rad; NaN without a covariance.
         effective_weights: (S, K, 2) mean effective weights; None if a run has none.
         distance: (T,) m, distance between the fused position estimates.
-        modality_distance: (T, K) m, distance between the unimodal position estimates.
+        modality_distance: (T, K) m, distance between the positions of the single-modality updates.
         error: (T, 2) m, position error.
         component_error: (T, n, 2) error by component.
         nees_at: (T, 2) NEES / n by step.
@@ -168,7 +169,7 @@ class Comparison(Diagnostic):
         curves = [Curve("fused", 100 * self.distance, chart, "cm", "fused")]
         if len(self.modalities) > 1:
             curves += [
-                Curve(f"{m} only", 100 * self.modality_distance[:, k], chart, "cm", m)
+                Curve(layer_label(m), 100 * self.modality_distance[:, k], chart, "cm", m)
                 for k, m in enumerate(self.modalities)
             ]
 
@@ -219,7 +220,13 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
     masks = phases(this)
     masks["blackout"] = masks["all"] & either_blackout
     masks = {phase: mask for phase, mask in masks.items() if mask.any()}
-    shared = tuple(name for name in this.modalities_with_posterior if name in other.modalities_with_posterior)
+    # A standalone estimate is not comparable with an update of a prior that other modalities have informed.
+    standalone = any("standalone" in run.settings for run in runs)
+    shared = (
+        ()
+        if standalone
+        else tuple(name for name in this.modalities_with_posterior if name in other.modalities_with_posterior)
+    )
     layers = np.stack([_layers(run, shared) for run in runs], axis=-1)  # (T, K + 1, n, 2)
     distance = np.linalg.norm(wrapped(task, layers[..., 1] - layers[..., 0])[..., list(task.map_indices)], axis=-1)
     error = np.stack([errors(run)[:, -1] for run in runs], axis=-1)
@@ -257,7 +264,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
 
 
 def _layers(run: Trace, shared: tuple[str, ...]) -> Array:
-    """(T, K + 1, n): unimodal estimates of the shared modalities, then the fused estimate."""
+    """(T, K + 1, n): single-modality updates of the shared modalities, then the fused estimate."""
     return means(run)[:, [*(run.modalities.index(name) for name in shared), -1]]
 
 

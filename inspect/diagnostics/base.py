@@ -5,21 +5,35 @@ Fields of a result are in SI units; its views are in cm and degrees.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, compare
+from beliefscope.inspect.diagnostics.healthy_profile import find_profile
 from beliefscope.inspect.diagnostics.views import Views
 from beliefscope.inspect.trace import Trace
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+NO_DEFAULT = (None, inspect.Parameter.empty)
+
+
+NO_RECORD = "No healthy record of this filter; compared with theory."
+"""Start of the verdicts on filters without a healthy profile."""
+
 
 class Diagnostic(Views):
     """Result of a diagnostic; subclasses are frozen dataclasses whose fields are its numbers."""
+
+    @property
+    def alarms(self) -> tuple[str, ...]:
+        """Significant deviations from the filter's healthy record, or without one from theory."""
+        return ()
 
     def plot(self) -> Figure:
         """Curves, plots and image panels as a matplotlib figure of a paper's width."""
@@ -42,6 +56,8 @@ class Entry:
         needs: ``trace`` only, or the ``checkpoint`` too.
         slow: takes more than two seconds; computed on request only.
         options: option -> description.
+        statistics: trace -> statistics of a healthy profile (``HealthyProfile``). Such a diagnostic takes the
+            comparison with the filter's profile as ``healthy``, None if the filter has none.
     """
 
     name: str
@@ -52,6 +68,22 @@ class Entry:
     needs: Literal["trace", "checkpoint"] = "trace"
     slow: bool = False
     options: Mapping[str, str] = field(default_factory=dict)
+    statistics: Callable[[Trace], dict[str, float]] | None = None
+
+    @property
+    def takes_progress(self) -> bool:
+        """Whether ``run`` has the argument ``progress``, a callback for the share done."""
+        return "progress" in inspect.signature(self.run).parameters
+
+    def to_json(self) -> dict[str, Any]:
+        """Description as JSON; the default of an option is text, empty if there is none."""
+        parameters = inspect.signature(self.run).parameters
+        defaults = {name: parameters[name].default for name in self.options}
+        options = [
+            {"name": name, "meaning": meaning, "default": "" if defaults[name] in NO_DEFAULT else str(defaults[name])}
+            for name, meaning in self.options.items()
+        ]
+        return {name: getattr(self, name) for name in ("name", "title", "question", "slow")} | {"options": options}
 
     def refusal(self, trace: Trace, checkpoint: Checkpoint | None) -> str | None:
         """One-line reason why the diagnostic cannot be computed, or None."""
@@ -77,4 +109,14 @@ class Entry:
                     f"traces of two checkpoints, {traces[0].checkpoint_hash[:12]} and {trace.checkpoint_hash[:12]}: "
                     "a diagnostic needs traces of one filter"
                 )
+        if self.statistics is not None:
+            options["healthy"] = self.compare(traces, checkpoint)
         return self.run(traces, checkpoint, **options) if self.needs == "checkpoint" else self.run(traces, **options)
+
+    def compare(self, traces: Sequence[Trace], checkpoint: Checkpoint | None) -> Comparison | None:
+        """Compare the traces with the filter's healthy profile; None without one."""
+        first = traces[0]
+        profile = find_profile(first.episode.task, first.filter, first.checkpoint_hash, checkpoint)
+        if self.statistics is None or profile is None:
+            return None
+        return compare(profile, [self.statistics(trace) for trace in traces])

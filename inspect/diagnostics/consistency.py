@@ -7,7 +7,7 @@ its standard deviations are too small by the root of the ratio.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from beliefscope.datasets.catalog import find_task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import nees_bounds
-from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
+from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
+from beliefscope.inspect.diagnostics.layer_consistency import LayerConsistency, inconsistency, number
 from beliefscope.inspect.diagnostics.views import Curve, Line, Plot, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import (
@@ -27,72 +29,14 @@ from beliefscope.inspect.statistics.calibration import (
     particle_crps,
     particle_level,
 )
-from beliefscope.inspect.statistics.innovations import Whiteness, innovations, whiteness_of
+from beliefscope.inspect.statistics.innovations import Whiteness, autocorrelations, nis_of, whiteness_of
+from beliefscope.inspect.statistics.intervals import mean_interval, too_few
 from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-ALL, FUSED, CONSISTENT = "all", "fused", "consistent"
-
-MIN_TRAJECTORIES = 5
-"""Minimum number of trajectories for an unqualified verdict of consistency."""
-
-MIN_STEPS = 10
-"""Minimum number of steps of a phase in the verdict."""
-
-
-@dataclass(frozen=True)
-class LayerConsistency:
-    """Consistency of one layer in one phase.
-
-    Attributes:
-        layer: modality or ``fused``.
-        phase: phase name.
-        trajectories, steps: number of trajectories and steps in the phase.
-        nees: mean of ``e^T S^-1 e / n``.
-        bounds: 95 % bounds of ``nees`` for a consistent filter, assuming one independent error per trajectory.
-        nis: mean of the normalised innovation squared over n; NaN without innovations.
-        coverage95: share of steps with the true state in the 95 % region.
-        calibration: (P,) share of steps with the true state in the region of each of ``LEVELS``.
-        miscalibration: mean absolute difference between ``calibration`` and ``LEVELS``.
-        nll: mean negative log density of the true state, nats in m and rad.
-        rmse, sharpness, crps: (n,) m, rad: root mean square error, root mean predicted variance, mean CRPS.
-    """
-
-    layer: str
-    phase: str
-    trajectories: int
-    steps: int
-    nees: float
-    bounds: tuple[float, float]
-    nis: float
-    coverage95: float
-    calibration: Array
-    miscalibration: float
-    nll: float
-    rmse: Array
-    sharpness: Array
-    crps: Array
-
-    @property
-    def factor(self) -> float:
-        """Factor by which predicted standard deviations are too small; below 1 if too large."""
-        return math.sqrt(self.nees)
-
-    @property
-    def assessment(self) -> str:
-        """``consistent`` within the bounds, otherwise over- or underconfident with the factor."""
-        low, high = self.bounds
-        if self.nees > high:
-            return f"overconfident by a factor of {_number(self.factor)}"
-        return f"underconfident by a factor of {_number(1.0 / self.factor)}" if self.nees < low else CONSISTENT
-
-    @property
-    def evidence(self) -> str:
-        """NEES / n and its bounds."""
-        low, high = self.bounds
-        return f"NEES/n {_number(self.nees)}, 95 % bounds {low:.2f} to {high:.2f}"
+ALL, FUSED = "all", "fused"
 
 
 @dataclass(frozen=True)
@@ -107,6 +51,7 @@ class Consistency(Diagnostic):
         levels: (P,) levels of the calibration curves.
         nees, nis: (T, L), (T, K) NEES / n and NIS / n by step of a single trace; (0, L), (0, K) for several.
         contact, blackout: (T,) masks of a single trace.
+        healthy: comparison with the filter's healthy record, if it has one.
     """
 
     task: str
@@ -119,6 +64,7 @@ class Consistency(Diagnostic):
     nis: Array
     contact: Mask
     blackout: Mask
+    healthy: Comparison | None = None
 
     def entry(self, layer: str, phase: str = ALL) -> LayerConsistency:
         """Consistency of a layer in a phase. Raises KeyError if the phase has no steps."""
@@ -137,38 +83,47 @@ class Consistency(Diagnostic):
     @property
     def verdict(self) -> str:
         fused = self.entry(FUSED)
-        assessment = fused.assessment
-        if assessment == CONSISTENT and self.trajectories < MIN_TRAJECTORIES:
-            assessment += f", based on {self.trajectories} trajector{'y' if self.trajectories == 1 else 'ies'} only"
-        parts = [_sentence(f"{assessment} ({fused.evidence})")]
-        candidates = [entry for entry in self.by_layer if entry.steps >= MIN_STEPS]
+        if self.healthy is not None:
+            return f"{self.healthy.sentence} {fused.evidence}; 1 in theory."
+        parts = [f"{NO_RECORD} {_sentence(f'{fused.assessment} ({fused.evidence})')}"]
+        candidates = [entry for entry in self.by_layer if entry.refusal is None]
         phases = [entry for entry in candidates if entry.layer == FUSED and entry.phase != ALL]
-        worst = max(phases, key=_inconsistency, default=fused)
-        if worst.assessment != CONSISTENT and _inconsistency(worst) > _inconsistency(fused) + 2.0 * math.log(1.1):
+        worst = max(phases, key=inconsistency, default=fused)
+        if worst.inconsistent and inconsistency(worst) > inconsistency(fused) + 2.0 * math.log(1.1):
             parts.append(f"Least consistent phase: {worst.phase}, {worst.assessment} ({worst.evidence}).")
-        elif phases and all(entry.assessment == CONSISTENT for entry in (fused, *phases)):
+        elif phases and not any(entry.inconsistent for entry in (fused, *phases)):
             parts.append(f"Also consistent in each phase: {', '.join(entry.phase for entry in phases)}.")
         unimodal = [entry for entry in candidates if entry.layer != FUSED]
         if len(self.layers) > 2 and unimodal:
-            parts.append(self._unimodal_sentence(max(unimodal, key=_inconsistency)))
-        if self.whiteness:
+            parts.append(self._unimodal_sentence(unimodal))
+        if self.whiteness and too_few(self.trajectories) is None:
             parts.append(self._innovation_sentence())
         return " ".join(parts)
 
-    def _unimodal_sentence(self, worst: LayerConsistency) -> str:
-        if worst.assessment == CONSISTENT:
-            return "All unimodal posteriors are consistent."
+    @property
+    def alarms(self) -> tuple[str, ...]:
+        if self.healthy is not None:
+            return tuple(alarm.text for alarm in self.healthy.alarms)
+        entries = [entry for entry in self.by_layer if entry.inconsistent]
+        texts = [f"{entry.layer}, {entry.phase}: {entry.assessment}" for entry in entries]
+        return (*texts, *(f"innovations of {test.modality} are not white" for test in self.whiteness if not test.white))
+
+    def _unimodal_sentence(self, entries: Sequence[LayerConsistency]) -> str:
+        worst = max((entry for entry in entries if entry.inconsistent), key=inconsistency, default=None)
+        if worst is None:
+            return "All single-modality updates are consistent."
         where = "all steps" if worst.phase == ALL else worst.phase
         return (
-            f"Least consistent unimodal posterior: {worst.layer} in {where}, {worst.assessment} "
-            f"(NEES/n {_number(worst.nees)})."
+            f"Least consistent single-modality update: {worst.layer} in {where}, {worst.assessment} "
+            f"(NEES/n {number(worst.nees)})."
         )
 
     def _innovation_sentence(self) -> str:
-        strongest = max(self.whiteness, key=lambda test: abs(test.autocorrelation))
-        if min(test.p_value for test in self.whiteness) > 0.05 / len(self.whiteness):
+        colored = [test for test in self.whiteness if not test.white]
+        if not colored:
             return "Innovations are white."
-        size = _number(math.sqrt(self.entry(strongest.modality).nis))
+        strongest = max(colored, key=lambda test: abs(test.autocorrelation))
+        size = number(math.sqrt(self.entry(strongest.modality).nis))
         where = f"{strongest.modality}, {strongest.component}: autocorrelation {strongest.autocorrelation:.2f} at lag 1"
         text = f"Innovations are not white ({where}) and {size} times as large as predicted"
         if strongest.autocorrelation > 0.2:
@@ -181,14 +136,15 @@ class Consistency(Diagnostic):
         rows: list[tuple[Value, ...]] = []
         error_rows: list[tuple[Value, ...]] = []
         for entry in self.by_layer:
-            low, high = entry.bounds
+            low, high = entry.interval
+            interval = "" if math.isnan(low) else f"{low:.2f} to {high:.2f}"
             nis = None if math.isnan(entry.nis) else entry.nis
-            head = (entry.layer, entry.phase)
-            values = (entry.trajectories, entry.steps, entry.nees, f"{low:.2f} to {high:.2f}", nis, entry.coverage95)
+            head = (measures.layer_label(entry.layer), entry.phase)
+            values = (entry.trajectories, entry.steps, entry.nees, interval, nis, entry.coverage95)
             rows.append((*head, *values, entry.miscalibration, entry.nll, entry.assessment))
             components = zip(entry.rmse * scale, entry.sharpness * scale, entry.crps * scale, strict=True)
             error_rows.append((*head, *(float(value) for component in components for value in component)))
-        columns = ("layer", "phase", "trajectories", "steps", "NEES/n", "95 % bounds", "NIS/n", "95 % coverage")
+        columns = ("layer", "phase", "trajectories", "steps", "NEES/n", "95 % interval", "NIS/n", "95 % coverage")
         tables = [Table("Consistency", (*columns, "miscalibration", "NLL (nats)", "result"), tuple(rows))]
         names = [
             f"{c.name} ({unit}): {quantity}"
@@ -199,19 +155,20 @@ class Consistency(Diagnostic):
         tables.append(Table(title, ("layer", "phase", *names), tuple(error_rows)))
         if self.whiteness:
             tests = tuple(
-                (test.modality, test.component, test.autocorrelation, test.statistic, test.degrees, test.p_value)
+                (test.modality, test.component, test.autocorrelation, *test.ends, test.statistic, test.p_value)
                 for test in self.whiteness
             )
             heads = (
                 "modality",
                 "component",
                 "autocorrelation at lag 1",
+                "95 % from",
+                "to",
                 "Ljung-Box Q",
-                "degrees of freedom",
-                "p-value",
+                "p-value if white",
             )
             tables.append(Table("Whiteness of the innovations", heads, tests))
-        return tables
+        return tables if self.healthy is None else [*tables, self.healthy.table()]
 
     def curves(self) -> list[Curve]:
         """Roots of NEES / n and NIS / n: errors in predicted standard deviations, with 95 % bounds."""
@@ -219,13 +176,15 @@ class Consistency(Diagnostic):
             return []
         low, high = nees_bounds(len(find_task(self.task).components), 1)
         bounds = (math.sqrt(low), math.sqrt(high))
-        charts = [("Error in predicted standard deviations (root of NEES/n)", "error", self.nees, self.layers)]
+        title = "Error in predicted standard deviations (root of NEES/n)"
+        charts: list[tuple[str, str, Array, tuple[str, ...], Callable[[str], str]]]
+        charts = [(title, "error", self.nees, self.layers, measures.layer_label)]
         if self.nis.size:
             title = "Innovation in predicted standard deviations (root of NIS/n)"
-            charts.append((title, "innovation", self.nis, self.layers[:-1]))
+            charts.append((title, "innovation", self.nis, self.layers[:-1], str))
         return [
-            Curve(f"{layer} {quantity}", np.sqrt(values[:, k]), chart, "standard deviations", layer, bounds)
-            for chart, quantity, values, names in charts
+            Curve(f"{name(layer)} {quantity}", np.sqrt(values[:, k]), chart, "standard deviations", layer, bounds)
+            for chart, quantity, values, names, name in charts
             for k, layer in enumerate(names)
         ]
 
@@ -236,7 +195,7 @@ class Consistency(Diagnostic):
         plots = []
         for phase in self.phases:
             lines = [
-                Line(entry.layer, self.levels, entry.calibration, entry.layer)
+                Line(measures.layer_label(entry.layer), self.levels, entry.calibration, entry.layer)
                 for entry in self.by_layer
                 if entry.phase == phase
             ]
@@ -255,19 +214,23 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     return None
 
 
-def consistency(traces: Sequence[Trace]) -> Consistency:
+def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> Consistency:
     """Evaluate the consistency of one filter over one or more trajectories."""
     first = traces[0]
     steps_of = [_step_measures(trace) for trace in traces]
     pooled = {name: np.concatenate([steps[name] for steps in steps_of]) for name in steps_of[0]}
     owner, phases = measures.trace_indices(traces), measures.pooled_phases(traces)
+    # An external filter may not report single-modality updates.
+    cells = [
+        (k, layer, phase, where)
+        for k, layer in enumerate(measures.layers(first))
+        for phase, where in phases.items()
+        if np.isfinite(pooled["nees"][where, k]).any()
+    ]
     by_layer = []
-    for k, layer in enumerate(measures.layers(first)):
-        for phase, where in phases.items():
-            steps = {name: values[where, k] for name, values in pooled.items()}
-            # An external filter may not report unimodal posteriors.
-            if np.isfinite(steps["nees"]).any():
-                by_layer.append(_summarise(layer, phase, len(np.unique(owner[where])), steps))
+    for k, layer, phase, where in cells:
+        steps = {name: values[where, k] for name, values in pooled.items()}
+        by_layer.append(_summarise(layer, phase, owner[where], steps, len(cells)))
     keep = len(first) if len(traces) == 1 else 0
     has_nis = first.observation_mean is not None
     return Consistency(
@@ -281,7 +244,23 @@ def consistency(traces: Sequence[Trace]) -> Consistency:
         nis=pooled["nis"][:keep, : len(first.modalities) if has_nis else 0],
         contact=first.episode.contact.astype(bool)[:keep],
         blackout=measures.blackout(first)[:keep],
+        healthy=healthy,
     )
+
+
+def trajectory_statistics(trace: Trace) -> dict[str, float]:
+    """Statistics of a healthy profile: NEES/n by layer and phase, NIS/n and autocorrelation of the innovations."""
+    nees, nis = measures.nees(trace), nis_of(trace)
+    phases = measures.long_phases(trace)
+    values = {
+        f"nees/{layer}/{phase}": float(nees[mask, k].mean())
+        for k, layer in enumerate(measures.layers(trace))
+        for phase, mask in phases.items()
+    }
+    if nis is not None and ALL in phases:
+        values |= {f"nis/{m}/{ALL}": float(nis[phases[ALL], k].mean()) for k, m in enumerate(trace.modalities)}
+    values |= {f"autocorrelation/{m} {c}/{ALL}": r for (m, c), r in autocorrelations(trace).items()}
+    return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
 def _step_measures(trace: Trace) -> dict[str, Array]:
@@ -292,9 +271,8 @@ def _step_measures(trace: Trace) -> dict[str, Array]:
     nees = measures.nees(trace)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     nis = np.full(nees.shape, np.nan)
-    if (pair := innovations(trace)) is not None:
-        nu, s = pair
-        nis[:, :-1] = np.einsum("tkn,tkn->tk", nu, np.linalg.solve(s, nu[..., None])[..., 0]) / n
+    if (values := nis_of(trace)) is not None:
+        nis[:, :-1] = values
     if trace.log_likelihood is None or trace.prior_log_weights is None:
         level = gaussian_level(n * nees, n)
         crps = gaussian_crps(error, np.sqrt(variance))
@@ -311,16 +289,23 @@ def _step_measures(trace: Trace) -> dict[str, Array]:
     return {"error": error, "variance": variance, "nees": nees, "nis": nis, "level": level, "nll": nll, "crps": crps}
 
 
-def _summarise(layer: str, phase: str, trajectories: int, steps: dict[str, Array]) -> LayerConsistency:
+def _summarise(
+    layer: str, phase: str, owner: NDArray[np.int64], steps: dict[str, Array], cells: int
+) -> LayerConsistency:
+    """``owner``: (S,) index of each step's trajectory. ``cells``: number of layers and phases, for ``adjusted``."""
     error, level = steps["error"], steps["level"]
     curve = calibration_curve(level)
+    _, index, counts = np.unique(owner, return_inverse=True, return_counts=True)
+    sums = np.bincount(index, steps["nees"])
+    (_, low, high), (_, lowest, highest) = (mean_interval(sums, counts, 1.0 - 0.05 / m) for m in (1, cells))
     return LayerConsistency(
         layer=layer,
         phase=phase,
-        trajectories=trajectories,
+        trajectories=len(counts),
         steps=len(error),
         nees=float(steps["nees"].mean()),
-        bounds=nees_bounds(error.shape[-1], trajectories),
+        interval=(float(low), float(high)),
+        adjusted=(float(lowest), float(highest)),
         nis=float(steps["nis"].mean()),
         coverage95=float((level <= 0.95).mean()),
         calibration=curve,
@@ -330,15 +315,6 @@ def _summarise(layer: str, phase: str, trajectories: int, steps: dict[str, Array
         sharpness=np.sqrt(steps["variance"].mean(0)),
         crps=steps["crps"].mean(0),
     )
-
-
-def _inconsistency(entry: LayerConsistency) -> float:
-    """Absolute logarithm of NEES / n."""
-    return abs(math.log(entry.nees)) if entry.nees > 0 else math.inf
-
-
-def _number(value: float) -> str:
-    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
 def _sentence(text: str) -> str:
@@ -351,4 +327,5 @@ ENTRY = Entry(
     question="Do the errors match the predicted covariance, and in which phases do they not?",
     run=consistency,
     why_not=why_not,
+    statistics=trajectory_statistics,
 )

@@ -1,4 +1,4 @@
-"""Statistics of the likelihood maps of all steps: area, divergence and ridge orientation."""
+"""Statistics of the likelihood maps of all steps: area, divergence, shape and ridge orientation."""
 
 from __future__ import annotations
 
@@ -7,18 +7,26 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
-from beliefscope.inspect.likelihood import COARSE, MapEngine, no_maps
+from beliefscope.inspect.likelihood import COARSE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.maps.statistics import MapStatistics, measure_maps
-from beliefscope.inspect.statistics.measures import blackout, phases
+from beliefscope.inspect.statistics.measures import blackout, phases, trace_indices
 from beliefscope.inspect.trace import Trace
 
 Mask = NDArray[np.bool_]
-ROUND = 1.3
-"""Elongation below which the principal axis of a map is not meaningful."""
+
+NOUNS = {"flat": "flat", "round": "a round peak", "ridge": "a ridge", "ring": "a ring"}
+"""Shape -> description."""
+
+MIN_TRAJECTORIES, RESAMPLES = 5, 2000
+"""Minimum number of trajectories for an interval; bootstrap samples."""
+
+VALUES_AT_ONCE = 10_000_000
 
 STEPS_AT_ONCE = 64
 """Number of maps processed together; limits memory to a few MB."""
@@ -30,45 +38,66 @@ class MapSurvey(Diagnostic):
 
     Attributes:
         numbers: statistics of B steps.
-        ridge_layers: modalities that observe the end effector, whose ridge orientation is evaluated.
+        title: quantity of the maps and rule of the fused one (``LikelihoodMap.title``).
+        ridge_layers: modalities that observe the end effector, whose shape is evaluated.
         phases: phase -> mask (B,) without warm-up steps.
-        trajectories: number of traces.
+        trajectories: number of traces. trajectory: (B,) index of each step's trace.
         size: cells per side.
         contact, blackout: (B,) masks including warm-up steps.
     """
 
     numbers: MapStatistics
+    title: str
     ridge_layers: tuple[str, ...]
     phases: dict[str, Mask]
     trajectories: int
+    trajectory: NDArray[np.int64]
     size: int
     contact: Mask
     blackout: Mask
 
     @property
+    def quantity(self) -> str:
+        return self.title.split(".", 1)[0].lower()
+
+    @property
     def verdict(self) -> str:
         if not self.ridge_layers:
-            return "No modality observes the end effector, so there is no ridge orientation to evaluate."
-        sentences = [self._ridge(layer) for layer in self.ridge_layers]
-        return " ".join([*sentences, "A random orientation has a median of 45°."])
+            return "No modality observes the end effector, so there is no shape to evaluate."
+        sentences = [
+            self._shape(layer, phase)
+            for layer in self.ridge_layers
+            for phase in ("contact", "free motion")
+            if self.phases[phase].any()
+        ]
+        if np.isfinite(self.numbers.expected).any():
+            sentences.append("A random orientation is 45° off in the median.")
+        return " ".join(sentences)
 
-    def _ridge(self, layer: str) -> str:
-        index, parts = self.numbers.layers.index(layer), []
-        for phase in ("contact", "free motion"):
-            mask = self.phases[phase]
-            if not mask.any():
-                continue
-            low, median, high = np.percentile(np.degrees(self.numbers.off_line[mask, index]), (25, 50, 75))
-            elongation = float(np.median(self.numbers.elongation[mask, index]))
-            note = ", no distinct ridge" if elongation < ROUND else ""
-            parts.append(
-                f"{phase} {median:.0f}° (quartiles {low:.0f}° to {high:.0f}°) over {mask.sum()} steps, "
-                f"elongation {elongation:.1f}{note}"
-            )
-        return (
-            f"Median angle between the principal axis of the {layer} map and the line from the true position to the "
-            f"end effector: {'; '.join(parts)}."
-        )
+    def _shape(self, layer: str, phase: str) -> str:
+        """Most frequent shape of a layer's map in a phase, and its measures."""
+        n, i, mask = self.numbers, self.numbers.layers.index(layer), self.phases[phase]
+        counts = np.bincount(n.shape[mask, i], minlength=len(SHAPES))
+        shape = SHAPES[int(counts.argmax())]
+        text = f"In {phase}, the {layer} {self.quantity} is {NOUNS[shape]} in {counts.max()} of {mask.sum()} steps"
+        of_shape = mask & (n.shape[:, i] == SHAPES.index(shape))
+        if shape == "ring":
+            radius, coverage = (float(np.median(a[of_shape, i])) for a in (n.ring_radius, n.ring_coverage))
+            return f"{text}, median radius {100.0 * radius:.1f} cm, over {100.0 * coverage:.0f} % of the circle."
+        if shape != "ridge":
+            return f"{text}."
+        text += f", median elongation {np.median(n.elongation[of_shape, i]):.1f}"
+        known = mask & np.isfinite(n.expected)
+        if not known.any():
+            return f"{text}; the task expects no direction."
+        return f"{text}; its long axis is {self._deviation(i, known)} off the direction that the task expects."
+
+    def _deviation(self, layer: int, mask: Mask) -> str:
+        """Median deviation over steps, with a 95 % interval over trajectories if there are enough."""
+        median, low, high = median_interval(np.degrees(self.numbers.deviation[mask, layer]), self.trajectory[mask])
+        if np.isnan(low):
+            return f"{median:.1f}°"
+        return f"{median:.1f}° (95 % interval {low:.1f}° to {high:.1f}°)"
 
     def tables(self) -> list[Table]:
         n = self.numbers
@@ -79,8 +108,10 @@ class MapSurvey(Diagnostic):
                 if not mask.any():
                     continue
                 values = (
-                    np.degrees(n.off_line[:, i]),
+                    np.degrees(n.deviation[:, i]),
                     n.elongation[:, i],
+                    *(100.0 * (n.shape[:, i] == k) for k in range(len(SHAPES))),
+                    100.0 * np.where(n.shape[:, i] == SHAPES.index("ring"), n.ring_radius[:, i], np.nan),
                     1e4 * n.area50[:, i],
                     1e4 * n.area95[:, i],
                     n.entropy[:, i] + np.log(1e4),
@@ -88,22 +119,26 @@ class MapSurvey(Diagnostic):
                     n.divergence[:, i, fused],
                     n.overlap[:, i, fused],
                 )
-                medians = [round(float(np.median(value[mask])), 3) for value in values]
+                # Of a shape, the part of the steps; the radius is the median over rings.
+                parts = range(2, 2 + len(SHAPES))
+                medians = [
+                    round(float((np.mean if k in parts else _median)(value[mask])), 3) for k, value in enumerate(values)
+                ]
                 rows.append((layer, phase, int(mask.sum()), *(v if np.isfinite(v) else None for v in medians)))
-        columns = ("map", "phase", "steps", "angle to line (deg)", "elongation", "50 % area (cm²)", "95 % area (cm²)")
-        more = ("entropy (nats, per cm²)", "ln p(true position) / max", "KL to fused (nats)", "overlap with fused")
-        return [Table("Medians over steps", (*columns, *more), tuple(rows))]
+        shapes = (*(f"{shape} (% of steps)" for shape in SHAPES), "ring radius (cm)")
+        columns = ("map", "phase", "steps", "off expected ridge (deg)", "elongation", *shapes)
+        more = ("50 % area (cm²)", "95 % area (cm²)", "entropy (nats, per cm²)", "ln p(true position) / max")
+        last = ("KL to fused (nats)", "overlap with fused")
+        return [Table(f"{self.title}. Medians over steps", (*columns, *more, *last), tuple(rows))]
 
     def curves(self) -> list[Curve]:
         if self.trajectories > 1:
             return []
         n, curves = self.numbers, []
-        for layer in self.ridge_layers:
-            angle = np.degrees(n.off_line[:, n.layers.index(layer)])
+        for layer in self.ridge_layers if np.isfinite(n.expected).any() else ():
+            angle = np.degrees(n.deviation[:, n.layers.index(layer)])
             curves.append(
-                Curve(
-                    layer, angle, "Angle between principal axis and line to the end effector", "°", layer, (0.0, 45.0)
-                )
+                Curve(layer, angle, "Angle between principal axis and expected ridge", "°", layer, (0.0, 45.0))
             )
         for i, layer in enumerate(n.layers):
             curves.append(Curve(layer, 1e4 * n.area95[:, i], "95 % area", "cm²", layer))
@@ -115,19 +150,54 @@ class MapSurvey(Diagnostic):
         return {} if self.trajectories > 1 else {"contact": self.contact, "blackout": self.blackout}
 
 
+def _median(values: NDArray[np.float64]) -> float:
+    """Median without NaN; NaN if there is no value."""
+    values = values[~np.isnan(values)]
+    return float(np.median(values)) if len(values) else np.nan
+
+
+def median_interval(values: NDArray[np.float64], trajectory: NDArray[np.int64]) -> tuple[float, float, float]:
+    """Median of S values with its 95 % interval, by bootstrap over the trajectories (S,) that they belong to.
+
+    Expanded percentile interval (Hesterberg, "What Teachers Should Know About the Bootstrap", 2015): the level is that
+    of Student's t with R - 1 degrees of freedom at ``sqrt(R / (R - 1))`` standard deviations, since the percentiles
+    are too narrow for few trajectories R.
+
+    Returns:
+        Median, low and high; the last two are NaN below ``MIN_TRAJECTORIES`` trajectories.
+    """
+    order = np.argsort(values)
+    ordered, (names, member) = values[order], np.unique(trajectory[order], return_inverse=True)
+    count = len(names)
+    if count < MIN_TRAJECTORIES:
+        return float(np.median(values)), np.nan, np.nan
+    draws = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), RESAMPLES)
+    at_once = max(1, VALUES_AT_ONCE // len(values))
+    medians = []
+    for first in range(0, RESAMPLES, at_once):
+        cumulative = draws[first : first + at_once, member].cumsum(axis=1)
+        medians.append(ordered[(2 * cumulative >= cumulative[:, -1:]).argmax(axis=1)])
+    tail = float(ndtr(np.sqrt(count / (count - 1)) * stdtrit(count - 1, 0.025)))
+    low, high = np.quantile(np.concatenate(medians), [tail, 1.0 - tail])
+    return float(np.median(values)), float(low), float(high)
+
+
 def maps(
     traces: Sequence[Trace],
     checkpoint: Checkpoint,
     size: int = COARSE,
+    quantity: Quantity | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> MapSurvey:
     """Evaluate the maps of all steps at the true angle. Raises BadInput for a filter without maps."""
-    parts, masks = [], []
+    parts, masks, title = [], [], ""
     for i, trace in enumerate(traces):
         engine = MapEngine(checkpoint, trace)
         for first in range(0, len(trace), STEPS_AT_ONCE):
             steps = range(first, min(first + STEPS_AT_ONCE, len(trace)))
-            parts.append(measure_maps(list(engine.maps(steps, size)), trace))
+            computed = list(engine.maps(steps, size, quantity=quantity))
+            title = computed[0].title
+            parts.append(measure_maps(computed, trace))
             if progress is not None:
                 progress((i + steps.stop / len(trace)) / len(traces))
         masks.append(phases(trace))
@@ -144,18 +214,29 @@ def maps(
     contact = np.concatenate([trace.episode.contact.astype(bool) for trace in traces])
     blackouts = np.concatenate([blackout(trace) for trace in traces])
     return MapSurvey(
-        MapStatistics(layers=parts[0].layers, **joined), ridge_layers, pooled, len(traces), size, contact, blackouts
+        numbers=MapStatistics(layers=parts[0].layers, **joined),
+        title=title,
+        ridge_layers=ridge_layers,
+        phases=pooled,
+        trajectories=len(traces),
+        trajectory=trace_indices(traces),
+        size=size,
+        contact=contact,
+        blackout=blackouts,
     )
 
 
 ENTRY = Entry(
     name="maps",
     title="Likelihood maps",
-    question="Which positions does each modality consider likely, and does the haptics map have a ridge towards the "
-    "end effector?",
+    question="Which positions does each modality consider likely, is the haptics map a ridge or a ring, and does the "
+    "ridge have the direction that the task expects?",
     run=maps,
     why_not=lambda trace, checkpoint: None if checkpoint is None else no_maps(checkpoint, trace),
     needs="checkpoint",
     slow=True,
-    options={"size": "cells per side, 41 by default"},
+    options={
+        "size": "cells per side, 41 by default",
+        "quantity": "likelihood or posterior; likelihood by default, if the filter has one",
+    },
 )

@@ -11,6 +11,7 @@ from scipy.ndimage import label
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import particle_level
@@ -21,6 +22,9 @@ Mask = NDArray[np.bool_]
 
 DEGENERATE = 0.1
 """Ratio of effective sample size to particles below which a particle set is degenerate."""
+
+OUTSIDE = 1e-6
+"""Share of predicted weight farther than the true state below which this is outside of all particles: rounding."""
 
 CELLS, EDGE = 64, 4.0
 """Density grid: cells per side, and extent in standard deviations from the mean."""
@@ -95,6 +99,7 @@ class ParticleHealth(Diagnostic):
         steps: measures by step of a single trace; None for several.
         worst_episode, worst_step: episode and step with the smallest effective sample size.
         worst: measures of that step.
+        healthy: comparison with the filter's healthy record, if it has one.
     """
 
     filter: str
@@ -106,6 +111,11 @@ class ParticleHealth(Diagnostic):
     worst_episode: int
     worst_step: int
     worst: ParticleSteps
+    healthy: Comparison | None = None
+
+    @property
+    def alarms(self) -> tuple[str, ...]:
+        return () if self.healthy is None else tuple(alarm.text for alarm in self.healthy.alarms)
 
     @property
     def verdict(self) -> str:
@@ -117,7 +127,8 @@ class ParticleHealth(Diagnostic):
         where = f"step {self.worst_step} of episode {self.worst_episode}" + (
             f", in {' and '.join(conditions)}" if conditions else ""
         )
-        parts = [
+        parts = [] if self.healthy is None else [self.healthy.sentence]
+        parts += [
             f"The effective sample size is {frequency}, with a median of {total.effective:.0f}.",
             f"Minimum at {where}: effective sample size {worst.effective[0]:.1f}, largest weight "
             f"{worst.largest[0]:.2f}, {worst.ancestors[0]} particles with offspring.",
@@ -165,7 +176,8 @@ class ParticleHealth(Diagnostic):
             "true state outside (% of steps)",
             *(f"evidence of {modality} (nats)" for modality in self.modalities),
         )
-        return [Table(f"Particle health, {self.particles} particles", columns, tuple(rows))]
+        tables = [Table(f"Particle health, {self.particles} particles", columns, tuple(rows))]
+        return tables if self.healthy is None else [*tables, self.healthy.table()]
 
     def curves(self) -> list[Curve]:
         if self.steps is None:
@@ -194,7 +206,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     return None
 
 
-def particle_health(traces: Sequence[Trace]) -> ParticleHealth:
+def particle_health(traces: Sequence[Trace], healthy: Comparison | None = None) -> ParticleHealth:
     """Evaluate the particle health of one filter over one or more trajectories."""
     first = traces[0]
     assert first.particles is not None
@@ -218,7 +230,22 @@ def particle_health(traces: Sequence[Trace]) -> ParticleHealth:
         worst_episode=traces[index].episode_index,
         worst_step=at - sum(len(trace) for trace in traces[:index]),
         worst=ParticleSteps(**{name: values[at : at + 1] for name, values in pooled.items()}),
+        healthy=healthy,
     )
+
+
+def trajectory_statistics(trace: Trace) -> dict[str, float]:
+    """Statistics of a healthy profile: mean relative effective sample size, and how often the truth is outside."""
+    assert trace.log_weights is not None
+    effective = 1.0 / np.exp(2.0 * trace.log_weights.astype(np.float64)).sum(1) / trace.log_weights.shape[1]
+    phases = measures.long_phases(trace)
+    values = {f"ess//{phase}": float(effective[mask].mean()) for phase, mask in phases.items()}
+    if "all" in phases:
+        prior = trace.prior_log_weights
+        weights = np.full(trace.log_weights.shape, 1.0) if prior is None else np.exp(prior.astype(np.float64))
+        farther = _farther(trace, weights / weights.sum(1, keepdims=True))
+        values["outside//all"] = float((farther[phases["all"]] < OUTSIDE).mean())
+    return values
 
 
 def measure_steps(trace: Trace) -> ParticleSteps:
@@ -307,8 +334,7 @@ def _summarise(phase: str, count: int, steps: dict[str, Array]) -> PhaseParticle
         degenerate=float((effective < DEGENERATE * count).mean()),
         resampled=float(steps["resampled"].mean()),
         several_modes=float((steps["modes"] > 1).mean()),
-        # Tolerance for rounding in the sum of weights.
-        outside=float((steps["farther"] < 1e-6).mean()),
+        outside=float((steps["farther"] < OUTSIDE).mean()),
         evidence=steps["evidence"].mean(0),
     )
 
@@ -319,4 +345,5 @@ ENTRY = Entry(
     question="Do enough particles carry the belief, and do they cover the true state?",
     run=particle_health,
     why_not=why_not,
+    statistics=trajectory_statistics,
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -198,12 +197,3 @@ def colour_of(layer: str, layers: Sequence[str]) -> str:
     """Colour of a layer; dark gray without a layer."""
     names = list(dict.fromkeys(name for name in layers if name))
     return colour(layer, names) if layer else "#333333"
-
-
-@cache
-def colour_table(name: str) -> NDArray[np.uint8]:
-    """(256, 3) RGB values of a matplotlib colour map."""
-    from matplotlib import colormaps
-
-    colours = np.asarray(colormaps[name](np.linspace(0.0, 1.0, 256)))
-    return np.rint(255.0 * colours[:, :3]).astype(np.uint8)

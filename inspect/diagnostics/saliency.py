@@ -12,9 +12,9 @@ import torch
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
-from beliefscope.inspect.diagnostics.shapley import input_modalities
 from beliefscope.inspect.diagnostics.single_step import SingleStep, channel_names
 from beliefscope.inspect.diagnostics.views import Array, ImagePanel, Table, Value
 from beliefscope.inspect.statistics import measures

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.batch import Batch
-from beliefscope.filters.belief import Evidence, Gaussian
+from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import rollout
+from beliefscope.filters.subsets import input_modalities, subset_evidence
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES, resample_sums
+from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, jackknife, too_few
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.replay import Replay
 
@@ -46,7 +44,7 @@ class PhaseValues:
         trajectories, steps: number of trajectories and steps in the phase.
         rmse: (2^K, 1 + n) m, rad: RMSE of the position and of each component, by subset.
         shapley: (K, 1 + n) m, rad: Shapley values of the RMSE; negative if a modality lowers it.
-        low, high: 95 % bootstrap intervals over trajectories; NaN below ``MIN_TRAJECTORIES`` trajectories.
+        low, high: 95 % intervals over trajectories; NaN below ``MIN_TRAJECTORIES`` trajectories.
     """
 
     phase: str
@@ -112,8 +110,8 @@ class Shapley(Diagnostic):
             sentences.append(f"All steps: {total[-1]:.2f} cm, {', '.join(without)}.")
         if not self.offset:
             sentences.append(f"Runs start at the true state, which favours {self.baseline}.")
-        if self.trajectories < MIN_TRAJECTORIES:
-            sentences.append(f"Intervals need {MIN_TRAJECTORIES} trajectories.")
+        if why := too_few(self.trajectories):
+            sentences.append(f"No intervals: {why}.")
         return " ".join(sentences)
 
     @property
@@ -191,11 +189,6 @@ class Shapley(Diagnostic):
         return {"contact": self.contact, "blackout": self.blackout} if len(self.position_values) else {}
 
 
-def input_modalities(filter_: Filter) -> tuple[str, ...]:
-    """Input modalities of a filter, including modalities with a shared model."""
-    return tuple(dict.fromkeys(modality for model in filter_.names for modality in model.split("+")))
-
-
 def members(count: int) -> Mask:
     """(2^K, K) membership of K modalities in each subset; the first row is empty, the last complete."""
     return (np.arange(2**count)[:, None] >> np.arange(count) & 1).astype(bool)
@@ -212,49 +205,6 @@ def shapley_weights(count: int) -> Array:
     with_member = factorial[np.maximum(size - 1, 0)] * factorial[count - size]
     without_member = factorial[np.minimum(size, count - 1)] * factorial[np.maximum(count - size - 1, 0)]
     return np.where(member.T, with_member, -without_member) / factorial[count]
-
-
-def subset_evidence(replay: Replay, member: Mask) -> Evidence:
-    """Evidence (T, 2^K, ...) of all subsets of ``input_modalities(filter)`` in a replayed run.
-
-    Models without any of their modalities are deselected (``Evidence.select_models``). For a shared model that lacks
-    some modalities, and for an LSTM, missing images are black and missing vectors are at the training mean. Beta keeps
-    the proportions of the original run.
-    """
-    filter_ = replay.checkpoint.filter
-    models = [model.split("+") for model in filter_.names]
-    uses = torch.tensor([[modality in model for modality in input_modalities(filter_)] for model in models])
-    has = torch.from_numpy(member)
-    present = (has[:, None] & uses).any(-1)
-    evidence = replay.evidence
-    if any(len(model) > 1 for model in models):
-        weights = evidence.log_weights
-        evidence = replace(
-            filter_.encode(_without(replay.batch, filter_, has)),
-            log_weights=None if weights is None else weights.expand(-1, len(member), -1, -1),
-        )
-    return evidence.select_models(present.expand(len(evidence), -1, -1))
-
-
-def _without(batch: Batch, filter_: Filter, has: Tensor) -> Batch:
-    """Repeat a batch of one trajectory for S subsets; modalities missing in ``has`` (S, K) are neutralised."""
-
-    def expand(values: Tensor) -> Tensor:
-        return values.expand(-1, len(has), *values.shape[2:])
-
-    observations = {modality: expand(values) for modality, values in batch.observations.items()}
-    for k, modality in enumerate(input_modalities(filter_)):
-        values = observations[modality]
-        available = has[:, k].reshape(-1, *(1,) * (values.ndim - 2))
-        neutral = values.new_zeros(()) if values.ndim == 4 else filter_.statistics.mean_std(modality)[0]
-        observations[modality] = torch.where(available, values, neutral)
-    return Batch(
-        observations=observations,
-        controls=expand(batch.controls),
-        states=expand(batch.states),
-        contact=expand(batch.contact),
-        previous=batch.previous.expand(len(has), -1),
-    )
 
 
 @torch.no_grad()
@@ -279,7 +229,7 @@ def run_subsets(
     start = Gaussian((start.mean + offset * shift[..., 0]).expand(count, -1), start.covariance.expand(count, -1, -1))
     result = rollout(
         filter_,
-        subset_evidence(replay, member),
+        subset_evidence(filter_, replay.batch, replay.evidence, torch.from_numpy(member)),
         start,
         Common().manual_seed(trace.seed),
         int(trace.settings["particles"]),
@@ -349,11 +299,11 @@ def _phases(
             continue
         sums = np.stack([square[mask[phase]].sum(0) for square, mask in zip(squares, masks, strict=True)])[nonempty]
         rmse = np.sqrt(sums.sum(0) / counts.sum())
-        low = high = np.full((len(weights), rmse.shape[-1]), np.nan)
-        if nonempty.sum() >= MIN_TRAJECTORIES:
-            steps = resample_sums(counts[nonempty])[:, None, None]
-            low, high = np.percentile(weights @ np.sqrt(resample_sums(sums) / steps), [2.5, 97.5], axis=0)
-        values.append(PhaseValues(phase, int(nonempty.sum()), int(counts.sum()), rmse, weights @ rmse, low, high))
+        steps = np.broadcast_to(counts[nonempty, None, None], (*sums.shape[:-1], 1))
+        phi, low, high = jackknife(
+            np.concatenate([sums, steps], axis=-1), lambda table: weights @ np.sqrt(table[..., :-1] / table[..., -1:])
+        )
+        values.append(PhaseValues(phase, int(nonempty.sum()), int(counts.sum()), rmse, phi, low, high))
     return tuple(values)
 
 

@@ -17,7 +17,7 @@ from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace
 from beliefscope.filters.evaluate import UNITS
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.models.pf import ParticleFilter
-from beliefscope.inspect.diagnostics.shapley import input_modalities
+from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.views import Array
 from beliefscope.inspect.traces.replay import Edit, Replay, repeat_belief
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -124,6 +124,24 @@ class Views(ABC):
     def views(self) -> dict[str, Any]:
         """Verdict and all ``VIEWS`` as JSON values."""
         return {"verdict": self.verdict, **{name: as_json(getattr(self, name)()) for name in VIEWS}}
+
+
+def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Value]]) -> str:
+    """A table with a title as text; numbers are right-aligned with three digits, None is ``-``."""
+
+    def text(value: Value) -> str:
+        return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+    cells = [list(columns), *([text(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    alignments = [
+        ">" if rows and not any(isinstance(row[i], str) for row in rows) else "<" for i in range(len(columns))
+    ]
+    lines = [
+        "  ".join(f"{cell:{align}{width}}" for cell, width, align in zip(row, widths, alignments, strict=True))
+        for row in cells
+    ]
+    return "\n".join([title, *(f"  {line.rstrip()}" for line in lines)])
 
 
 def as_json(value: Any) -> Any:

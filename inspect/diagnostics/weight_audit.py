@@ -1,7 +1,8 @@
-"""Weight audit: comparison of fusion weights with an oracle's, and their correlation with contact and blackout.
+"""Weight audit: comparison of fusion weights with the best ones, and their correlation with contact and blackout.
 
 The oracle knows the true state and chooses, step by step, the convex weights whose fused mean is closest to it. The
-excess error relative to the oracle (regret) bounds the benefit of better weights.
+excess error relative to the oracle (regret) bounds the benefit of better weights. No filter can reach it, so the
+verdict compares with the best constant weights by phase, and with the filter's healthy record.
 """
 
 from __future__ import annotations
@@ -16,18 +17,29 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
+from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
+from beliefscope.inspect.diagnostics.weight_steps import (
+    Correlation,
+    add_constant,
+    excess_error,
+    trajectory_statistics,
+    weight_correlations,
+    weight_steps,
+)
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES, correlate, correlation_sums
-from beliefscope.inspect.statistics.oracle import oracle_weights
+from beliefscope.inspect.statistics.intervals import too_few
 from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MIN_REGRET = 0.05
-"""Regret relative to the error above which better weights would help."""
+"""Relative decrease of the error above which better weights would help."""
+
+ERRORS = ("fused", "hindsight", "constant", "unimodal")
+"""Fields of ``PhaseWeights`` that are root mean squares of errors."""
 
 OTHERS = {"oracle": "the oracle weight", "contact": "contact", "blackout": "blackout"}
 """Signals that weights are correlated with, and their display names."""
@@ -46,7 +58,8 @@ class PhaseWeights:
         beta, effective_weights, oracle: (K, W) mean weights; beta is None without a weight model.
         fused, hindsight: (1 + n,) m, rad: RMSE of the position and of each component, of the filter and with the
             oracle's weights.
-        unimodal: (K, 1 + n) RMSE of the unimodal estimates.
+        constant: (1 + n,) RMSE with the best constant weights by phase; NaN for one trajectory.
+        unimodal: (K, 1 + n) RMSE of the single-modality updates, which are not standalone (``inspect/standalone.py``).
     """
 
     phase: str
@@ -56,6 +69,7 @@ class PhaseWeights:
     oracle: Array
     fused: Array
     hindsight: Array
+    constant: Array
     unimodal: Array
     beta: Array | None = None
 
@@ -63,27 +77,6 @@ class PhaseWeights:
     def regret(self) -> Array:
         """(1 + n,) m, rad: excess of each RMSE over that with the oracle's weights."""
         return self.fused - self.hindsight
-
-
-@dataclass(frozen=True)
-class Correlation:
-    """Correlation of a modality's weight with another signal over all counted steps.
-
-    Attributes:
-        weight: ``beta``, ``effective_weights`` or ``oracle``.
-        modality, component: of the weight; component is None for a scalar weight.
-        other: ``contact`` or ``blackout`` (point-biserial), or ``oracle``, the oracle's weight.
-        value: NaN if one of the signals is constant.
-        low, high: 95 % bootstrap interval over trajectories; NaN below ``MIN_TRAJECTORIES`` trajectories.
-    """
-
-    weight: str
-    modality: str
-    component: str | None
-    other: str
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -101,6 +94,9 @@ class WeightAudit(Diagnostic):
         regret: (T, W) m, rad: decrease of the error with the oracle's weights by component; of the position error for
             a scalar weight.
         contact, blackout: (T,) masks.
+        excess: relative excess of the position error over that with the best constant weights by phase, and its 95 %
+            interval over trajectories; NaN for too few of them.
+        healthy: comparison with the filter's healthy record, if it has one.
     """
 
     task: str
@@ -115,6 +111,14 @@ class WeightAudit(Diagnostic):
     regret: Array
     contact: Mask
     blackout: Mask
+    excess: tuple[float, float, float]
+    healthy: Comparison | None = None
+
+    @property
+    def alarms(self) -> tuple[str, ...]:
+        if self.healthy is not None:
+            return tuple(alarm.text for alarm in self.healthy.alarms)
+        return ("better weights would reduce the error",) if self.excess[1] > MIN_REGRET else ()
 
     @property
     def beta_is_effective(self) -> bool:
@@ -150,21 +154,30 @@ class WeightAudit(Diagnostic):
 
         fused, best, unimodal = 100.0 * total.fused[0], 100.0 * total.hindsight[0], 100.0 * total.unimodal[:, 0]
         strongest = int(unimodal.argmin())
-        regret = fused - best
-        parts = [
+        parts = [NO_RECORD if self.healthy is None else self.healthy.sentence]
+        parts += [
             f"The posterior is dominated by {name}: effective weight {mean_weights('effective_weights')}"
             f"{' (mean over components)' if len(self._columns) > 1 else ''}; oracle: {mean_weights('oracle')}.",
-            f"Regret {regret:.3f} cm: position RMSE {fused:.3f} cm, {best:.3f} cm with the oracle's weights, "
-            f"{unimodal[strongest]:.3f} cm with {self.modalities[strongest]} only. Better weights would "
-            f"{'hardly reduce' if regret < MIN_REGRET * fused else 'reduce'} the error.",
+            f"Position RMSE {fused:.3f} cm, {unimodal[strongest]:.3f} cm for the "
+            f"{measures.layer_label(self.modalities[strongest])}, {best:.3f} cm with the oracle's weights, which no "
+            "filter can reach.",
+            self._comparison_with_constant_weights(),
         ]
         source = "beta" if self.beta_is_effective else "effective_weights"
         correlations = [pair for other in OTHERS if (pair := self.correlation(source, name, other))]
         if correlations:
             parts.append(f"Correlation of its weight: {', '.join(map(_description, correlations))}.")
-        if self.trajectories < MIN_TRAJECTORIES:
-            parts.append(f"Intervals need {MIN_TRAJECTORIES} trajectories.")
         return " ".join(parts)
+
+    def _comparison_with_constant_weights(self) -> str:
+        if why := too_few(self.trajectories):
+            return f"Comparison with the best constant weights: {why}."
+        value, low, high = (100.0 * x for x in self.excess)
+        effect = "would" if low > 100.0 * MIN_REGRET else "might" if high > 100.0 * MIN_REGRET else "would hardly"
+        return (
+            f"The best constant weights by phase {effect} reduce the error: {100.0 * self.phases[0].constant[0]:.3f} "
+            f"cm with them, {value:+.1f} % without (95 % interval {low:+.1f} to {high:+.1f} %)."
+        )
 
     @property
     def _columns(self) -> tuple[str | None, ...]:
@@ -194,14 +207,25 @@ class WeightAudit(Diagnostic):
                 weights = [getattr(entry, s)[k, w] for k in range(len(self.modalities)) for s in self._sources]
                 means.append((entry.phase, entry.steps, column or "all", *map(float, weights)))
             for q, (name, unit, factor) in enumerate(quantities):
-                values = (entry.fused[q], entry.hindsight[q], entry.regret[q], *entry.unimodal[:, q])
-                errors.append((entry.phase, f"{name} ({unit})", *(float(factor * value) for value in values)))
+                values = (entry.fused[q], entry.hindsight[q], entry.regret[q], entry.constant[q], *entry.unimodal[:, q])
+                numbers = (None if math.isnan(value) else float(factor * value) for value in values)
+                errors.append((entry.phase, f"{name} ({unit})", *numbers))
         heads = [f"{modality}: {LABELS[source]}" for modality in self.modalities for source in self._sources]
-        unimodal = [f"{modality}-only" for modality in self.modalities]
+        unimodal = [measures.layer_label(modality) for modality in self.modalities]
         tables = [
             Table("Mean weights", ("phase", "steps", "component", *heads), tuple(means)),
             Table(
-                "RMSE", ("phase", "quantity", "fused", "with the oracle's weights", "regret", *unimodal), tuple(errors)
+                "RMSE",
+                (
+                    "phase",
+                    "quantity",
+                    "fused",
+                    "with the oracle's weights",
+                    "regret",
+                    "with constant weights",
+                    *unimodal,
+                ),
+                tuple(errors),
             ),
         ]
         rows = [
@@ -212,7 +236,7 @@ class WeightAudit(Diagnostic):
         if rows:
             heads = ["modality", "weight", "component", "with", "r", "95 % from", "to"]
             tables.append(Table("Correlations of the weights", tuple(heads), tuple(rows)))
-        return tables
+        return tables if self.healthy is None else [*tables, self.healthy.table()]
 
     def curves(self) -> list[Curve]:
         """Weights by component, then regrets. With two modalities, only the weights of the first."""
@@ -242,7 +266,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if trace.effective_weights is not None:
         missing = np.isnan(trace.modality_mean).all()
-        return f"{trace.filter} reports no unimodal posteriors" if missing else None
+        return f"{trace.filter} reports no single-modality updates" if missing else None
     if not trace.modalities:
         return f"{trace.filter} has no fusion weights: one network processes all modalities"
     if len(trace.modalities) > 1:
@@ -250,17 +274,17 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     return f"{trace.filter} has only one measurement model, {trace.modalities[0]}"
 
 
-def audit(traces: Sequence[Trace]) -> WeightAudit:
+def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightAudit:
     """Audit the weights of one filter over one or more trajectories."""
     first = traces[0]
-    step_values = [_steps(trace) for trace in traces]
+    step_values = add_constant([weight_steps(trace) for trace in traces], traces)
     pooled = {name: np.concatenate([steps[name] for steps in step_values]) for name in step_values[0]}
     index = measures.trace_indices(traces)
     phases = []
     for phase, where in measures.pooled_phases(traces).items():
         if where.any():
             steps = {name: values[where] for name, values in pooled.items()}
-            rmse = {name: np.sqrt(np.square(steps[name]).mean(0)) for name in ("fused", "hindsight", "unimodal")}
+            rmse = {name: np.sqrt(np.square(steps[name]).mean(0)) for name in ERRORS}
             weights: dict[str, Any] = {
                 name: steps[name].mean(0) for name in ("beta", "effective_weights", "oracle") if name in steps
             }
@@ -275,85 +299,16 @@ def audit(traces: Sequence[Trace]) -> WeightAudit:
         modalities=first.modalities,
         trajectories=len(traces),
         phases=tuple(phases),
-        correlations=tuple(_correlations(traces, step_values)),
+        correlations=tuple(weight_correlations(traces, step_values)),
         beta=pooled["beta"][:keep] if "beta" in pooled else None,
         effective_weights=pooled["effective_weights"][:keep],
         oracle=pooled["oracle"][:keep],
         regret=pooled["regret"][:keep],
         contact=first.episode.contact.astype(bool)[:keep],
         blackout=measures.blackout(first)[:keep],
+        excess=excess_error(traces, step_values),
+        healthy=healthy,
     )
-
-
-def position_regret(trace: Trace) -> Array:
-    """(T,) m: fused position error minus the error with the oracle's weights.
-
-    Negative if the filter is better than any convex combination, which is possible for a product of experts.
-    """
-    steps = _steps(trace)
-    return steps["fused"][:, 0] - steps["hindsight"][:, 0]
-
-
-def _steps(trace: Trace) -> dict[str, Array]:
-    """By step: weights (T, K, W), regret (T, W), position and component errors (T, 1 + n), unimodal (T, K, 1 + n)."""
-    assert trace.effective_weights is not None
-    effective_weights = trace.effective_weights.astype(np.float64)
-    error, where = measures.errors(trace), list(measures.task_of(trace).map_indices)
-    unimodal, fused = error[:, :-1], error[:, -1]
-    per_component = effective_weights.shape[-1] == error.shape[-1]
-    if per_component:
-        near = np.swapaxes(effective_weights, 1, 2)
-        oracle = np.swapaxes(oracle_weights(np.swapaxes(unimodal, 1, 2)[:, :, None], near), 1, 2)
-    else:  # a scalar weight minimises the position error
-        oracle = oracle_weights(np.swapaxes(unimodal[..., where], 1, 2), effective_weights[..., 0])[..., None]
-    hindsight = (oracle * unimodal).sum(1)
-    distances = [
-        np.abs(e) if per_component else np.linalg.norm(e[:, where], axis=-1, keepdims=True) for e in (fused, hindsight)
-    ]
-    steps = {
-        "effective_weights": effective_weights,
-        "oracle": oracle,
-        # A product of experts may be better than any convex weights; the regret is zero then.
-        "regret": np.maximum(distances[0] - distances[1], 0.0),
-        "fused": _with_position(fused, where),
-        "hindsight": _with_position(hindsight, where),
-        "unimodal": _with_position(unimodal, where),
-    }
-    return steps if trace.weights is None else {"beta": trace.weights.astype(np.float64), **steps}
-
-
-def _with_position(error: Array, where: list[int]) -> Array:
-    """(..., 1 + n): position error followed by the component errors (..., n)."""
-    return np.concatenate([np.linalg.norm(error[..., where], axis=-1, keepdims=True), error], axis=-1)
-
-
-def _correlations(traces: Sequence[Trace], step_values: Sequence[dict[str, Array]]) -> list[Correlation]:
-    names = [name for name in ("beta", "effective_weights", "oracle") if name in step_values[0]]
-    task, modalities = measures.task_of(traces[0]), traces[0].modalities
-    width = step_values[0]["oracle"].shape[-1]
-    columns = [c.name for c in task.components] if width == len(task.components) else [None]
-    labels: list[tuple[str, str, str | None, str]] = []
-    sums = []
-    for trace, steps in zip(traces, step_values, strict=True):
-        keep = measures.counted(trace)
-        others = {"contact": trace.episode.contact, "blackout": measures.blackout(trace)}
-        pairs = []
-        labels = []
-        for name in names:
-            for k, modality in enumerate(modalities):
-                for w, column in enumerate(columns):
-                    x = steps[name][keep, k, w]
-                    pairs += [(x, other[keep].astype(np.float64)) for other in others.values()]
-                    labels += [(name, modality, column, other) for other in others]
-                    if name != "oracle":
-                        pairs.append((x, steps["oracle"][keep, k, w]))
-                        labels.append((name, modality, column, "oracle"))
-        x, y = (np.stack(side) for side in zip(*pairs, strict=True))
-        sums.append(correlation_sums(x, y))
-    value, low, high = correlate(np.stack(sums))
-    return [
-        Correlation(*label, *map(float, v)) for label, v in zip(labels, zip(value, low, high, strict=True), strict=True)
-    ]
 
 
 def _description(correlation: Correlation) -> str:
@@ -374,4 +329,5 @@ ENTRY = Entry(
     question="Does the filter weight the modalities appropriately, and how much accuracy do suboptimal weights cost?",
     run=audit,
     why_not=why_not,
+    statistics=trajectory_statistics,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,16 +11,15 @@ from scipy.special import bdtrc
 
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import UNITS
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
-from beliefscope.inspect.failures.step_scores import PHASES, RECENT, Score, Survey, scores_of
-from beliefscope.inspect.statistics.measures import Mask
-from beliefscope.inspect.trace import Trace, trace
+from beliefscope.inspect.failures.step_scores import PHASES, RECENT, Survey
+from beliefscope.inspect.failures.survey import check_applies, find_score, survey_of
+from beliefscope.inspect.statistics.measures import Mask, layer_label
 
 HIGH = 0.9
 """Quantile of the scores of all steps above which a step is part of an event."""
@@ -75,7 +74,7 @@ class PhaseStatistics:
     Attributes:
         name: one of ``PHASES``.
         steps, events: number of steps, and of events whose peak is in the phase.
-        share, event_share: shares of all steps and of all events.
+        share, event_share: shares of all steps with a score, and of all events.
         lift: ``event_share / share``, the relative frequency of events in the phase.
         p_value: probability of at least this number of events if peaks were uniform over all steps (binomial).
         inside, outside: mean score of the steps in the phase, and of all others.
@@ -185,7 +184,8 @@ class Failures(Diagnostic):
 
     def event_table(self, events: Sequence[Event]) -> Table:
         """One row per event with the values at its peak."""
-        columns = ("episode", "step", "from", "to", self._label, "phase", *(f"{layer} cm" for layer in self.layers))
+        columns: tuple[str, ...] = ("episode", "step", "from", "to", self._label, "phase")
+        columns += tuple(f"{layer_label(layer)} cm" for layer in self.layers)
         columns += tuple(f"{name.replace('_', ' ')} deg" for name in self.angles)
         columns += ("NEES", *(("ESS",) if self.particles else ()))
         columns += tuple(f"{layer} effective weight %" for layer in self.layers[:-1] if len(self.layers) > 2)
@@ -244,46 +244,26 @@ def find_failures(
 
     Raises BadInput for an unknown score, and as ``trace``.
     """
-    _find_score(by, checkpoint.task)
+    find_score(by, checkpoint.task)
     if episodes is None and isinstance(data, Dataset):
         episodes = data.held_out()
     elif episodes is None:
         episodes = data if isinstance(data, Mapping) else range(len(data))
-    survey = survey_of(checkpoint, data, episodes, faults=faults, seed=seed, particles=particles, progress=progress)
+    survey = survey_of(
+        checkpoint, data, episodes, by=by, faults=faults, seed=seed, particles=particles, progress=progress
+    )
     return failures_of(survey, by)
-
-
-def survey_of(
-    checkpoint: Checkpoint,
-    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
-    episodes: Iterable[int],
-    *,
-    faults: Faults = NO_FAULTS,
-    seed: int = 0,
-    particles: int = 300,
-    progress: Callable[[float], None] | None = None,
-) -> Survey:
-    """Run a filter over episodes of a data set. Raises BadInput as ``trace``."""
-    indices = list(episodes)
-
-    def traces() -> Iterator[Trace]:
-        for done, index in enumerate(indices):
-            yield trace(
-                checkpoint, data[index], index, seed, particles, faults, _partial_progress(progress, done, len(indices))
-            )
-
-    return Survey.from_traces(traces())
 
 
 def failures_of(survey: Survey, by: str = "error") -> Failures:
     """Rank the events of a survey. Raises BadInput with the reason for a score that does not apply."""
-    definition = _find_score(by, survey.task)
-    if by in survey.refused:
-        raise BadInput(f"no failures by {by}: {survey.refused[by]}")
+    definition = find_score(by, survey.task)
+    check_applies(by, survey.refused.get(by))
     score = survey.scores[by]
     threshold = float(np.nanquantile(score, HIGH)) if np.isfinite(score).any() else np.nan
     gap = max(1, round(RECENT / survey.task.dt))
-    phase = survey.phase_index
+    has_score = np.isfinite(score) | ~np.isfinite(score).any()
+    phase = np.where(has_score, survey.phase_index, -1)
     spans = event_spans(score > threshold, survey.episode, gap)
     events = [_event(survey, score, first, last) for first, last in spans]
     events.sort(key=lambda event: (-event.score, event.episode, event.step))
@@ -305,7 +285,9 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
         layers=survey.layers,
         angles=survey.angles,
         phases=tuple(
-            _phase_statistics(name, phase == i, score, events) for i, name in enumerate(PHASES) if (phase == i).any()
+            _phase_statistics(name, (phase == i)[has_score], score[has_score], events)
+            for i, name in enumerate(PHASES)
+            if (phase == i).any()
         ),
         events=tuple(events),
         quantiles=quantiles,
@@ -365,19 +347,6 @@ def _phase_statistics(name: str, inside: Mask, score: Array, events: Sequence[Ev
         inside=_mean(score[inside]),
         outside=_mean(score[~inside]),
     )
-
-
-def _find_score(by: str, task: Task) -> Score:
-    scores = scores_of(task)
-    if by not in scores:
-        raise unknown_name(f"score of task {task.name!r}", by, scores)
-    return scores[by]
-
-
-def _partial_progress(
-    progress: Callable[[float], None] | None, done: int, count: int
-) -> Callable[[float], None] | None:
-    return None if progress is None else lambda share: progress((done + share) / count)
 
 
 def _mean(values: Array) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import WARMUP
-from beliefscope.inspect.diagnostics.weight_audit import position_regret
+from beliefscope.inspect.diagnostics.weight_steps import position_regret
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
@@ -54,7 +54,7 @@ class Survey:
         layers: L names: the K modalities, then ``fused``.
         angles: names of the A components in rad.
         episode, step: (S,) indices in the data set and in the episode.
-        scores: name -> (S,), for available scores.
+        scores: name -> (S,), for available scores; NaN at steps without a score.
         refused: name -> reason, for scores that do not apply.
         error: (S, L) m, position error.
         angle_error: (S, L, A) rad.
@@ -139,7 +139,7 @@ def scores_of(task: Task) -> dict[str, Score]:
 
 
 def disagreement(trace: Trace) -> Array:
-    """(T,): maximum of ``sqrt(d^T (S_i + S_j)^-1 d / n)`` over pairs of unimodal posteriors with difference d.
+    """(T,): maximum of ``sqrt(d^T (S_i + S_j)^-1 d / n)`` over pairs of single-modality updates with difference d.
 
     1 if the difference matches the covariances. Because they share a prediction, a consistent filter has lower values.
     """
@@ -160,6 +160,11 @@ def _degeneracy(trace: Trace) -> Array:
     return trace.particles.shape[1] / trace.effective_sample_size.astype(np.float64)
 
 
+def _regret(trace: Trace) -> Array:
+    """NaN in the warm-up: the belief starts at the truth, so the oracle's error is zero there with any weights."""
+    return np.where(measures.counted(trace), position_regret(trace), np.nan)
+
+
 def _no_covariance(trace: Trace) -> str | None:
     return None if trace.has_covariance else "this filter has no covariance"
 
@@ -177,7 +182,7 @@ SCORES: dict[str, Score] = {
     "nees": Score("NEES", "", lambda trace: measures.nees(trace)[:, -1], _no_covariance),
     "ess": Score("particles per effective particle", "x", _degeneracy, _no_particles),
     "disagreement": Score("disagreement of modalities", "sigma", disagreement, _no_fusion),
-    "regret": Score("regret of the weights", "m", position_regret, _no_fusion),
+    "regret": Score("regret of the weights", "m", _regret, _no_fusion),
 }
 """Scores by name; scores of angles follow ``error``."""
 

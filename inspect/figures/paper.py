@@ -19,7 +19,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import weight_audit
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
-from beliefscope.inspect.likelihood import FINE, LikelihoodMap, MapEngine
+from beliefscope.inspect.likelihood import FINE, LikelihoodMap, MapEngine, Quantity
 from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -88,16 +88,25 @@ def panels(task: Task, modalities: Sequence[str], steps: dict[bool, int]) -> lis
     return layout
 
 
-def maps_figure(checkpoint: Checkpoint, trace: Trace, steps: dict[bool, int], size: int = FINE) -> Figure:
-    """Likelihood maps of each modality relative to their maxima, centred on the true position.
+def maps_figure(
+    checkpoint: Checkpoint,
+    trace: Trace,
+    steps: dict[bool, int],
+    size: int = FINE,
+    quantity: Quantity | None = None,
+) -> Figure:
+    """Maps of each modality relative to their maxima, centred on the true position.
 
-    Maps in contact show the line to the end effector. Raises BadInput if the filter has no maps.
+    Haptics maps in contact show the direction of the ridge that the task expects, and the end effector. Raises BadInput
+    if the filter has no maps, or not those of the quantity.
 
     Args:
         size: cells per side.
+        quantity: by default the first one that the filter has.
     """
     engine = MapEngine(checkpoint, trace)
-    maps = {state: engine.map(step, size=size) for state, step in steps.items()}
+    quantity = quantity or engine.quantities[0]
+    maps = {state: engine.map(step, size=size, quantity=quantity) for state, step in steps.items()}
     layout = panels(checkpoint.task, trace.modalities, steps)
     if not layout:
         raise BadInput(f"filter {checkpoint.name!r} has no map of a modality: it has no separate modalities")
@@ -111,7 +120,9 @@ def maps_figure(checkpoint: Checkpoint, trace: Trace, steps: dict[bool, int], si
         for i, (axes, panel) in enumerate(zip(grid.flat, layout, strict=False)):
             image = _draw_map(axes, checkpoint.task, trace, panel, maps[panel.contact])
             letter = f"({chr(ord('a') + i)}) " if len(layout) > 1 else ""
-            axes.set_title(f"{letter}{panel.modality}\n{STATES[panel.contact]}, step {panel.step}", fontsize=7.5)
+            axes.set_title(
+                f"{letter}{panel.modality} {quantity}\n{STATES[panel.contact]}, step {panel.step}", fontsize=7.5
+            )
             if i + columns >= len(layout):
                 axes.set_xlabel(f"{_display_name(checkpoint.task.map_components[0])} offset (cm)")
                 axes.tick_params(labelbottom=True)
@@ -119,7 +130,7 @@ def maps_figure(checkpoint: Checkpoint, trace: Trace, steps: dict[bool, int], si
                 axes.set_ylabel(f"{_display_name(checkpoint.task.map_components[1])} offset (cm)")
         for axes in grid.flat[len(layout) :]:
             axes.set_visible(False)
-        figure.colorbar(image, ax=list(grid.flat), label="likelihood / maximum", shrink=0.8, aspect=25)
+        figure.colorbar(image, ax=list(grid.flat), label=f"{quantity} / maximum", shrink=0.8, aspect=25)
     return figure
 
 
@@ -136,7 +147,10 @@ def _draw_map(axes: Axes, task: Task, trace: Trace, panel: Panel, map_: Likeliho
         interpolation="nearest",
     )
     if panel.contact and panel.modality in _effector_modalities(task, trace.modalities):
-        _draw_line(axes, 100.0 * (_effector(task, trace, panel.step) - map_.centre))
+        _draw_expected_ridge(axes, task, trace, panel.step)
+        _draw_effector(axes, 100.0 * (_effector(task, trace, panel.step) - map_.centre))
+        style = {"labelcolor": "white", "facecolor": "black", "framealpha": 0.5, "edgecolor": "none"}
+        axes.legend(loc="best", fontsize=6, **style)
     _draw_crosshairs(axes, half)
     axes.set(xlim=(-half, half), ylim=(-half, half))
     return image
@@ -168,13 +182,18 @@ def _draw_crosshairs(axes: Axes, half: float) -> None:
         axes.plot(x, y, color="white", lw=0.5, alpha=0.7)
 
 
-def _draw_line(axes: Axes, effector: NDArray[np.float32]) -> None:
-    """Draw the line from the true position to the end effector (2,) cm, which may be outside of the map."""
-    x, y = map(float, effector)
+def _draw_expected_ridge(axes: Axes, task: Task, trace: Trace, step: int) -> None:
+    """Draw the line through the true position along which the task expects a ridge, if any."""
+    if task.ridge_direction is None:
+        return
+    direction = float(task.ridge_direction(trace.episode.states[step]))
     style: dict[str, Any] = {"color": "white", "path_effects": EDGE}
-    axes.plot([0.0, x], [0.0, y], lw=1.0, ls="--", label="to the end effector", **style)
-    axes.plot(x, y, marker="o", ms=4, **style)
-    axes.legend(loc="best", fontsize=6, labelcolor="white", facecolor="black", framealpha=0.5, edgecolor="none")
+    axes.axline((0.0, 0.0), (np.cos(direction), np.sin(direction)), lw=1.0, ls="--", label="expected ridge", **style)
+
+
+def _draw_effector(axes: Axes, effector: NDArray[np.float32]) -> None:
+    """Mark the end effector (2,) cm, which may be outside of the map."""
+    axes.plot(*map(float, effector), marker="o", ms=4, ls="", color="white", path_effects=EDGE, label="end effector")
 
 
 def _display_name(component: str) -> str:
@@ -217,7 +236,7 @@ def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
         steps, fused, label="fused", color=COLOURS["fused"], lw=2.4
     )  # wide, so that a dominant modality on top leaves it visible
     for modality, values in zip(trace.modalities, unimodal, strict=True):
-        axes.plot(steps, values, label=modality, color=colour(modality, trace.modalities), lw=0.9)
+        axes.plot(steps, values, label=measures.layer_label(modality), color=colour(modality, trace.modalities), lw=0.9)
     truth = 100.0 * trace.episode.states[:, component].astype(np.float64)
     axes.plot(steps, truth, label="truth", color=COLOURS["truth"], lw=1.4, ls="--")
 

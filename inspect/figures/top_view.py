@@ -22,9 +22,9 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.simulation.shapes import shapes
 from beliefscope.datasets.task import Outline, Task
-from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, colour_table
+from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
 from beliefscope.inspect.likelihood import LikelihoodMap
-from beliefscope.inspect.palette import COLOURS, colour
+from beliefscope.inspect.palette import COLOURS, colour, colour_table
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 
@@ -140,7 +140,7 @@ def _draw_belief(axes: Axes, trace: Trace, task: Task, step: int, map_: Likeliho
     x_name, y_name = (f"{name.replace('_', ' ')} (cm)" for name in task.map_components)
     axes.set(xlim=centre[0] + np.array([-half, half]), ylim=centre[1] + np.array([-half, half]), aspect="equal")
     axes.set(xlabel=x_name, ylabel=y_name)
-    axes.set_title("belief" if map_ is None else f"belief, on the {map_.layers[-1]} likelihood", loc="left")
+    axes.set_title("belief" if map_ is None else f"belief, on the {map_.layers[-1]} {map_.quantity}", loc="left")
 
 
 def _draw_map(axes: Axes, map_: LikelihoodMap | None) -> None:
@@ -184,7 +184,7 @@ def _draw_positions(axes: Axes, trace: Trace, task: Task, step: int, size: float
     style: dict[str, Any] = {"ls": "", "zorder": 4}
     ring: dict[str, Any] = {"mfc": "none", "mew": 1.2}
     for name, mean, _ in _estimates(trace, step):
-        label = "estimate" if name == "fused" and len(trace.modalities) < 2 else name
+        label = "estimate" if name == "fused" and len(trace.modalities) < 2 else measures.layer_label(name)
         marker, edge = "D" if name == "fused" else "o", colour(name, trace.modalities)
         x, y = 100.0 * mean[plane]
         axes.plot(x, y, ms=size, label=label, marker=marker, mec=edge, **ring, **style)
@@ -208,7 +208,7 @@ def _draw_force(axes: Axes, trace: Trace, step: int) -> None:
 
 
 def _estimates(trace: Trace, step: int) -> list[tuple[str, Array, Array]]:
-    """(name, mean (n,), covariance (n, n)) of each unimodal posterior, if there are several, and of the fused one."""
+    """(name, mean (n,), covariance (n, n)) of the single-modality updates, if several, and of the fused estimate."""
     modalities = enumerate(trace.modalities_with_posterior) if len(trace.modalities_with_posterior) > 1 else ()
     unimodal = [(name, trace.modality_mean[step, k], trace.modality_covariance[step, k]) for k, name in modalities]
     return [*unimodal, ("fused", trace.estimate_mean[step], trace.estimate_covariance[step])]

@@ -1,21 +1,27 @@
-"""Likelihood maps of one step: a grid of positions around the true one."""
+"""Maps of one step: a grid of positions around the true one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
+Quantity = Literal["likelihood", "posterior"]
+QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+"""What a map can contain; the first that a filter has is the default."""
+
 
 @dataclass(frozen=True)
 class LikelihoodMap:
     """One map per modality and one fused map, over offsets from the true position.
 
-    PF: log-likelihood of each measurement model, and of the fused mixture. EKF, UKF: log density of each unimodal
-    posterior and of the fused posterior.
+    Likelihood: of the observation given the state. EKF, UKF: ``N(z_k; x, R_k)`` of each virtual sensor; PF: each
+    measurement model, up to a factor. Posterior: density of the state. EKF, UKF: posterior of the update with one
+    modality, and the fused posterior; PF: prior of the particles (``maps.particle_density``) times likelihood.
 
     Attributes:
         step: step of the trace.
@@ -23,7 +29,10 @@ class LikelihoodMap:
         layers: L names: the trace's modalities, then ``fused``.
         offsets_x, offsets_y: (S,) m, cell centres relative to ``centre``, increasing.
         centre: (2,) m, the true position, or the fused estimate where it is unknown.
-        log_likelihood: (L, S, S) natural log, not normalised; [l, iy, ix] is at offsets_y[iy], offsets_x[ix].
+        log_likelihood: (L, S, S) natural log of the quantity, likelihoods not normalised; [l, iy, ix] is at
+            offsets_y[iy], offsets_x[ix].
+        quantity: of all layers.
+        rule: how the fused layer results from the modalities.
     """
 
     step: int
@@ -33,9 +42,16 @@ class LikelihoodMap:
     offsets_y: Array
     centre: Array
     log_likelihood: Array
+    quantity: Quantity = "likelihood"
+    rule: str = ""
+
+    @property
+    def title(self) -> str:
+        """Quantity and fusion rule: ``Posterior. Fused: product of posteriors (unimodal)``."""
+        return f"{self.quantity.capitalize()}. Fused: {self.rule}"
 
     def normalised(self) -> NDArray[np.uint8]:
-        """(L, S, S) uint8: likelihood relative to the maximum of its layer, times 255."""
+        """(L, S, S) uint8: value relative to the maximum of its layer, times 255."""
         peak = self.log_likelihood.max(axis=(1, 2), keepdims=True)
         return np.rint(255.0 * np.exp(self.log_likelihood - peak)).astype(np.uint8)
 

@@ -1,4 +1,4 @@
-"""Statistics of likelihood maps: peak, entropy, area, orientation and divergence."""
+"""Statistics of likelihood maps: peak, entropy, area, orientation, shape and divergence."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
+from beliefscope.inspect.maps.shape import classify, fit_rings
+from beliefscope.inspect.statistics.measures import task_of
 from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
@@ -29,8 +32,12 @@ class MapStatistics:
         area50, area95: (B, L) m^2, area of the smallest region with that share of p.
         axis: (B, L) rad in -pi/2..pi/2 from the x axis: principal axis of p.
         elongation: (B, L) ratio of largest to smallest standard deviation of p; at 1 the axis is undefined.
-        line: (B,) rad, direction from the true position to the end effector; NaN without an end effector.
-        off_line: (B, L) rad in 0..pi/2, angle between axis and line; 45 deg on average for random axes.
+        expected: (B,) rad, direction of the ridge that the task expects (``Task.ridge_direction``) in the true state;
+            NaN for a task without one, and where the truth is unknown.
+        deviation: (B, L) rad in 0..pi/2, angle between axis and expected direction; 45 deg on average for random axes.
+        shape: (B, L) index in ``SHAPES``: flat, round, ridge or ring.
+        ring_centre, ring_radius, ring_spread, ring_coverage: (B, L, 2) m, (B, L) m, (B, L), (B, L): circle fitted to
+            the 50 % region (``shape.Rings``); of interest where the shape is a ring.
         divergence: (B, L, L) nats, ``KL(p_i || p_j)``.
         overlap: (B, L, L) ``int min(p_i, p_j)``, 0 to 1.
     """
@@ -45,8 +52,13 @@ class MapStatistics:
     area95: Array
     axis: Array
     elongation: Array
-    line: Array
-    off_line: Array
+    expected: Array
+    deviation: Array
+    shape: NDArray[np.int64]
+    ring_centre: Array
+    ring_radius: Array
+    ring_spread: Array
+    ring_coverage: Array
     divergence: Array
     overlap: Array
 
@@ -66,10 +78,12 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
     at_truth = log[:, :, middle][..., middle].mean(axis=(2, 3))
     best = flat.argmax(axis=-1)
     axis, elongation = _principal(share, x, y)
-    line = _line(maps, trace)
-    deviation = np.abs((axis - line[:, None] + np.pi / 2.0) % np.pi - np.pi / 2.0)
+    expected = _expected(maps, trace)
+    deviation = np.abs((axis - expected[:, None] + np.pi / 2.0) % np.pi - np.pi / 2.0)
     plogp = np.einsum("blc,blc->bl", flat, flat_log)
     ordered = -np.sort(-flat, axis=-1)
+    area50, lowest = _area(ordered, 0.5)
+    rings = fit_rings(share, share >= lowest[..., None, None], x, y)
     return MapStatistics(
         steps=np.array([m.step for m in maps]),
         layers=maps[0].layers,
@@ -77,24 +91,32 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
         log_peak=log_peak,
         truth=at_truth - log_peak,
         entropy=-plogp + np.log(cell),
-        area50=_area(ordered, 0.5) * cell,
-        area95=_area(ordered, 0.95) * cell,
+        area50=area50 * cell,
+        area95=_area(ordered, 0.95)[0] * cell,
         axis=axis,
         elongation=elongation,
-        line=line,
-        off_line=deviation,
+        expected=expected,
+        deviation=deviation,
+        shape=classify(area50, size * size, elongation, rings),
+        ring_centre=rings.centre,
+        ring_radius=rings.radius,
+        ring_spread=rings.spread,
+        ring_coverage=rings.coverage,
         divergence=np.maximum(plogp[:, :, None] - np.einsum("blc,bmc->blm", flat, flat_log), 0.0),
         overlap=np.minimum(flat[:, :, None], flat[:, None]).sum(axis=-1),
     )
 
 
-def _area(ordered: Array, mass: float) -> Array:
-    """(B, L) number of cells, largest first, with that share of the total; the last cell counts in part."""
+def _area(ordered: Array, mass: float) -> tuple[Array, Array]:
+    """(B, L) number of cells, largest first, with that share of the total, and value of the last cell.
+
+    The last cell counts in part.
+    """
     cumulative = ordered.cumsum(axis=-1)
     complete = (cumulative < mass).sum(axis=-1, keepdims=True)
     last = np.take_along_axis(ordered, complete, axis=-1)
     before = np.take_along_axis(cumulative, complete, axis=-1) - last
-    return np.asarray((complete + (mass - before) / last)[..., 0], dtype=np.float64)
+    return np.asarray((complete + (mass - before) / last)[..., 0], dtype=np.float64), last[..., 0]
 
 
 def _principal(share: Array, x: Array, y: Array) -> tuple[Array, Array]:
@@ -109,9 +131,22 @@ def _principal(share: Array, x: Array, y: Array) -> tuple[Array, Array]:
     return 0.5 * np.arctan2(2.0 * xy, xx - yy), np.sqrt(ratio)
 
 
-def _line(maps: Sequence[LikelihoodMap], trace: Trace) -> Array:
-    effector = trace.episode.observations.get("effector_position")
-    if effector is None:
+def _expected(maps: Sequence[LikelihoodMap], trace: Trace) -> Array:
+    direction = task_of(trace).ridge_direction
+    if direction is None:
         return np.full(len(maps), np.nan)
-    to = np.stack([effector[m.step, :2] - m.centre for m in maps]).astype(np.float64)
-    return np.arctan2(to[:, 1], to[:, 0])
+    return np.asarray(direction(trace.episode.states[[m.step for m in maps]]), dtype=np.float64)
+
+
+def particle_cloud(trace: Trace, step: int, task: Task) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Positions (M, 2) of the predicted particles on the map, m, and their weights (L, M) by layer, which sum to 1.
+
+    None for a filter without particles or without weights by layer.
+    """
+    if trace.particles is None or trace.log_likelihood is None or trace.prior_log_weights is None:
+        return None
+    assert trace.log_weights is not None
+    unimodal = trace.prior_log_weights[step] + trace.log_likelihood[step]
+    log = np.concatenate([unimodal, trace.log_weights[step][None]])
+    weights = np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True))
+    return trace.particles[step][:, list(task.map_indices)], weights

@@ -19,6 +19,9 @@ Mask = NDArray[np.bool_]
 FLOOR = 1e-8
 """m^2 or rad^2 added to the diagonal of a covariance before inversion; a particle set may have collapsed."""
 
+MIN_STEPS = 10
+"""Minimum number of steps of a phase for a verdict."""
+
 
 def task_of(trace: Trace) -> Task:
     """The task of a trace's episode."""
@@ -26,8 +29,15 @@ def task_of(trace: Trace) -> Task:
 
 
 def layers(trace: Trace) -> tuple[str, ...]:
-    """Names of the L estimates: the K modalities, then ``fused``."""
+    """Names of the L estimates: the K modalities, for their updates, then ``fused``."""
     return (*trace.modalities, "fused")
+
+
+def layer_label(layer: str) -> str:
+    """Display name of an estimate: that of a modality is an update of the fused filter's prior, not standalone."""
+    if layer in ("fused", "truth"):
+        return layer
+    return f"{layer} update" if "+" in layer else f"{layer}-only update"
 
 
 def wrapped(task: Task, difference: NDArray[Any]) -> Array:
@@ -88,11 +98,11 @@ def particle_log_weights(trace: Trace) -> Array:
 
 
 def blackout(trace: Trace) -> Mask:
-    """(T,): whether an image is blacked out, all pixels zero."""
+    """(T,): whether an image is blacked out: all its pixels are equal."""
     black = np.zeros(len(trace), dtype=bool)
     for array in trace.episode.observations.values():
         if array.ndim == 3 and array.dtype == np.uint8:
-            black |= ~array.any(axis=(1, 2))
+            black |= (array == array[:, :1, :1]).all(axis=(1, 2))
     return black
 
 
@@ -105,6 +115,11 @@ def phases(trace: Trace) -> dict[str, Mask]:
     """Phase -> mask (T,) without warm-up steps: ``all``, ``contact``, ``free motion``, ``blackout``."""
     contact, keep = trace.episode.contact.astype(bool), counted(trace)
     return {"all": keep, "contact": keep & contact, "free motion": keep & ~contact, "blackout": keep & blackout(trace)}
+
+
+def long_phases(trace: Trace) -> dict[str, Mask]:
+    """``phases`` of at least ``MIN_STEPS`` steps."""
+    return {phase: mask for phase, mask in phases(trace).items() if mask.sum() >= MIN_STEPS}
 
 
 def pooled_phases(traces: Sequence[Trace]) -> dict[str, Mask]:

@@ -1,10 +1,12 @@
-"""Oracle fusion weights: the best convex weights given the true state."""
+"""Oracle fusion weights, the best given the true state, and the best constant weights by phase."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beliefscope.inspect.statistics.measures import Array
 
@@ -26,8 +28,12 @@ def oracle_weights(errors: Array, near: Array) -> Array:
     Returns:
         (..., K).
     """
-    count = errors.shape[-1]
-    gram = np.swapaxes(errors, -1, -2) @ errors
+    return simplex_minimum(np.swapaxes(errors, -1, -2) @ errors, near)
+
+
+def simplex_minimum(gram: Array, near: Array) -> Array:
+    """Minimum of ``w^T G w`` over ``w_k >= 0, sum w_k = 1`` for G (..., K, K); ties as in ``oracle_weights``."""
+    count = gram.shape[-1]
     size = np.trace(gram, axis1=-2, axis2=-1)[..., None, None]
     gram = np.divide(gram, size, out=np.zeros_like(gram), where=size > 0)
     best, lowest = np.zeros_like(near), np.full(near.shape[:-1], np.inf)
@@ -44,3 +50,30 @@ def oracle_weights(errors: Array, near: Array) -> Array:
         lowest = np.where(better, cost, lowest)
     best = np.maximum(best, 0.0)
     return best / best.sum(-1, keepdims=True)
+
+
+def constant_weights(
+    errors: Sequence[Array], phases: Sequence[NDArray[np.int64]], near: Sequence[Array]
+) -> list[Array]:
+    """Best constant weights by phase, each trajectory's from all others (leave-one-out), by step.
+
+    They are causal: a filter that recognises the phase could use them, which is impossible for the oracle's weights.
+
+    Args:
+        errors: by trajectory (T, W, d, K): errors of the K estimates in d components, for each of W weights.
+        phases: by trajectory (T,): index of the phase.
+        near: by trajectory (T, W, K): weights that resolve ties, and are used for phases without other trajectories.
+
+    Returns:
+        By trajectory (T, W, K).
+    """
+    count = 1 + max(int(phase.max()) for phase in phases)
+    masks = [phase == np.arange(count)[:, None] for phase in phases]  # (P, T)
+    grams = np.stack(
+        [np.einsum("pt,twdk,twdl->pwkl", mask, e, e, optimize=True) for mask, e in zip(masks, errors, strict=True)]
+    )
+    sums = sum(np.einsum("pt,twk->pwk", mask, w) for mask, w in zip(masks, near, strict=True))
+    steps = np.maximum(sum(mask.sum(1) for mask in masks), 1)
+    others = grams.sum(0) - grams
+    weights = simplex_minimum(others, np.broadcast_to(sums / steps[:, None, None], others.shape[:-1]))
+    return [w[phase] for w, phase in zip(weights, phases, strict=True)]

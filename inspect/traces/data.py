@@ -35,8 +35,11 @@ class Trace:
             captured. Statements about EKFs below hold for UKFs as well.
         filter: filter name.
         estimate_mean, estimate_covariance: (T, n), (T, n, n) fused posterior. LSTM: the covariance is NaN.
-        modality_mean, modality_covariance: (T, K, n), (T, K, n, n) posterior after an update with one modality only.
-            EKF: posterior of the unimodal filter; PF: predicted particles weighted by one likelihood.
+        modality_mean, modality_covariance: (T, K, n), (T, K, n, n) single-modality updates: the prior of
+            this step, updated with one modality only. PF: the predicted particles weighted by one likelihood. EKF:
+            the posterior of each filter of the bank. The prior comes from the fused belief, and so from all
+            modalities; standalone runs (``inspect/standalone.py``) are less accurate. Only a bank of EKFs without
+            feedback keeps the modalities apart: its updates are the standalone estimates.
         start_mean, start_covariance: (n,), (n, n) belief before the first step.
         weights: (T, K, W) fusion weights beta, the network's output; W is n (per component) or 1.
         effective_weights: (T, K, W) share of each modality in the posterior; sums to one over K. None where K < 2.
@@ -52,7 +55,7 @@ class Trace:
         episode_index: index in the data set.
         seed: seed of the filter and of the fault injection.
         faults: injected sensor faults; ``data_hash`` is of the episode before injection.
-        settings: JSON values: particles, versions, edits.
+        settings: JSON values: particles, versions, edits; ``standalone``: the modality of a standalone run.
     """
 
     episode: Episode

@@ -351,3 +351,17 @@ def _split(content: bytes, shapes: Shapes, rows: int | None) -> Arrays:
         arrays[name] = np.frombuffer(content, dtype, math.prod(full), at).reshape(full)
         at += arrays[name].nbytes
     return arrays
+
+
+def write_live(trace: Trace, path: Path) -> None:
+    """Write a trace as the file of a live run that has ended, atomically."""
+    part = path.with_name(f".{path.name}.part")
+    part.unlink(missing_ok=True)
+    writer = LiveFileWriter(part, trace, len(trace))
+    try:
+        writer.append(trace)
+        writer.finish()
+        part.replace(path)
+    finally:
+        writer.close()
+        part.unlink(missing_ok=True)

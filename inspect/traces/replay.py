@@ -18,6 +18,7 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Belief, Evidence, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.rollout import start_at_truth
+from beliefscope.filters.subsets import standalone_evidence
 from beliefscope.inspect.traces.data import ARRAYS, Trace
 from beliefscope.inspect.traces.run import assemble_trace
 
@@ -149,8 +150,11 @@ class Replay:
         self.checkpoint = checkpoint
         self.batch = Steps.from_episodes(filter_.task, [trace.episode]).episode(0)
         self.evidence = filter_.encode(self.batch)
+        self._standalone = trace.settings.get("standalone", "")
         for edit in trace.settings.get("edits", []):
             self.evidence = self.apply_weights(self.evidence, Edit.from_json(edit))
+        if self._standalone:
+            self.evidence = standalone_evidence(filter_, self.batch, self.evidence, self._standalone)
         self.start = start_at_truth(filter_, self.batch)
         generator = torch.Generator().manual_seed(trace.seed)
         belief = filter_.start(self.start, int(trace.settings["particles"]), generator)
@@ -200,7 +204,10 @@ class Replay:
         episode = edit.timed_faults.apply(original.episode, original.seed)
         evidence = self.evidence
         if edit.faults:
-            evidence = filter_.encode(Steps.from_episodes(filter_.task, [episode]).episode(0))
+            batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
+            evidence = filter_.encode(batch)
+            if self._standalone:
+                evidence = standalone_evidence(filter_, batch, evidence, self._standalone)
         edits = [*original.settings.get("edits", []), edit.to_json()]
         for values in edits:
             evidence = self.apply_weights(evidence, Edit.from_json(values))
@@ -223,6 +230,8 @@ class Replay:
         for name in edit.weights:
             if name not in names:
                 raise unknown_name(f"modality of filter {self.checkpoint.name!r}", name, names)
+        if self._standalone:
+            raise BadInput(f"{self._standalone} standalone has no fusion weights: it uses one modality")
         if evidence.log_weights is None:
             raise BadInput(f"filter {self.checkpoint.name!r} has no fusion weights beta; only crossmodal filters have")
         span = slice(edit.first, edit.to)

@@ -25,14 +25,16 @@ import torch
 from matplotlib.figure import Figure
 
 from beliefscope import __version__
+from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.diagnostics import weight_audit
 from beliefscope.inspect.diagnostics.plotting import charts_of, write_figure
 from beliefscope.inspect.diagnostics.views import Table, as_json
 from beliefscope.inspect.figures import paper
 from beliefscope.inspect.figures.top_view import draw_step
-from beliefscope.inspect.likelihood import FINE, MapEngine, no_maps
+from beliefscope.inspect.likelihood import FINE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.report.figures import error_figure, event_figure, zoom_of
@@ -51,11 +53,11 @@ from beliefscope.recordings.report.sections import (
 
 SCENE_CAPTION = (
     "The scene from above with the object at its true state (solid) and at its estimated state (dashed). Arrow: force "
-    "on the end effector, 4 cm per 10 N. Right: the belief over the likelihood; 2 sigma contours, and particles "
+    "on the end effector, 4 cm per 10 N. Right: the belief over the fused map; 2 sigma contours, and particles "
     "coloured by weight"
 )
 MAP_CAPTION = (
-    "Inputs of the filter, and likelihood maps over offsets from the true position, each relative to its maximum. "
+    "Inputs of the filter, and maps over offsets from the true position, each relative to its maximum. "
     "Cross hairs: true position. Rings: estimate of each layer, which also depends on the prediction."
 )
 MAX_CHARTS = 8
@@ -73,6 +75,7 @@ def compose(
     link: Callable[[int, int], str] = lambda trace, step: "",
     links_note: str = "",
     commands: tuple[str, ...] = (),
+    quantity: Quantity | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Report:
     """Compute the contents of a report, including every applicable diagnostic.
@@ -85,18 +88,11 @@ def compose(
         link: permalink of an event.
         links_note: how to open permalinks, or why there are none.
         commands: command lines that reproduce the report.
+        quantity: of the maps; by default the first one that the filter has.
     """
     first = traces[0]
-    results, reasons = {}, {}
-    for index, (name, entry) in enumerate(DIAGNOSTICS.items(), start=1):
-        reason = next(filter(None, (entry.refusal(trace, checkpoint) for trace in traces)), None)
-        if reason is None and entry.slow and not slow:
-            reason = "slow diagnostic; include it with --all"
-        if reason is None:
-            results[name] = entry(traces, checkpoint)
-        else:
-            reasons[entry.title] = reason
-        progress(index / len(DIAGNOSTICS))
+    options = {name: {"quantity": quantity} if "quantity" in e.options else {} for name, e in DIAGNOSTICS.items()}
+    results, reasons = run_diagnostics(traces, checkpoint, options, slow, progress)
     events = [Event(index, step) for index, step in steps] or worst_events(traces)
     return Report(
         title=title or f"{first.filter} on {first.episode.task}",
@@ -104,11 +100,12 @@ def compose(
         checkpoint=checkpoint,
         results=results,
         titles={name: (DIAGNOSTICS[name].title, DIAGNOSTICS[name].question) for name in results},
-        reasons=reasons,
+        reasons={DIAGNOSTICS[name].title: reason for name, reason in reasons.items()},
         events=tuple(replace(event, link=link(event.trace, event.step)) for event in events),
         events_note="Requested steps." if steps else "Steps with the largest position error, in descending order.",
         links_note=links_note,
         commands=commands,
+        quantity=quantity,
         sources=tuple({"file": f.name, "sha256": hashlib.sha256(f.read_bytes()).hexdigest()} for f in files),
         versions={
             "beliefscope": __version__,
@@ -120,6 +117,22 @@ def compose(
     )
 
 
+def parse_event(text: str, traces: Sequence[Trace]) -> tuple[int, int]:
+    """Index of the trace and step of a text such as 68 or 9:68."""
+    episode, _, step = text.rpartition(":")
+    if not step.isdecimal() or (episode and not episode.isdecimal()):
+        raise BadInput(f"--event {text!r} is not STEP or EPISODE:STEP, such as 68 or 9:68")
+    episodes = [trace.episode_index for trace in traces]
+    if not episode and len(traces) > 1:
+        raise BadInput(f"--event {text!r} is ambiguous for {len(traces)} traces: write {episodes[0]}:{step}")
+    if episode and int(episode) not in episodes:
+        raise BadInput(f"--event {text!r}: no trace of episode {episode}. Available: {', '.join(map(str, episodes))}.")
+    index = episodes.index(int(episode)) if episode else 0
+    if int(step) >= len(traces[index]):
+        raise BadInput(f"--event {text!r}: episode {episodes[index]} has steps 0 to {len(traces[index]) - 1}")
+    return index, int(step)
+
+
 class Writer:
     """Writes figures, tables and data of a report to a folder, and returns them as sections of the page."""
 
@@ -129,7 +142,7 @@ class Writer:
             (folder / name).mkdir()
         self.no_maps: str | None = "the filter's checkpoint is not available"
         if report.checkpoint is not None:
-            self.no_maps = no_maps(report.checkpoint, report.traces[0])
+            self.no_maps = no_maps(report.checkpoint, report.traces[0], report.quantity)
         self._engines: dict[int, MapEngine] = {}
 
     def figure(self, name: str, caption: str, figure: Figure, *data: str) -> Item:
@@ -163,11 +176,12 @@ class Writer:
             f" The {MAX_CHARTS} of {len(traces)} traces with the largest errors." if len(charts) < len(traces) else ""
         )
         caption = (
-            "Position error of each modality's update and of the fused estimate. Shaded: contact; gray: image "
+            "Position error of the single-modality updates of the fused filter's prior, which are not standalone "
+            "filters, and of the fused estimate. Shaded: contact; gray: image "
             f"blackout. Dotted: the events below.{omitted}"
         )
         items = [
-            self.table("accuracy", accuracy(traces)),
+            self.table("accuracy", accuracy(traces, standalone_runs(traces, self.report.checkpoint))),
             self.figure("error", caption, error_figure([traces[i] for i in charts], marks)),
         ]
         worst = traces[int(np.argmax(rmse))]
@@ -176,10 +190,11 @@ class Writer:
             items.append(self.figure("estimates", caption, paper.weights_figure(worst)))
         if self.no_maps is None and worst.modalities_with_posterior and worst.episode.contact.any():
             assert self.report.checkpoint is not None
-            figure = paper.maps_figure(self.report.checkpoint, worst, paper.steps_by_contact(worst))
+            steps = paper.steps_by_contact(worst)
+            figure = paper.maps_figure(self.report.checkpoint, worst, steps, quantity=self.report.quantity)
             caption = (
-                f"Likelihood of each modality around the true position, episode {worst.episode_index}, in the middle "
-                "of the longest stretch of contact and of free motion."
+                "Likelihood or posterior (see the titles) of each modality around the true position, episode "
+                f"{worst.episode_index}, in the middle of the longest stretch of contact and of free motion."
             )
             items.append(self.figure("maps-by-contact", caption, figure))
         return Section("summary", "Accuracy", "", "", tuple(items))
@@ -206,15 +221,16 @@ class Writer:
         map_ = zoomed = None
         zoom, data = 1, []
         if self.no_maps is None:
-            map_ = zoomed = self._engine(event.trace).map(step, size=FINE)
+            quantity = self.report.quantity
+            map_ = zoomed = self._engine(event.trace).map(step, size=FINE, quantity=quantity)
             buffer = io.BytesIO()
             arrays: dict[str, Any] = {f.name: np.asarray(getattr(map_, f.name)) for f in fields(map_)}
             np.savez_compressed(buffer, **arrays)
             data.append(self.write(f"data/{name}-maps.npz", buffer.getvalue()))
-            caption, zoom = MAP_CAPTION, zoom_of(map_)
+            caption, zoom = f"{map_.title}. {MAP_CAPTION}", zoom_of(map_)
             if zoom > 1:
                 caption += f" Centre of the map, magnified {zoom} times."
-                zoomed = self._engine(event.trace).map(step, size=FINE * zoom)
+                zoomed = self._engine(event.trace).map(step, size=FINE * zoom, quantity=quantity)
         else:
             caption = f"Inputs of the filter, and estimates as offsets from the true position. No maps: {self.no_maps}."
         items = (

@@ -53,7 +53,7 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
             for layer, values in zip(measures.layers(trace), error.T, strict=True):
                 if layer == "fused" or layer in trace.modalities_with_posterior:
                     style = {"lw": 1.5, "zorder": 2.5} if layer == "fused" else {"lw": 0.9}
-                    axes.plot(values, label=layer, color=colour(layer, trace.modalities), **style)
+                    axes.plot(values, label=measures.layer_label(layer), color=colour(layer, trace.modalities), **style)
             bands = {"contact": trace.episode.contact.astype(bool), "blackout": measures.blackout(trace)}
             draw_bands(axes, bands, labelled=True)
             for step, name in marks.get(index, ()):
@@ -128,7 +128,7 @@ def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None,
         if layer == "fused" or layer in trace.modalities_with_posterior:
             _draw_estimate(axes, positions[layer], colour(layer, trace.modalities), layer)
     axes.set(xlim=(-half / zoom, half / zoom), ylim=(-half / zoom, half / zoom), aspect="equal")
-    axes.set_title(layer, loc="left", fontsize=7.5)
+    axes.set_title(layer if map_ is None else f"{layer} {map_.quantity}", loc="left", fontsize=7.5)
     axes.set_xlabel(f"{task.map_components[0].replace('_', ' ')} offset (cm)")
     axes.set_ylabel(f"{task.map_components[1].replace('_', ' ')} offset (cm)")
 
@@ -136,4 +136,4 @@ def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None,
 def _draw_estimate(axes: Axes, position: np.ndarray, hue: str, name: str) -> None:
     """Draw a ring, which leaves the map below visible."""
     style: dict[str, Any] = {"marker": "o", "ms": 7, "mfc": "none", "mec": hue, "mew": 1.3, "ls": ""}
-    axes.plot(*position, label=name, path_effects=EDGE, zorder=4, **style)
+    axes.plot(*position, label=measures.layer_label(name), path_effects=EDGE, zorder=4, **style)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,8 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import UNITS, metrics
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Table, Value
-from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.likelihood import LikelihoodMap, Quantity
+from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.maps.statistics import measure_maps
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -76,6 +77,7 @@ class Report:
         events_note: how the events were selected.
         links_note: how to open permalinks, or why there are none.
         commands: command lines that reproduce the report.
+        quantity: of the maps; None for the first one that the filter has.
         sources: file of each trace, for the manifest.
         versions: of the packages that affect the results.
     """
@@ -90,6 +92,7 @@ class Report:
     events_note: str = ""
     links_note: str = ""
     commands: tuple[str, ...] = ()
+    quantity: Quantity | None = None
     sources: tuple[Mapping[str, Any], ...] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -109,8 +112,18 @@ def worst_events(traces: Sequence[Trace], count: int = DEFAULT_EVENTS) -> list[E
     return events
 
 
-def accuracy(traces: Sequence[Trace]) -> Table:
-    """Metrics of ``beliefscope evaluate`` per layer (each modality's update and fused), over the counted steps."""
+def accuracy(traces: Sequence[Trace], standalone: Mapping[str, Sequence[Trace]] | None = None) -> Table:
+    """Metrics of ``beliefscope evaluate`` of the updates and the fused estimate, over the counted steps.
+
+    Args:
+        standalone: modality -> its standalone runs over the same episodes, with a row each.
+    """
+    table = _accuracy(traces)
+    rows = [(f"{name} standalone", *_accuracy(runs).rows[-1][1:]) for name, runs in (standalone or {}).items()]
+    return replace(table, rows=(*table.rows, *rows))
+
+
+def _accuracy(traces: Sequence[Trace]) -> Table:
     task, first = measures.task_of(traces[0]), traces[0]
     counted = [measures.counted(trace) for trace in traces]
     error = torch.from_numpy(np.concatenate([measures.errors(t)[c] for t, c in zip(traces, counted, strict=True)]))
@@ -120,7 +133,7 @@ def accuracy(traces: Sequence[Trace]) -> Table:
     ]
     covariance = torch.from_numpy(np.concatenate(covariances))
     rows: list[tuple[Value, ...]] = []
-    columns = ["layer"]
+    columns = ["estimate"]
     for i, layer in enumerate(measures.layers(first)):
         if layer != "fused" and layer not in first.modalities_with_posterior:
             continue
@@ -129,8 +142,8 @@ def accuracy(traces: Sequence[Trace]) -> Table:
         values: dict[str, Value] = dict(zip(names, result.rmse.values(), strict=True))
         if first.has_covariance:
             values |= {"NEES/n": result.nees, "95 % coverage": result.coverage95, "NLL (nats)": result.nll}
-        columns = ["layer", *values]
-        rows.append((layer, *values.values()))
+        columns = ["estimate", *values]
+        rows.append((measures.layer_label(layer), *values.values()))
     return Table("RMSE and calibration of the covariance", tuple(columns), tuple(rows))
 
 
@@ -141,17 +154,17 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     error, nees = measures.errors(trace)[step] * factors, measures.nees(trace)[step]
     distance = 100.0 * measures.position_error(trace)[step]
     statistics = None if map_ is None else measure_maps([map_], trace)
-    columns = ["layer", *(f"{c.name} error ({u})" for c, u in zip(task.components, units, strict=True))]
+    columns = ["estimate", *(f"{c.name} error ({u})" for c, u in zip(task.components, units, strict=True))]
     columns += ["position error (cm)"]
     columns += ["NEES/n"] if trace.has_covariance else []
     for name, weights in (("beta", trace.weights), ("effective weight", trace.effective_weights)):
         if weights is not None:
             columns.append(name if weights.shape[-1] == 1 else f"{name} (mean)")
-    columns += ["map: peak to truth (cm)", "map: 95 % region (cm²)"] if statistics is not None else []
+    columns += ["map: peak to truth (cm)", "map: 95 % region (cm²)", "map: shape"] if statistics is not None else []
     rows: list[tuple[Value, ...]] = []
     for i, layer in enumerate(measures.layers(trace)):
         has_estimate = layer == "fused" or layer in trace.modalities_with_posterior
-        row: list[Value] = [layer]
+        row: list[Value] = [measures.layer_label(layer)]
         row += (*map(float, error[i]), float(distance[i])) if has_estimate else [None] * (len(units) + 1)
         row += [float(nees[i]) if np.isfinite(nees[i]) else None] if trace.has_covariance else []
         for weights in (trace.weights, trace.effective_weights):
@@ -159,8 +172,10 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
                 row.append(float(weights[step, i].mean()) if i < weights.shape[1] else None)
         if statistics is not None:
             row += [100.0 * float(np.hypot(*statistics.peak[0, i])), 1e4 * float(statistics.area95[0, i])]
+            row += [SHAPES[statistics.shape[0, i]]]
         rows.append(tuple(row))
-    return Table(f"Step {step} of episode {trace.episode_index}", tuple(columns), tuple(rows))
+    title = f"Step {step} of episode {trace.episode_index}" + ("" if map_ is None else f". Maps: {map_.title}")
+    return Table(title, tuple(columns), tuple(rows))
 
 
 def event_summary(trace: Trace, step: int) -> str:

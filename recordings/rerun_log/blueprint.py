@@ -21,9 +21,8 @@ from beliefscope.recordings.schema import STEP
 TRAIL_STEPS = 100
 VIEWING_DISTANCE = 1.2
 """m from the centre of the scene, so that the reach of the arm is in view."""
-# Dark in every theme of the viewer, so that empty cells of a map look empty.
-BACKGROUND = rrb.Background(kind="SolidColor", color=[16, 17, 24])
-LINKED = rrb.TimeAxis(link="LinkToGlobal")
+BACKGROUND = [16, 17, 24]
+"""RGB, dark in every theme of the viewer, so that empty cells of a map look empty."""
 
 
 def blueprint(
@@ -42,7 +41,7 @@ def blueprint(
     """
     observed = [_camera(key) for key, shape in task.observations.items() if len(shape) == 2]
     if first is not None:
-        observed += [_map(layer, len(first.offsets_x)) for layer in first.layers]
+        observed += [_map(layer, first) for layer in first.layers]
     scene = rrb.Vertical(
         _scene(trace, task),
         rrb.Horizontal(*observed) if observed else rrb.TextDocumentView(origin="about"),
@@ -77,7 +76,7 @@ def _scene(trace: Trace, task: Task) -> rrb.Container:
         origin="world",
         name="Scene",
         eye_controls=_eye(middle, middle + VIEWING_DISTANCE * np.array([-0.62, -0.12, 0.78]), (0, 0, 1)),
-        background=BACKGROUND,
+        background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.1, plane=rr.components.Plane3D.XY),
         overrides={"world/effector": rrb.VisibleTimeRanges(trail)},
     )
@@ -86,7 +85,7 @@ def _scene(trace: Trace, task: Task) -> rrb.Container:
         contents="world/plane/**",
         name=f"Belief: {task.map_components[0]}, {task.map_components[1]}",
         eye_controls=_eye(anchor, anchor + np.array([0.0, 0.0, 3.4 * task.map_half_width]), (0, 1, 0)),
-        background=BACKGROUND,
+        background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
     )
     about = rrb.TextDocumentView(origin="about", name="About")
@@ -101,15 +100,17 @@ def _camera(key: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=f"observations/{key}", name="Camera")
 
 
-def _map(layer: str, side: int) -> rrb.Spatial2DView:
+def _map(layer: str, first: LikelihoodMap) -> rrb.Spatial2DView:
+    side = len(first.offsets_x)
+    name = f"{layer} {first.quantity}" + (f": {first.rule}" if layer == "fused" and first.rule else "")
     # Without bounds, the view would zoom out to include estimates outside the map.
     bounds = rrb.VisualBounds2D(x_range=[0, side], y_range=[0, side])
-    return rrb.Spatial2DView(origin=f"maps/{layer}", name=layer, visual_bounds=bounds)
+    return rrb.Spatial2DView(origin=f"maps/{layer}", name=name, visual_bounds=bounds)
 
 
 def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     rows: list[rrb.View | rrb.Container] = []
-    rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=LINKED))
+    rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=_linked()))
     shares = [1.6]
     titles = {"weights": "Fusion weights beta", "effective_weights": "Effective weights"}
     fusion = [_plot(name, title, (-0.05, 1.05)) for name, title in titles.items() if getattr(trace, name) is not None]
@@ -145,12 +146,17 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
     return _plot(f"states/{component.name}", name, limits, legend=False)
 
 
+def _linked() -> rrb.TimeAxis:
+    """The axis of every time series. A function, as the first Arrow array of a process imports pandas, if installed."""
+    return rrb.TimeAxis(link="LinkToGlobal")
+
+
 def _plot(origin: str, name: str, limits: tuple[float, float] | None = None, legend: bool = True) -> rrb.TimeSeriesView:
     axis = None if limits is None else rrb.ScalarAxis(range=limits)
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
-        axis_x=LINKED,
+        axis_x=_linked(),
         axis_y=axis,
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Component, Outline, Task
 from beliefscope.inspect.palette import colour
-from beliefscope.inspect.statistics.measures import contours
+from beliefscope.inspect.statistics.measures import contours, layer_label
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import STEP, TIME
 
@@ -28,7 +28,7 @@ PARTICLE_GRID, SHADES = 2.0**-13, 32
 particles are under ``trace/``."""
 
 ROBOT_COLOUR = "#B0B0B0"
-MODALITY = "single-modality update, fusion weight"
+MODALITY = "update of the fused filter's prior with this modality only, not a standalone filter; fusion weight"
 KINDS = {
     "ekf": "An extended Kalman filter for each measurement model",
     "ukf": "An unscented Kalman filter for each measurement model",
@@ -110,7 +110,7 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
         ),
     )
     for source in sources(trace):
-        hue, width = _hex(source, trace), 2.5 if source == "fused" else 1.2
+        hue, width, label = _hex(source, trace), 2.5 if source == "fused" else 1.2, layer_label(source)
         yield f"world/plane/{source}/mean", _marker(hue, 3.5 if source == "fused" else 2.5)
         if trace.has_covariance:
             yield (
@@ -119,11 +119,11 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
                     colors=rgba(hue), line_radii=rr.Radius.ui_points(width), fill_mode="MajorWireframe"
                 ),
             )
-        yield f"errors/position/{source}", line(hue, width, f"{source} (cm)")
+        yield f"errors/position/{source}", line(hue, width, f"{label} (cm)")
         for component in angles(task):
-            yield f"errors/{component.name}/{source}", line(hue, width, f"{source} (deg)")
+            yield f"errors/{component.name}/{source}", line(hue, width, f"{label} (deg)")
         for component in task.components:
-            yield f"states/{component.name}/{source}", line(hue, width, source)
+            yield f"states/{component.name}/{source}", line(hue, width, label)
     for component in task.components:
         truth = line(_hex("truth", trace), 2.0, "truth")
         yield f"states/{component.name}/truth", truth
@@ -294,7 +294,8 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
 * **Scene**: the true and the estimated pose of the object. Contours are 2 sigma in
   {task.map_components[0]} and {task.map_components[1]}. Brighter particles have larger weights. Gray: the end
   effector and its recent path.
-* **Likelihood maps**: likelihood of positions around the true one, relative to the maximum of each map;
+* **Likelihood maps**: likelihood or posterior (see the titles) of positions around the true one, relative to the
+  maximum of each map;
   {200 * task.map_half_width:g} cm per side, {task.map_components[0]} to the right. Squares
   frame the true position (large) and the estimate (small).
 * **Plots**: in centimetres and degrees. Thin lines around the fused estimate are the 2 sigma band.

@@ -20,7 +20,8 @@ PLANE_CELLS = 80  # maximum per side of the map in the scene; the image view has
 
 
 def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
-    """Static properties of all maps of a recording: size, colour map, markers."""
+    """Static properties of all maps of a recording: quantity, size, colour map, markers."""
+    yield "maps/title", rr.TextDocument(first.title)
     side = len(first.offsets_x)
     depth = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8")
     for layer in first.layers:

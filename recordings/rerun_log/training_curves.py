@@ -111,6 +111,19 @@ def tuning_curves(folder: Path, viewer: str = "") -> Iterator[Write]:
             stream.disconnect()
 
 
+@contextmanager
+def log_losses(folder: Path | None) -> Iterator[Callable[[str, str, int, float], None]]:
+    """Yields (kind of loss, stage, step, loss) -> None, which writes to TensorBoard's event file in the folder."""
+    if folder is None:
+        yield lambda kind, stage, step, loss: None
+        return
+    with tensorboard_writer(folder) as writer:
+        # Tags must not contain spaces or commas.
+        yield lambda kind, stage, step, loss: writer.add_scalar(
+            f"{re.sub('[^a-z0-9]+', '_', stage)}/{kind}", loss, step
+        )
+
+
 def _path(name: str) -> str:
     slice_, _, measure = name.rpartition("/")
     return f"{ROOT}/{slug(measure)}/{slug(slice_) if slice_ else 'run'}"

@@ -47,6 +47,7 @@ def test_tabs_and_dialogs_are_accessible(open_page: Any, theme: str) -> None:
     assert {name: lines for name, lines in violations.items() if lines} == {}
 
 
+@pytest.mark.long
 def test_tab_key_visits_every_control_once(open_page: Any) -> None:
     page = open_page("?tab=failures")
     assert page.page.evaluate(LAYOUT_SHIFT) < 0.05

@@ -58,7 +58,7 @@ def test_missing_outputs_are_explained_per_filter(open_page: Any, start_server: 
 
     select(page, "filter", "crossmodal-pf")
     page.until("() => document.querySelectorAll('#heatmaps h3').length === 3")
-    assert text("#step-table tbody th").all_text_contents() == ["image", "haptics", "fused"]
+    assert text("#step-table tbody th").all_text_contents() == ["image-only update", "haptics-only update", "fused"]
     assert text("#angle-label").is_visible()
     select(page, "data", "sample")
     page.until("() => location.search.includes('data=sample')")

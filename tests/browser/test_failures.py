@@ -18,7 +18,7 @@ def open_results(open_page: Any, parameters: str = "", **options: Any) -> Any:
     page.until("() => ['absent', 'ready'].includes(document.querySelector('#failures').dataset.state)")
     if page.page.locator("#failures").get_attribute("data-state") == "absent":
         page.page.get_by_role("button", name="Search for failures").click()
-    page.until(READY)
+    page.until(READY, 240)  # 64 held-out episodes
     return page
 
 

@@ -54,18 +54,17 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     page = open_page(LINK + "&track=nees&window=20-60")
     mouse, slider = page.page.mouse, page.page.locator("#tracks")
     nees = column(page, "nees")
-    names = ("image", "haptics", "fused")
+    names = ("image-only update", "haptics-only update", "fused")
     assert page.page.evaluate("() => document.querySelector('#reset-zoom').disabled") is False
     assert {name: value for name, (value,) in legend(page, 2).items()} == {
         n: pytest.approx(v, rel=6e-3) for n, v in zip(names, nees[40], strict=True)
     }
 
     # The legend shows the values at the pointer; the layout stays.
-    box = slider.bounding_box()
-    left, width = 140 + 46, box["width"] - 140 - 46 - 12  # px of the plots at this size of window
+    box, plot = slider.bounding_box(), page.page.locator("#tracks .u-over").first.bounding_box()
 
     def at(step: float, window: tuple[float, float]) -> float:
-        return box["x"] + left + width * (step - window[0]) / (window[1] - window[0])
+        return plot["x"] + plot["width"] * (step - window[0]) / (window[1] - window[0])
 
     rows = (
         "() => JSON.stringify([...document.querySelectorAll('#tracks .track')].map((r) => r.getBoundingClientRect()))"
@@ -148,8 +147,7 @@ def test_event_marks_and_comparison_run(open_page: Any) -> None:
     page.page.keyboard.press("0")
 
     page.page.evaluate(ADD_COMPARISON)
-    page.until("() => !document.querySelector('#comparison-key').hidden")
-    assert page.page.locator("#comparison-key").text_content() == "unimodal-ekf"
+    page.until("() => document.querySelector('#comparison-key').textContent === 'unimodal-ekf'")
     selected, comparison = (100 * column(page, "estimate_mean", f)[70, 0] for f in ("crossmodal-ekf", "unimodal-ekf"))
     assert legend(page, 1)["fused"] == [near(selected), near(comparison)]
     truth = 100 * column(page, "truth")[70, 0]
@@ -162,6 +160,16 @@ def test_event_marks_and_comparison_run(open_page: Any) -> None:
         )
         <= 1
     )
+
+    # A standalone filter is chosen beside the charts, and has a line of its own.
+    page.page.locator("#standalone").select_option("haptics")
+    page.until("() => document.querySelector('#comparison-key').textContent === 'haptics standalone'")
+    assert page.state["against"] == "only=haptics"
+    assert {"haptics-only update", "haptics standalone", "fused"} <= set(legend(page, 1))
+    page.page.locator("#standalone").select_option("")
+    page.until("() => document.querySelector('#comparison-key').hidden")
+    page.page.evaluate(ADD_COMPARISON)
+    page.until("() => document.querySelector('#comparison-key').textContent === 'unimodal-ekf'")
 
     # Another episode has neither these marks nor this comparison run.
     page.page.locator("#episode").select_option("8")

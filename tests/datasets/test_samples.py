@@ -25,13 +25,18 @@ def stacked(episodes: list[Episode], key: str) -> Array:
 
 
 def test_file_size() -> None:
-    assert sample_path("door").stat().st_size <= 3_000_000
+    assert sample_path("door").stat().st_size <= 4_100_000
 
 
 def test_splits_and_policies(episodes: list[Episode]) -> None:
-    assert len(episodes) == 140
+    assert len(episodes) == 190
     assert {len(e) for e in episodes} == {100}
-    for split, count in (("train", 112), ("val", 14), ("test", 14)):
+    assert [(e.seed, e.provenance["spawn_index"]) for e in episodes] == [
+        *((0, i) for i in range(140)),
+        *((2, i) for i in range(50)),
+    ]
+    assert {e.split for e in episodes[140:]} == {"test"}
+    for split, count in (("train", 112), ("val", 14), ("test", 64)):
         policies = [e.provenance["policy"] for e in episodes if e.split == split]
         assert len(policies) == count
         assert policies.count("pull") == policies.count("push") == count // 2

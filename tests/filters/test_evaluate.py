@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate, metrics, nees_bounds
+from beliefscope.filters.filter import Filter
+from beliefscope.filters.rollout import start_at_truth
+from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start
 
 DOOR = find_task("door")
 
@@ -51,3 +58,138 @@ def test_nees_bounds_contain_95_percent_of_consistent_filters() -> None:
     errors = np.random.default_rng(0).standard_normal((20_000, 14, 3))
     nees = (errors**2).sum(-1).mean(-1) / 3
     assert np.mean((nees > low) & (nees < high)) == pytest.approx(0.95, abs=0.006)
+
+
+def short(count: int = 4, steps: int = 40) -> list[Episode]:
+    with open_dataset(sample_path("door")) as dataset:
+        return [shortened(dataset[i], steps) for i in range(count)]
+
+
+def shortened(episode: Episode, steps: int) -> Episode:
+    observations = {key: values[:steps] for key, values in episode.observations.items()}
+    arrays = {key: getattr(episode, key)[:steps] for key in ("states", "controls", "contact", "qpos")}
+    return replace(episode, observations=observations, **arrays)
+
+
+def fitted(name: str, episodes: list[Episode]) -> Filter:
+    filter_ = build(architecture("door", name), seed=0)
+    filter_.statistics.fit(Steps.from_episodes(DOOR, episodes))
+    return filter_.eval()
+
+
+def test_stay_is_the_distance_from_the_start() -> None:
+    episodes = short()
+    result = evaluate(fitted("crossmodal-ekf", episodes), episodes, baselines=True)
+    stay = result.baselines["stay"]
+    assert stay is not None
+    assert stay.rmse["position_cm"] == pytest.approx(0.0, abs=1e-4), "the hinge does not move"
+    for rmse, first in ((stay.rmse, 30), (stay.rmse_from_step_0, 0)):
+        moved = np.concatenate([(e.states[:, 2] - e.states[0, 2])[first:] for e in episodes])
+        assert rmse["angle_deg"] == pytest.approx(math.degrees(math.sqrt((moved**2).mean())), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["crossmodal-ekf", "unimodal-ekf", "image-ekf", "crossmodal-pf"])
+def test_dynamics_uses_no_observation(name: str) -> None:
+    """Other images change the filter, but not the filter with all observations masked; nor does the fusion."""
+    episodes = short()
+    filter_ = fitted(name, episodes)
+    dark = [
+        replace(e, observations={**e.observations, "image": np.zeros_like(e.observations["image"])}) for e in episodes
+    ]
+    clean, black = (evaluate(filter_, data, particles=30, baselines=True) for data in (episodes, dark))
+    assert clean.rmse != black.rmse
+    first, second = clean.baselines["dynamics"], black.baselines["dynamics"]
+    assert first is not None
+    assert second is not None
+    assert first.rmse == pytest.approx(second.rmse, rel=1e-5), "equal up to the rounding of the fusion"
+    assert first.rmse_from_step_0 == pytest.approx(second.rmse_from_step_0, rel=1e-5)
+
+
+def test_lstm_has_no_dynamics_baseline() -> None:
+    episodes = short(2)
+    document = evaluate(fitted("lstm", episodes), episodes, baselines=True).to_dict()
+    assert document["baselines"]["dynamics"] is None
+    assert document["baselines"]["stay"]["rmse"].keys() == document["rmse"].keys()
+
+
+def test_start_offset_has_its_length_and_covariance() -> None:
+    """Distances are exact, directions uniform, and the variance of each component is that of the offsets."""
+    offset = StartOffset.parse("3cm,20deg", DOOR)
+    (episode,) = short(1, 1)
+    episodes = [replace(episode, seed=seed) for seed in range(2000)]
+    vectors = offset.vectors(DOOR, episodes, 0).astype(float)
+    np.testing.assert_allclose(np.linalg.norm(vectors[:, :2], axis=1), 0.03, rtol=1e-5)
+    np.testing.assert_allclose(np.abs(vectors[:, 2]), np.deg2rad(20.0), rtol=1e-5)
+    np.testing.assert_allclose(np.cov(vectors.T), np.diag(offset.variances(DOOR)), atol=0.1 * np.deg2rad(20.0) ** 2)
+    np.testing.assert_allclose(np.cov(vectors.T)[:2, :2], np.diag(offset.variances(DOOR)[:2]), atol=0.1 * 0.03**2)
+    np.testing.assert_array_equal(offset.vectors(DOOR, episodes[5:7], 0), offset.vectors(DOOR, episodes, 0)[5:7])
+    assert (offset.vectors(DOOR, episodes, 1) != offset.vectors(DOOR, episodes, 0)).any(axis=1).all()
+
+
+def test_offset_start_is_where_stay_stays() -> None:
+    episodes = short()
+    filter_ = fitted("crossmodal-ekf", episodes)
+    result = evaluate(filter_, episodes, start_offset=StartOffset.parse("3cm", DOOR), baselines=True)
+    stay = result.baselines["stay"]
+    assert stay is not None
+    assert stay.rmse["position_cm"] == pytest.approx(3.0, rel=1e-3)
+    assert evaluate(filter_, episodes, start_offset=NO_OFFSET).to_dict() == evaluate(filter_, episodes).to_dict()
+    batch = Steps.from_episodes(DOOR, episodes[:1]).episode(0)
+    offset = StartOffset.parse("3cm", DOOR)
+    start = offset_start(
+        filter_,
+        batch,
+        torch.from_numpy(offset.vectors(DOOR, episodes[:1], 0)),
+        torch.from_numpy(offset.variances(DOOR)),
+    )
+    covariance = filter_.statistics.covariance_to_si(start.covariance)[0]
+    truth = filter_.statistics.covariance_to_si(start_at_truth(filter_, batch).covariance)[0]
+    np.testing.assert_allclose(covariance[:2, :2], np.eye(2) * 0.03**2 / 2, rtol=1e-4, atol=1e-12)
+    assert covariance[2, 2] == pytest.approx(float(truth[2, 2])), "no offset of the angle"
+
+
+@pytest.mark.parametrize("text", ["3", "3N", "cm", "-3cm", "3cm,4cm", "nancm"])
+def test_invalid_start_offset(text: str) -> None:
+    with pytest.raises(BadInput, match="start offset"):
+        StartOffset.parse(text, DOOR)
+
+
+def test_start_offset_of_another_task() -> None:
+    offset = StartOffset.parse("3cm,20deg", DOOR)
+    assert str(offset) == "3cm,20deg"
+    assert str(offset.of(find_task("push"))) == "3cm"
+    with pytest.raises(BadInput, match=r"'20deg' is not in a unit of task 'push': cm"):
+        StartOffset.parse("3cm,20deg", find_task("push"))
+
+
+def test_squares_give_the_rmse() -> None:
+    episodes = [*short(2, 40), *short(1, 35)]
+    result = evaluate(fitted("crossmodal-ekf", episodes), episodes)
+    steps, *squares = result.squares.sum(0)
+    assert steps == 10 + 10 + 5
+    assert list(result.rmse.values()) == pytest.approx(np.sqrt(np.array(squares) / steps))
+
+
+def test_updates_and_standalone_filters_are_reported_separately() -> None:
+    checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
+    with open_dataset(sample_path("door")) as dataset:
+        episodes = [dataset[i] for i in dataset.held_out()[:3]]
+    document = evaluate(checkpoint.filter, episodes, modalities=True).to_dict()
+    assert set(document["updates"]) == set(document["standalone"]) == {"image", "haptics"}
+    update, alone = (document[key]["haptics"]["rmse"]["position_cm"] for key in ("updates", "standalone"))
+    assert update < 1.0
+    assert alone > 2.0 * update
+    single = evaluate(checkpoint.filter, episodes, only="haptics").to_dict()
+    assert single["rmse"] == document["standalone"]["haptics"]["rmse"]
+    assert "updates" not in single
+    assert document["rmse"] == evaluate(checkpoint.filter, episodes).rmse
+
+
+def test_only_applies_to_filters_without_a_weight_model() -> None:
+    filter_ = build(architecture("door", "unimodal-ekf")).eval().requires_grad_(False)
+    with open_dataset(sample_path("door")) as dataset:
+        episodes = [dataset[9]]
+    fused, image = evaluate(filter_, episodes), evaluate(filter_, episodes, only="image")
+    assert fused.rmse != image.rmse
+    with pytest.raises(BadInput, match=r"Modality 'touch' is not in this filter"):
+        evaluate(filter_, episodes, only="touch")

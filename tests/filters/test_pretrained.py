@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def held_out() -> list[Episode]:
     with open_dataset(sample_path("door")) as dataset:
-        return [dataset[s.index] for s in dataset.summaries if s.split == "test"]
+        return [dataset[s.index] for s in dataset.summaries if s.split == "test"][:14]
 
 
 NAMES = sorted(path.stem for path in PRETRAINED.glob("*.safetensors"))
@@ -46,12 +46,18 @@ def test_record_has_the_training_command(name: str) -> None:
     checkpoint = load_checkpoint(PRETRAINED / f"{name}.safetensors")
     record = checkpoint.record
     assert name == f"{checkpoint.task.name}-{checkpoint.name}"
-    assert record["command"].startswith(f"beliefscope train {checkpoint.task.name} --filter {checkpoint.name}")
     readme = (PRETRAINED / "README.md").read_text()
+    if "base" in record:
+        assert record["command"].startswith(f"beliefscope finetune {checkpoint.task.name}-base.safetensors")
+        assert record["base"]["hash"] in readme
+        assert {"best_step", "frozen", "noise_factor"} <= record.keys()
+    else:
+        assert record["command"].startswith(f"beliefscope train {checkpoint.task.name} --filter {checkpoint.name}")
+        assert "plan" in record
     assert checkpoint.hash in readme
     assert record["data_hash"] in readme
     assert record["command"] in readme
-    assert {"seed", "plan", "metrics", "versions", "seconds"} <= record.keys()
+    assert {"seed", "metrics", "versions", "seconds"} <= record.keys()
 
 
 @pytest.mark.parametrize("faults", ["", "blackout=0.8"])

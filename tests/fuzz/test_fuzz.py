@@ -1,4 +1,4 @@
-"""A short run of ``bench/fuzz.py`` with fixed inputs: all readers, routes and the view's WebSocket."""
+"""A short run of ``tools/stress/fuzz.py`` with fixed inputs: all readers, routes and the view's WebSocket."""
 
 from __future__ import annotations
 

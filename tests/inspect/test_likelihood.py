@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,9 +11,12 @@ import torch
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
+from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.models.ekf import ExtendedKalmanFilter, update
 from beliefscope.filters.models.pf import ParticleFilter
-from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine
+from beliefscope.inspect.likelihood import QUANTITIES, LikelihoodMap, MapEngine
+from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.trace import trace
 
 
@@ -70,18 +75,81 @@ def test_particle_filter_maps_equal_a_direct_evaluation(pf: MapEngine) -> None:
     np.testing.assert_allclose(map_.log_likelihood[2], fused, atol=2e-4)
 
 
-def test_ekf_maps_are_gaussians(ekf: MapEngine) -> None:
-    map_ = ekf.map(50, angle=0.5, size=31)
-    cells = states_of(map_)
+def gaussian(cells: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(S, S) log density."""
+    error, covariance = cells - mean, covariance.astype(np.float64)
+    squared = np.einsum("yxi,ij,yxj->yx", error, np.linalg.inv(covariance), error)
+    return -0.5 * (squared + np.log(np.linalg.det(2.0 * np.pi * covariance)))
+
+
+def test_posteriors_of_an_ekf_are_gaussians(ekf: MapEngine) -> None:
+    map_ = ekf.map(50, angle=0.5, size=31, quantity="posterior")
     trace_ = ekf.trace
     means = [*trace_.modality_mean[50], trace_.estimate_mean[50]]
     covariances = [*trace_.modality_covariance[50], trace_.estimate_covariance[50]]
     for layer, mean, covariance in zip(map_.log_likelihood, means, covariances, strict=True):
-        precision = np.linalg.inv(covariance.astype(np.float64))
-        error = cells - mean
-        squared = np.einsum("yxi,ij,yxj->yx", error, precision, error)
-        expected = -0.5 * (squared + np.log(np.linalg.det(2.0 * np.pi * covariance.astype(np.float64))))
+        np.testing.assert_allclose(layer, gaussian(states_of(map_), mean, covariance), rtol=1e-4, atol=1e-3)
+    assert map_.title == "Posterior. Fused: beta-weighted mean of posteriors (crossmodal)"
+
+
+def test_likelihoods_of_an_ekf_are_those_of_its_virtual_sensors(ekf: MapEngine) -> None:
+    """``N(z_k; x, R_k)``, which does not depend on the prior; the default quantity."""
+    map_, trace_ = ekf.map(50, angle=0.5, size=31), ekf.trace
+    assert map_.quantity == "likelihood"
+    assert trace_.observation_mean is not None
+    assert trace_.observation_covariance is not None
+    for k, layer in enumerate(map_.log_likelihood[:2]):
+        expected = gaussian(states_of(map_), trace_.observation_mean[50, k], trace_.observation_covariance[50, k])
         np.testing.assert_allclose(layer, expected, rtol=1e-4, atol=1e-3)
+    shifted = {
+        name: getattr(trace_, name) + np.float32(0.05) for name in ("modality_mean", "estimate_mean", "predicted_mean")
+    }
+    other = MapEngine(ekf.checkpoint, replace(trace_, **shifted))
+    np.testing.assert_array_equal(other.map(50, angle=0.5, size=31).log_likelihood, map_.log_likelihood)
+    posteriors = (e.map(50, angle=0.5, size=31, quantity="posterior").log_likelihood for e in (other, ekf))
+    assert np.abs(next(posteriors) - next(posteriors)).max() > 0.1
+
+
+@pytest.mark.parametrize("name", ["crossmodal-ekf", "unimodal-ekf"])
+def test_fused_likelihood_of_an_ekf_is_the_fused_posterior_of_a_flat_prior(name: str) -> None:
+    """The filter's own update and fusion with a prior of large covariance."""
+    step, flat = 50, engine(name)
+    trace_, filter_ = flat.trace, flat.checkpoint.filter
+    assert isinstance(filter_, ExtendedKalmanFilter)
+    assert trace_.observation_mean is not None
+    assert trace_.observation_covariance is not None
+    z, r = (
+        torch.from_numpy(a[step][None].astype(np.float64))
+        for a in (trace_.observation_mean, trace_.observation_covariance)
+    )
+    prior = Gaussian(torch.zeros_like(z), 1e6 * torch.eye(3, dtype=torch.float64).expand_as(r))
+    beta = None if trace_.weights is None else torch.from_numpy(trace_.weights[step][None].astype(np.float64)).log()
+    fused = filter_.fuse(update(prior, z, r.diagonal(dim1=-2, dim2=-1).sqrt()), beta)
+    map_ = flat.map(step, size=31)
+    expected = gaussian(states_of(map_), fused.mean[0].numpy(), fused.covariance[0].numpy())
+    np.testing.assert_allclose(map_.log_likelihood[2], expected, rtol=1e-3, atol=1e-3)
+    if name == "unimodal-ekf":  # the product of both likelihoods, up to a factor
+        difference = map_.log_likelihood[2] - map_.log_likelihood[:2].sum(axis=0)
+        assert np.ptp(difference) < 1e-2
+        assert map_.rule == "product of virtual sensors (unimodal)"
+
+
+def test_posterior_of_a_particle_filter_is_prior_times_likelihood(pf: MapEngine) -> None:
+    """Every layer has the same prior, and its density is normalised by the mean likelihood of the particles."""
+    step, trace_ = 40, pf.trace
+    likelihood, posterior = (pf.map(step, size=31, quantity=q) for q in QUANTITIES)
+    assert trace_.particles is not None
+    assert trace_.prior_log_weights is not None
+    assert trace_.log_likelihood is not None
+    density = ParticleDensity(pf.task, trace_.particles[step], trace_.prior_log_weights[step])
+    prior = density.log_density(trace_.episode.states[step].astype(np.float64), likelihood.offsets_x.astype(np.float64))
+    evidence = [np.logaddexp.reduce(trace_.prior_log_weights[step] + ll) for ll in trace_.log_likelihood[step]]
+    # The mixture of normalised likelihoods with weights that sum to one has evidence 1.
+    for layer, log in zip(range(3), [*evidence, 0.0], strict=True):
+        expected = likelihood.log_likelihood[layer] + prior - log
+        np.testing.assert_allclose(posterior.log_likelihood[layer], expected, atol=2e-3)
+    assert posterior.rule == "prior times beta-weighted sum of normalised likelihoods (crossmodal)"
+    assert likelihood.rule == "beta-weighted sum of normalised likelihoods (crossmodal)"
 
 
 def test_axes_are_cell_centres_around_the_true_position(pf: MapEngine) -> None:
@@ -146,6 +214,7 @@ def test_normalised_maps_peak_at_255(pf: MapEngine) -> None:
         ({"step": 10**6}, "it has steps 0 to"),
         ({"step": 0, "size": 1}, "2 to 1024 cells per side, not 1"),
         ({"step": 0, "angle": float("nan")}, "finite number of rad, not nan"),
+        ({"step": 0, "quantity": "prior"}, "quantity of a map 'prior'.*likelihood, posterior"),
     ],
 )
 def test_invalid_arguments(pf: MapEngine, arguments: dict, message: str) -> None:

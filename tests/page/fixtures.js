@@ -77,6 +77,7 @@ export function makeTrace(arrays, header = {}, images = null) {
       image_size: null,
       nees_bounds: null,
       no_maps: null,
+      missing_quantities: {},
       columns,
       ...header,
     }),

@@ -2,7 +2,12 @@ import assert from 'node:assert/strict';
 import test from 'node:test';
 
 import { CELL_STEPS } from '../../app/page/core/constants.js';
-import { layerMeasures, pairwiseMeasures, valuesAt } from '../../app/page/maps/map_summary.js';
+import {
+  layerMeasures,
+  mapTitle,
+  pairwiseMeasures,
+  valuesAt,
+} from '../../app/page/maps/map_summary.js';
 import {
   borders,
   cellAt,
@@ -20,7 +25,11 @@ const HEADER = {
   other: false,
   step: 2,
   size: 3,
+  quantity: 'likelihood',
+  rule: 'sum of likelihoods (unimodal)',
   angle: null,
+  expected: 1.5,
+  shape: ['round', 'ridge', 'ring'],
   layers: ['image', 'haptics', 'fused'],
   half_width: 0.3,
   centre: [1, 2],
@@ -42,7 +51,14 @@ const HEADER = {
     area95: [0.01, 0.1, 0.01],
     axis: [0, Math.PI / 2, 0],
     elongation: [1, 3, 2],
-    off_line: [null, Math.PI / 6, null],
+    deviation: [null, Math.PI / 6, null],
+    ring_centre: [
+      [0, 0],
+      [0, 0],
+      [0.03, -0.01],
+    ],
+    ring_radius: [0.01, 0.01, 0.062],
+    ring_coverage: [1, 1, 0.9],
     divergence: [
       [0, 1.25],
       [20, 0],
@@ -133,11 +149,20 @@ test('measures as text', () => {
   assert.deepEqual(layerMeasures(maps, 1, false).lines, [
     'peak +10.0, −10.0 cm',
     '50 % 100, 95 % 1000 cm²',
-    'ridge at 30° · entropy 10.21',
+    'ridge, 30° off · entropy 10.21',
   ]);
   assert.match(layerMeasures(maps, 1, true).lines[0], /^peak 110\.0, 190\.0 cm$/);
-  assert.match(layerMeasures(maps, 0, false).lines[2], /^no ridge/);
-  assert.match(layerMeasures(maps, 2, false).lines[2], /^axis 0°/);
+  assert.match(layerMeasures(maps, 0, false).lines[2], /^round/);
+  assert.match(layerMeasures(maps, 2, false).lines[2], /^ring, radius 6\.2 cm/);
+  const { description } = layerMeasures(maps, 2, false);
+  assert.match(description, /around \+3\.0, −1\.0 cm from the truth, over 90 % of the circle/);
+  const noDirection = { ...maps, numbers: { ...maps.numbers, deviation: [null, null, null] } };
+  assert.match(layerMeasures(noDirection, 1, false).lines[2], /^ridge at 90°/);
+  assert.equal(mapTitle(maps), 'Likelihood. Fused: sum of likelihoods (unimodal)');
+  assert.equal(
+    mapTitle({ ...maps, quantity: 'posterior', layers: ['image', 'fused'] }),
+    'Posterior',
+  );
   assert.equal(
     pairwiseMeasures(maps),
     'KL(image‖haptics) 1.3, KL(haptics‖image) 20 nats, overlap 50 %',

@@ -1,6 +1,7 @@
 import assert from 'node:assert/strict';
 import test from 'node:test';
 
+import { cssVariable } from '../../app/page/core/palette.js';
 import { stepSummary } from '../../app/page/step/step_summary.js';
 import { chartData, valueRange } from '../../app/page/timeline/chart.js';
 import { formatValue } from '../../app/page/timeline/legend.js';
@@ -66,6 +67,34 @@ test('a comparison run adds its lines', () => {
   assert.equal(weights.series.length, 2);
   assert.deepEqual(estimates.series.at(-1)?.comparison, true);
   assert.equal(estimates.series.length, 5);
+});
+
+test('estimates of modalities are labelled as updates, weights are not', () => {
+  assert.deepEqual(
+    trace.sources.map((name) => trace.label(name)),
+    ['image-only update', 'haptics-only update', 'fused'],
+  );
+  const [weights, estimates] = tracks(trace, state);
+  assert.ok(weights.ofModalities);
+  assert.ok(!estimates.ofModalities);
+});
+
+test('a standalone run adds its estimate under its own name and in the colour of its modality', () => {
+  const columns = { truth: FUSION.truth, estimate_mean: FUSION.estimate_mean };
+  const other = makeTrace(columns, {
+    modalities: ['image'],
+    settings: { standalone: 'image' },
+  });
+  const [weights, estimates, error] = tracks(trace, state, other);
+  assert.equal(weights.series.length, 2);
+  for (const track of [estimates, error]) {
+    const line = track.series.at(-1);
+    assert.equal(line?.name, 'image standalone');
+    assert.ok(line?.comparison);
+  }
+  assert.equal(cssVariable('image standalone'), '--image');
+  assert.deepEqual(trace.inputs, ['image', 'haptics']);
+  assert.deepEqual(other.inputs, []);
 });
 
 test('the error of the selected component', () => {

@@ -1,17 +1,22 @@
-"""Models of JSON responses: shared ones, the health check and the catalog.
+"""Base of the models of JSON responses, and models shared by several routes.
 
 The page's TypeScript types are generated from all models in this package. Large responses are sent without validation;
-the tests validate them (``tests/app/conftest.py``).
+the tests validate them (``tests/app/conftest.py``). Dataclasses of other folders are used as they are if they have only
+plain fields; models of those with arrays are derived by ``fields_of``.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict
+import numpy as np
+from pydantic import BaseModel, ConfigDict, create_model
 
 from beliefscope.app.jobs.queue import Job
 from beliefscope.datasets.dataset import EpisodeSummary
+from beliefscope.datasets.task import Component
 
 Number = float | None
 """None if not finite or not available."""
@@ -21,6 +26,34 @@ class Reply(BaseModel):
     """Base of all response models; unknown fields are errors."""
 
     model_config = ConfigDict(extra="forbid")
+
+
+R = TypeVar("R", bound=Reply)
+
+
+def fields_of(source: type, *names: str) -> Callable[[type[R]], type[R]]:
+    """Class decorator that adds fields of a dataclass, all or the named ones, as ``as_json`` encodes them.
+
+    Arrays become lists of one dimension; declare the field in the class for other ones.
+    """
+
+    def add(model: type[R]) -> type[R]:
+        hints = get_type_hints(source)
+        wanted = names or [field.name for field in dataclasses.fields(source)]
+        fields: Any = {name: (_json_type(hints[name]), ...) for name in wanted if name not in model.model_fields}
+        return create_model(
+            model.__name__, __base__=model, __doc__=model.__doc__, __module__=model.__module__, **fields
+        )
+
+    return add
+
+
+def _json_type(hint: Any) -> Any:
+    """The type of a field's JSON value: None for non-finite numbers, lists for arrays."""
+    if get_origin(hint) is np.ndarray:
+        (scalar,) = get_args(get_args(hint)[1])
+        return list[bool] if scalar is np.bool_ else list[Number]
+    return Number if hint is float else hint
 
 
 class Error(Reply):
@@ -47,13 +80,6 @@ class Health(Reply):
     status: Literal["ok"]
     version: str
     late: float
-
-
-class Component(Reply):
-    """A component of the state."""
-
-    name: str
-    unit: str
 
 
 class MapArea(Reply):

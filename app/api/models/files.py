@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+from pydantic import ConfigDict, with_config
+
 from beliefscope.app.api.models.catalog import Reply
+from beliefscope.app.workspace.reports import ReportEntry
 from beliefscope.app.workspace.trash import DeletedFile
+from beliefscope.recordings.probe import RecordingInfo
 
 
 class DeletedId(Reply):
@@ -25,13 +31,13 @@ class RunNames(Reply):
     data: str
 
 
-class RecordingEntry(Reply):
-    """A recording.
+@with_config(ConfigDict(json_schema_serialization_defaults_required=True))
+@dataclass(frozen=True, kw_only=True)
+class RecordingEntry(RecordingInfo):
+    """A recording, with its metadata once they have been read.
 
     Attributes:
-        automatic: written for display only. reading: whether its metadata are being read.
-        task ... data_hash: of its run; None or empty for recordings of other applications.
-        problem: why no run can be read from it, or empty.
+        modified: ISO 8601. reading: whether its metadata are being read.
         run: the same run in the catalog, or None; ``why_not`` explains why.
     """
 
@@ -39,24 +45,7 @@ class RecordingEntry(Reply):
     url: str
     bytes: int
     modified: str
-    automatic: bool
-    tags: list[str]
     reading: bool
-    application: str
-    title: str
-    entities: int
-    rows: int
-    problem: str
-    task: str | None
-    filter: str | None
-    episode: int | None
-    steps: int | None
-    seed: int | None
-    faults: str
-    particles: int | None
-    edited: bool
-    checkpoint_hash: str
-    data_hash: str
     run: RunNames | None
     why_not: str
 
@@ -78,21 +67,6 @@ class WrittenRecording(Reply):
     url: str
     bytes: int
     seconds: float | None
-
-
-class ReportEntry(Reply):
-    """A report. created: ISO 8601. pdf: address of its PDF, or None."""
-
-    name: str
-    url: str
-    title: str
-    created: str
-    task: str
-    filter: str
-    episode: int
-    faults: str
-    bytes: int
-    pdf: str | None
 
 
 class ReportList(Reply):

@@ -4,63 +4,42 @@ from __future__ import annotations
 
 from typing import Literal
 
-from beliefscope.app.api.models.catalog import Number, Reply
+from beliefscope.app.api.models.catalog import Number, Reply, fields_of
+from beliefscope.inspect.diagnostics import views
+from beliefscope.inspect.diagnostics.base import Entry
+from beliefscope.inspect.failures import by_episode
+from beliefscope.inspect.failures.events import Event, PhaseStatistics
 
 
-class Table(Reply):
-    """A table; column names include the unit."""
-
-    title: str
-    columns: list[str]
-    rows: list[list[str | int | float | None]]
-
-
+@fields_of(views.Curve)
 class Curve(Reply):
     """A quantity over the steps of a trace."""
 
-    name: str
-    values: list[Number]
-    chart: str
-    unit: str
-    layer: str
-    bounds: tuple[float, float] | None
 
-
+@fields_of(views.Line)
 class Line(Reply):
     """A line of a plot."""
 
-    name: str
-    x: list[Number]
-    y: list[Number]
-    layer: str
 
-
+@fields_of(views.Plot)
 class Plot(Reply):
     """A plot whose x axis is not time. diagonal: draw y = x. names: labels of x = 0, 1, ..."""
 
-    title: str
-    x_label: str
-    y_label: str
     lines: list[Line]
-    kind: Literal["line", "points", "bars"]
-    diagonal: bool
-    names: list[str]
 
 
+@fields_of(views.ImagePanel)
 class PixelMap(Reply):
     """A value per pixel of a camera image."""
 
-    title: str
     values: list[list[Number]]
-    unit: str
-    signed: bool
 
 
 class ResultViews(Reply):
     """Tables, curves and figures of a result, in cm and degrees."""
 
     verdict: str
-    tables: list[Table]
+    tables: list[views.Table]
     curves: list[Curve]
     bands: dict[str, list[bool]]
     plots: list[Plot]
@@ -88,13 +67,10 @@ class DiagnosticOption(Reply):
     default: str
 
 
+@fields_of(Entry, "name", "title", "question", "slow")
 class DiagnosticInfo(Reply):
     """A diagnostic. slow: computed by a job."""
 
-    name: str
-    title: str
-    question: str
-    slow: bool
     options: list[DiagnosticOption]
 
 
@@ -104,32 +80,18 @@ class TraceDiagnosticInfo(DiagnosticInfo):
     why_not: str | None
 
 
+@fields_of(PhaseStatistics)
 class PhaseInfo(Reply):
-    """The steps of a phase compared with all others (``inspect.failures.events.PhaseStatistics``)."""
+    """The steps of a phase compared with all others."""
 
-    name: str
-    steps: int
-    events: int
-    share: Number
-    event_share: Number
-    lift: Number
-    p_value: Number
-    inside: Number
-    outside: Number
     over_represented: bool
 
 
+@fields_of(Event, "episode", "step", "first", "last", "phase", "other_phases", "error")
 class FailureEvent(Reply):
     """A failure event. error: per layer, m. link: the page's address that opens it."""
 
-    episode: int
-    step: int
-    first: int
-    last: int
     value: Number
-    phase: str
-    other_phases: list[str]
-    error: list[Number]
     nees: Number
     ess: Number
     effective_weights: list[Number] | None
@@ -151,16 +113,9 @@ class FailureScore(Reply):
     events: list[FailureEvent] | None = None
 
 
+@fields_of(by_episode.EpisodeErrors)
 class EpisodeErrors(Reply):
-    """Position errors of one episode (``inspect.failures.by_episode``)."""
-
-    index: int
-    steps: int
-    rmse: Number
-    worst: Number
-    worst_step: int | None
-    error: list[Number]
-    contact: list[bool]
+    """Position errors of one episode."""
 
 
 class Failures(Reply):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from beliefscope.app.api.models.catalog import Component, Reply, TaskInfo
+from beliefscope.app.api.models.catalog import Reply, TaskInfo
 from beliefscope.app.protocol.messages import SceneLayer
+from beliefscope.datasets.task import Component
+from beliefscope.inspect.maps.likelihood_map import Quantity
 
 
 class LiveState(Reply):
@@ -57,7 +59,9 @@ class TraceHeader(Reply):
     Attributes:
         weight_width: 0 for a filter without weights. settings: of the run.
         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
-        no_maps: why there are no likelihood maps, or None. image_size: height and width of the camera images, or None.
+        no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
+            reasons. image_size: height and width of the camera images, or None.
+        data_warning: how the data differ from the checkpoint's training data, or None.
         scene: layers of its 3D scene. live: present while the trace is of a live run.
     """
 
@@ -76,8 +80,10 @@ class TraceHeader(Reply):
     settings: dict[str, Any]
     nees_bounds: tuple[float, float] | None
     no_maps: str | None
+    missing_quantities: dict[Quantity, str]
     image_size: tuple[int, int] | None
     columns: list[Column]
+    data_warning: str | None = None
     scene: list[SceneLayer]
     live: LiveRun | None = None
 

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
 
-from beliefscope.app.api.models.catalog import Number, Reply
+from pydantic import ConfigDict
+
+from beliefscope.app.api.models.catalog import Number, Reply, fields_of
 from beliefscope.app.api.models.results import ResultViews
 from beliefscope.app.jobs.queue import Job
+from beliefscope.app.workspace.finetune_runs import FineTuneRun
+from beliefscope.filters.finetuning.choices import Choices
+from beliefscope.filters.finetuning.loop import Validation
+from beliefscope.filters.training.study_table import Row
+from beliefscope.inspect.compare.effects import Regression
 
 
 class LineageMember(Reply):
@@ -25,9 +34,9 @@ class LineageMember(Reply):
     run: str | None
     train: list[str]
     learned: list[str]
-    rmse: dict[str, Number]
-    before: dict[str, dict[str, Number]]
-    after: dict[str, dict[str, Number]]
+    rmse: Mapping[str, Number]
+    before: Mapping[str, Mapping[str, Number]]
+    after: Mapping[str, Mapping[str, Number]]
 
 
 class Lineage(Reply):
@@ -36,67 +45,27 @@ class Lineage(Reply):
     members: list[LineageMember]
 
 
-class ModuleInfo(Reply):
-    """A module of a filter. gradient, change: of the fine-tuning that wrote the checkpoint."""
-
-    name: str
-    kind: str
-    description: str
-    parameters: int
-    depth: int
-    gradient: Number = None
-    change: Number = None
-
-
-class PresetInfo(Reply):
-    """A preset. trains: names of parameters."""
-
-    name: str
-    trains: list[str]
-
-
-class SliceInfo(Reply):
-    """A slice of a data set (``filters.finetuning.slices``)."""
-
-    name: str
-    faults: list[dict[str, Any]]
-    contact: bool | None
-    only: list[str]
-    text: str
-
-
-class FineTuneRunInfo(Reply):
+@dataclass(frozen=True)
+class FineTuneRunInfo(FineTuneRun):
     """A fine-tuning run. finetuned: catalog name of its checkpoint. saved_as: its place in the catalog."""
 
-    run: str
-    task: str
-    filter: str
-    data: str
-    settings: dict[str, Any]
-    submitted: float
     job: Job | None
     finetuned: str | None
     saved_as: Literal["saved", "default"] | None
 
 
-class FineTuneOffer(Reply):
-    """Options for fine-tuning a filter, and runs of its task. why_not: why it cannot be fine-tuned, or None."""
+@dataclass(frozen=True)
+class FineTuneOffer(Choices):
+    """Options for fine-tuning a filter, and runs of its task."""
 
-    why_not: str | None
-    modules: list[ModuleInfo]
-    presets: list[PresetInfo]
-    slices: list[SliceInfo]
-    settings: dict[str, Any]
     runs: list[FineTuneRunInfo]
 
 
+@fields_of(Validation)
 class ValidationInfo(Reply):
-    """A validation. slices: name -> metrics (``filters.finetuning.loop.Validation``)."""
+    """A validation."""
 
-    step: int
     loss: Number
-    slices: dict[str, Any]
-    score: Number
 
 
 class FineTuneProgress(Reply):
@@ -108,28 +77,20 @@ class FineTuneProgress(Reply):
 
 
 class FineTunedCheckpoint(Reply):
-    """A fine-tuned checkpoint."""
+    """A fine-tuned checkpoint. no_change: what to try, if the base checkpoint was best; else empty."""
 
     name: str
     hash: str
     best_step: int
     steps: int
     seconds: float
+    no_change: str = ""
 
 
+@fields_of(Regression)
 class RegressionEvent(Reply):
-    """Consecutive steps with a larger error than before (``inspect.compare.effects.Regression``), m."""
+    """Consecutive steps with a larger error than before."""
 
-    slice: str
-    faults: str
-    only: list[str]
-    episode: int
-    first: int
-    last: int
-    step: int
-    contact: bool
-    before: Number
-    after: Number
     link: str
 
 
@@ -142,6 +103,7 @@ class FineTuneResult(Reply):
     events: list[RegressionEvent]
 
 
+@dataclass(frozen=True)
 class FineTuneDetails(FineTuneRunInfo):
     """A fine-tuning run with its progress and result."""
 
@@ -164,27 +126,15 @@ class StudyFilter(Reply):
     trained: list[TrainedSeed]
 
 
-class StudyRow(Reply):
-    """A row of a study's table (``filters.training.study_table.Row``)."""
-
-    filter: str
-    blackout: Number
-    seeds: int
-    requested: int
-    failed: int
-    mean: dict[str, Number]
-    spread: dict[str, Number]
-    bounds: tuple[float, float] | None
-    by_seed: dict[str, dict[str, Number]]
-
-
 class StudyTask(Reply):
     """The part of a study for one task. data: file of the training and evaluation data."""
+
+    model_config = ConfigDict(json_schema_serialization_defaults_required=True)  # optional fields of rows are sent
 
     name: str
     data: str
     filters: list[StudyFilter]
-    rows: list[StudyRow]
+    rows: list[Row]
 
 
 class StudyInfo(Reply):

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
@@ -15,13 +13,8 @@ if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
 
 
-def convert(
-    task: opt.TaskName,
-    data: Annotated[Path, typer.Option(metavar="FILE|DIR", help="Files in a supported format (docs/data.md).")],
-    output: opt.DatasetPath,
-    skip_bad: opt.SkipBad = False,
-    json: opt.Json = None,
-) -> None:
+@opt.with_options(data=opt.option("FILE|DIR", "Files in a supported format (docs/data.md)."), output=opt.DATASET)
+def convert(task: str, data: Path, output: Path, skip_bad: bool = False, json: str | None = None) -> None:
     """Convert external data to a Beliefscope HDF5 file.
 
     Every command also reads the external files directly; a converted file opens faster and has the same hash.
@@ -35,7 +28,6 @@ def convert(
     from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.store import write_dataset
 
-    opt.check_output(output)
     target = load_task(task)
     with opt.open_episodes(target, data, skip_bad) as episodes, console.progress("Converting") as advance:
 

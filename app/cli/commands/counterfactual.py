@@ -3,42 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
 from beliefscope.datasets.errors import BadInput
 
 
+@opt.with_options(
+    first=opt.option("STEP", "First step of the intervention.", "--from", parser=opt.integer(0)),
+    to=opt.option("STEP", "First step after the intervention.", parser=opt.integer(1)),
+    weights=opt.option(
+        "MODALITY=BETA,...",
+        "Manual fusion weights that replace the network's; other modalities share the remainder.",
+    ),
+    output=opt.output_file("FIGURE", "Also draw a .svg, .pdf or .png figure."),
+    trace_path=opt.output_file("RUN.trace", "Also write the trace of the modified run.", ".trace", names=("--trace",)),
+)
 def counterfactual(
-    task: opt.TaskName,
-    filter_: opt.FilterName,
-    first: Annotated[
-        int, typer.Option("--from", parser=opt.integer(0), metavar="STEP", help="First step of the intervention.")
-    ],
-    to: Annotated[int, typer.Option(parser=opt.integer(1), metavar="STEP", help="First step after the intervention.")],
-    data: opt.DataPath = None,
-    skip_bad: opt.SkipBad = False,
-    episode: opt.EpisodeIndex = None,
-    faults_: opt.FaultsText = "",
-    weights: Annotated[
-        str,
-        typer.Option(
-            metavar="MODALITY=BETA,...",
-            help="Manual fusion weights that replace the network's; other modalities share the remainder.",
-        ),
-    ] = "",
-    particles: opt.Particles = 300,
-    seed: opt.Seed = 0,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FIGURE", help="Also draw a .svg, .pdf or .png figure.")
-    ] = None,
-    trace_path: Annotated[
-        Path | None, typer.Option("--trace", metavar="TRACE", help="Also write the trace of the modified run.")
-    ] = None,
-    json: opt.Json = None,
+    run: opt.Run,
+    first: int,
+    to: int,
+    weights: str = "",
+    output: Path | None = None,
+    trace_path: Path | None = None,
+    json: str | None = None,
 ) -> None:
     """Rerun a filter with a temporary intervention.
 
@@ -58,17 +46,15 @@ def counterfactual(
     from beliefscope.inspect.trace import save_trace, trace
     from beliefscope.inspect.traces.replay import Edit, Replay, parse_weights
 
-    opt.check_output(output)
-    opt.check_output(trace_path)
     if output is not None:
         figure_format(output)
-    checkpoint = opt.open_checkpoint(task, filter_)
-    edit = Edit(first, to, opt.parse_faults(faults_, checkpoint.task), parse_weights(weights))
+    checkpoint, faults = run.open()
+    edit = Edit(first, to, faults, parse_weights(weights))
     if not edit.faults and not edit.weights:
         raise BadInput("no intervention: give --faults, --weights or both")
-    recorded, index = opt.select_episode(checkpoint.task, data, skip_bad, episode)
+    recorded, index = run.read_episode(checkpoint.task)
     with console.progress("Filtering") as advance:
-        original = trace(checkpoint, recorded, index, seed, particles)
+        original = trace(checkpoint, recorded, index, run.seed, run.particles)
         replay = Replay(checkpoint, original, progress=advance)
         edited = replay.edited(edit)
     result = compare(replay.original, edited, edit)
@@ -80,7 +66,7 @@ def counterfactual(
         "task": checkpoint.task.name,
         "filter": checkpoint.name,
         "episode": index,
-        "seed": seed,
+        "seed": run.seed,
         "checkpoint_hash": checkpoint.hash,
         "data_hash": original.data_hash,
         **result.to_dict(),

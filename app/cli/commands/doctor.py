@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -11,13 +10,13 @@ from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
 
 
+@opt.with_options(
+    workspace=opt.option("DIR", "Workspace folder of the server."),
+    host=opt.option("ADDRESS", "Address the server would listen on."),
+    port=opt.option("N", "Port the server would listen on.", parser=opt.integer(0, 65535)),
+)
 def doctor(
-    workspace: Annotated[Path, typer.Option(metavar="DIR", help="Workspace folder of the server.")] = Path("workspace"),
-    host: Annotated[str, typer.Option(help="Address the server would listen on.")] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(parser=opt.integer(0, 65535), metavar="N", help="Port the server would listen on.")
-    ] = 8000,
-    json: opt.Json = None,
+    workspace: Path = Path("workspace"), host: str = "127.0.0.1", port: int = 8000, json: str | None = None
 ) -> None:
     """Check the installation and suggest fixes.
 

@@ -2,90 +2,106 @@
 
 from __future__ import annotations
 
-import json as json_format
-from typing import Annotated
-
-import typer
+from typing import Any
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
-from beliefscope.datasets.errors import BadInput
 
 
+@opt.with_options(
+    only=opt.option("MODALITY", "Run the standalone filter of this modality: all others are masked."),
+    start_offset=opt.option(
+        "OFFSET", "Distance of the first belief from the true state, in a random direction, such as 3cm,20deg."
+    ),
+)
 def evaluate(
-    task: opt.TaskName,
-    filter_: opt.FilterName,
-    data: opt.DataPath = None,
-    skip_bad: opt.SkipBad = False,
-    faults_: opt.FaultsText = "",
-    only: Annotated[
-        str | None, typer.Option(metavar="MODALITY", help="Use only this modality, overriding the fusion weights.")
-    ] = None,
-    particles: opt.Particles = 300,
-    seed: opt.Seed = 0,
-    json: opt.Json = None,
+    runs: opt.Runs, only: str | None = None, start_offset: str = "", align: bool = False, json: str | None = None
 ) -> None:
     """Measure the accuracy of a filter on held-out episodes.
 
     Uses the test episodes; if there are none, the validation episodes or all. Each run starts at the true state with
-    covariance 0.1 I in standardised units, and its first 30 steps are excluded. Reports the RMSE; nll, the negative
-    log-likelihood of the truth in nats; nees, the normalised estimation error squared per dimension, 1 for a
-    calibrated covariance; coverage95, the fraction of steps with the truth inside the 95 % ellipsoid.
+    covariance 0.1 I in standardised units, or at --start-offset with the covariance of such offsets. Reports the RMSE
+    without the first 30 steps and from step 0; nll, the negative log-likelihood of the truth in nats; nees, the
+    normalised estimation error squared per dimension, 1 for a calibrated covariance; coverage95, the fraction of steps
+    with the truth inside the 95 % ellipsoid. Two baselines run from the same start: stay keeps the start as its
+    estimate; dynamics is the filter with all observations masked. Two errors of each modality: its update, the fused
+    filter's prior of each step updated with this modality only; and standalone, the same filter and random numbers with
+    the observations of all other modalities masked in every step. Warns if the data differ from the training data.
 
     \b
     Examples:
       beliefscope evaluate door --filter crossmodal-pf
+      beliefscope evaluate door --filter crossmodal-pf --start-offset 3cm,20deg
       beliefscope evaluate door --filter crossmodal-pf --faults blackout=0.8 --json -
       beliefscope evaluate push-real --filter crossmodal-pf --data mit_push/val
       beliefscope evaluate door --filter crossmodal-pf --faults delay=haptics:steps=5 --only haptics
     """
     from beliefscope.filters.evaluate import evaluate as measure
     from beliefscope.filters.external.load import ExternalFilter
+    from beliefscope.filters.start_offset import StartOffset
+    from beliefscope.filters.subsets import check_modality
 
-    text, modality = _split_only(opt.read_faults(faults_))
-    checkpoint = opt.open_checkpoint(task, filter_)
-    faults, only = opt.parse_faults(text, checkpoint.task), only or modality
-    with opt.open_episodes(checkpoint.task, data, skip_bad) as episodes, output.progress("Evaluating") as advance:
-        held_out = episodes.held_out()
+    checkpoint, faults = runs.open()
+    if only is not None and not isinstance(checkpoint, ExternalFilter):
+        check_modality(checkpoint.filter, only)
+    offset = StartOffset.parse(start_offset, checkpoint.task)
+    with runs.episodes(checkpoint.task) as data:
+        data_hash, held_out = data.hash, [data[i] for i in data.held_out()]
+    held_out = runs.check(checkpoint, held_out, align)
+    with output.progress("Evaluating") as advance:
         metrics = measure(
             checkpoint if isinstance(checkpoint, ExternalFilter) else checkpoint.filter,
-            [episodes[i] for i in held_out],
+            held_out,
             faults=faults,
             only=only,
-            particles=particles,
-            seed=seed,
+            particles=runs.particles,
+            seed=runs.seed,
+            start_offset=offset,
+            baselines=True,
+            modalities=only is None,
             progress=advance,
         ).to_dict()
-        data_hash = episodes.hash
     document = {
-        "task": task,
+        "task": runs.task,
         "filter": checkpoint.name,
         "checkpoint_hash": checkpoint.hash,
         "data_hash": data_hash,
         "episodes": len(held_out),
         "faults": faults.to_json(),
         "only": only,
-        "particles": particles if checkpoint.kind == "pf" else None,
-        "seed": seed,
+        "particles": runs.particles if checkpoint.kind == "pf" else None,
+        "seed": runs.seed,
+        "start_offset": dict(offset.lengths),
         **metrics,
     }
-    values = {f"rmse {name}": value for name, value in metrics["rmse"].items()}
-    values |= {name: value for name, value in metrics.items() if name != "rmse"}
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {len(held_out)} episodes"
-    rows = [[name, None if value is None else f"{value:8.2f}"] for name, value in values.items()]
-    table = output.grid(title + (f" with {faults}" if faults else ""), ["measure", "value"], rows)
-    output.result(document, table, json)
+    title += (f", start offset {offset}" if offset else "") + (f", with {faults}" if faults else "")
+    output.result(document, _table(title, metrics), json)
 
 
-def _split_only(text: str) -> tuple[str, str | None]:
-    """Faults without, and value of, the former JSON key ``only``, which older scripts use instead of ``--only``."""
-    try:
-        value = json_format.loads(text)
-    except (ValueError, RecursionError):
-        return text, None
-    if not isinstance(value, dict) or "only" not in value:
-        return text, None
-    only = value.pop("only")
-    if not isinstance(only, str):
-        raise BadInput(f"key 'only' of the faults is {only!r}, not the name of a modality")
-    return json_format.dumps(value), only
+def _table(title: str, metrics: dict[str, Any]) -> str:
+    """The metrics of the filter and of its baselines, a row for each measure; then those of its modalities."""
+    from beliefscope.filters.evaluate import STANDALONE, UPDATE
+
+    columns = [metrics, *(baseline or {} for baseline in metrics["baselines"].values())]
+    rows = [
+        [f"rmse {name}{label}", *(_number(column.get(key, {}).get(name)) for column in columns)]
+        for key, label in (("rmse", ""), ("rmse_from_step_0", ", from step 0"))
+        for name in metrics["rmse"]
+    ]
+    rows += [[name, _number(metrics[name]), "", ""] for name in ("nll", "nees", "coverage95")]
+    table = output.grid(title, ["measure", "filter", *metrics["baselines"]], rows)
+    errors = {
+        label.format(name): metrics[key][name]["rmse"]
+        for name in metrics.get("standalone", {})
+        for key, label in (("updates", UPDATE), ("standalone", STANDALONE))
+        if name in metrics.get(key, {})
+    }
+    if not errors:
+        return table
+    rows = [[f"rmse {name}", *(_number(rmse[name]) for rmse in errors.values())] for name in metrics["rmse"]]
+    return f"{table}\n\n{output.grid('Modalities', ['measure', *errors], rows)}"
+
+
+def _number(value: float | None) -> str | None:
+    return None if value is None else f"{value:8.2f}"

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from beliefscope.app.cli import options as opt
 
 
-def export(
-    source: Annotated[Path, typer.Argument(metavar="TRACE|RUN.rrd", help="Trace file or recording.")],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE", help="Output file: .parquet, .mcap or .npz.")
-    ],
-    json: opt.Json = None,
-) -> None:
+@opt.with_options(
+    source=opt.argument("TRACE|RUN.rrd", "Trace file or recording."),
+    output=opt.output_file("FILE", "Output file: .parquet, .mcap or .npz."),
+)
+def export(source: Path, output: Path, json: str | None = None) -> None:
     """Export a trace to Parquet, MCAP or NumPy.
 
     Parquet has one row per step and one column per number, for pandas and similar tools. MCAP has one topic per array,
@@ -29,7 +24,6 @@ def export(
     """
     from beliefscope.recordings.export import export_format, export_trace
 
-    opt.check_output(output)
     export_format(output)
     trace = opt.open_trace(source)
     export_trace(trace, output)

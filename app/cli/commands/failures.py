@@ -3,41 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
-from beliefscope.app.runs.command_lines import is_path, serve_command
 from beliefscope.datasets.errors import unknown_name
+from beliefscope.recordings.report.command_lines import serve_command
 
 
+@opt.with_options(
+    by=opt.option(
+        "SCORE",
+        "Score that ranks the events: error (position), the name of an angle, nees, ess (effective sample size), "
+        "disagreement (of the modalities) or regret (of the fusion weights).",
+    ),
+    top=opt.option("N", "Number of events.", parser=opt.integer(1)),
+    phase=opt.option("NAME", "Only events of this phase, such as 'contact made'."),
+    every=opt.flag("Search all episodes, not only the held-out ones.", "--all"),
+    url=opt.option("URL", "Address of a running server; prints a full permalink per event."),
+)
 def failures(
-    task: opt.TaskName,
-    filter_: opt.FilterName,
-    data: opt.DataPath = None,
-    skip_bad: opt.SkipBad = False,
-    faults_: opt.FaultsText = "",
-    by: Annotated[
-        str,
-        typer.Option(
-            metavar="SCORE",
-            help="Score that ranks the events: error (position), the name of an angle, nees, ess (effective sample "
-            "size), disagreement (of the modalities) or regret (of the fusion weights).",
-        ),
-    ] = "error",
-    top: Annotated[int, typer.Option(parser=opt.integer(1), metavar="N", help="Number of events.")] = 20,
-    phase: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Only events of this phase, such as 'contact made'.")
-    ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Search all episodes, not only the held-out ones.")] = False,
-    url: Annotated[
-        str | None, typer.Option(metavar="URL", help="Address of a running server; prints a full permalink per event.")
-    ] = None,
-    particles: opt.Particles = 300,
-    seed: opt.Seed = 0,
-    json: opt.Json = None,
+    runs: opt.Runs,
+    by: str = "error",
+    top: int = 20,
+    phase: str | None = None,
+    every: bool = False,
+    url: str | None = None,
+    json: str | None = None,
 ) -> None:
     """Find the events at which a filter fails.
 
@@ -54,28 +45,29 @@ def failures(
     """
     from beliefscope.app.protocol.permalinks import permalink
     from beliefscope.app.runs.catalog import served_names
+    from beliefscope.filters.open_filter import is_path
     from beliefscope.inspect.diagnostics.views import as_json
     from beliefscope.inspect.failures.events import find_failures
     from beliefscope.inspect.failures.step_scores import PHASES
 
     if phase is not None and phase not in PHASES:
         raise unknown_name("phase", phase, PHASES)
-    checkpoint = opt.open_checkpoint(task, filter_)
-    faults = opt.parse_faults(faults_, checkpoint.task)
-    with opt.open_episodes(checkpoint.task, data, skip_bad) as episodes, output.progress("Filtering") as advance:
+    checkpoint, faults = runs.open()
+    particles, seed = runs.particles, runs.seed
+    with runs.episodes(checkpoint.task) as episodes, output.progress("Filtering") as advance:
         indices = range(len(episodes)) if every else episodes.held_out()
         report = find_failures(
             checkpoint, episodes, indices, by=by, faults=faults, seed=seed, particles=particles, progress=advance
         )
-    files = [filter_] if is_path(filter_) else []
-    names, data_name = served_names(files, data)
-    name = names.get(str(Path(filter_)), filter_)
+    files = [runs.filter] if is_path(runs.filter) else []
+    names, data_name = served_names(files, runs.data)
+    name = names.get(str(Path(runs.filter)), runs.filter)
     events = report.worst(top, phase)
     base = "" if url is None else url.rstrip("/") + "/"
     links = [base + permalink(checkpoint.task, name, data_name, e.episode, e.step, str(faults), by) for e in events]
     document = report.to_dict() | {
         "events": [as_json(event) | {"link": link} for event, link in zip(events, links, strict=True)],
-        "serve": serve_command(files, data, seed),
+        "serve": serve_command(files, runs.data, seed),
     }
     text = "\n\n".join([report.verdict, *output.grids([report.phase_table(), report.event_table(events)])])
     if url is not None:

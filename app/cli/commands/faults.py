@@ -6,7 +6,8 @@ from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
 
 
-def faults(json: opt.Json = None) -> None:
+@opt.with_options()
+def faults(json: str | None = None) -> None:
     """List the sensor faults available for --faults.
 
     Several faults are separated by commas and applied in order. The value after a fault's name is its first

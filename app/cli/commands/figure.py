@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
-
-import typer
+from pathlib import Path
+from typing import Any
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
@@ -13,58 +12,57 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 KINDS = ("maps", "weights")
 
 
+@opt.with_options(
+    kind=opt.argument("maps|weights", "Kind of figure."),
+    output=opt.FIGURE,
+    steps=opt.option(
+        "T",
+        "Step of a map: one in contact, one in free motion, or both (repeat the option). Default: the middle of the "
+        "longest stretch of each.",
+        "--step",
+        parser=opt.integer(0),
+    ),
+)
 def figure(
-    kind: Annotated[str, typer.Argument(metavar="maps|weights", help="Kind of figure.")],
-    task: opt.TaskName,
-    filter_: opt.FilterName,
-    output: opt.FigurePath,
-    data: opt.DataPath = None,
-    skip_bad: opt.SkipBad = False,
-    episode: opt.EpisodeIndex = None,
-    steps: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--step",
-            parser=opt.integer(0),
-            metavar="T",
-            help="Step of a map: one in contact, one in free motion, or both (repeat the option). Default: the middle "
-            "of the longest stretch of each.",
-        ),
-    ] = None,
-    faults_: opt.FaultsText = "",
-    particles: opt.Particles = 300,
-    seed: opt.Seed = 0,
-    json: opt.Json = None,
+    kind: str,
+    run: opt.Run,
+    output: Path,
+    steps: list[int] | None = None,
+    quantity: opt.Quantity | None = None,
+    json: str | None = None,
 ) -> None:
     """Draw a figure of the paper from a filter run.
 
-    maps: likelihood of each modality around the true position, in free motion and in contact. weights: estimates of
-    each modality and of the fused filter over time, with the fusion weights below and contact shaded.
+    maps: likelihood or posterior of each modality around the true position, in free motion and in contact.
+    weights: estimates of each modality and of the fused filter over time, with the fusion weights below and contact
+    shaded.
 
     \b
     Examples:
       beliefscope figure maps door --filter crossmodal-pf -o maps.svg
+      beliefscope figure maps door --filter crossmodal-ekf --map posterior -o posterior.svg
       beliefscope figure weights push --filter crossmodal-ekf --episode 9 -o weights.pdf
     """
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
     from beliefscope.inspect.figures import paper
     from beliefscope.inspect.likelihood import no_maps
 
-    opt.check_output(output)
     if kind not in KINDS:
         raise unknown_name("figure", kind, KINDS)
     figure_format(output)
     if kind == "weights" and steps:
         raise BadInput(f"--step {steps[0]}: the figure of weights covers all steps; only maps have a step")
-    checkpoint, trace = opt.run_filter(task, filter_, data, skip_bad, episode, faults_, particles, seed)
+    if kind == "weights" and quantity:
+        raise BadInput(f"--map {quantity}: only the figure maps has a quantity")
+    checkpoint, trace = run.trace()
     extra: dict[str, Any] = {}
     if kind == "maps":
-        if reason := no_maps(checkpoint, trace):
+        if reason := no_maps(checkpoint, trace, quantity):
             raise BadInput(reason)
         selection = paper.steps_by_contact(trace, steps or ())
         if False not in selection:
             console.note(f"episode {trace.episode_index} is in contact at every step: no map of free motion")
-        write_figure(paper.maps_figure(checkpoint, trace, selection), output)
+        write_figure(paper.maps_figure(checkpoint, trace, selection, quantity=quantity), output)
         extra["shown"] = {paper.STATES[state]: step for state, step in selection.items()}
     else:
         write_figure(paper.weights_figure(trace), output)

@@ -2,84 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.cli.commands.modules import Freeze, Train
-from beliefscope.app.runs.command_lines import finetune_command
 from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.report.command_lines import finetune_command
 
 if TYPE_CHECKING:
-    from beliefscope.datasets.task import Task
     from beliefscope.filters.finetuning.finetune import FineTuned
     from beliefscope.filters.finetuning.loop import Validation
     from beliefscope.filters.finetuning.settings import FineTune
 
-Target = Annotated[
-    str, typer.Argument(metavar="TASK|CHECKPOINT", help="Task of the filter given with --filter, or .safetensors file.")
-]
-Filter = Annotated[
-    str | None,
-    typer.Option("--filter", metavar="NAME|CHECKPOINT", help="Name of a built-in filter, or .safetensors file."),
-]
-FaultSets = Annotated[
-    list[str] | None,
-    typer.Option("--faults", metavar="FAULTS", help="Learn a slice of all steps with these sensor faults. Repeatable."),
-]
-CleanWeight = Annotated[float, typer.Option(metavar="SHARE", help="Weight of clean data in the loss.")]
-Events = Annotated[
-    list[str] | None,
-    typer.Option("--event", metavar="EPISODE[:FIRST-LAST]", help="Learn slices only from these steps. Repeatable."),
-]
-Steps = Annotated[int, typer.Option(parser=opt.integer(1), metavar="N", help="Maximum number of optimiser steps.")]
-Length = Annotated[int, typer.Option(parser=opt.integer(1), metavar="T", help="Window length in steps.")]
-Rates = Annotated[
-    list[str] | None,
-    typer.Option(
+
+@opt.with_options(
+    target=opt.argument("TASK|CHECKPOINT", "Task of the filter given with --filter, or .safetensors file."),
+    output=opt.CHECKPOINT,
+    filter=opt.option("NAME|CHECKPOINT", "Name of a built-in filter, or .safetensors file."),
+    fault_sets=opt.option("FAULTS", "Learn a slice of all steps with these sensor faults. Repeatable.", "--faults"),
+    clean_weight=opt.option("SHARE", "Weight of clean data in the loss."),
+    events=opt.option("EPISODE[:FIRST-LAST]", "Learn slices only from these steps. Repeatable.", "--event"),
+    steps=opt.option("N", "Maximum number of optimiser steps.", parser=opt.integer(1)),
+    length=opt.option("T", "Window length in steps.", parser=opt.integer(1)),
+    rates=opt.option(
+        "R|PATTERN=R",
+        "Learning rate of Adam (default 0.0003), or of modules that match a pattern: 'weight_model=0.0001'.",
         "--rate",
-        metavar="R|PATTERN=R",
-        help="Learning rate of Adam (default 0.0003), or of modules that match a pattern: 'weight_model=0.0001'.",
     ),
-]
-Strength = Annotated[float, typer.Option("--l2-sp", metavar="X", help="L2-SP strength (decay to the base weights).")]
-Patience = Annotated[
-    int, typer.Option(parser=opt.integer(1), metavar="N", help="Stop after N validations without improvement.")
-]
-Log = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", help="Folder for losses and errors as a Rerun recording and TensorBoard logs."),
-]
-Viewer = Annotated[
-    str, typer.Option(metavar="URL", help="Address of a running Rerun viewer to stream to; requires --log.")
-]
-
-
+    l2_sp=opt.option("X", "L2-SP strength (decay to the base weights)."),
+    calibrate=opt.flag("Then scale process and measurement noise such that NEES is 1 on the validation episodes."),
+    patience=opt.option("N", "Stop after N validations without improvement.", parser=opt.integer(1)),
+    log=opt.option("DIR", "Folder for losses and errors as a Rerun recording and TensorBoard logs."),
+    rerun=opt.option("URL", "Address of a running Rerun viewer to stream to; requires --log."),
+)
 def finetune(
-    target: Target,
-    output: opt.CheckpointPath,
-    filter_: Filter = None,
-    train: Train = None,
-    freeze: Freeze = None,
-    slices: opt.SliceTexts = None,
-    fault_sets: FaultSets = None,
-    clean_weight: CleanWeight = 0.5,
-    events: Events = None,
-    data: opt.DataPath = None,
-    skip_bad: opt.SkipBad = False,
-    steps: Steps = 300,
-    length: Length = 32,
-    rates: Rates = None,
-    l2_sp: Strength = 1.0,
-    patience: Patience = 6,
-    seed: opt.Seed = 0,
-    log: Log = None,
-    rerun: Viewer = "",
-    json: opt.Json = None,
+    target: str,
+    output: Path,
+    filter: str | None = None,
+    train: list[str] | None = None,
+    freeze: list[str] | None = None,
+    slices: list[str] | None = None,
+    fault_sets: list[str] | None = None,
+    clean_weight: float = 0.5,
+    events: list[str] | None = None,
+    data: Path | None = None,
+    skip_bad: bool = False,
+    steps: int = 300,
+    length: int = 32,
+    rates: list[str] | None = None,
+    l2_sp: float = 1.0,
+    calibrate: bool = False,
+    patience: int = 6,
+    seed: int = 0,
+    log: Path | None = None,
+    rerun: str = "",
+    json: str | None = None,
 ) -> None:
     """Fine-tune modules of a filter.
 
@@ -95,20 +73,23 @@ def finetune(
       beliefscope finetune door --filter crossmodal-ekf --train noise-only --rate 0.003 -o finetuned.safetensors
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
-    from beliefscope.filters.finetuning.settings import FineTune, StepRange
+    from beliefscope.filters.finetuning.report import held_out_rows, training_summary
+    from beliefscope.filters.finetuning.settings import FineTune, StepRange, parse_rates
+    from beliefscope.filters.finetuning.slices import parse_slices
+    from beliefscope.filters.open_filter import open_filter
+    from beliefscope.inspect.healthy import measure_profile
 
-    opt.check_output(output)
     opt.check_folder(log, "--log")
     if rerun and log is None:
         raise BadInput(f"--rerun {rerun!r} requires --log DIR")
-    if filter_ is None and not target.endswith(".safetensors"):
+    if filter is None and not target.endswith(".safetensors"):
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
-    base = load_checkpoint(Path(target)) if filter_ is None else opt.open_checkpoint(target, filter_)
-    rate, own_rates = _parse_rates(rates or ())
+    base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
+    rate, own_rates = parse_rates(rates or ())
     settings = FineTune(
         train=tuple(train or ()),
         freeze=tuple(freeze or ()),
-        mix=_parse_slices(slices or (), fault_sets or (), base.task),
+        mix=tuple((slice_, 1.0) for slice_ in parse_slices(slices or (), fault_sets or (), base.task)),
         clean_weight=clean_weight,
         events=tuple(StepRange.parse(text) for text in events or ()),
         steps=steps,
@@ -116,16 +97,23 @@ def finetune(
         rate=rate,
         rates=own_rates,
         l2_sp=l2_sp,
+        calibrate=calibrate,
         patience=patience,
         seed=seed,
     )
     partial = output.with_name(f"{output.name}.partial")
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
-        command = finetune_command(target, filter_, data, settings)
-        tuned = _run(base, list(episodes), settings, partial, log, rerun, data_hash=episodes.hash, command=command)
-    checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output)
-    text = _summary(opt.path_and_size(output), tuned.record)
-    opt.print_checkpoint(output, base.task.name, base.name, checkpoint_hash, tuned.record, text, json)
+        command = finetune_command(target, filter, data, settings)
+        members = list(episodes)
+        tuned = _run(base, members, settings, partial, log, rerun, data_hash=episodes.hash, command=command)
+    profile = measure_profile(tuned.filter, base.name, members, command)
+    checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
+    frozen = tuned.record["frozen"]
+    lines = [f"{opt.path_and_size(output)}: {training_summary(tuned.record)}", ""]
+    lines += [console.grid("On held-out episodes", ["", "before", "after", "change"], held_out_rows(tuned.record)), ""]
+    unchanged = f"Frozen: {frozen['tensors']} tensors, unchanged (hash {frozen['after'][:12]})."
+    lines.append(unchanged if frozen["tensors"] else "No tensor was frozen.")
+    opt.print_checkpoint(output, base.task.name, base.name, checkpoint_hash, tuned.record, "\n".join(lines), json)
 
 
 def _run(
@@ -158,61 +146,3 @@ def _run(
         )
     assert tuned is not None, "runs without a stop callback always complete"
     return tuned
-
-
-def _parse_slices(texts: Sequence[str], fault_sets: Sequence[str], task: Task) -> tuple[tuple[Any, float], ...]:
-    """Slices and their weights from --slice and --faults."""
-    from beliefscope.filters.finetuning.slices import Slice, standard_slices
-
-    slices = [Slice.parse(text, standard_slices(task)) for text in texts]
-    for text in fault_sets:
-        faults = opt.parse_faults(text, task)
-        slices.append(Slice(str(faults).replace("=", " ").replace(":", " "), faults))
-    return tuple((slice_, 1.0) for slice_ in slices)
-
-
-def _parse_rates(texts: Sequence[str]) -> tuple[float, tuple[tuple[str, float], ...]]:
-    """Parse ``0.001`` and ``PATTERN=0.001`` to the default rate and the rates of patterns."""
-    default, rates = 3e-4, []
-    for text in texts:
-        pattern, _, number = text.rpartition("=")
-        try:
-            value = float(number)
-        except ValueError:
-            raise BadInput(f"--rate {text!r} is neither a number nor PATTERN=NUMBER") from None
-        if pattern:
-            rates.append((pattern, value))
-        else:
-            default = value
-    return default, tuple(rates)
-
-
-def _summary(file: str, record: dict[str, Any]) -> str:
-    """File, errors on held-out episodes by slice before and after, and the frozen tensors."""
-    lines = [
-        f"{file}: {record['base']['name']}, fine-tuned from {record['base']['hash'][:12]}, best validation at step "
-        f"{record['best_step']} of {record['steps']}, {record['seconds']:.0f} s"
-    ]
-    if not record["best_step"]:
-        lines.append("No validation improved on the base checkpoint: its weights are unchanged.")
-    before, after = (
-        {name: {**metrics["rmse"], **metrics} for name, metrics in record["held_out"][state].items()}
-        for state in ("before", "after")
-    )
-    keys = [*next(iter(before.values()))["rmse"], "nll", "nees"]
-    rows = [
-        [f"{name}: {key}", values[key], after[name][key], _difference(values[key], after[name][key], key)]
-        for name, values in before.items()
-        for key in keys
-    ]
-    lines += ["", console.grid("On held-out episodes", ["", "before", "after", "change"], rows)]
-    count, digest = record["frozen"]["tensors"], record["frozen"]["after"][:12]
-    lines += ["", f"Frozen: {count} tensors, unchanged (hash {digest})." if count else "No tensor was frozen."]
-    return "\n".join(lines)
-
-
-def _difference(before: float | None, after: float | None, key: str) -> str | None:
-    """Change in percent for errors; absolute difference for nll and nees."""
-    if before is None or after is None:
-        return None
-    return f"{after - before:+.2f}" if key in ("nll", "nees") or not before else f"{100 * (after / before - 1):+.0f} %"

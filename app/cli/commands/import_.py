@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from beliefscope.app.cli import options as opt
 
 
-def import_(
-    recording: Annotated[Path, typer.Argument(metavar="RUN.rrd|RUN.live", help="Recording, or file of a live run.")],
-    output: opt.TracePath,
-    json: opt.Json = None,
-) -> None:
+@opt.with_options(
+    recording=opt.argument("RUN.rrd|RUN.live", "Recording, or file of a live run."),
+    output=opt.TRACE,
+)
+def import_(recording: Path, output: Path, json: str | None = None) -> None:
     """Extract the trace from a recording.
 
     The arrays equal those of the recorded trace, including their types, so all diagnostics give the same results. Of
@@ -27,7 +24,6 @@ def import_(
     """
     from beliefscope.inspect.trace import save_trace
 
-    opt.check_output(output)
     trace = opt.open_recording(recording)
     save_trace(trace, output)
     opt.print_trace(trace, output, json)

@@ -3,31 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-
-if TYPE_CHECKING:
-    from beliefscope.filters.checkpoint import Checkpoint
-    from beliefscope.inspect.trace import Trace
+from beliefscope.datasets.errors import BadInput
 
 
-@opt.with_run_options
+@opt.with_options(
+    output=opt.output_file("RUN.rrd", "Output recording.", ".rrd"),
+    maps=opt.option("STRIDE", "Likelihood maps every STRIDE steps; 0: none.", parser=opt.integer(0)),
+    map_size=opt.option("S", "Cells per side of a map.", parser=opt.integer(2, 1024)),
+    diagnostics=opt.flag("Include every applicable fast diagnostic, one tab each."),
+)
 def record(
-    checkpoint: Checkpoint,
-    trace: Trace,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN.rrd", help="Output recording.")],
-    maps: Annotated[
-        int, typer.Option(parser=opt.integer(0), metavar="STRIDE", help="Likelihood maps every STRIDE steps; 0: none.")
-    ] = 10,
-    map_size: Annotated[
-        int, typer.Option(parser=opt.integer(2, 1024), metavar="S", help="Cells per side of a map.")
-    ] = 135,
-    diagnostics: Annotated[bool, typer.Option(help="Include every applicable fast diagnostic, one tab each.")] = True,
-    json: opt.Json = None,
+    run: opt.Run,
+    output: Path,
+    maps: int = 10,
+    map_size: int = 135,
+    quantity: opt.Quantity | None = None,
+    diagnostics: bool = True,
+    json: str | None = None,
 ) -> None:
     """Record a filter run over one episode as a Rerun recording.
 
@@ -44,10 +39,14 @@ def record(
     from beliefscope.inspect.likelihood import MapEngine, no_maps
     from beliefscope.recordings.write import write_recording
 
-    if maps and (reason := no_maps(checkpoint, trace)):
+    checkpoint, trace = run.trace()
+    if maps and (reason := no_maps(checkpoint, trace, quantity)):
+        if quantity:
+            raise BadInput(reason)
         console.note(f"no likelihood maps: {reason}")
         maps = 0
-    layers = MapEngine(checkpoint, trace).maps(range(0, len(trace), maps), map_size) if maps else None
+    steps = range(0, len(trace), maps) if maps else range(0)
+    layers = MapEngine(checkpoint, trace).maps(steps, map_size, quantity=quantity) if maps else None
     results = quick(trace, checkpoint) if diagnostics else {}
     with console.progress("Recording") as advance:
         write_recording(trace, output, maps=layers, progress=advance, diagnostics=results)

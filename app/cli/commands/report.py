@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output as console
-from beliefscope.app.runs.command_lines import is_code, is_path, report_command, serve_command, trace_command
 from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
@@ -21,28 +19,32 @@ URL = "http://127.0.0.1:8000"
 """Default address of ``beliefscope serve``."""
 
 
+@opt.with_options(
+    paths=opt.argument("TRACE...", "Traces or recordings of one filter, or folders of traces."),
+    output=opt.option("FOLDER", "Output folder; replaces an existing report.", "-o", "--output"),
+    title=opt.option("TEXT", "Title of the report."),
+    events=opt.option(
+        "[EPISODE:]STEP",
+        "Step to show in detail, with images, maps and values. Repeatable. Default: the 3 with largest error.",
+        "--event",
+    ),
+    filter=opt.TRACE_FILTER,
+    every=opt.flag("Include slow diagnostics.", "--all"),
+    url=opt.option("ADDRESS", "Address of the dashboard, for permalinks."),
+    pdf=opt.flag("Also print report.pdf; requires Chromium.", "--pdf"),
+)
 def report(
-    paths: Annotated[
-        list[Path], typer.Argument(metavar="TRACE...", help="Traces or recordings of one filter, or folders of traces.")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FOLDER", help="Output folder; replaces an existing report.")
-    ] = Path("report"),
-    title: Annotated[str, typer.Option(metavar="TEXT", help="Title of the report.")] = "",
-    events: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--event",
-            metavar="[EPISODE:]STEP",
-            help="Step to show in detail, with images, maps and values. Repeatable. Default: the 3 with largest error.",
-        ),
-    ] = None,
-    filter_: opt.TraceFilter = "",
-    data: opt.DataPath = None,
-    every: Annotated[bool, typer.Option("--all", help="Include slow diagnostics.")] = False,
-    url: Annotated[str, typer.Option(metavar="ADDRESS", help="Address of the dashboard, for permalinks.")] = URL,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Also print report.pdf; requires Chromium.")] = False,
-    json: opt.Json = None,
+    paths: list[Path],
+    output: Path = Path("report"),
+    title: str = "",
+    events: list[str] | None = None,
+    filter: str = "",
+    data: Path | None = None,
+    quantity: opt.Quantity | None = None,
+    every: bool = False,
+    url: str = URL,
+    pdf: bool = False,
+    json: str | None = None,
 ) -> None:
     """Write a report of filter runs.
 
@@ -56,7 +58,8 @@ def report(
       beliefscope report runs/*.trace -o report --title "Doors, 40 % image blackout" --pdf
       beliefscope report run.trace --event 35 --event 68 --all
     """
-    from beliefscope.recordings.report.compose import compose, write_report
+    from beliefscope.inspect.likelihood import no_maps
+    from beliefscope.recordings.report.compose import compose, parse_event, write_report
     from beliefscope.recordings.report.folder import check_folder
     from beliefscope.recordings.report.pdf import browser, print_page
 
@@ -67,11 +70,14 @@ def report(
     files = [file for path in paths for file in (sorted(path.glob("*.trace")) if path.is_dir() else [path])]
     if not files:
         raise BadInput(f"folder {str(paths[0])!r} contains no .trace file")
-    traces, checkpoint = opt.open_traces(files, filter_)
-    steps = [_parse_event(text, traces) for text in events or ()]
-    link, links_note = _permalinks(traces, checkpoint, filter_, data, url)
-    commands = [trace_command(trace, file.name, filter_, data) for file, trace in zip(files, traces, strict=True)]
-    source = [*(["--filter", filter_] if filter_ else []), *(["--data", str(data)] if data else [])]
+    traces, checkpoint = opt.open_traces(files, filter)
+    if quantity and checkpoint is not None and (reason := no_maps(checkpoint, traces[0], quantity)):
+        raise BadInput(reason)
+    steps = [parse_event(text, traces) for text in events or ()]
+    link, links_note = _permalinks(traces, checkpoint, filter, data, url)
+    commands = [trace_command(trace, file.name, filter, data) for file, trace in zip(files, traces, strict=True)]
+    shown = ["--map", quantity] if quantity else []
+    source = [*shown, *(["--filter", filter] if filter else []), *(["--data", str(data)] if data else [])]
     commands.append(report_command([file.name for file in files], events or (), every, title, *source))
     with console.progress("Reporting") as advance:
         content = compose(
@@ -84,6 +90,7 @@ def report(
             link=link,
             links_note=links_note,
             commands=tuple(commands),
+            quantity=quantity,
             progress=lambda fraction: advance(0.6 * fraction),
         )
         printer = None if chromium is None else lambda page, target: print_page(chromium, page, target)
@@ -95,22 +102,6 @@ def report(
     console.result(document | {"path": str(output)}, "\n\n".join(lines), json)
 
 
-def _parse_event(text: str, traces: Sequence[Trace]) -> tuple[int, int]:
-    """Index of the trace and step of a text such as 68 or 9:68."""
-    episode, _, step = text.rpartition(":")
-    if not step.isdecimal() or (episode and not episode.isdecimal()):
-        raise BadInput(f"--event {text!r} is not STEP or EPISODE:STEP, such as 68 or 9:68")
-    episodes = [trace.episode_index for trace in traces]
-    if not episode and len(traces) > 1:
-        raise BadInput(f"--event {text!r} is ambiguous for {len(traces)} traces: write {episodes[0]}:{step}")
-    if episode and int(episode) not in episodes:
-        raise BadInput(f"--event {text!r}: no trace of episode {episode}. Available: {', '.join(map(str, episodes))}.")
-    index = episodes.index(int(episode)) if episode else 0
-    if int(step) >= len(traces[index]):
-        raise BadInput(f"--event {text!r}: episode {episodes[index]} has steps 0 to {len(traces[index]) - 1}")
-    return index, int(step)
-
-
 def _permalinks(
     traces: Sequence[Trace], checkpoint: Checkpoint | None, filter_: str, data: Path | None, url: str
 ) -> tuple[Callable[[int, int], str], str]:
@@ -118,11 +109,13 @@ def _permalinks(
     from beliefscope.app.protocol.permalinks import permalink
     from beliefscope.app.runs.catalog import served_names
     from beliefscope.datasets.catalog import find_task
+    from beliefscope.filters.open_filter import is_code, is_path
+    from beliefscope.inspect.traces.provenance import reproducible
 
     first, task = traces[0], find_task(traces[0].episode.task)
     if checkpoint is None:
         return lambda index, step: "", "No permalinks: the filter's checkpoint is not available."
-    linked = _reproducible(traces, data)
+    linked = reproducible(traces, data)
     if not linked:
         source = "the sample episodes" if data is None else str(data)
         return lambda index, step: "", f"No permalinks: the dashboard cannot reproduce these runs over {source}."
@@ -136,24 +129,3 @@ def _permalinks(
         return f"{url.rstrip('/')}/{query}" if index in linked else ""
 
     return link, f"Permalinks open an event in the dashboard, served by: {serve_command(files, data, first.seed)}."
-
-
-def _reproducible(traces: Sequence[Trace], data: Path | None) -> set[int]:
-    """Indices of the traces that the dashboard reproduces: same episode and seed, 300 particles, no interventions."""
-    from beliefscope.datasets.catalog import find_task
-    from beliefscope.datasets.store import open_dataset, sample_path
-
-    task = find_task(traces[0].episode.task)
-    try:
-        with open_dataset(sample_path(task.name) if data is None else data, task) as episodes:
-            return {
-                i
-                for i, trace in enumerate(traces)
-                if trace.episode_index < len(episodes)
-                and episodes[trace.episode_index].digest() == trace.data_hash
-                and trace.seed == traces[0].seed
-                and trace.settings.get("particles", 300) == 300
-                and not trace.settings.get("edits")
-            }
-    except BadInput:
-        return set()

@@ -7,70 +7,51 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import options as opt
 from beliefscope.app.cli import output
-from beliefscope.app.runs.command_lines import is_code
 from beliefscope.datasets.errors import unknown_name
 
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
 
-Port = Annotated[int, typer.Option(parser=opt.integer(0, 65535), metavar="N", help="Port; 0 selects a free one.")]
-Host = Annotated[str, typer.Option(help="Address to listen on. Any but the loopback address requires a token.")]
-Token = Annotated[bool, typer.Option("--token", help="Require a token on the loopback address too (shared machines).")]
-ReadOnly = Annotated[
-    bool, typer.Option("--read-only", help="Read-only server: disable recording, computation, training and deletion.")
-]
-HostNames = Annotated[
-    list[str] | None,
-    typer.Option("--allow-host", metavar="NAME", help="Additional host name of this machine. Repeatable."),
-]
-Tasks = Annotated[
-    list[str] | None, typer.Option("--task", metavar="FILE.py:NAME", help="Custom task to serve. Repeatable.")
-]
-DataPaths = Annotated[
-    list[Path] | None, typer.Option("--data", metavar="FILE|DIR", help="Additional episodes to serve. Repeatable.")
-]
-Filters = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--filter",
-        metavar="CHECKPOINT|MODULE:BUILD",
-        help="Additional filter to serve. Repeatable. An external filter (docs/own_filter.md) is for its own task or, "
-        "if it has none, for the one given with --task.",
+
+@opt.with_options(
+    port=opt.option("N", "Port; 0 selects a free one.", parser=opt.integer(0, 65535)),
+    host=opt.option("ADDRESS", "Address to listen on. Any but the loopback address requires a token."),
+    token=opt.flag("Require a token on the loopback address too (shared machines).", "--token"),
+    read_only=opt.flag("Read-only server: disable recording, computation, training and deletion.", "--read-only"),
+    allow_host=opt.option("NAME", "Additional host name of this machine. Repeatable."),
+    task=opt.option("FILE.py:NAME", "Custom task to serve. Repeatable."),
+    data=opt.option("FILE|DIR", "Additional episodes to serve. Repeatable."),
+    filter=opt.option(
+        "CHECKPOINT|MODULE:BUILD",
+        "Additional filter to serve. Repeatable. An external filter (docs/own_filter.md) is for its own task or, if it "
+        "has none, for the one given with --task.",
     ),
-]
-Studies = Annotated[
-    list[Path] | None, typer.Option("--study", metavar="DIR", help="Folder of a study to serve. Repeatable.")
-]
-Views = Annotated[int, typer.Option(parser=opt.integer(1, 1024), metavar="N", help="Maximum number of open pages.")]
-OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the dashboard in a browser.")]
-LogLevel = Annotated[
-    str, typer.Option(metavar="LEVEL", help="Log level on standard error: debug, info, warning or error.")
-]
-LogFormat = Annotated[str, typer.Option(metavar="NAME", help="Log format: text or json.")]
-
-
+    study=opt.option("DIR", "Folder of a study to serve. Repeatable."),
+    views=opt.option("N", "Maximum number of open pages.", parser=opt.integer(1, 1024)),
+    open_page=opt.flag("Open the dashboard in a browser.", "--open/--no-open"),
+    log_level=opt.option("LEVEL", "Log level on standard error: debug, info, warning or error."),
+    log_format=opt.option("NAME", "Log format: text or json."),
+)
 def serve(
-    port: Port = 8000,
-    host: Host = "127.0.0.1",
-    token: Token = False,
-    read_only: ReadOnly = False,
-    allow_host: HostNames = None,
-    workspace: opt.Workspace = Path("workspace"),
-    task: Tasks = None,
-    data: DataPaths = None,
-    filter_: Filters = None,
-    study: Studies = None,
-    views: Views = 32,
-    open_page: OpenPage = False,
-    log_level: LogLevel = "warning",
-    log_format: LogFormat = "text",
-    seed: opt.Seed = 0,
+    port: int = 8000,
+    host: str = "127.0.0.1",
+    token: bool = False,
+    read_only: bool = False,
+    allow_host: list[str] | None = None,
+    workspace: Path = Path("workspace"),
+    task: list[str] | None = None,
+    data: list[Path] | None = None,
+    filter: list[str] | None = None,
+    study: list[Path] | None = None,
+    views: int = 32,
+    open_page: bool = False,
+    log_level: str = "warning",
+    log_format: str = "text",
+    seed: int = 0,
 ) -> None:
     """Serve the dashboard: replay, maps and weights.
 
@@ -106,7 +87,7 @@ def serve(
     settings = Settings(
         workspace=workspace,
         data=short_names(data or (), {SAMPLE}),
-        checkpoints=_checkpoints(filter_ or (), task or ()),
+        checkpoints=_checkpoints(filter or (), task or ()),
         hosts=(*host_names(host), *(allow_host or ())),
         seed=seed,
         views=views,
@@ -135,6 +116,7 @@ def _checkpoints(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path
     from beliefscope.datasets.catalog import TASKS, load_task
     from beliefscope.filters.catalog import filters_of
     from beliefscope.filters.external.load import load_external
+    from beliefscope.filters.open_filter import is_code
 
     names = [load_task(name).name for name in tasks]
     default_task = names[0] if len(names) == 1 else ""

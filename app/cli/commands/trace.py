@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from beliefscope.app.cli import options as opt
 
-if TYPE_CHECKING:
-    from beliefscope.filters.checkpoint import Checkpoint
-    from beliefscope.inspect.trace import Trace
 
-
-@opt.with_run_options
-def trace(checkpoint: Checkpoint, trace: Trace, output: opt.TracePath, json: opt.Json = None) -> None:
+@opt.with_options(output=opt.TRACE)
+def trace(run: opt.Run, output: Path, align: bool = False, json: str | None = None) -> None:
     """Save all internal quantities of a filter run.
 
     A trace contains, for every step, the beliefs before and after the observation, each modality's own update, fusion
@@ -26,5 +22,6 @@ def trace(checkpoint: Checkpoint, trace: Trace, output: opt.TracePath, json: opt
     """
     from beliefscope.inspect.trace import save_trace
 
+    _, trace = run.trace(align)
     save_trace(trace, output)
     opt.print_trace(trace, output, json)

@@ -65,7 +65,10 @@ export function showError(error) {
  */
 export function showProperties(trace) {
   for (const body of bodies.slice(1)) setPanelState(body, 'ready');
-  const { no_maps: noMaps } = trace.header;
+  const { no_maps: noMaps, data_warning: warning } = trace.header;
+  const line = html('#data-warning');
+  line.textContent = line.title = warning ? `Warning: ${warning}` : '';
+  line.hidden = !warning;
   const position = displayName(trace.task.map.x).replace(/(^| )x$/, '');
   html('#maps-quantity').textContent = position || 'position';
   const { classList } = html('#maps');

@@ -49,6 +49,7 @@ export function bindControls(page) {
     j: () => page.jobs.toggle(),
     l: () => page.live.newest(),
     m: () => page.maps.togglePin(),
+    p: () => page.maps.switchQuantity(),
     s: () => page.save(),
     '?': showHelp,
   });

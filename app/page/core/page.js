@@ -161,7 +161,7 @@ export class Page {
   #bindSaveButton() {
     const button = element('#save', HTMLButtonElement);
     return connectSaveButton(button, html('#save-status'), this.jobs, {
-      request: () => this.#trace && api.recordingRequest(this.#trace),
+      request: () => this.#trace && api.recordingRequest(this.#trace, this.#store.state.map),
       openRerun: () => this.openTab('rerun'),
       openRecordings: (name) => {
         this.openTab('recordings');
@@ -176,7 +176,7 @@ export class Page {
    * @param {api.ReportOptions} options
    */
   async #createReport(selection, options) {
-    await api.createReport(selection, options);
+    await api.createReport(selection, { ...options, quantity: this.#store.state.map });
     if (html('#jobs').hidden) this.jobs.toggle();
     else this.jobs.refresh();
   }
@@ -246,7 +246,7 @@ export class Page {
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
     if (any('component', 'weights', 'track')) this.#showComponent(this.#trace);
-    if (any('step', 'angle', 'beside')) this.#move(this.#trace);
+    if (any('step', 'angle', 'beside', 'map')) this.#move(this.#trace);
   }
 
   /** Loads the trace that the state selects. */
@@ -359,7 +359,7 @@ export class Page {
   /** @param {Trace} trace */
   #move(trace) {
     const { state, origin, inputTime } = this.#store;
-    const { step, angle, against } = state;
+    const { step, angle, against, map: quantity } = state;
     this.timeline.move(step);
     this.camera.move(step);
     this.stepTable.move(step);
@@ -368,7 +368,7 @@ export class Page {
     this.failures.move(step);
     this.compare.move(step);
     this.rerun.move(step, origin === 'rerun');
-    const cursor = { ...trace.selection, step, angle, against };
+    const cursor = { ...trace.selection, step, angle, against, quantity };
     this.socket.move({ ...cursor, comparison_maps: state.beside === 'gain' }, inputTime);
     showSummary(trace, step, state.component);
     showCount(trace, step);

@@ -25,6 +25,8 @@ const STOPS = {
 const DASHES = { truth: [], fused: [], image: [7, 3], haptics: [2, 2.5] };
 /** @type {Record<string, number>} */
 const WIDTHS = { truth: 1.25, fused: 2.25 };
+/** Suffix of the estimate of a standalone filter, which has the colour of its modality. */
+const STANDALONE = / standalone$/;
 const SPARE_DASHES = [
   [9, 3, 2, 3],
   [4, 2],
@@ -100,8 +102,10 @@ const spareIndex = (name) => Math.max(0, unnamed.indexOf(name)) % SPARE_DASHES.l
  * Returns the CSS variable with the colour of a source.
  * @param {string} name truth, fused or a modality
  */
-export const cssVariable = (name) =>
-  Object.hasOwn(DASHES, name) ? `--${name}` : `--spare-${spareIndex(name)}`;
+export const cssVariable = (name) => {
+  const source = name.replace(STANDALONE, '');
+  return Object.hasOwn(DASHES, source) ? `--${source}` : `--spare-${spareIndex(source)}`;
+};
 
 /**
  * @param {string} colour `rgb(...)`
@@ -118,7 +122,8 @@ export const translucent = (colour, alpha) =>
  * @returns {LineStyle}
  */
 export function lineStyle(name) {
-  const dash = DASHES[name] ?? SPARE_DASHES[spareIndex(name)];
+  const source = name.replace(STANDALONE, '');
+  const dash = DASHES[source] ?? SPARE_DASHES[spareIndex(source)];
   return { stroke: colour(cssVariable(name).slice(2)), dash, width: WIDTHS[name] ?? 1.5 };
 }
 

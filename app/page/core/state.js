@@ -3,7 +3,7 @@
 /** @import { Catalog } from '../data/api.js' */
 
 import { TRACKS } from '../timeline/tracks.js';
-import { SCENE_CHOICES } from './constants.js';
+import { MAP_QUANTITIES, SCENE_CHOICES } from './constants.js';
 import { displayName } from './units.js';
 
 /**
@@ -28,6 +28,7 @@ import { displayName } from './units.js';
  * @property {string} list content of the list of failures: `events` or `episodes`
  * @property {string} by score that ranks failures
  * @property {string} phase of the failures in the list, empty for all
+ * @property {'likelihood' | 'posterior'} map quantity of the maps
  * @property {string} scale of the maps: `normalised` or `log`
  * @property {string} range of the maps' colours: `own` of each map, or the `same` for all
  * @property {string} axes of the maps: `offset` from the true position, or `world`
@@ -70,6 +71,7 @@ const CHOICES = {
   over: ['episode', 'held-out'],
   list: ['events', 'episodes'],
   among: ['held-out', 'all'],
+  map: MAP_QUANTITIES,
   axes: ['offset', 'world'],
   regions: ['shown', 'hidden'],
   zoom: ['fit', '1', '4'],

@@ -3,7 +3,7 @@
 /** @import { State, Store } from './state.js' */
 
 /** @type {(keyof State)[]} */
-const SELECTION = ['task', 'filter', 'data', 'episode', 'faults', 'against'];
+const SELECTION = ['task', 'filter', 'data', 'episode', 'faults', 'against', 'map'];
 /** Restored together with the selection. @type {(keyof State)[]} */
 const CURSOR = ['step', 'angle', 'component'];
 const MAX_ENTRIES = 100;

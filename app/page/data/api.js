@@ -36,7 +36,7 @@ export { ServerError };
  * @typedef {import('../types/server.js').WrittenRecording} Recording
  * @typedef {import('../types/server.js').FaultInfo} Fault
  */
-/** @typedef {Selection & {maps: number, automatic: boolean}} RecordingRequest maps: steps from one map to the next */
+/** @typedef {Selection & {maps: number, quantity: State['map']}} RecordingRequest maps: steps from one map of the quantity to the next */
 
 const POLL_INTERVAL = 150; // ms
 const MAPS_PER_RECORDING = 40; // computed within a few seconds
@@ -248,12 +248,12 @@ export const recordings = () => get('/api/recordings');
 export const reports = () => get('/api/reports');
 
 /**
- * Renames a recording, changes its tags, or keeps an automatic one.
+ * Renames a recording.
  * @param {{url: string}} file
- * @param {{name?: string, tags?: string[], automatic?: false}} change
+ * @param {string} name
  * @returns {Promise<RecordingEntry>}
  */
-export const changeRecording = ({ url }, change) => send(url, change, 'PATCH');
+export const renameRecording = ({ url }, name) => send(url, { name }, 'PATCH');
 
 /**
  * Starts a job that imports the run of a recording; the job's link opens it.
@@ -304,7 +304,7 @@ export const cancelJob = (id) => send(path(['jobs', id]), undefined, 'DELETE');
 /**
  * Starts a job that writes a report; the job's link opens it.
  * @param {Selection} selection
- * @param {ReportOptions} options
+ * @param {ReportOptions & {quantity: State['map']}} options quantity: of the maps
  * @returns {Promise<StartedJob>}
  */
 export const createReport = ({ task, filter, episode, data, faults }, options) =>
@@ -313,13 +313,13 @@ export const createReport = ({ task, filter, episode, data, faults }, options) =
 /**
  * Returns the request for a recording of a trace, with likelihood maps at regular steps.
  * @param {Trace} trace
- * @param {boolean} [automatic] whether the file may be deleted later
+ * @param {State['map']} [quantity] of the maps
  * @returns {RecordingRequest}
  */
-export const recordingRequest = (trace, automatic = false) => ({
+export const recordingRequest = (trace, quantity = 'likelihood') => ({
   ...trace.selection,
   maps: Math.ceil(trace.steps / MAPS_PER_RECORDING),
-  automatic,
+  quantity,
 });
 
 /**

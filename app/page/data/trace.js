@@ -9,6 +9,12 @@ import { append, norm, slice, stride } from './arrays.js';
 
 const FUSED = 'fused';
 
+/**
+ * Returns the label of a modality's estimate: the prior of the fused filter, updated with this modality only.
+ * @param {string} modality
+ */
+export const updateLabel = (modality) => `${modality}-only update`;
+
 export class Trace {
   /** Source of further steps of a live run. @type {LiveStream | undefined} */
   stream;
@@ -107,7 +113,22 @@ export class Trace {
    * @param {string} source
    */
   label(source) {
-    return source === FUSED && !this.fuses ? 'estimate' : source;
+    if (source === FUSED && !this.fuses) return 'estimate';
+    return this.modalities.includes(source) ? updateLabel(source) : source;
+  }
+
+  /** The modality of a standalone run; undefined for a run with all modalities. @returns {string | undefined} */
+  get standalone() {
+    return this.header.settings?.standalone;
+  }
+
+  /** Modalities whose standalone filter differs from this one. @returns {string[]} */
+  get inputs() {
+    const { kind } = this.header;
+    if (kind === 'external' || this.standalone) return [];
+    const names = kind === 'lstm' ? this.task.modalities : this.modalities;
+    const inputs = [...new Set(names.flatMap((name) => name.split('+')))];
+    return inputs.length > 1 ? inputs : [];
   }
 
   /**
@@ -336,7 +357,7 @@ export class Trace {
     const blackout = new Uint8Array(this.steps);
     blackout.set(this.blackout.subarray(0, first));
     for (let t = first; t < this.steps; t++)
-      blackout[t] = Number(this.image(t)?.every((v) => v === 0) ?? false);
+      blackout[t] = Number(this.image(t)?.every((v, _, image) => v === image[0]) ?? false);
     this.blackout = blackout;
   }
 }

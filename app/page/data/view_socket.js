@@ -9,7 +9,7 @@ import { readMaps } from '../maps/map_values.js';
 import { openView } from './api.js';
 
 /**
- * @typedef {Selection & {step: number, angle: number | null, comparison_maps?: boolean}} Cursor
+ * @typedef {Selection & {step: number, angle: number | null, quantity: string, comparison_maps?: boolean}} Cursor
  * @typedef {Cursor & {size: number, scene: boolean}} Message
  * @typedef {{size?: number, inputTime?: number | null}} Cause of an answer: the cursor's map size and input
  * @typedef {object} Handlers

@@ -187,7 +187,7 @@ function drawBorder(context, segments, side, zoom, opacity) {
 }
 
 /**
- * Draws particles, truth, estimates, the line to the end effector in contact, and the crosshair.
+ * Draws particles, truth, estimates, the end effector and the expected ridge in contact, and the crosshair.
  * @param {Context} context
  * @param {Layer} layer
  * @param {number} side
@@ -195,7 +195,7 @@ function drawBorder(context, segments, side, zoom, opacity) {
  */
 function drawMarks(context, layer, side, { cloud, zoom, hover }) {
   const { maps, trace, name } = layer;
-  const { centre, estimate, effector, step } = maps;
+  const { centre, estimate, effector, expected, step } = maps;
   const half = maps.half_width / zoom;
   /** @type {Projection} */
   const project = ([x, y]) => [
@@ -203,7 +203,9 @@ function drawMarks(context, layer, side, { cloud, zoom, hover }) {
     ((centre[1] - y + half) / (2 * half)) * side,
   ];
   const centrePx = project(centre);
-  if (effector && trace.contact[step]) drawEffectorLine(context, centrePx, project(effector));
+  if (trace.contact[step] && expected !== null)
+    drawExpectedRidge(context, centrePx, expected, side);
+  if (trace.contact[step] && effector) drawEffector(context, project(effector));
   if (cloud) drawParticles(context, layer, project);
   if (maps.truth[0] !== null) drawTruth(context, centrePx);
   const single = name !== 'fused' && trace.fuses;
@@ -214,17 +216,43 @@ function drawMarks(context, layer, side, { cloud, zoom, hover }) {
 }
 
 /**
+ * Draws a dashed line through the true position.
  * @param {Context} context
- * @param {number[]} from px
- * @param {number[]} to px
+ * @param {number[]} position px
+ * @param {number} direction rad
+ * @param {number} side px
  */
-function drawEffectorLine(context, [x, y], to) {
+function drawExpectedRidge(context, [x, y], direction, side) {
+  const [dx, dy] = [2 * side * Math.cos(direction), -2 * side * Math.sin(direction)];
   context.setLineDash([4, 4]);
   strokeAll(context, [['rgb(255 255 255 / 0.8)', 1]], () => {
-    context.moveTo(x, y);
-    context.lineTo(to[0], to[1]);
+    context.moveTo(x - dx, y - dy);
+    context.lineTo(x + dx, y + dy);
   });
   context.setLineDash([]);
+}
+
+/**
+ * Draws a square.
+ * @param {Context} context
+ * @param {number[]} position px
+ */
+function drawEffector(context, [x, y]) {
+  /** @type {Stroke[]} */
+  const strokes = [
+    ['rgb(0 0 0 / 0.6)', 3.5],
+    ['#fff', 1.5],
+  ];
+  strokeAll(context, strokes, () => {
+    context.moveTo(x - 4, y - 4);
+    for (const [dx, dy] of [
+      [4, -4],
+      [4, 4],
+      [-4, 4],
+      [-4, -4],
+    ])
+      context.lineTo(x + dx, y + dy);
+  });
 }
 
 /**

@@ -7,6 +7,7 @@ import { context2d, create, element, html, messageOf } from '../core/dom.js';
 import { COLOUR_TABLES } from '../core/palette.js';
 import { fixed } from '../core/units.js';
 import { MARGIN, drawMap } from './draw_map.js';
+import { mapTitle } from './map_summary.js';
 import { logLikelihood, rangeDigits, rangeLabels } from './map_values.js';
 import { SvgContext } from './svg_context.js';
 
@@ -62,6 +63,7 @@ export function bindExport(host, displayed) {
 function fileName({ trace, maps }, layer) {
   const { task, filter, episode } = trace.selection;
   return [task, filter, `episode${episode}`, `step${maps.step}`, layer || 'maps']
+    .concat(maps.quantity === 'likelihood' ? [] : maps.quantity)
     .join('-')
     .replaceAll(/[^\w.-]+/g, '-');
 }
@@ -88,10 +90,10 @@ export function csv(sheet) {
     ({ name, index }) => `${name} ${fixed(maps.log_max[index] - maps.log_range[index], 3)}`,
   );
   const comments = [
-    `# Beliefscope: ${caption(sheet)}: natural logarithm of the likelihood`,
+    `# Beliefscope: ${caption(sheet)}: natural logarithm. ${mapTitle(maps)}`,
     `# dx and dy: offset from the true position; x and y: world position. Values are clipped at: ${lowest.join(' / ')}`,
   ];
-  const names = layers.map(({ name }) => `${name}_ln_likelihood_nats`);
+  const names = layers.map(({ name }) => `${name}_ln_${maps.quantity}_nats`);
   const rows = [
     ...comments.map((line) => line.replaceAll('−', '-')),
     ['dx_cm', 'dy_cm', 'x_cm', 'y_cm', ...names].join(','),
@@ -162,7 +164,7 @@ function drawSheet(context, sheet, width, height) {
     context.fillStyle = INK;
     context.font = '600 13px system-ui, sans-serif';
     [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
-    context.fillText(layer.name, 0, -8);
+    context.fillText(`${layer.name} ${sheet.maps.quantity}`, 0, -8);
     drawColourBar(context, layer);
     const options = { ...sheet.options, textColour: INK, withY: true, hover: null };
     drawMap(context, layer, SIDE, options);
@@ -172,7 +174,7 @@ function drawSheet(context, sheet, width, height) {
   context.font = '10px system-ui, sans-serif';
   [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
   context.fillText(caption(sheet), padding, height - padding - 12);
-  context.fillText(`Colour: ${sheet.title}`, padding, height - padding);
+  context.fillText(`${mapTitle(sheet.maps)}. Colour: ${sheet.title}`, padding, height - padding);
 }
 
 /**

@@ -14,10 +14,10 @@ const GAP = 6; // px between the menu and the panel
 const OPTIONS = [
   {
     key: 'scale',
-    label: 'Quantity',
+    label: 'Scale',
     options: [
-      ['normalised', 'likelihood / peak'],
-      ['log', 'log-likelihood'],
+      ['normalised', 'relative to the peak'],
+      ['log', 'logarithm'],
     ],
   },
   {

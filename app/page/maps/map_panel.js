@@ -9,16 +9,29 @@
 /** @import { Figure } from './map_figure.js' */
 /** @import { Maps, Range, Scale } from './map_values.js' */
 
+import { MAP_QUANTITIES } from '../core/constants.js';
 import { context2d, html } from '../core/dom.js';
 import { colour } from '../core/palette.js';
-import { displayName } from '../core/units.js';
+import { displayName, sentence } from '../core/units.js';
+import { choice } from '../widgets/pickers.js';
 import { MARGIN, drawMap, paintCells } from './draw_map.js';
 import { createFigure, updateColourBar } from './map_figure.js';
-import { layerMeasures, pairwiseMeasures, positionText, valuesAt } from './map_summary.js';
+import {
+  QUANTITY_NAMES,
+  layerMeasures,
+  mapTitle,
+  pairwiseMeasures,
+  positionText,
+  valuesAt,
+} from './map_summary.js';
 import { borders, shades } from './map_values.js';
 import { formatPin, parsePin } from './pin.js';
 
 const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom']; // keys of the state
+const EXPLANATIONS = {
+  likelihood: 'Likelihood of the observation given the state',
+  posterior: 'Posterior of the state: prior times likelihood',
+};
 const REGION_SHARES = [0.5, 0.95];
 const CLOSE_UP = 4; // zoom while all maps of the run fit into it
 const MIN_SIDE = 60; // px
@@ -71,6 +84,7 @@ export class MapPanel {
     this.#host = html('#heatmaps', panel);
     new ResizeObserver(() => this.#resize()).observe(this.#host);
     store.listen((_, changed) => {
+      if (changed.has('map')) this.#showSwitch();
       if (OPTIONS.some((key) => changed.has(key))) this.#shade();
       if (changed.has('pin')) this.#restorePin();
     });
@@ -88,17 +102,48 @@ export class MapPanel {
     // The zoom does not return to the close-up: axes that change from step to step are hard to read.
     this.#wide = (this.#wide && this.#trace === trace) || !fitsCloseUp(maps);
     [this.#maps, this.#trace] = [maps, trace];
+    this.#panel.classList.toggle('no-expected', maps.expected === null);
     // With a single measurement model the fused map equals that of the model.
     if (rebuild)
       this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
     const pinned = this.#pinned;
-    if (
+    if (pinned && pinned.maps.quantity !== maps.quantity) {
+      [this.#pinned, this.#requestedPin] = [null, '']; // requested again, in the new quantity
+    } else if (
       pinned &&
       (pinned.selection.task !== trace.selection.task || !comparable(pinned.maps, maps))
     )
       this.togglePin();
     this.#restorePin();
+    this.#showSwitch();
     this.#shade();
+  }
+
+  /** Shows the other quantity: likelihoods or posteriors. */
+  switchQuantity() {
+    const maps = this.#maps;
+    const other = MAP_QUANTITIES.find((quantity) => quantity !== maps?.quantity);
+    if (other && !this.#trace?.header.missing_quantities[other]) this.#store.set({ map: other });
+  }
+
+  /** Shows which quantities the filter has; one that it does not have has the reason as its tooltip. */
+  #showSwitch() {
+    if (!this.#maps || !this.#trace) return;
+    const missing = this.#trace.header.missing_quantities;
+    const host = html('#maps-map', this.#panel);
+    const shown = missing[this.#store.state.map] ? this.#maps.quantity : this.#store.state.map;
+    choice(
+      host,
+      MAP_QUANTITIES.map((quantity) => [quantity, QUANTITY_NAMES[quantity]]),
+      shown,
+      (map) => this.#store.set({ map: /** @type {Maps['quantity']} */ (map) }),
+    );
+    host.querySelectorAll('input').forEach((input, i) => {
+      const reason = missing[MAP_QUANTITIES[i]];
+      input.disabled = Boolean(reason);
+      const label = input.closest('label');
+      if (label) label.title = reason ? sentence(reason) : `${EXPLANATIONS[MAP_QUANTITIES[i]]} (p)`;
+    });
   }
 
   /** Pins the displayed maps as the reference of later ones, or releases the pinned ones. */
@@ -124,8 +169,9 @@ export class MapPanel {
     if (!pin || !this.#maps || this.#pinned || this.#requestedPin === pin) return;
     this.#requestedPin = pin;
     const { selection, step, angle } = parsePin(pin, task);
-    const maps = await this.#requestMaps({ ...selection, step, angle });
-    if (this.#store.state.pin !== pin || this.#pinned) return;
+    const quantity = this.#store.state.map;
+    const maps = await this.#requestMaps({ ...selection, step, angle, quantity });
+    if (this.#store.state.pin !== pin || this.#pinned || quantity !== this.#store.state.map) return;
     if (comparable(maps, this.#maps)) this.#setPinned({ maps, selection });
     else this.#store.set({ pin: '' });
   }
@@ -196,29 +242,32 @@ export class MapPanel {
   #showTitle(reference) {
     const log = this.#store.state.scale === 'log';
     const kind = html('#maps-kind', this.#panel);
-    kind.textContent = log ? 'Log-likelihood' : 'Likelihood';
+    const shown = this.#maps?.quantity ?? 'likelihood';
+    kind.textContent = log ? `Log ${shown}` : QUANTITY_NAMES[shown];
     if (reference) kind.textContent = `Gain over ${reference.name}`;
     html('h2', this.#panel).title = this.#title();
+    const title = this.#maps ? mapTitle(this.#maps) : '';
+    html('#maps-rule', this.#panel).textContent = reference
+      ? ` · ${title}`
+      : title.replace(/^\w+/, '');
     const quantity = html('#maps-of', this.#panel);
     quantity.hidden = Boolean(reference);
-    quantity.classList.toggle('wide-only', log);
   }
 
   /** Describes what the colours show. */
   #title() {
     const { scale, range } = this.#store.state;
+    const quantity = this.#maps?.quantity;
     const reference = this.#reference;
     if (reference) {
       const { selection, name } = reference;
       const run = selection
         ? `${name} (${selection.filter}, episode ${selection.episode})`
         : `the comparison run (${name})`;
-      return `log of the likelihood relative to ${run}, both as densities over the displayed area`;
+      return `log of the ${quantity} relative to ${run}, both as densities over the displayed area`;
     }
-    if (scale === 'log') return 'log-likelihood';
-    return range === 'same'
-      ? 'likelihood relative to the highest peak'
-      : 'likelihood relative to its own peak';
+    if (scale === 'log') return `log ${quantity}`;
+    return `${quantity} relative to ${range === 'same' ? 'the highest' : 'its own'} peak`;
   }
 
   /** @param {string[]} layers */
@@ -376,7 +425,9 @@ export class MapPanel {
  * @param {Maps} b
  */
 const comparable = (a, b) =>
-  a.layers.join() === b.layers.join() && Math.abs(a.half_width - b.half_width) < 1e-6;
+  a.layers.join() === b.layers.join() &&
+  a.quantity === b.quantity &&
+  Math.abs(a.half_width - b.half_width) < 1e-6;
 
 /**
  * Returns whether peaks and 95 % regions, approximated by ellipses, fit into the close-up.

@@ -5,7 +5,7 @@
 import { fixed, percent, signed } from '../core/units.js';
 import { cellAt, valueAt } from './map_values.js';
 
-const MIN_ELONGATION = 1.3; // below this ratio a map has no long axis
+export const QUANTITY_NAMES = { likelihood: 'Likelihood', posterior: 'Posterior' };
 
 /** @param {number | null} radians */
 const degrees = (radians) => (radians === null ? null : (radians * 180) / Math.PI);
@@ -28,6 +28,13 @@ export function positionText(maps, offset, world) {
 }
 
 /**
+ * Returns the quantity of the maps and the rule of the fused one.
+ * @param {Maps} maps
+ */
+export const mapTitle = ({ quantity, layers, rule }) =>
+  QUANTITY_NAMES[quantity] + (layers.length > 2 ? `. Fused: ${rule}` : '');
+
+/**
  * Returns the measures of a layer as lines below its map, and as one description.
  * @param {Maps} maps
  * @param {number} layer
@@ -40,36 +47,46 @@ export function layerMeasures(maps, layer, world) {
     short(1e4 * m2),
   );
   const entropy = fixed(numbers.entropy[layer] + Math.log(1e4), 2); // of a density per cm²
-  const elongated = numbers.elongation[layer] >= MIN_ELONGATION;
-  const angle = numbers.off_line[layer];
-  const ridge =
-    elongated && angle !== null
-      ? `; the long axis is ${fixed(degrees(angle), 0)}° from the line between truth and end effector`
-      : '';
+  const shape = shapeText(maps, layer);
   return {
     lines: [
       `peak ${peak} cm`,
       `50 % ${area50}, 95 % ${area95} cm²`,
-      `${axisText(maps, layer, elongated)} · entropy ${entropy}`,
+      `${shape.short} · entropy ${entropy}`,
     ],
     description:
-      `peak at ${peak} cm, log-likelihood ${fixed(logMax[layer], 2)} at the peak and ${fixed(numbers.truth[layer], 2)} relative to it at the truth; ` +
-      `50 % of the likelihood within ${area50} cm², 95 % within ${area95} cm²; entropy ${entropy} nats (density per cm²); ` +
-      `length-to-width ratio ${fixed(numbers.elongation[layer], 1)}${ridge}`,
+      `peak at ${peak} cm, ln ${maps.quantity} ${fixed(logMax[layer], 2)} at the peak and ${fixed(numbers.truth[layer], 2)} relative to it at the truth; ` +
+      `50 % of the ${maps.quantity} within ${area50} cm², 95 % within ${area95} cm²; entropy ${entropy} nats (density per cm²); ` +
+      `length-to-width ratio ${fixed(numbers.elongation[layer], 1)}; ${shape.long}`,
   };
 }
 
 /**
+ * Describes the shape of a layer, in short and in full.
  * @param {Maps} maps
  * @param {number} layer
- * @param {boolean} elongated
  */
-function axisText({ numbers }, layer, elongated) {
-  const angle = numbers.off_line[layer];
-  if (!elongated) return 'no ridge';
-  return angle === null
-    ? `axis ${fixed(degrees(numbers.axis[layer]), 0)}°`
-    : `ridge at ${fixed(degrees(angle), 0)}°`;
+function shapeText({ numbers, shape }, layer) {
+  const [deviation, axis] = [numbers.deviation[layer], numbers.axis[layer]];
+  if (shape[layer] === 'ring') {
+    const radius = fixed(100 * numbers.ring_radius[layer]);
+    const [x, y] = numbers.ring_centre[layer].map((m) => signed(100 * (m ?? NaN)));
+    const part = percent(numbers.ring_coverage[layer]);
+    return {
+      short: `ring, radius ${radius} cm`,
+      long: `ring with radius ${radius} cm around ${x}, ${y} cm from the truth, over ${part} of the circle`,
+    };
+  }
+  if (shape[layer] !== 'ridge') return { short: shape[layer], long: `shape: ${shape[layer]}` };
+  if (deviation === null) {
+    const text = `ridge at ${fixed(degrees(axis), 0)}°`;
+    return { short: text, long: `${text} from the x axis` };
+  }
+  const off = fixed(degrees(deviation), 0);
+  return {
+    short: `ridge, ${off}° off`,
+    long: `ridge, ${off}° off the direction that the task expects`,
+  };
 }
 
 /**

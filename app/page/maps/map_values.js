@@ -11,7 +11,10 @@ import { fixed, signed } from '../core/units.js';
  * @property {number[]} area95 m²
  * @property {(number | null)[]} axis rad, direction of the long axis
  * @property {number[]} elongation length of the long axis over the short one
- * @property {(number | null)[]} off_line rad between the long axis and the line to the end effector
+ * @property {(number | null)[]} deviation rad between the long axis and the direction of the ridge that the task expects
+ * @property {(number | null)[][]} ring_centre m, centre of the circle fitted to the 50 % region, as an offset from the truth
+ * @property {number[]} ring_radius m
+ * @property {number[]} ring_coverage part of the circle in the 50 % region, 0 to 1
  * @property {(number | null)[][]} divergence nats, from layer to layer
  * @property {(number | null)[][]} overlap
  *
@@ -21,7 +24,11 @@ import { fixed, signed } from '../core/units.js';
  * @property {Maps | null} beside maps of the comparison run at the same step
  * @property {number} step
  * @property {number} size S, cells along a side
+ * @property {'likelihood' | 'posterior'} quantity
+ * @property {string} rule of the fused layer
  * @property {number | null} angle rad
+ * @property {number | null} expected rad, direction of the ridge that the task expects
+ * @property {('flat' | 'round' | 'ridge' | 'ring')[]} shape of each layer
  * @property {string[]} layers L names
  * @property {number} half_width m
  * @property {number[]} centre m

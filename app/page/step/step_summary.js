@@ -3,6 +3,7 @@
 /** @import { Trace } from '../data/trace.js' */
 
 import { displayName, fixed, percent } from '../core/units.js';
+import { updateLabel } from '../data/trace.js';
 
 const MAX_SIGMAS = 2; // an error up to this many standard deviations is consistent
 const DOMINANT_SHARE = 0.6; // effective weight from which a modality is dominant
@@ -80,7 +81,7 @@ function uninformativeReason(modality, trace, step) {
 }
 
 /**
- * Describes the most accurate modality if it is clearly more accurate than the fused estimate.
+ * Describes the most accurate single-modality update if it is clearly more accurate than the fused estimate.
  * @param {string} dominant modality
  * @param {Trace} trace
  * @param {number} step
@@ -92,7 +93,7 @@ function moreAccurateModality(dominant, trace, step, tone) {
   const gain = tone === 'good' ? MIN_GAIN.consistent : MIN_GAIN.other;
   if (!best || best.name === dominant) return '';
   if (!(best.error < Math.min(error - gain, MAX_RATIO * error))) return '';
-  return `the ${best.name}-only error is ${fixed(best.error, 1)} cm`;
+  return `the error of the ${updateLabel(best.name)} is ${fixed(best.error, 1)} cm`;
 }
 
 /**

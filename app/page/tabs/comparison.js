@@ -6,13 +6,14 @@
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
 import { element, html, isAbort, messageOf } from '../core/dom.js';
+import { percent } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { ComparisonForm } from './comparison_form.js';
 
 const NO_COMPARISON =
-  'No comparison yet. Choose another filter, other sensor faults or an intervention over some steps, then compare.';
+  'No comparison yet. Choose another filter, other sensor faults, the standalone filter of a modality or an intervention over some steps, then compare.';
 
 export class ComparisonTab {
   #catalog;
@@ -104,8 +105,10 @@ export class ComparisonTab {
     this.#setOther(null, '');
     this.#show(null);
     if (!against) return setPanelState(this.#result, 'empty', NO_COMPARISON);
-    const progress = (/** @type {number | null} */ share) =>
+    const progress = (/** @type {number | null} */ share) => {
       setPanelState(this.#result, 'loading', 'Computing the comparison run …', share);
+      this.#overlay(null, share === null ? 'computing …' : `computing, ${percent(share)}`);
+    };
     progress(null);
     try {
       const task = this.#catalog.tasks.find((t) => t.name === name) ?? this.#catalog.tasks[0];
@@ -118,6 +121,7 @@ export class ComparisonTab {
       setPanelState(this.#result, 'ready');
     } catch (error) {
       if (isAbort(error)) return;
+      this.#overlay(null, '');
       if (!(error instanceof api.ServerError)) console.error(error);
       setPanelState(this.#result, 'error', messageOf(error));
     }
@@ -129,7 +133,7 @@ export class ComparisonTab {
    * @param {string} [name]
    */
   #setOther(other, label, name = label) {
-    if (other === this.#other) return;
+    if (other === this.#other) return this.#overlay(other, label);
     this.#other = other;
     this.name = name;
     this.#overlay(other, label);

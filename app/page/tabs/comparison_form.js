@@ -1,4 +1,4 @@
-/** Form for the comparison run: another filter, other sensor faults, or an intervention over some steps of this run. */
+/** Form for the comparison run: another filter, other faults, a standalone filter, or an intervention over some steps. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
@@ -10,12 +10,13 @@ import { fixed } from '../core/units.js';
 import { faultPicker } from '../widgets/fault_dialog.js';
 import { choice } from '../widgets/pickers.js';
 
-/** @typedef {'filter' | 'faults' | 'edit'} Kind of comparison */
+/** @typedef {'filter' | 'faults' | 'only' | 'edit'} Kind of comparison */
 
 /** @type {[Kind, string][]} */
 const KINDS = [
   ['filter', 'another filter'],
   ['faults', 'other sensor faults'],
+  ['only', 'one modality'],
   ['edit', 'an intervention'],
 ];
 const DEFAULT_SPAN = 20; // steps of an intervention
@@ -36,6 +37,7 @@ const joined = (pairs) =>
  */
 function kindOf(against) {
   if (against.has('from')) return 'edit';
+  if (against.has('only')) return 'only';
   return against.has('faults') && !against.has('filter') ? 'faults' : 'filter';
 }
 
@@ -44,6 +46,7 @@ export class ComparisonForm {
   #store;
   #catalog;
   #filter;
+  #only;
   #first;
   #last;
   #clearButton;
@@ -70,6 +73,7 @@ export class ComparisonForm {
     this.#catalog = catalog;
     this.#store = store;
     this.#filter = element('[name=filter]', HTMLSelectElement, form);
+    this.#only = element('[name=only]', HTMLSelectElement, form);
     this.#first = element('[name=from]', HTMLInputElement, form);
     this.#last = element('[name=last]', HTMLInputElement, form);
     this.#clearButton = element('.clear', HTMLButtonElement, form);
@@ -108,6 +112,9 @@ export class ComparisonForm {
     const task = this.#catalog.tasks.find((t) => t.name === name);
     const others = (task?.filters ?? []).map((f) => f.name).filter((other) => other !== filter);
     this.#filter.replaceChildren(...others.map((other) => new Option(other, other)));
+    this.#only.replaceChildren(
+      ...trace.inputs.map((name) => new Option(`${name} standalone`, name)),
+    );
     for (const input of [this.#first, this.#last]) input.max = String(trace.steps - 1);
     if (isNew) this.#setSpan(step, step + DEFAULT_SPAN - 1);
     for (const modality of this.#manual.keys())
@@ -146,6 +153,7 @@ export class ComparisonForm {
     const filter = against.get('filter') ?? '';
     if ([...this.#filter.options].some(({ value }) => value === filter))
       this.#filter.value = filter;
+    if (this.#kind === 'only') this.#only.value = against.get('only') ?? '';
     if (this.#kind === 'faults') this.#faults = against.get('faults') ?? '';
     if (this.#kind !== 'edit') return;
     this.#setSpan(Number(against.get('from')), Number(against.get('to')) - 1);
@@ -188,6 +196,7 @@ export class ComparisonForm {
       const { value } = this.#filter;
       return value ? joined([['filter', value]]) : this.#setError('This task has no other filter.');
     }
+    if (this.#kind === 'only') return joined([['only', this.#only.value]]);
     if (this.#kind === 'faults') {
       return this.#faults === this.#store.state.faults
         ? this.#setError('This run has these sensor faults already. Choose others.')
@@ -234,11 +243,18 @@ export class ComparisonForm {
     html('[data-kind="edit"] > .why-not', this.#form).textContent = isExternal
       ? 'Interventions are not possible: an external filter cannot be resumed at a step.'
       : '';
+    const noInputs = !this.#only.options.length;
+    this.#only.disabled = noInputs;
+    html('[data-kind="only"] .why-not', this.#form).textContent = noInputs
+      ? 'This filter has no separate modalities to run standalone.'
+      : 'The same filter and random numbers, without the observations of all other modalities.';
     html('.betas', this.#form).hidden = isExternal;
     const fields = this.#form.querySelectorAll('[data-kind="edit"] :is(input, select)');
     for (const field of fields) field.toggleAttribute('disabled', isExternal);
     element('.run', HTMLButtonElement, this.#form).disabled =
-      (this.#kind === 'edit' && isExternal) || (this.#kind === 'filter' && this.#filter.disabled);
+      (this.#kind === 'edit' && isExternal) ||
+      (this.#kind === 'only' && noInputs) ||
+      (this.#kind === 'filter' && this.#filter.disabled);
   }
 
   /**

@@ -5,6 +5,7 @@
 import { copyText } from '../core/clipboard.js';
 import { create, element } from '../core/dom.js';
 import { fixed, percent, significant } from '../core/units.js';
+import { updateLabel } from '../data/trace.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { displayUnit, formatScore } from './failure_scores.js';
 
@@ -175,10 +176,11 @@ function eventColumns({ layers }, score, events) {
   ];
   const modalities = layers.slice(0, -1); // the last layer is the fused estimate
   const fuses = modalities.length > 1;
+  const label = (/** @type {string} */ layer) => (layer === 'fused' ? layer : updateLabel(layer));
   layers.forEach((layer, i) => {
     if (layer === 'fused' ? score.name === 'error' : !fuses) return;
     columns.push({
-      title: `${fuses ? layer : 'error'} cm`,
+      title: `${fuses ? label(layer) : 'error'} cm`,
       content: ({ error }) => centimetres(error[i]),
       number,
       help: 'Position error',

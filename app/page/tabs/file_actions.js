@@ -12,9 +12,7 @@ import { recordedRun, reportedRun } from './recorded_run.js';
  * @property {(file: RecordingEntry) => void} openInRerun
  * @property {(run: Run) => void} openRun
  * @property {(file: RecordingEntry) => void} importRun
- * @property {(file: RecordingEntry) => void} keep
  * @property {(file: RecordingEntry) => void} rename
- * @property {(file: RecordingEntry) => void} editTags
  * @property {(file: {name: string, url: string}, kind: 'recordings' | 'reports') => void} remove
  */
 
@@ -39,19 +37,13 @@ export class FileActions {
    * @returns {Action[]}
    */
   forRecording(file) {
-    const { openInRerun, keep, rename, editTags } = this.#handlers;
+    const { openInRerun, rename } = this.#handlers;
     const disabledReason = this.#disabledReason;
     const problem = file.reading
       ? 'The server is still reading this file.'
       : file.application
         ? undefined
         : sentence(file.problem);
-    const keepAction = {
-      name: 'Keep',
-      run: () => keep(file),
-      disabledReason,
-      hint: 'Automatic recordings of the Rerun tab are deleted when there are many.',
-    };
     return [
       {
         name: 'Open in Rerun',
@@ -60,9 +52,7 @@ export class FileActions {
         disabledReason: problem,
       },
       { name: 'Open run in dashboard', ...this.#runAction(file, problem) },
-      ...(file.automatic ? [keepAction] : []),
       { name: 'Rename', key: 'F2', run: () => rename(file), disabledReason },
-      { name: 'Tags', run: () => editTags(file), disabledReason },
       { name: `Download, ${formatBytes(file.bytes)}`, href: file.url, download: file.name },
       this.#removal(file, 'recordings'),
     ];

@@ -65,7 +65,9 @@ export class FinetuneRun {
     const modules = settings.train.map((name) => name.replace('-only', '')).join(', ');
     html('h3', this.#host).textContent =
       `${run.filter}: ${modules || 'all'} on ${trainingData(run)}`;
-    this.showVerdict(result ? result.comparison.verdict : stateText(job));
+    this.showVerdict(
+      result ? result.finetuned.no_change || result.comparison.verdict : stateText(job),
+    );
     const isPaused = job?.state === 'cancelled';
     this.#host.dataset.state = result ? 'ready' : active || isPaused ? 'active' : 'ended';
     const controls = html('.doing', this.#host);
@@ -93,7 +95,7 @@ export class FinetuneRun {
     const host = html('.decide', this.#host);
     host.hidden = !result;
     if (!result) return;
-    const { best_step: best, steps, seconds } = result.finetuned;
+    const { best_step: best, steps, seconds, no_change: noChange } = result.finetuned;
     const text = place
       ? SAVED_AS[place]
       : `${name}: step ${best} of ${steps}, trained in ${fixed(seconds, 0)} s. The base checkpoint is unchanged.`;
@@ -102,9 +104,14 @@ export class FinetuneRun {
         'promote',
         'Promote to default',
         'Use it as the default filter of this server',
-        place === 'default',
+        place === 'default' || Boolean(noChange),
       ),
-      this.#decisionButton('save', 'Save', 'Add it to the catalog', place === 'saved'),
+      this.#decisionButton(
+        'save',
+        'Save',
+        'Add it to the catalog',
+        place === 'saved' || Boolean(noChange),
+      ),
       this.#decisionButton('discard', 'Discard', 'Remove it from the catalog', place === null),
       create('span', { textContent: text }),
     );

@@ -72,14 +72,11 @@ const dateColumn = (date) => ({
   number: true,
 });
 
-/**
- * @param {(tag: string) => void} search called for the tag that was clicked
- * @returns {Column<RecordingEntry>[]}
- */
-export const recordingColumns = (search) => [
+/** @type {Column<RecordingEntry>[]} */
+export const RECORDING_COLUMNS = [
   {
     ...textColumn('name', 'name', 'File name', (/** @type {RecordingEntry} */ { name }) => name),
-    content: (file) => notesAndTags(file, search),
+    content: contentNote,
     hint: (file) => (file.reading ? '' : file.problem),
   },
   ...RUN_COLUMNS,
@@ -101,24 +98,13 @@ export const REPORT_COLUMNS = [
 ];
 
 /**
- * Returns what follows the name of a recording: a note about its content, and its tags.
+ * Returns what follows the name of a recording: a note about its content.
  * @param {RecordingEntry} file
- * @param {(tag: string) => void} search
  */
-function notesAndTags(file, search) {
-  const host = create('span', { className: 'tags' });
-  if (file.reading) host.append(smallNote('reading …'));
-  else if (!file.application) host.append(smallNote('unreadable', 'bad'));
-  else if (file.problem) host.append(smallNote(`written by ${file.application}`));
-  else if (file.automatic) host.append(smallNote('automatic'));
-  for (const tag of file.tags) {
-    const title = `Search for ${tag}`;
-    const button = create('button', { type: 'button', className: 'tag', title }, tag);
-    button.dataset.part = `tag ${tag}`;
-    button.addEventListener('click', () => search(tag));
-    host.append(button);
-  }
-  return host;
+function contentNote(file) {
+  if (file.reading) return smallNote('reading …');
+  if (!file.application) return smallNote('unreadable', 'bad');
+  return file.problem ? smallNote(`written by ${file.application}`) : '';
 }
 
 /**

@@ -1,4 +1,4 @@
-/** The Recordings tab: search, import, rename, tag, compare, delete and restore recordings and reports. */
+/** The Recordings tab: search, import, rename, compare, delete and restore recordings and reports. */
 
 /** @import { State, Store } from '../core/state.js' */
 /** @import { Catalog, Job, RecordingEntry, RecordingList, ReportEntry, ReportList } from '../types/server.js' */
@@ -19,7 +19,7 @@ import { StatusLine } from '../widgets/status_line.js';
 import { Uploads } from '../widgets/upload.js';
 import { FileActions } from './file_actions.js';
 import { differences, recordedRun, selectRun } from './recorded_run.js';
-import { REPORT_COLUMNS, recordingColumns } from './recording_columns.js';
+import { RECORDING_COLUMNS, REPORT_COLUMNS } from './recording_columns.js';
 import { SelectionBar } from './selection_bar.js';
 import { Trash } from './trash.js';
 
@@ -31,7 +31,7 @@ const READ_ONLY = 'Read-only server: nothing can be changed';
 
 const BODY = `
   <div class="top">
-    <input type="search" placeholder="Search name, task, filter, tag" aria-label="Search recordings and reports" autocomplete="off" spellcheck="false">
+    <input type="search" placeholder="Search name, task, filter" aria-label="Search recordings and reports" autocomplete="off" spellcheck="false">
     <span class="summary" aria-live="polite"></span>
     <button type="button" class="text add" title="Add .rrd files of any application. Files can also be dropped on this tab">Add .rrd…</button>
     <input type="file" accept=".rrd" multiple hidden aria-label="Recordings to add">
@@ -42,7 +42,6 @@ const BODY = `
   <div class="scroll" tabindex="-1">
     <table class="recordings" aria-label="Recordings"><thead></thead><tbody></tbody></table>
     <p class="rest"></p>
-    <p class="automatic" hidden><span></span> <button type="button" class="text quiet">Show</button></p>
     <section class="reports"><h2>Reports</h2><table aria-label="Reports"><thead></thead><tbody></tbody></table></section>
     <details class="trash" hidden></details>
   </div>
@@ -66,7 +65,6 @@ export class Recordings {
   #files = null;
   #reply = ''; // last files as JSON
   #highlighted = ''; // file to highlight once it is listed
-  #showsAutomatic = false;
   #import = ''; // ID of the job that imports a run
   #open = false;
   #timer = 0;
@@ -94,7 +92,7 @@ export class Recordings {
     const actions = this.#fileActions();
     this.#recordings = new FileTable(
       element('table.recordings', HTMLTableElement, host),
-      recordingColumns((tag) => this.#toggleSearch(tag)),
+      RECORDING_COLUMNS,
       {
         actions: (file) => actions.forRecording(file),
         sort: { name: 'when', down: true },
@@ -181,9 +179,7 @@ export class Recordings {
       openInRerun: (file) => this.#openInRerun([file]),
       openRun: (run) => this.#openRun(run),
       importRun: (file) => this.#importRun(file),
-      keep: (file) => this.#keep(file),
       rename: (file) => this.#rename(file),
-      editTags: (file) => this.#editTags(file),
       remove: (file, kind) => this.#delete(file, kind),
     });
   }
@@ -192,19 +188,18 @@ export class Recordings {
     if (!this.#files) return;
     const { recordings, reports } = this.#files;
     this.#selection.show(this.#list);
-    const candidates = this.#list.filter(({ automatic }) => this.#showsAutomatic || !automatic);
-    const matches = candidates.filter((file) => this.#matches(file));
+    const all = this.#list;
+    const matches = all.filter((file) => this.#matches(file));
     this.#recordings.show(matches);
     this.#reports.show(reports.reports.filter((file) => this.#matches(file)));
     html('section.reports', this.#host).hidden = !reports.reports.length;
-    const total = `${candidates.length} recording${candidates.length === 1 ? '' : 's'}`;
-    const count = matches.length < candidates.length ? `${matches.length} of ${total}` : total;
+    const total = `${all.length} recording${all.length === 1 ? '' : 's'}`;
+    const count = matches.length < all.length ? `${matches.length} of ${total}` : total;
     const used = reports.reports.reduce((sum, { bytes }) => sum + bytes, recordings.bytes);
     html('.summary', this.#host).textContent =
       `${count} · ${formatBytes(used)} used, ${formatBytes(recordings.free)} free`;
-    const hint = candidates.length ? 'No recording matches all words.' : NO_RECORDINGS;
+    const hint = all.length ? 'No recording matches all words.' : NO_RECORDINGS;
     html('.rest', this.#host).textContent = matches.length ? '' : hint;
-    this.#drawAutomatic(this.#list.filter((file) => file.automatic && this.#matches(file)));
     this.#trash.show([
       ...recordings.deleted.map((file) => ({ ...file, kind: /** @type {const} */ ('recordings') })),
       ...reports.deleted.map((file) => ({ ...file, kind: /** @type {const} */ ('reports') })),
@@ -214,36 +209,16 @@ export class Recordings {
     this.#highlighted = '';
   }
 
-  /** @param {RecordingEntry[]} files written for the Rerun tab */
-  #drawAutomatic(files) {
-    const host = html('.automatic', this.#host);
-    host.hidden = !files.length;
-    const size = formatBytes(files.reduce((sum, { bytes }) => sum + bytes, 0));
-    const count = `${files.length} automatic recording${files.length === 1 ? '' : 's'}`;
-    html('span', host).textContent =
-      `${count} of the Rerun tab, ${size}. The oldest are deleted when there are many.`;
-    html('button', host).textContent = this.#showsAutomatic ? 'Hide' : 'Show';
-  }
-
   /**
    * Returns whether a file matches all words of the search.
    * @param {RecordingEntry | ReportEntry} file
    */
   #matches(file) {
     const { name, task, filter, faults } = file;
-    const more = 'tags' in file ? [...file.tags, file.application, file.run?.data] : [];
+    const more = 'application' in file ? [file.application, file.run?.data] : [];
     const text = [name, task, filter, faults, ...more].join(' ').toLowerCase();
     const words = this.#search.value.toLowerCase().split(/\s+/);
     return words.every((word) => text.includes(word));
-  }
-
-  /**
-   * Searches for a text, or clears the search if it is the current one.
-   * @param {string} text
-   */
-  #toggleSearch(text) {
-    this.#search.value = this.#search.value.trim() === text ? '' : text;
-    this.#draw();
   }
 
   /** @param {RecordingEntry} file */
@@ -294,29 +269,10 @@ export class Recordings {
   #rename(file) {
     const stem = file.name.replace(/\.rrd$/, '');
     this.#recordings.edit(file, `New name of ${file.name}`, stem, async (text) => {
-      const { name } = await api.changeRecording(file, { name: text });
+      const { name } = await api.renameRecording(file, text);
       this.#selection.rename(file.name, name);
       this.#highlighted = name;
       await this.load();
-    });
-  }
-
-  /** @param {RecordingEntry} file */
-  #editTags(file) {
-    const label = `Tags of ${file.name}, separated by commas`;
-    this.#recordings.edit(file, label, file.tags.join(', '), async (text) => {
-      const tags = text.split(',').map((tag) => tag.trim());
-      await api.changeRecording(file, { tags: tags.filter(Boolean) });
-      await this.load();
-    });
-  }
-
-  /** @param {RecordingEntry} file */
-  #keep(file) {
-    return this.#attempt(async () => {
-      await api.changeRecording(file, { automatic: false });
-      this.#highlighted = file.name;
-      return { text: `${file.name} is no longer deleted automatically.` };
     });
   }
 
@@ -379,17 +335,15 @@ export class Recordings {
     const add = element('.add', HTMLButtonElement, this.#host);
     if (this.#readOnlyReason) [add.disabled, add.title] = [true, this.#readOnlyReason];
     add.addEventListener('click', () => picker.click());
-    html('.automatic button', this.#host).addEventListener('click', () => {
-      this.#showsAutomatic = !this.#showsAutomatic;
-      this.#draw();
-    });
     picker.addEventListener('change', () => {
       this.#upload([...(picker.files ?? [])]);
       picker.value = '';
     });
     this.#search.addEventListener('input', () => this.#draw());
     this.#search.addEventListener('keydown', (event) => {
-      if (event.key === 'Escape') this.#toggleSearch(this.#search.value.trim());
+      if (event.key !== 'Escape') return;
+      this.#search.value = '';
+      this.#draw();
     });
   }
 }

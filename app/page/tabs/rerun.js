@@ -153,7 +153,7 @@ export class Rerun {
       await response.body?.cancel();
       if (response.ok) return { url };
     }
-    return writeRecording(recordingRequest(trace, true), this.#jobs, ({ progress, message }) => {
+    return writeRecording(recordingRequest(trace), this.#jobs, ({ progress, message }) => {
       if (this.#source !== trace) return;
       const text = `Writing the recording: ${message || 'starting'} …`;
       setPanelState(this.#host, 'loading', text, progress);

@@ -20,6 +20,7 @@ import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
  * @property {boolean} [log] whether the y axis is logarithmic; needs `bounds`
  * @property {[number, number]} [bounds] interval that is expected to contain the values
  * @property {number} [digits] of the values in the legend; three significant ones by default
+ * @property {boolean} [ofModalities] whether the series are quantities of the modalities rather than estimates
  * @property {string} [note] text in place of a chart
  *
  * @typedef {[first: number, last: number]} Interval of steps

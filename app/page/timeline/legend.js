@@ -28,7 +28,7 @@ export function legend(track, trace, compared) {
     const first = series.find((item) => item.name === name) ?? { name };
     const { dash, width } = seriesStyle(first, compared);
     const sample = lineSample(cssVariable(name), dash, width);
-    const label = trace.label(name);
+    const label = track.ofModalities ? name : trace.label(name);
     list.append(create('dt', { title: label }, sample, label));
     for (const comparison of compared ? [false, true] : [false]) {
       const text = new Text();

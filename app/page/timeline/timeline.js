@@ -15,6 +15,7 @@ import { EventMarks } from './event_marks.js';
 import { Gestures } from './gestures.js';
 import { layoutKey, noteElement, trackHeights } from './layout.js';
 import { formatValue, legend, updateLegend } from './legend.js';
+import { StandalonePicker } from './standalone_picker.js';
 import { fitWindow, formatWindow, parseWindow, zoomWindow } from './step_window.js';
 import { TRACKS, selectedError, tracks } from './tracks.js';
 
@@ -56,6 +57,7 @@ export class Timeline {
   #level = overlayMark('level');
   #selection = overlayMark('selection');
   #marks;
+  #standalone;
   #readout;
   #resetButton = element('#reset-zoom', HTMLButtonElement);
   #legendWidth = 0;
@@ -71,6 +73,7 @@ export class Timeline {
     this.#level.append(this.#levelText);
     this.#host.append(this.#cursor, this.#pointer, this.#level, this.#selection);
     this.#marks = new EventMarks(html('#marks', body), store);
+    this.#standalone = new StandalonePicker(store);
     this.#trackSelect = element('#track', HTMLSelectElement);
     this.#trackSelect.replaceChildren(
       ...Object.entries(TRACKS).map(([key, label]) => new Option(label, key)),
@@ -107,6 +110,7 @@ export class Timeline {
     const all = this.#allSteps;
     this.#window = fitWindow(sameLength ? parseWindow(window, all) : all, all);
     this.#marks.set([]);
+    this.#standalone.show(trace);
     this.redraw();
     this.#setWindow(this.#window);
   }
@@ -118,10 +122,7 @@ export class Timeline {
     const comparison = this.#activeComparison;
     this.#tracks = tracks(this.#trace, state, comparison);
     [this.#trackSelect.value, this.#trackSelect.disabled] = [state.track, false];
-    const key = html('#comparison-key');
-    [key.hidden, key.title] = [!comparison, this.#comparisonName];
-    html('span', key).textContent = this.#comparisonName;
-    html('#timeline').classList.toggle('compared', Boolean(comparison));
+    this.#showComparison();
     this.#build();
   }
 
@@ -178,11 +179,22 @@ export class Timeline {
   /**
    * Draws a comparison run, dashed, if it has the same episode.
    * @param {Trace | null} trace
-   * @param {string} [name]
+   * @param {string} [name] its name; without a trace, the progress of its computation
    */
   compareWith(trace, name = '') {
+    const changed = trace !== this.#comparison;
     [this.#comparison, this.#comparisonName] = [trace, name];
-    this.redraw();
+    if (changed) this.redraw();
+    else this.#showComparison();
+  }
+
+  /** Shows the name of the comparison run, or the progress of its computation. */
+  #showComparison() {
+    const key = html('#comparison-key');
+    const hidden = this.#comparison !== null && !this.#activeComparison; // of another episode
+    [key.hidden, key.title] = [hidden || !this.#comparisonName, this.#comparisonName];
+    html('span', key).textContent = this.#comparisonName;
+    html('#timeline').classList.toggle('compared', Boolean(this.#activeComparison));
   }
 
   /** Shows the whole episode. */

@@ -41,7 +41,7 @@ export function tracks(trace, state, comparison = null) {
     (run) => LOWEST_TRACKS[state.track](run, component),
   ];
   return builders.map((build) =>
-    comparison ? overlay(build(trace), build(comparison)) : build(trace),
+    comparison ? overlay(build(trace), build(comparison), comparison.standalone) : build(trace),
   );
 }
 
@@ -49,13 +49,18 @@ export function tracks(trace, state, comparison = null) {
  * Adds the lines of the comparison run to a track.
  * @param {Track} track
  * @param {Track} other
+ * @param {string} [standalone] the only modality of the comparison run
  * @returns {Track}
  */
-function overlay(track, other) {
+function overlay(track, other, standalone) {
   if (other.note) return track;
   const lines = other.series
     .filter(({ name }) => name !== 'truth')
-    .map(({ name, values }) => ({ name, values, comparison: true }));
+    .map(({ name, values }) => ({
+      name: name === 'fused' && standalone ? `${standalone} standalone` : name,
+      values,
+      comparison: true,
+    }));
   if (track.note) return { ...other, series: lines };
   /** @type {[number, number] | undefined} */
   const limits = track.limits &&
@@ -91,7 +96,14 @@ function weightTrack(trace, selected, component) {
   const scope = trace.weightWidth > 1 ? `, ${displayName(trace.components[component].name)}` : '';
   const title = kind === 'raw' ? `Weight β${scope}` : `Effective weight${scope}`;
   const max = Math.max(1, ...series.map(({ values }) => maximum(values)));
-  return { title, unit: '', series, limits: [-0.04 * max, 1.06 * max], digits: 2 };
+  return {
+    title,
+    unit: '',
+    series,
+    ofModalities: true,
+    limits: [-0.04 * max, 1.06 * max],
+    digits: 2,
+  };
 }
 
 /** @param {Trace} trace */
@@ -207,6 +219,7 @@ function innovationTrack(trace, component) {
     unit: trace.unitOf(component).unit,
     help: 'Measurement minus prediction of each modality. For a consistent filter 95 % are within the band.',
     series,
+    ofModalities: true,
     digits: 1,
   };
 }

@@ -24,18 +24,6 @@ export interface components {
             problems: string[];
         };
         /**
-         * ChangeRequest
-         * @description Body of ``PATCH /api/recordings/{name}.rrd``: the properties to change.
-         */
-        ChangeRequest: {
-            /** Name */
-            name?: string | null;
-            /** Tags */
-            tags?: string[] | null;
-            /** Automatic */
-            automatic?: false | null;
-        };
-        /**
          * Column
          * @description A float32 array in the columns buffer; offset in bytes.
          */
@@ -76,13 +64,16 @@ export interface components {
         };
         /**
          * Component
-         * @description A component of the state.
+         * @description A state component. Components in rad are angles.
          */
         Component: {
             /** Name */
             name: string;
-            /** Unit */
-            unit: string;
+            /**
+             * Unit
+             * @enum {string}
+             */
+            unit: "m" | "rad";
         };
         /**
          * Curve
@@ -144,6 +135,8 @@ export interface components {
          * @description A diagnostic. slow: computed by a job.
          */
         DiagnosticInfo: {
+            /** Options */
+            options: components["schemas"]["DiagnosticOption"][];
             /** Name */
             name: string;
             /** Title */
@@ -152,8 +145,6 @@ export interface components {
             question: string;
             /** Slow */
             slow: boolean;
-            /** Options */
-            options: components["schemas"]["DiagnosticOption"][];
         };
         /**
          * DiagnosticOption
@@ -191,7 +182,7 @@ export interface components {
         };
         /**
          * EpisodeErrors
-         * @description Position errors of one episode (``inspect.failures.by_episode``).
+         * @description Position errors of one episode.
          */
         EpisodeErrors: {
             /** Index */
@@ -240,22 +231,8 @@ export interface components {
          * @description A failure event. error: per layer, m. link: the page's address that opens it.
          */
         FailureEvent: {
-            /** Episode */
-            episode: number;
-            /** Step */
-            step: number;
-            /** First */
-            first: number;
-            /** Last */
-            last: number;
             /** Value */
             value: number | null;
-            /** Phase */
-            phase: string;
-            /** Other Phases */
-            other_phases: string[];
-            /** Error */
-            error: (number | null)[];
             /** Nees */
             nees: number | null;
             /** Ess */
@@ -264,6 +241,20 @@ export interface components {
             effective_weights: (number | null)[] | null;
             /** Link */
             link: string;
+            /** Episode */
+            episode: number;
+            /** Step */
+            step: number;
+            /** First */
+            first: number;
+            /** Last */
+            last: number;
+            /** Phase */
+            phase: string;
+            /** Other Phases */
+            other_phases: string[];
+            /** Error */
+            error: (number | null)[];
         };
         /**
          * FailureScore
@@ -415,7 +406,7 @@ export interface components {
         };
         /**
          * FineTuneOffer
-         * @description Options for fine-tuning a filter, and runs of its task. why_not: why it cannot be fine-tuned, or None.
+         * @description Options for fine-tuning a filter, and runs of its task.
          */
         FineTuneOffer: {
             /** Why Not */
@@ -487,7 +478,7 @@ export interface components {
         };
         /**
          * FineTunedCheckpoint
-         * @description A fine-tuned checkpoint.
+         * @description A fine-tuned checkpoint. no_change: what to try, if the base checkpoint was best; else empty.
          */
         FineTunedCheckpoint: {
             /** Name */
@@ -500,6 +491,11 @@ export interface components {
             steps: number;
             /** Seconds */
             seconds: number;
+            /**
+             * No Change
+             * @default
+             */
+            no_change: string;
         };
         /**
          * Freed
@@ -812,7 +808,7 @@ export interface components {
         };
         /**
          * ModuleInfo
-         * @description A module of a filter. gradient, change: of the fine-tuning that wrote the checkpoint.
+         * @description A module of a filter. gradient, change: of the fine-tuning that wrote the checkpoint; None without one.
          */
         ModuleInfo: {
             /** Name */
@@ -826,9 +822,9 @@ export interface components {
             /** Depth */
             depth: number;
             /** Gradient */
-            gradient?: number | null;
+            gradient: number | null;
             /** Change */
-            change?: number | null;
+            change: number | null;
         };
         /**
          * Name
@@ -839,10 +835,20 @@ export interface components {
             name: string;
         };
         /**
+         * NewName
+         * @description Body of ``PATCH /api/recordings/{name}.rrd``.
+         */
+        NewName: {
+            /** Name */
+            name: string;
+        };
+        /**
          * PhaseInfo
-         * @description The steps of a phase compared with all others (``inspect.failures.events.PhaseStatistics``).
+         * @description The steps of a phase compared with all others.
          */
         PhaseInfo: {
+            /** Over Represented */
+            over_represented: boolean;
             /** Name */
             name: string;
             /** Steps */
@@ -861,18 +867,16 @@ export interface components {
             inside: number | null;
             /** Outside */
             outside: number | null;
-            /** Over Represented */
-            over_represented: boolean;
         };
         /**
          * PixelMap
          * @description A value per pixel of a camera image.
          */
         PixelMap: {
-            /** Title */
-            title: string;
             /** Values */
             values: (number | null)[][];
+            /** Title */
+            title: string;
             /** Unit */
             unit: string;
             /** Signed */
@@ -883,14 +887,14 @@ export interface components {
          * @description A plot whose x axis is not time. diagonal: draw y = x. names: labels of x = 0, 1, ...
          */
         Plot: {
+            /** Lines */
+            lines: components["schemas"]["Line"][];
             /** Title */
             title: string;
             /** X Label */
             x_label: string;
             /** Y Label */
             y_label: string;
-            /** Lines */
-            lines: components["schemas"]["Line"][];
             /**
              * Kind
              * @enum {string}
@@ -921,38 +925,37 @@ export interface components {
         };
         /**
          * RecordingEntry
-         * @description A recording.
+         * @description A recording, with its metadata once they have been read.
          *
          *     Attributes:
-         *         automatic: written for display only. reading: whether its metadata are being read.
-         *         task ... data_hash: of its run; None or empty for recordings of other applications.
-         *         problem: why no run can be read from it, or empty.
+         *         modified: ISO 8601. reading: whether its metadata are being read.
          *         run: the same run in the catalog, or None; ``why_not`` explains why.
          */
         RecordingEntry: {
-            /** Name */
-            name: string;
-            /** Url */
-            url: string;
-            /** Bytes */
-            bytes: number;
-            /** Modified */
-            modified: string;
-            /** Automatic */
-            automatic: boolean;
-            /** Tags */
-            tags: string[];
-            /** Reading */
-            reading: boolean;
-            /** Application */
+            /**
+             * Application
+             * @default
+             */
             application: string;
-            /** Title */
+            /**
+             * Title
+             * @default
+             */
             title: string;
-            /** Entities */
+            /**
+             * Entities
+             * @default 0
+             */
             entities: number;
-            /** Rows */
+            /**
+             * Rows
+             * @default 0
+             */
             rows: number;
-            /** Problem */
+            /**
+             * Problem
+             * @default
+             */
             problem: string;
             /** Task */
             task: string | null;
@@ -964,16 +967,38 @@ export interface components {
             steps: number | null;
             /** Seed */
             seed: number | null;
-            /** Faults */
+            /**
+             * Faults
+             * @default
+             */
             faults: string;
             /** Particles */
             particles: number | null;
-            /** Edited */
+            /**
+             * Edited
+             * @default false
+             */
             edited: boolean;
-            /** Checkpoint Hash */
+            /**
+             * Checkpoint Hash
+             * @default
+             */
             checkpoint_hash: string;
-            /** Data Hash */
+            /**
+             * Data Hash
+             * @default
+             */
             data_hash: string;
+            /** Name */
+            name: string;
+            /** Url */
+            url: string;
+            /** Bytes */
+            bytes: number;
+            /** Modified */
+            modified: string;
+            /** Reading */
+            reading: boolean;
             run: components["schemas"]["RunNames"] | null;
             /** Why Not */
             why_not: string;
@@ -996,10 +1021,7 @@ export interface components {
         };
         /**
          * RecordingRequest
-         * @description Body of ``POST /api/recordings``.
-         *
-         *     Attributes:
-         *         maps: steps between likelihood maps; 0 for none. automatic: for display only; may be deleted later.
+         * @description Body of ``POST /api/recordings``. maps: steps between maps of ``quantity``; 0 for none.
          */
         RecordingRequest: {
             /** Task */
@@ -1024,16 +1046,19 @@ export interface components {
              */
             maps: number;
             /**
-             * Automatic
-             * @default false
+             * Quantity
+             * @default likelihood
+             * @enum {string}
              */
-            automatic: boolean;
+            quantity: "likelihood" | "posterior";
         };
         /**
          * RegressionEvent
-         * @description Consecutive steps with a larger error than before (``inspect.compare.effects.Regression``), m.
+         * @description Consecutive steps with a larger error than before.
          */
         RegressionEvent: {
+            /** Link */
+            link: string;
             /** Slice */
             slice: string;
             /** Faults */
@@ -1054,8 +1079,6 @@ export interface components {
             before: number | null;
             /** After */
             after: number | null;
-            /** Link */
-            link: string;
         };
         /**
          * ReportEntry
@@ -1099,6 +1122,7 @@ export interface components {
          *
          *     Attributes:
          *         events: steps to show instead of the three worst. slow: include slow diagnostics. pdf: also write a PDF.
+         *         quantity: of the maps; the other one if the filter does not have it.
          */
         ReportRequest: {
             /**
@@ -1121,6 +1145,12 @@ export interface components {
              * @default
              */
             title: string;
+            /**
+             * Quantity
+             * @default likelihood
+             * @enum {string}
+             */
+            quantity: "likelihood" | "posterior";
         };
         /**
          * ResultViews
@@ -1141,6 +1171,67 @@ export interface components {
             plots: components["schemas"]["Plot"][];
             /** Images */
             images: components["schemas"]["PixelMap"][];
+        };
+        /**
+         * Row
+         * @description One row of the table.
+         *
+         *     Attributes:
+         *         task, filter: names; ``TRIVIAL`` for the trivial predictor. blackout: probability of an image blackout; None
+         *             for the trivial predictor.
+         *         seeds: number of finished seeds. requested, failed: number of requested and failed ones.
+         *         mean, spread: over the seeds, by quantity: RMSE (``hinge_x_cm``, ..., ``position_cm``), ``nll``, ``nees``,
+         *             ``coverage95``, ``seconds`` of training. The spread is the standard deviation (n - 1). None if a seed lacks
+         *             the quantity, and for the spread of one seed.
+         *         bounds: of ``nees``, see ``nees_bounds``. None without a covariance.
+         *         updates: modality -> mean RMSE over the seeds of its single-modality updates, which start from the fused prior;
+         *             empty for studies of earlier versions. standalone: the same for the filter with only that modality. Both for
+         *             filters of several models only. by_seed: seed -> quantity -> value.
+         */
+        Row: {
+            /** Task */
+            task: string;
+            /** Filter */
+            filter: string;
+            /** Blackout */
+            blackout: number | null;
+            /** Seeds */
+            seeds: number;
+            /** Requested */
+            requested: number;
+            /** Failed */
+            failed: number;
+            /** Mean */
+            mean: {
+                [key: string]: number | null;
+            };
+            /** Spread */
+            spread: {
+                [key: string]: number | null;
+            };
+            /** Bounds */
+            bounds: [
+                number,
+                number
+            ] | null;
+            /** Standalone */
+            standalone: {
+                [key: string]: {
+                    [key: string]: number | null;
+                };
+            };
+            /** Updates */
+            updates: {
+                [key: string]: {
+                    [key: string]: number | null;
+                };
+            };
+            /** By Seed */
+            by_seed: {
+                [key: string]: {
+                    [key: string]: number | null;
+                };
+            };
         };
         /**
          * RunNames
@@ -1213,41 +1304,6 @@ export interface components {
             problems: string[];
         };
         /**
-         * StudyRow
-         * @description A row of a study's table (``filters.training.study_table.Row``).
-         */
-        StudyRow: {
-            /** Filter */
-            filter: string;
-            /** Blackout */
-            blackout: number | null;
-            /** Seeds */
-            seeds: number;
-            /** Requested */
-            requested: number;
-            /** Failed */
-            failed: number;
-            /** Mean */
-            mean: {
-                [key: string]: number | null;
-            };
-            /** Spread */
-            spread: {
-                [key: string]: number | null;
-            };
-            /** Bounds */
-            bounds: [
-                number,
-                number
-            ] | null;
-            /** By Seed */
-            by_seed: {
-                [key: string]: {
-                    [key: string]: number | null;
-                };
-            };
-        };
-        /**
          * StudyTask
          * @description The part of a study for one task. data: file of the training and evaluation data.
          */
@@ -1259,11 +1315,11 @@ export interface components {
             /** Filters */
             filters: components["schemas"]["StudyFilter"][];
             /** Rows */
-            rows: components["schemas"]["StudyRow"][];
+            rows: components["schemas"]["Row"][];
         };
         /**
          * Table
-         * @description A table; column names include the unit.
+         * @description Rows of values, None where a value is not available. Column names include the unit.
          */
         Table: {
             /** Title */
@@ -1299,6 +1355,8 @@ export interface components {
          * @description A diagnostic of one trace. why_not: why it is not available for this trace, or None.
          */
         TraceDiagnosticInfo: {
+            /** Options */
+            options: components["schemas"]["DiagnosticOption"][];
             /** Name */
             name: string;
             /** Title */
@@ -1307,8 +1365,6 @@ export interface components {
             question: string;
             /** Slow */
             slow: boolean;
-            /** Options */
-            options: components["schemas"]["DiagnosticOption"][];
             /** Why Not */
             why_not: string | null;
         };
@@ -1319,7 +1375,9 @@ export interface components {
          *     Attributes:
          *         weight_width: 0 for a filter without weights. settings: of the run.
          *         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
-         *         no_maps: why there are no likelihood maps, or None. image_size: height and width of the camera images, or None.
+         *         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
+         *             reasons. image_size: height and width of the camera images, or None.
+         *         data_warning: how the data differ from the checkpoint's training data, or None.
          *         scene: layers of its 3D scene. live: present while the trace is of a live run.
          */
         TraceHeader: {
@@ -1358,6 +1416,10 @@ export interface components {
             ] | null;
             /** No Maps */
             no_maps: string | null;
+            /** Missing Quantities */
+            missing_quantities: {
+                [key: string]: string;
+            };
             /** Image Size */
             image_size: [
                 number,
@@ -1365,6 +1427,8 @@ export interface components {
             ] | null;
             /** Columns */
             columns: components["schemas"]["Column"][];
+            /** Data Warning */
+            data_warning?: string | null;
             /** Scene */
             scene: ("replay" | "objects" | "estimates" | "contours" | "particles" | "force" | "map" | "camera")[];
             live?: components["schemas"]["LiveRun"] | null;
@@ -1383,16 +1447,18 @@ export interface components {
         };
         /**
          * ValidationInfo
-         * @description A validation. slices: name -> metrics (``filters.finetuning.loop.Validation``).
+         * @description A validation.
          */
         ValidationInfo: {
-            /** Step */
-            step: number;
             /** Loss */
             loss: number | null;
+            /** Step */
+            step: number;
             /** Slices */
             slices: {
-                [key: string]: unknown;
+                [key: string]: {
+                    [key: string]: unknown;
+                };
             };
             /** Score */
             score: number | null;
@@ -1442,7 +1508,6 @@ export interface components {
     pathItems: never;
 }
 export type Catalog = components['schemas']['Catalog'];
-export type ChangeRequest = components['schemas']['ChangeRequest'];
 export type Column = components['schemas']['Column'];
 export type Comparison = components['schemas']['Comparison'];
 export type Component = components['schemas']['Component'];
@@ -1485,6 +1550,7 @@ export type LiveState = components['schemas']['LiveState'];
 export type MapArea = components['schemas']['MapArea'];
 export type ModuleInfo = components['schemas']['ModuleInfo'];
 export type Name = components['schemas']['Name'];
+export type NewName = components['schemas']['NewName'];
 export type PhaseInfo = components['schemas']['PhaseInfo'];
 export type PixelMap = components['schemas']['PixelMap'];
 export type Plot = components['schemas']['Plot'];
@@ -1498,12 +1564,12 @@ export type ReportEntry = components['schemas']['ReportEntry'];
 export type ReportList = components['schemas']['ReportList'];
 export type ReportRequest = components['schemas']['ReportRequest'];
 export type ResultViews = components['schemas']['ResultViews'];
+export type Row = components['schemas']['Row'];
 export type RunNames = components['schemas']['RunNames'];
 export type SliceInfo = components['schemas']['SliceInfo'];
 export type StudyFilter = components['schemas']['StudyFilter'];
 export type StudyInfo = components['schemas']['StudyInfo'];
 export type StudyList = components['schemas']['StudyList'];
-export type StudyRow = components['schemas']['StudyRow'];
 export type StudyTask = components['schemas']['StudyTask'];
 export type Table = components['schemas']['Table'];
 export type TaskInfo = components['schemas']['TaskInfo'];

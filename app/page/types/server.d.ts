@@ -4,6 +4,9 @@ import type * as api from './api.js';
 
 export type * from './api.js';
 
+/** A row of a study's table. */
+export type StudyRow = api.Row;
+
 export interface Component extends api.Component {
   unit: 'm' | 'rad';
 }
@@ -47,7 +50,7 @@ export interface Selection {
 
 export interface TraceHeader extends Omit<api.TraceHeader, 'components' | 'settings'> {
   components: Component[];
-  settings: { particles?: number; edits?: { from: number; to: number }[] };
+  settings: { particles?: number; edits?: { from: number; to: number }[]; standalone?: string };
 }
 
 /** A live run of a displayed trace. Its state is `gone` if the server no longer has it. */

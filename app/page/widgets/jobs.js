@@ -189,7 +189,10 @@ export class Jobs {
  * @param {Job} job
  */
 export function jobSummary(job) {
-  if (job.state === 'running') return `${percent(job.progress)}, ${job.message || 'starting'}`;
+  if (job.state === 'running')
+    return [percent(job.progress), job.message || 'starting', remaining(job, Date.now() / 1000)]
+      .filter(Boolean)
+      .join(', ');
   if (job.error && job.error !== job.state)
     return sentence(job.state === 'failed' ? job.error : `${STATES[job.state]}: ${job.error}`);
   if (job.state === 'done') {
@@ -197,6 +200,17 @@ export function jobSummary(job) {
     return `Done in ${Math.max(1, Math.round(seconds))} s.`;
   }
   return sentence(STATES[job.state]);
+}
+
+/**
+ * Returns the estimated time to the end of a running job; empty before 5 % are done.
+ * @param {Pick<Job, 'started' | 'progress'>} job
+ * @param {number} now s since 1970
+ */
+export function remaining({ started, progress }, now) {
+  if (!started || progress < 0.05 || progress >= 1) return '';
+  const seconds = ((now - started) * (1 - progress)) / progress;
+  return seconds < 90 ? `${Math.ceil(seconds)} s left` : `${Math.round(seconds / 60)} min left`;
 }
 
 /**

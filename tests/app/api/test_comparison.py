@@ -16,9 +16,8 @@ from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.app.views.scene import Scene
-from beliefscope.app.views.scene_belief import OUTLINE_EDGES
-from beliefscope.app.views.scene_comparison import dashed
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.inspect.figures.scene_shapes import OUTLINE_EDGES, dashed
 from beliefscope.inspect.traces.replay import Edit
 
 pytestmark = pytest.mark.slow
@@ -93,6 +92,7 @@ def test_manual_weights(server: TestClient) -> None:
     [
         ("filter=crossmodal-pf", {}, ["crossmodal-ekf", "crossmodal-pf"]),
         ("faults=blackout=0.5", {}, ["as recorded", "blackout=0.5"]),
+        ("only=haptics", {}, ["all modalities", "haptics standalone"]),
         ("faults=", {"faults": "blackout=0.5"}, ["blackout=0.5", "as recorded"]),
         (
             "filter=crossmodal-pf&faults=",
@@ -122,6 +122,8 @@ def test_compare_with_another_filter_or_other_faults(
         ("filter=kalman", "'kalman'"),
         ("faults=lightning", "lightning"),
         ("speed=3", "the comparison run"),
+        ("only=touch", "Modality 'touch' is not in this filter. Available: image, haptics."),
+        ("only=image&filter=crossmodal-pf", "the comparison run"),
         ("from=40&to=60", "is empty: give faults"),
         ("from=40&faults=blackout", "'to' of edit"),
         ("from=60&to=40&faults=blackout", "has no steps"),

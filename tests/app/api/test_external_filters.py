@@ -66,10 +66,10 @@ def test_trace_and_recording_are_equal(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(recorded, name), getattr(traced, name))
 
 
-@pytest.mark.parametrize("command", ["trace", "record", "evaluate"])
-def test_error_is_one_line_and_leaves_no_file(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("command", "name"), [("trace", "new.trace"), ("record", "new.rrd"), ("evaluate", "")])
+def test_error_is_one_line_and_leaves_no_file(command: str, name: str, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(FAILS)
-    output = () if command == "evaluate" else ("-o", tmp_path / "new")
+    output = ("-o", tmp_path / name) if name else ()
     code, out, err = run(command, "door", "--filter", f"{tmp_path}/own.py:Fails", *output)
     assert (code, out) == (2, "")
     assert err.splitlines()[-1] == f"error: {tmp_path}/own.py:Fails fails at step 0: KeyError: 'touch'"

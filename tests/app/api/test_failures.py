@@ -11,11 +11,12 @@ from urllib.parse import parse_qsl
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.jobs.failures import MAX_EVENTS, failure_document
+from beliefscope.app.jobs.failures import failure_document
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.inspect.failures.events import survey_of
+from beliefscope.inspect.failures.survey import survey_of
+from beliefscope.inspect.failures.survey_json import MAX_EVENTS
 
 pytestmark = pytest.mark.slow
 

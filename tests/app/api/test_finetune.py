@@ -12,10 +12,9 @@ from urllib.parse import parse_qsl
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.jobs.finetune import ProgressLog
 from beliefscope.app.runs.settings import Settings
-from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.filters.checkpoint import load_checkpoint
+from beliefscope.inspect.compare.progress_log import ProgressLog
 
 pytestmark = pytest.mark.slow
 
@@ -52,6 +51,22 @@ def test_options(shared_client: TestClient) -> None:
     assert not any(name.startswith("virtual_sensors.image") for name in presets["haptics-only"])
     assert "haptics only" in [m["name"] for m in offer["slices"]]
     assert offer["runs"] == []
+
+
+@pytest.mark.long
+def test_run_without_improvement_cannot_be_promoted(client: TestClient) -> None:
+    # A learning rate this large ruins the weights, so that the base checkpoint is best.
+    run = client.post(URL, json=SMALL | {"mix": [BLACKOUT], "rate": 100.0}).json()["run"]
+    details = wait_for(client, run)
+    assert details["job"]["state"] == "done", details["job"]
+    advice = details["result"]["finetuned"]["no_change"]
+    assert advice.startswith("No change: the base checkpoint was best. Try ")
+    before = filters(client)
+    for action in ("promote", "save"):
+        response = client.post(f"/api/tuned/{run}/{action}")
+        assert response.status_code == 409
+        assert advice in response.json()["error"]
+    assert filters(client) == before
 
 
 @pytest.mark.long
@@ -100,17 +115,16 @@ def test_run_is_compared_with_its_base_and_saved(settings: Settings, open_client
 
 
 def test_interrupted_run_keeps_its_losses(tmp_path: Path) -> None:
-    runs = FineTuneRuns(tmp_path)
-    runs.folder("run").mkdir(parents=True)
-    before = ProgressLog(runs, "run", 9)
+    path = tmp_path / "progress.json"
+    before = ProgressLog(path, 9)
     for step in range(1, 6):
         before.add_step(step, 1.0 / step)
     before.write()
-    after = ProgressLog(runs, "run", 9)
+    after = ProgressLog(path, 9)
     after.resume(4)  # the last validation; the fifth step is repeated
     after.add_step(5, 0.25)
     after.write()
-    losses = json.loads((runs.folder("run") / "progress.json").read_text())["losses"]
+    losses = json.loads(path.read_text())["losses"]
     assert losses == [[1, 1.0], [2, 0.5], [3, pytest.approx(1 / 3)], [4, 0.25], [5, 0.25]]
 
 

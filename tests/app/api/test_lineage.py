@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from beliefscope.app.api.finetune import _options
 from beliefscope.app.runs.saved_filters import SavedFilter, save_filter
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
+from beliefscope.filters.finetuning.choices import choices
 
 pytestmark = pytest.mark.slow
 
@@ -79,8 +79,8 @@ def test_module_tree_shows_changes_of_fine_tuning() -> None:
     checkpoint = load_checkpoint(shipped("door", "crossmodal-ekf"))
     names = [name for name, _ in checkpoint.filter.named_parameters() if name.startswith("weight_model")]
     changes = {name: [0.5, 0.1, 2.0] for name in names}
-    options = _options(replace(checkpoint, record={**checkpoint.record, "parts": changes}))
-    changed = {m["name"]: (m["gradient"], m["change"]) for m in options["modules"] if "gradient" in m}
+    options = choices(replace(checkpoint, record={**checkpoint.record, "parts": changes}))
+    changed = {m.name: (m.gradient, m.change) for m in options.modules if m.gradient is not None}
     assert changed["weight_model"] == pytest.approx((0.5 * len(names) ** 0.5, 0.05))
     assert all(name.startswith("weight_model") for name in changed), "frozen modules have no change"
 

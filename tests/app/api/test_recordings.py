@@ -1,8 +1,7 @@
-"""Recordings over HTTP: write, upload, rename, tag, delete and restore."""
+"""Recordings over HTTP: write, upload, rename, delete and restore."""
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Callable
@@ -18,13 +17,13 @@ from starlette.testclient import TestClient
 from beliefscope.app.api import recordings
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace import trash
-from beliefscope.app.workspace.recording_probe import RecordingInfo, RecordingProbe
 from beliefscope.app.workspace.recordings import checked
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.trace import trace
+from beliefscope.recordings.probe import RecordingInfo, RecordingProbe
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.rerun_log.metadata import describe
 from beliefscope.recordings.write import write_recording
@@ -255,34 +254,24 @@ def test_crash_of_the_reader(
 
 
 @IN_PROCESS
-def test_names_and_tags_are_stored(
-    settings: Settings, open_client: Callable[..., TestClient], run_recording: bytes
-) -> None:
-    with open_client(settings) as client:
-        client.put(f"{URL}/a.rrd", content=run_recording)
-        client.put(f"{URL}/b.rrd", content=run_recording)
-        answer = client.patch(f"{URL}/a.rrd", json={"tags": ["paper", "Fig  3", "PAPER"]})
-        assert answer.json()["tags"] == ["paper", "Fig 3"]
-        conflict = client.patch(f"{URL}/a.rrd", json={"name": "b"})
-        assert (conflict.status_code, "'b.rrd' already exists" in conflict.json()["error"]) == (409, True)
-        assert client.put(f"{URL}/b.rrd", content=run_recording).status_code == 409
-        renamed = client.patch(f"{URL}/a.rrd", json={"name": "Tür (neu)"}).json()
-        assert (renamed["name"], renamed["tags"]) == ("Tür (neu).rrd", ["paper", "Fig 3"])
-        assert client.get(renamed["url"]).content == run_recording
-        assert client.get(f"{URL}/a.rrd").status_code == 404
-    with open_client(settings) as client:
-        assert {name: r["tags"] for name, r in listed(client).items()} == {
-            "Tür (neu).rrd": ["paper", "Fig 3"],
-            "b.rrd": [],
-        }
+def test_rename(client: TestClient, run_recording: bytes) -> None:
+    client.put(f"{URL}/a.rrd", content=run_recording)
+    client.put(f"{URL}/b.rrd", content=run_recording)
+    conflict = client.patch(f"{URL}/a.rrd", json={"name": "b"})
+    assert (conflict.status_code, "'b.rrd' already exists" in conflict.json()["error"]) == (409, True)
+    assert client.put(f"{URL}/b.rrd", content=run_recording).status_code == 409
+    renamed = client.patch(f"{URL}/a.rrd", json={"name": "Tür (neu)"}).json()
+    assert (renamed["name"], renamed["reading"], renamed["task"]) == ("Tür (neu).rrd", False, "door")
+    assert client.get(renamed["url"]).content == run_recording
+    assert client.get(f"{URL}/a.rrd").status_code == 404
+    assert listed(client).keys() == {"Tür (neu).rrd", "b.rrd"}
 
 
 @IN_PROCESS
-def test_invalid_names_and_tags_are_refused(client: TestClient, run_recording: bytes) -> None:
+def test_invalid_names_are_refused(client: TestClient, run_recording: bytes) -> None:
     before = client.put(f"{URL}/a.rrd", content=run_recording).json()
     names = ("", "..", "../x", "a\\b", ".hidden", "a" * 300)
-    tags = ([""], ["a,b"], ["x" * 41], [f"{i}" for i in range(30)], "x")
-    for body in (*({"name": name} for name in names), *({"tags": value} for value in tags), {"tag": 1}, [], None):
+    for body in (*({"name": name} for name in names), {"tag": 1}, [], None):
         answer = client.patch(f"{URL}/a.rrd", json=body)
         assert answer.status_code in (400, 422), body
         assert "\n" not in answer.json()["error"]
@@ -298,7 +287,7 @@ def test_invalid_file_names(name: str) -> None:
 @IN_PROCESS
 def test_delete_and_restore(client: TestClient, run_recording: bytes, folder: Path) -> None:
     client.put(f"{URL}/a.rrd", content=run_recording)
-    before = client.patch(f"{URL}/a.rrd", json={"tags": ["paper"]}).json()
+    before = client.get(URL).json()["recordings"][0]
     id = client.delete(f"{URL}/a.rrd").json()["deleted"]
     lists = client.get(URL).json()
     assert lists["recordings"] == []
@@ -306,7 +295,8 @@ def test_delete_and_restore(client: TestClient, run_recording: bytes, folder: Pa
     client.put(f"{URL}/a.rrd", content=run_recording)
     assert client.post(f"{URL}/deleted/{id}").status_code == 409
     client.patch(f"{URL}/a.rrd", json={"name": "other"})
-    assert client.post(f"{URL}/deleted/{id}").json() == before
+    assert client.post(f"{URL}/deleted/{id}").json()["name"] == "a.rrd"
+    assert listed(client)["a.rrd"] == before
     assert client.post(f"{URL}/deleted/{id}").status_code == 404
     client.delete(f"{URL}/a.rrd")
     assert client.delete(f"{URL}/deleted").json() == {"freed": len(run_recording)}
@@ -339,7 +329,7 @@ def test_list_has_an_etag(
     assert client.get(URL, headers={"If-None-Match": tag}).json()["recordings"] == []
     for answer in (
         client.get(f"{URL}/a.rrd"),
-        client.patch(f"{URL}/a.rrd", json={"tags": ["x"]}),
+        client.patch(f"{URL}/a.rrd", json={"name": "x"}),
         client.delete(f"{URL}/a.rrd"),
     ):
         assert answer.status_code == 404
@@ -351,15 +341,13 @@ def test_metadata_are_read_again_after_a_change(
     client: TestClient, run_recording: bytes, foreign: bytes, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "a.rrd").write_bytes(run_recording)
-    client.patch(f"{URL}/a.rrd", json={"tags": ["x"]})
     assert listed(client)["a.rrd"]["task"] == "door"
     metadata = folder / ".about" / "a.rrd.json"
     written = metadata.stat().st_mtime_ns
     assert listed(client)["a.rrd"]["task"] == "door"
     assert metadata.stat().st_mtime_ns == written
     (folder / "a.rrd").write_bytes(foreign)
-    entry = listed(client)["a.rrd"]
-    assert (entry["application"], entry["tags"]) == ("their_app", ["x"])
+    assert listed(client)["a.rrd"]["application"] == "their_app"
     metadata.write_text("{broken")
     assert listed(client)["a.rrd"]["application"] == "their_app"
 
@@ -379,22 +367,3 @@ def test_links_and_partial_files_are_not_listed(
             assert client.delete(f"{URL}/{name}.rrd").status_code == 404
         assert client.put(f"{URL}/link.rrd", content=b"RRF2").status_code == 409
     assert secret.read_bytes() == b"secret"
-
-
-@IN_PROCESS
-def test_renamed_recording_is_recognised_by_content(
-    client: TestClient, trace_url: str, run_recording: bytes, folder: Path
-) -> None:
-    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
-    written = client.post(URL, json=body).json()
-    client.patch(f"{URL}/{written['name']}", json={"name": "mine"})
-    again = client.post(URL, json=body)
-    assert (again.status_code, again.json()["name"]) == (200, "mine.rrd")
-    client.delete(f"{URL}/mine.rrd")
-    client.put(f"{URL}/{written['name']}", content=run_recording)  # same name, other content
-    other = client.post(URL, json=body)
-    assert (other.status_code, other.json()["name"]) == (201, written["name"].replace(".rrd", "-2.rrd"))
-    assert read_recording(folder / other.json()["name"]).filter == "crossmodal-pf"
-    assert (
-        json.loads((folder / ".about" / f"{other.json()['name']}.json").read_text())["original_name"] == written["name"]
-    )

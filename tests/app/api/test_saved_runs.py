@@ -1,4 +1,4 @@
-"""Recordings of runs: likelihood maps, and deletion of automatic recordings."""
+"""Recordings of runs: likelihood maps."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
-
-from beliefscope.app.runs.settings import Settings
-from beliefscope.app.workspace import recordings as recording_files
 
 pytestmark = pytest.mark.slow
 
@@ -29,7 +26,7 @@ def test_recording_with_maps_is_a_job(client: TestClient, trace_url: str) -> Non
     response = client.post(URL, json=body)
     assert response.status_code == 202
     job = response.json()["job"]
-    assert client.post(URL, json=body | {"automatic": True}).json()["job"]["id"] == job["id"], "the same file"
+    assert client.post(URL, json=body).json()["job"]["id"] == job["id"], "the same file"
     end = time.monotonic() + TIMEOUT
     while (job := client.get(f"/api/jobs/{job['id']}").json())["state"] in ("waiting", "running"):
         assert time.monotonic() < end
@@ -38,31 +35,8 @@ def test_recording_with_maps_is_a_job(client: TestClient, trace_url: str) -> Non
     written = client.post(URL, json=body)
     assert (written.status_code, written.json()["url"]) == (200, f"/{job['link']}")
     (entry,) = client.get(URL).json()["recordings"]
-    assert (entry["name"], entry["reading"], entry["automatic"]) == (written.json()["name"], False, False)
+    assert (entry["name"], entry["reading"]) == (written.json()["name"], False)
     plain = client.post(URL, json=body | {"maps": 0}).json()["name"]
     assert entry["entities"] > listed(client)[plain]["entities"], "it has maps"
     client.delete(entry["url"])
     assert client.post(URL, json=body).status_code == 202, "a deleted recording is written again"
-
-
-def test_oldest_automatic_recordings_are_deleted(
-    client: TestClient, trace_url: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recording_files, "MAX_AUTOMATIC", 2)
-    body = {"task": "door", "filter": "crossmodal-pf", "episode": 1}
-
-    def record(noise: int, automatic: bool = True) -> str:
-        request = body | {"faults": f"force_noise={noise}", "automatic": automatic}
-        name: str = client.post(URL, json=request).json()["name"]
-        return name
-
-    oldest, saved = record(1), record(2)
-    assert record(2, automatic=False) == saved
-    others = [record(3), record(4)]
-    recordings = listed(client)
-    assert {name: r["automatic"] for name, r in recordings.items()} == {saved: False} | dict.fromkeys(others, True)
-    assert not (settings.workspace / "recordings" / ".about" / f"{oldest}.json").exists()
-    assert client.patch(f"{URL}/{others[0]}", json={"automatic": False}).json()["automatic"] is False
-    assert client.patch(f"{URL}/{others[1]}", json={"tags": ["x"]}).json()["automatic"] is False
-    record(1)
-    assert len(listed(client)) == 4, "saved recordings are not deleted"

@@ -14,13 +14,12 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.api.studies import all_studies
-from beliefscope.app.cli.commands.study import _cells
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.workspace.studies import FILE, SHIPPED, Study
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
-from beliefscope.filters.training.study import run_cell
+from beliefscope.filters.training.study import run_cell, study_cells
 from beliefscope.recordings.study_figures import write_study
 
 pytestmark = pytest.mark.slow
@@ -134,7 +133,7 @@ def test_job_trains_unfinished_cells(
 ) -> None:
     folder = tmp_path / "mine"
     folder.mkdir()
-    cells = _cells("smoke", ["door"], ["haptics-ekf"], 2, [f"door={settings.data['mine']}"], False)
+    cells = study_cells("smoke", ["door"], ["haptics-ekf"], 2, {"door": settings.data["mine"]})
     write_study(folder, cells, "smoke")
     run_cell(cells[0], folder)  # without updating the table
     with open_client(replace(settings, studies={"mine": folder})) as client:

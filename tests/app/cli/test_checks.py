@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from beliefscope.app.cli import checks
-from beliefscope.app.cli.checks import CHECKS, Finding, Place, changed_files, read_sums, report, run_checks
+from beliefscope.app.cli.checks import CHECKS, Finding, Place, report, run_checks
 from beliefscope.app.server import main
+from beliefscope.datasets.io.checksums import changed_files, read_sums
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import PRETRAINED
 

@@ -30,7 +30,7 @@ def read(run: Trace) -> tuple[Trace, Columns, dict[str, Any]]:
         c["name"]: np.frombuffer(buffer, "<f4", int(np.prod(c["shape"])), c["offset"]).reshape(c["shape"])
         for c in descriptions
     }
-    return run, values, header(run, descriptions, find_task(run.episode.task), None)
+    return run, values, header(run, descriptions, find_task(run.episode.task), None, {})
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])

@@ -13,11 +13,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beliefscope.app.runs.filter_runner import RunRequest
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.runs.trace_worker import TraceWorker
+from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.trace import arrays_of, header_of
 

@@ -30,9 +30,9 @@ from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.app.views.registry import Views
 from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
 from beliefscope.app.views.view import PREFETCH_STEPS
-from beliefscope.app.workspace.recording_probe import RecordingInfo, RecordingProbe
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.recordings.probe import RecordingInfo, RecordingProbe
 
 pytestmark = pytest.mark.slow
 

@@ -20,8 +20,9 @@ from starlette.testclient import TestClient
 from beliefscope.app.server.auth import Access
 from beliefscope.app.server.main import PAGE, Settings, _listen, serve
 from beliefscope.app.server.static_files import PageFiles
-from beliefscope.app.server.vendor_files import RerunViewer, installed, without_names
+from beliefscope.app.server.vendor_files import viewer_wasm
 from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.web_viewer import WebViewer, installed, without_names
 
 pytestmark = pytest.mark.slow
 
@@ -44,20 +45,20 @@ def request(encodings: str, **headers: str) -> Request:
 
 
 def test_rerun_viewer_is_compressed_if_accepted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    viewer = RerunViewer(tmp_path)
+    viewer = WebViewer(tmp_path)
     module = PREAMBLE + SECTIONS["type"] + SECTIONS["name"]
     monkeypatch.setattr(viewer, "_original", tmp_path / "original")
     (tmp_path / "original").write_bytes(module)
-    assert "content-encoding" not in viewer.wasm(request("gzip, br")).headers
+    assert "content-encoding" not in viewer_wasm(viewer, request("gzip, br")).headers
     viewer.prepare()
-    answer = viewer.wasm(request("gzip, br;q=0.9"))
+    answer = viewer_wasm(viewer, request("gzip, br;q=0.9"))
     assert answer.headers["content-encoding"] == "br"
     assert answer.media_type == "application/wasm"
     assert answer.headers["vary"] == "accept-encoding"
     (compressed,) = tmp_path.glob("*.br")
     assert brotli.decompress(compressed.read_bytes()) == without_names(module)
-    assert "content-encoding" not in viewer.wasm(request("gzip")).headers
-    assert viewer.wasm(request("br", **{"if-none-match": answer.headers["etag"]})).status_code == 304
+    assert "content-encoding" not in viewer_wasm(viewer, request("gzip")).headers
+    assert viewer_wasm(viewer, request("br", **{"if-none-match": answer.headers["etag"]})).status_code == 304
 
 
 def test_installed_viewer_has_the_expected_code() -> None:

@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beliefscope.app.protocol.messages import LAYERS, SceneLayers
+from beliefscope.app.protocol.messages import LAYERS
 from beliefscope.app.protocol.trace_format import scene_layers
-from beliefscope.app.views.scene_belief import OUTLINE_EDGES, modality_shares
-from beliefscope.app.views.scene_context import LOG_RANGE, hand_bodies, map_pixels, object_bodies
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.replay import replay_model
+from beliefscope.datasets.simulation.shapes import hand_bodies, object_bodies
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
-from beliefscope.inspect.diagnostics.plotting import colour_table
+from beliefscope.inspect.figures.scene_shapes import LOG_RANGE, OUTLINE_EDGES, map_pixels
 from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.particles import modality_shares
+from beliefscope.inspect.palette import colour_table
 from beliefscope.inspect.trace import Trace, trace
 
 pytestmark = pytest.mark.slow
@@ -76,21 +77,22 @@ def test_hand_and_objects_are_separate_bodies(task: str, bodies: set[str]) -> No
 def test_map_colors_match_the_page(maps: LikelihoodMap) -> None:
     table = colour_table("viridis")
     intensity = np.exp(np.arange(-8.0, 1.0))
-    pixels = map_pixels(maps, 0, SceneLayers())
+    pixels = map_pixels(maps, 0, "viridis", False, False)
     assert pixels.shape == (9, 9, 3)
     np.testing.assert_array_equal(pixels[4], table[np.rint(255 * intensity).astype(int)])
     np.testing.assert_array_equal(pixels, pixels[:1].repeat(9, axis=0), "rows are y in increasing order")
-    log = map_pixels(maps, 1, SceneLayers(scale="log"))[:, 0]
+    log = map_pixels(maps, 1, "viridis", True, False)[:, 0]
     np.testing.assert_array_equal(log[[0, 4, 8]], table[[0, 0, 255]], "40 nats below the peak is the lowest color")
     np.testing.assert_array_equal(log[7], table[round(255 * (1 - 10 / LOG_RANGE))])
 
 
 def test_layers_can_share_a_color_range(maps: LikelihoodMap) -> None:
     table = colour_table("cividis")
-    same = SceneLayers(range="same", colours="cividis")
-    np.testing.assert_array_equal(map_pixels(maps, 0, same)[0, 8], table[255])
-    np.testing.assert_array_equal(map_pixels(maps, 1, same)[8, 0], table[0], "its peak is 9 nats lower")
-    np.testing.assert_array_equal(map_pixels(maps, 1, same.model_copy(update={"range": "own"}))[8, 0], table[255])
+    np.testing.assert_array_equal(map_pixels(maps, 0, "cividis", False, True)[0, 8], table[255])
+    np.testing.assert_array_equal(
+        map_pixels(maps, 1, "cividis", False, True)[8, 0], table[0], "its peak is 9 nats lower"
+    )
+    np.testing.assert_array_equal(map_pixels(maps, 1, "cividis", False, False)[8, 0], table[255])
 
 
 def test_mean_particle_shares_equal_the_effective_weights(run: Trace) -> None:

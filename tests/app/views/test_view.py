@@ -109,10 +109,10 @@ def test_outdated_cursors_are_skipped(
     busy, resume = threading.Event(), threading.Event()
     original = TracedRun.map
 
-    def slow(self: TracedRun, step: int, angle: float | None, size: int) -> Any:
+    def slow(self: TracedRun, *arguments: Any) -> Any:
         busy.set()
         assert resume.wait(10.0)
-        return original(self, step, angle, size)
+        return original(self, *arguments)
 
     monkeypatch.setattr(TracedRun, "map", slow)
     socket.send_json(cursor(serial=1, step=1))

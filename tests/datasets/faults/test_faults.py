@@ -125,6 +125,21 @@ def test_blackout_probability(episode: Episode) -> None:
     assert abs((black[1:] & black[:-1]).mean() - 0.16) < 0.015
 
 
+def test_gray_level_of_a_blackout(episode: Episode) -> None:
+    """The same steps are lost, with another level; texts and JSON without a level stay as they were."""
+    black, gray = (images(inject(text, episode)) for text in ("blackout=0.5", "blackout=0.5:gray=128"))
+    lost = ~black.any(axis=(1, 2))
+    assert 0 < lost.sum() < len(lost)
+    assert (gray[lost] == 128).all()
+    assert (gray[~lost] == black[~lost]).all()
+    faults = Faults.parse("blackout=0.5:gray=128")
+    assert str(faults) == "blackout=0.5:gray=128"
+    assert Faults.from_json(faults.to_json()) == faults
+    assert Faults.parse("blackout=0.5").to_json() == [{"fault": "blackout", "probability": 0.5}]
+    with pytest.raises(BadInput, match="gray"):
+        Faults.parse("blackout:gray=256")
+
+
 def test_image_faults(episode: Episode) -> None:
     clean = images(episode)
     assert (images(inject("image_frozen=30", episode))[30:] == clean[30]).all()

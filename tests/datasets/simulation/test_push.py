@@ -162,8 +162,8 @@ def test_simulation_is_deterministic() -> None:
 
 def test_size_and_splits_of_the_samples(samples: list[Episode]) -> None:
     assert sample_path("push").stat().st_size <= 3_000_000
-    assert [len(e) for e in samples] == [100] * 140
-    assert [sum(e.split == s for e in samples) for s in ("train", "val", "test")] == [112, 14, 14]
+    assert [len(e) for e in samples] == [100] * 190
+    assert [sum(e.split == s for e in samples) for s in ("train", "val", "test")] == [112, 14, 64]
 
 
 def test_statistics_are_similar_to_the_paper(samples: list[Episode]) -> None:

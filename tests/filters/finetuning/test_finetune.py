@@ -19,6 +19,7 @@ from beliefscope.filters.finetuning.batch_mix import Mix
 from beliefscope.filters.finetuning.finetune import FineTuned, finetune
 from beliefscope.filters.finetuning.loop import FineTuneLoop, Validation, score
 from beliefscope.filters.finetuning.module_selection import freeze, named_tensors, select_parameters
+from beliefscope.filters.finetuning.report import no_change
 from beliefscope.filters.finetuning.settings import FineTune, StepRange
 from beliefscope.filters.finetuning.slices import CLEAN, Slice
 from beliefscope.filters.training import losses
@@ -313,3 +314,12 @@ def test_settings_survive_json_and_invalid_ones_are_rejected(episodes: list[Epis
         run(episodes, replace(SMALL, events=(StepRange(99),)))
     with pytest.raises(BadInput, match="begins after its episode's 60 steps"):
         run(episodes, replace(SMALL, events=(StepRange(9, 70),)))
+
+
+def test_a_run_that_ruins_the_weights_keeps_the_base_and_says_so(episodes: list[Episode]) -> None:
+    record = run(episodes, replace(SMALL, rate=100.0)).record
+    assert record["best_step"] == 0
+    assert no_change(record).startswith("No change: the base checkpoint was best. Try ")
+    assert "a learning rate other than 100" in no_change(record)
+    assert not no_change(record | {"best_step": 2})
+    assert not no_change(record | {"noise_factor": 1.2})

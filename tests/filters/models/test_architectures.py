@@ -100,7 +100,7 @@ def test_unknown_names_are_rejected_with_the_available_ones(custom_task: Task) -
 
 def test_architectures_survive_json() -> None:
     unusual = Architecture(
-        "door", "pf", "unimodal", ("image",), 32, 1, "mean", "moments", True, "raw", "soft", soft_share=0.25
+        "door", "pf", "unimodal", ("image",), 32, 1, "authors", "mean", "moments", True, "raw", "soft", soft_share=0.25
     )
     for each in (*filters_of(DOOR).values(), unusual):
         assert Architecture.from_json(each.to_json()) == each

@@ -23,9 +23,6 @@ from beliefscope.filters.rollout import rollout
 sys.path.insert(0, str(Path(__file__).parent))
 import linear_system as linear
 
-kalman = pytest.importorskip("filterpy.kalman", reason="FilterPy is not installed: pip install -e '.[dev]'")
-monte_carlo = pytest.importorskip("filterpy.monte_carlo")
-
 Array = NDArray[np.float64]
 STEPS = 30
 R = np.diag(linear.R_STD**2)
@@ -41,21 +38,16 @@ def dynamics() -> Dynamics:
     return model.requires_grad_(False)
 
 
-class Extended(kalman.ExtendedKalmanFilter):  # type: ignore[misc, name-defined]
-    """FilterPy's EKF with a Jacobian from reverse-mode differentiation."""
-
-    def __init__(self, dynamics: Dynamics) -> None:
-        super().__init__(dim_x=3, dim_z=3)
-        self.dynamics = dynamics
-
-    def predict_x(self, u: Tensor) -> None:  # type: ignore[override]
-        x = torch.from_numpy(self.x)
-        self.F = torch.autograd.functional.jacobian(lambda state: self.dynamics(state, u), x).numpy()
-        self.x = self.dynamics(x, u).numpy()
-
-
 def extended(dynamics: Dynamics, parts: Tensor, observations: Array) -> Iterator[tuple[Array, Array]]:
-    oracle = Extended(dynamics)
+    """FilterPy's EKF with a Jacobian from reverse-mode differentiation."""
+    oracle = pytest.importorskip("filterpy.kalman").ExtendedKalmanFilter(dim_x=3, dim_z=3)
+
+    def predict_x(u: Tensor) -> None:
+        x = torch.from_numpy(oracle.x)
+        oracle.F = torch.autograd.functional.jacobian(lambda state: dynamics(state, u), x).numpy()
+        oracle.x = dynamics(x, u).numpy()
+
+    oracle.predict_x = predict_x
     oracle.x, oracle.P, oracle.Q, oracle.R = np.zeros(3), linear.START, np.diag(dynamics.noise.numpy() ** 2), R
     for u, z in zip(parts, observations, strict=True):
         oracle.predict(u)
@@ -64,6 +56,7 @@ def extended(dynamics: Dynamics, parts: Tensor, observations: Array) -> Iterator
 
 
 def unscented(dynamics: Dynamics, parts: Tensor, observations: Array) -> Iterator[tuple[Array, Array]]:
+    kalman = pytest.importorskip("filterpy.kalman")
     points = kalman.MerweScaledSigmaPoints(3, ALPHA, BETA, KAPPA)
     oracle = kalman.UnscentedKalmanFilter(
         3, 3, 1.0, hx=lambda x: x, fx=lambda x, dt, u: dynamics(torch.from_numpy(x), u).numpy(), points=points
@@ -91,6 +84,7 @@ def test_nonlinear_kalman_filters(kind: str, oracle: object, dynamics: Dynamics)
 
 
 def test_systematic_resampling_with_the_same_offset(monkeypatch: pytest.MonkeyPatch) -> None:
+    monte_carlo = pytest.importorskip("filterpy.monte_carlo")
     generator = torch.Generator().manual_seed(1)
     log_weights = torch.log_softmax(2.0 * torch.randn(20, 64, generator=generator, dtype=torch.float64), dim=-1)
     ours = systematic(log_weights, torch.Generator().manual_seed(2))

@@ -33,7 +33,7 @@ from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
 from beliefscope.filters.training import study
 from beliefscope.filters.training.plan import BLACKOUTS
 from beliefscope.filters.training.study import Cell, run_cell, run_ray
-from beliefscope.filters.training.study_table import TRIVIAL, Row, rows_of
+from beliefscope.filters.training.study_table import TRIVIAL, Row, rows_of, to_markdown
 from beliefscope.recordings.study_figures import bar_styles, results
 
 pytestmark = pytest.mark.slow
@@ -363,3 +363,26 @@ def test_cells_on_a_ray_cluster(data: Path, finished: Path, tmp_path: Path, monk
     assert answers[cells[0]] == cells[0].finished(tmp_path)
     assert answers[cells[0]]["metrics"] == document(finished, NAMES[0])["metrics"]
     assert "was changed while the study ran" in answers[cells[1]]["error"]
+
+
+def test_updates_and_standalone_filters_have_columns_of_their_own() -> None:
+    """The haptics-only update is near the fused estimate, the standalone filter is not."""
+    errors = {"fused": 0.5, "update": 0.6, "image": 0.7, "haptics": 2.0}
+    rmse = {name: {"hinge_x_cm": value, "position_cm": value} for name, value in errors.items()}
+    consistency = {"nll": None, "nees": None, "coverage95": None}
+    by_name = {
+        "fused": {"rmse": rmse["fused"], "updates": {m: {"rmse": rmse["update"]} for m in ("image", "haptics")}},
+        **{name: {"rmse": rmse[name]} for name in ("image", "haptics")},
+    }
+    by_name["fused"] |= consistency
+    cell = Cell("door", "crossmodal-ekf", 0, "smoke", "door", Path("door.h5"), "")
+    finished = {"seed": 0, "seconds": 1.0, "trivial": rmse["fused"], "metrics": {f"{b:g}": by_name for b in BLACKOUTS}}
+    rows = rows_of({cell: finished})
+    assert rows[0].updates["haptics"]["position_cm"] == 0.6
+    assert rows[0].standalone["haptics"]["position_cm"] == 2.0
+    table = to_markdown(rows)
+    head = "| fused | image-only update | image standalone | haptics-only update | haptics standalone |"
+    assert head in table
+    assert "| crossmodal-ekf | 0% | 0.50 | 0.60 | 0.70 | 0.60 | 2.00 |" in table
+    del by_name["fused"]["updates"]  # of earlier versions
+    assert "| crossmodal-ekf | 0% | 0.50 |  | 0.70 |  | 2.00 |" in to_markdown(rows_of({cell: finished}))

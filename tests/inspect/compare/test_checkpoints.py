@@ -33,8 +33,8 @@ from beliefscope.inspect.traces.replay import Edit, Replay
 
 pytestmark = pytest.mark.slow
 
-EPISODES = (9, 19, 29, 39, 49, 59)
-"""Held-out episodes, enough for intervals."""
+EPISODES = (9, 19, 29, 39, 49, 109, 129, 141)
+"""Held-out episodes: from step 30 to 40, five have steps with contact and five without, enough for intervals."""
 
 EKF = load_checkpoint(shipped("door", "crossmodal-ekf"))
 PF = load_checkpoint(shipped("door", "crossmodal-pf"))
@@ -202,7 +202,7 @@ def test_numbers_equal_evaluate(data: Dataset) -> None:
             assert errors == pytest.approx(metrics.rmse, rel=1e-4)
             beliefs = [getattr(rows[key], side) for key in ("nll", "nees", "coverage95")]
             assert beliefs == pytest.approx([metrics.nll, metrics.nees, metrics.coverage95], rel=1e-3)
-    assert "No verdict from" in result.verdict
+    assert result.verdict == "No verdict: too few trajectories (2; at least 5 needed)."
     assert not result.improvements()
     assert not result.regressions()
 

@@ -71,13 +71,13 @@ def test_invalid_edits(replay: Replay) -> None:
         replay.edited(Edit(40, 60, weights={"touch": 0.5}))
 
 
-@pytest.mark.parametrize("replay", ["crossmodal-pf"], indirect=True)  # the maps of an EKF are its posteriors
+@pytest.mark.parametrize("replay", ["crossmodal-pf", "crossmodal-ekf"], indirect=True)
 def test_maps_use_edited_beta(replay: Replay) -> None:
     edited = replay.edited(Edit(20, 40, weights={"image": 1.0}))
     step, size = 25, 21
     image, haptics, fused = MapEngine(replay.checkpoint, edited).map(step, size=size).log_likelihood
     # The mixture subtracts a constant from each map; a one-hot beta leaves a single map.
-    np.testing.assert_allclose(fused - fused.max(), image - image.max(), atol=1e-4)  # float32 of log-likelihoods
+    np.testing.assert_allclose(fused - fused.max(), image - image.max(), rtol=1e-4, atol=1e-4)
     assert np.abs((fused - fused.max()) - (haptics - haptics.max())).max() > 1.0
     same = (MapEngine(replay.checkpoint, run).map(step - 10, size=size) for run in (edited, replay.original))
     np.testing.assert_array_equal(*(run.log_likelihood for run in same))

@@ -122,7 +122,10 @@ def test_lineage_command(run: Run, family: Path, tmp_path: Path) -> None:
     assert "cut.safetensors" in err
     lines = out.splitlines()
     assert "door crossmodal-ekf" in lines[0]
-    assert next(line for line in lines if "finetuned" in line).startswith("└── ")
+    # Each generation is indented below its base.
+    assert not lines[0].startswith(" ")
+    assert any(line.startswith(f"    {family / 'finetuned.safetensors'} ") for line in lines)
+    assert any(line.startswith(f"        {family / 'deep' / 'first.safetensors'} ") for line in lines)
     assert "RMSE position cm 0.5, angle deg 1.25" in out
     assert "which is not in these folders" in out
     code, out, _ = run(f"lineage {family} --json -")

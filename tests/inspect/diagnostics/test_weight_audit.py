@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from beliefscope.inspect.diagnostics.weight_audit import ENTRY, audit
-from beliefscope.inspect.statistics.bootstrap import MIN_TRAJECTORIES, correlate, correlation_sums
+from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, correlate, correlation_sums
 from beliefscope.inspect.statistics.oracle import oracle_weights
 from beliefscope.inspect.trace import Trace
 
@@ -92,9 +92,11 @@ def test_regret_of_a_worked_example() -> None:
     np.testing.assert_allclose(total.regret[:2], 0.005, rtol=1e-3)
     np.testing.assert_allclose(total.unimodal[:, 0], [0.02, 0.01], rtol=1e-4)
     np.testing.assert_allclose(result.regret[:, 0], 0.005, rtol=1e-3)
-    assert "Regret 0.500 cm: position RMSE 0.500 cm, 0.000 cm with the oracle's weights" in result.verdict
-    assert "1.000 cm with haptics only. Better weights would reduce the error." in result.verdict
-    assert "Intervals need 5 trajectories." in result.verdict
+    assert (
+        "Position RMSE 0.500 cm, 1.000 cm for the haptics-only update, 0.000 cm with the oracle's weights"
+        in result.verdict
+    )
+    assert "constant weights: too few trajectories (1; at least 5 needed)." in result.verdict
 
 
 def test_angles_wrap() -> None:
@@ -114,7 +116,26 @@ def test_optimal_weights_have_no_regret() -> None:
     np.testing.assert_allclose(result.effective_weights, result.oracle, atol=1e-3)
     worse = audit([erring(image, haptics, 0.99)])
     assert (worse.phases[0].regret > 0.005).all()
-    assert "Better weights would reduce the error." in worse.verdict
+
+
+def test_only_weights_that_a_constant_beats_would_reduce_the_error() -> None:
+    """The oracle is far better than any filter, so its regret is no alarm."""
+
+    def planted_traces(weight: float) -> list[Trace]:
+        errors = np.random.default_rng(2).normal(0.0, [[[0.01]], [[0.03]]], (6, 2, 60, 3))
+        return [erring(image, haptics, weight) for image, haptics in errors]
+
+    best = audit(planted_traces(0.9))  # inverse variances
+    assert best.phases[0].regret[0] > 0.3 * best.phases[0].fused[0]
+    assert best.excess[1] < 0.05
+    assert "The best constant weights by phase would hardly reduce the error" in best.verdict
+    assert best.alarms == ()
+    worse = audit(planted_traces(0.1))
+    assert "The best constant weights by phase would reduce the error" in worse.verdict
+    assert worse.alarms == ("better weights would reduce the error",)
+    # Independent errors: RMSE with weight w is sqrt(w^2 + 9 (1 - w)^2) cm by component.
+    expected = math.sqrt((0.1**2 + 9 * 0.9**2) / (0.9**2 + 9 * 0.1**2)) - 1.0
+    assert worse.excess[0] == pytest.approx(expected, rel=0.25)  # 360 errors: three standard errors
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -185,7 +206,7 @@ def test_weight_determined_by_contact_correlates_with_it() -> None:
     np.testing.assert_allclose(contact.effective_weights[0], 0.2, rtol=1e-5)
     assert "0.80 in free motion, 0.20 in contact" in result.verdict
     assert "-1.00 with contact" in result.verdict
-    assert "Intervals need" not in result.verdict
+    assert "too few" not in result.verdict
     assert result.correlation("effective_weights", "image", "blackout") is None  # no blackout
 
 
@@ -211,7 +232,7 @@ def test_intervals_cover_a_known_correlation() -> None:
     x, y = np.repeat(x, 10, -1), np.repeat(y, 10, -1)
     _, low, high = correlate(np.stack([correlation_sums(a, b) for a, b in zip(x, y, strict=True)]))
     covered = ((low <= correlation) & (correlation <= high)).mean()
-    assert 0.88 <= covered <= 0.985  # 95 %, a little less for a percentile of 25; +- 3 standard errors
+    assert 0.88 <= covered <= 0.985  # 95 % +- 3 standard errors
     # Intervals over independent steps would be narrower by sqrt(10).
     assert np.median(high - low) == pytest.approx(
         2 * 1.96 * (1 - correlation**2) / math.sqrt(4 * trajectories), rel=0.15

@@ -14,8 +14,8 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import WARMUP, evaluate
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.by_episode import POINTS, by_episode
-from beliefscope.inspect.failures.events import survey_of
 from beliefscope.inspect.failures.step_scores import Survey
+from beliefscope.inspect.failures.survey import survey_of
 
 EPISODES = (9, 19, 59)
 

@@ -14,7 +14,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.inspect.diagnostics.weight_audit import position_regret
+from beliefscope.inspect.diagnostics.weight_steps import position_regret
 from beliefscope.inspect.failures.events import event_spans, failures_of, find_failures
 from beliefscope.inspect.failures.step_scores import PHASES, Survey, disagreement, scores_of
 from beliefscope.inspect.statistics import measures
@@ -138,7 +138,7 @@ def test_events_are_ranked_and_match_the_trace(traces: list[Trace], survey: Surv
         run = by_index[event.episode]
         score = scores_of(survey.task)[by].values(run)
         assert event.first <= event.step <= event.last
-        assert event.score == score[event.step] == score[event.first : event.last + 1].max() > failures.threshold
+        assert event.score == score[event.step] == np.nanmax(score[event.first : event.last + 1]) > failures.threshold
         np.testing.assert_array_equal(event.error, measures.position_error(run)[event.step])
         np.testing.assert_array_equal(event.nees, measures.nees(run)[event.step])
         assert event.ess == run.effective_sample_size[event.step]  # type: ignore[index]
@@ -157,6 +157,15 @@ def test_phases_partition_steps_and_events(survey: Survey) -> None:
         overall = survey.scores["disagreement"].mean()  # mean of inside and outside, weighted by share
         assert g.share * g.inside + (1 - g.share) * g.outside == pytest.approx(overall)
     assert [g.name for g in failures.phases] == [name for name in PHASES if name in {g.name for g in failures.phases}]
+
+
+def test_regret_in_the_warm_up_is_no_failure(survey: Survey) -> None:
+    """The belief starts at the truth, so small weights errors there are a large share of the regret."""
+    failures = failures_of(survey, "regret")
+    assert "start" not in {phase.name for phase in failures.phases}
+    assert min(event.step for event in failures.events) >= measures.WARMUP
+    assert sum(phase.share for phase in failures.phases) == pytest.approx(1.0)
+    assert "start" in {phase.name for phase in failures_of(survey, "error").phases}
 
 
 def test_contact_changes_last_half_a_second(traces: list[Trace]) -> None:
@@ -216,6 +225,14 @@ def test_angles_have_a_score_and_wrap() -> None:
     assert "deg at step 50" in failures.verdict
     with pytest.raises(BadInput, match="no failures by ess: this filter has no particles"):
         failures_of(Survey.from_traces([run]), "ess")
+
+
+def test_a_score_that_does_not_apply_is_refused_after_the_first_episode() -> None:
+    feature = load_checkpoint(shipped("door", "feature-ekf"))
+    progress: list[float] = []
+    with open_dataset(sample_path("door")) as data, pytest.raises(BadInput, match="no failures by regret"):
+        find_failures(feature, {9: shortened(data[9]), 19: data[19]}, by="regret", progress=progress.append)
+    assert max(progress) <= 0.5
 
 
 def test_failures_match_the_traces(checkpoint: Checkpoint, episodes: dict[int, Episode]) -> None:

@@ -111,12 +111,17 @@ def test_drawn_maps_equal_the_engine(pf: tuple[Checkpoint, Trace]) -> None:
         np.testing.assert_allclose(image.get_array(), likelihood / likelihood.max(), atol=1e-5)
         assert image.origin == "lower"
         np.testing.assert_allclose(image.get_extent(), [-13.5, 13.5, -13.5, 13.5])
-        assert axes.get_title().endswith(f"{modality}\n{paper.STATES[state]}, step {steps[state]}")
+        assert axes.get_title().endswith(f"{modality} likelihood\n{paper.STATES[state]}, step {steps[state]}")
     dots = [[line.get_xydata()[0] for line in axes.lines if line.get_marker() == "o"] for axes in figure.axes[:3]]
-    assert [len(points) for points in dots] == [0, 0, 1], "only haptics in contact has the line"
+    assert [len(points) for points in dots] == [0, 0, 1], "only haptics in contact shows the end effector"
     step = steps[True]
     effector = traced.episode.observations["effector_position"][step, :2] - traced.episode.states[step, :2]
     np.testing.assert_allclose(dots[2][0], 100.0 * effector, rtol=1e-5)
+    (ridge,) = (line for line in figure.axes[2].lines if line.get_label() == "expected ridge")
+    direction = np.subtract(ridge.get_xy2(), ridge.get_xy1())
+    assert np.arctan2(*direction[::-1]) == pytest.approx(traced.episode.states[step, 2] + np.pi / 2)
+    posterior = paper.maps_figure(checkpoint, traced, {True: step}, SIZE, "posterior")
+    assert posterior.axes[0].get_title().startswith("(a) image posterior")
 
 
 def lines_of(axes: object) -> dict[str, NDArray[np.float64]]:
@@ -135,7 +140,7 @@ def test_drawn_weights_and_estimates_equal_the_trace(ekf: tuple[Checkpoint, Trac
         np.testing.assert_allclose(estimates["truth"], 100.0 * traced.episode.states[:, i])
         np.testing.assert_allclose(estimates["fused"], 100.0 * traced.estimate_mean[:, i])
         for k, name in enumerate(traced.modalities):
-            np.testing.assert_allclose(estimates[name], 100.0 * traced.modality_mean[:, k, i])
+            np.testing.assert_allclose(estimates[f"{name}-only update"], 100.0 * traced.modality_mean[:, k, i])
             np.testing.assert_array_equal(weights[f"{name} beta"], traced.weights[:, k, i])
             np.testing.assert_array_equal(weights[f"{name} effective"], traced.effective_weights[:, k, i])
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.simulation.door import DOOR, panel_outline
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.likelihood_maps import ENTRY
@@ -18,7 +20,7 @@ from beliefscope.inspect.trace import trace
 
 SIZE, HALF = 135, 0.135
 OFFSETS = (((np.arange(SIZE) + 0.5) / SIZE * 2.0 - 1.0) * HALF).astype(np.float32)
-EFFECTOR = np.array([[0.3, 0.3, 0.5]])
+STATES = np.array([[0.0, 0.0, 0.3]])  # a door's hinge at the origin, at 0.3 rad
 
 
 def gaussian(mean: Any, covariance: Any) -> np.ndarray:
@@ -35,7 +37,7 @@ def rotated(sd: tuple[float, float], angle: float) -> np.ndarray:
 def numbers(*layers: np.ndarray) -> MapStatistics:
     names = tuple(f"layer{i}" for i in range(len(layers)))
     map_ = LikelihoodMap(0, math.nan, names, OFFSETS, OFFSETS, np.zeros(2, np.float32), np.stack(layers))
-    trace: Any = SimpleNamespace(episode=SimpleNamespace(observations={"effector_position": EFFECTOR}))
+    trace: Any = SimpleNamespace(episode=SimpleNamespace(task="door", states=STATES))
     return measure_maps([map_], trace)
 
 
@@ -51,8 +53,9 @@ def test_closed_forms_of_a_gaussian(angle: float) -> None:
     assert result.area95[0, 0] == pytest.approx(-2.0 * math.log(0.05) * math.pi * det, rel=0.01)
     assert result.axis[0, 0] == pytest.approx(angle, abs=2e-3)
     assert result.elongation[0, 0] == pytest.approx(25.0 / 12.0, rel=0.01)
-    angle_to_line = abs((angle - math.pi / 4 + math.pi / 2) % math.pi - math.pi / 2)
-    assert result.off_line[0, 0] == pytest.approx(angle_to_line, abs=2e-3)
+    # A closed door's panel is along y.
+    off_panel = abs((angle - (math.pi / 2 + 0.3) + math.pi / 2) % math.pi - math.pi / 2)
+    assert result.deviation[0, 0] == pytest.approx(off_panel, abs=2e-3)
     np.testing.assert_allclose(result.peak[0, 0], (0.01, -0.02), atol=0.0011)  # half a cell
     assert result.truth[0, 0] == pytest.approx(gaussian((0.01, -0.02), covariance)[67, 67] - result.log_peak[0, 0])
 
@@ -94,16 +97,46 @@ def test_rotation_changes_only_the_axis() -> None:
         np.testing.assert_allclose(getattr(after, name), getattr(before, name), rtol=1e-6)
 
 
-def test_diagnostic_reports_the_haptics_ridge() -> None:
+def test_expected_ridge_is_along_the_panel() -> None:
+    """The direction of the outline's long horizontal axis, not that from the hinge to the gripper."""
+    states = np.array([[0.8, -0.3, 0.0], [0.7, -0.2, 0.9], [0.9, 0.1, 2.0]])
+    direction = DOOR.ridge_direction
+    assert direction is not None
+    centre = panel_outline(states).position[:, :2] - states[:, :2]
+    along = np.stack([np.cos(direction(states)), np.sin(direction(states))], axis=1)
+    np.testing.assert_allclose(along, centre / np.linalg.norm(centre, axis=1, keepdims=True), atol=1e-12)
+    assert find_task("push").ridge_direction is None
+
+
+def test_ridge_of_a_simulated_door_is_along_the_panel_not_towards_the_gripper() -> None:
+    """Haptics map of the shipped PF in contact; the bar stands off the panel, so the two directions differ."""
     checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
     with open_dataset(sample_path("door")) as data:
         index = data.held_out()[0]
         run = trace(checkpoint, data[index], index, particles=50)
     result = ENTRY([run], checkpoint, size=21)
     assert result.ridge_layers == ("haptics",)
-    assert result.numbers.off_line.shape == (len(run), 3)
-    assert "principal axis of the haptics map" in result.verdict
+    assert result.numbers.deviation.shape == (len(run), 3)
     haptics, contact = result.numbers.layers.index("haptics"), result.phases["contact"]
-    # Property of the built-in filter; a random axis is within 30 degrees with probability 1/3.
-    assert np.degrees(np.median(result.numbers.off_line[contact, haptics])) < 30.0
+    to_gripper = run.episode.observations["effector_position"][:, :2] - run.episode.states[:, :2]
+    off_gripper = result.numbers.axis[:, haptics] - np.arctan2(to_gripper[:, 1], to_gripper[:, 0])
+    off_gripper = np.abs((off_gripper + np.pi / 2) % np.pi - np.pi / 2)
+    off_panel = result.numbers.deviation[:, haptics]
+    # Properties of the built-in filter; a random axis is 45 degrees off in the median.
+    assert np.degrees(np.median(off_panel[contact])) < 8.0
+    assert np.median(off_panel[contact]) < 0.6 * np.median(off_gripper[contact])
+    assert "the haptics likelihood is a ridge" in result.verdict
+    assert "off the direction that the task expects" in result.verdict
     assert len(result.views()["curves"]) == 1 + 3 + 2
+
+
+def test_push_expects_no_direction() -> None:
+    checkpoint = load_checkpoint(shipped("push", "crossmodal-pf"))
+    with open_dataset(sample_path("push")) as data:
+        index = data.held_out()[0]
+        run = trace(checkpoint, data[index], index, particles=50)
+    result = ENTRY([run], checkpoint, size=21, quantity="posterior")
+    assert np.isnan(result.numbers.expected).all()
+    assert "expects" not in result.verdict
+    assert result.tables()[0].title.startswith("Posterior. Fused: prior times beta-weighted sum")
+    assert len(result.views()["curves"]) == 3 + 2

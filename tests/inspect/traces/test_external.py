@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -106,8 +107,22 @@ def test_external_interface_reproduces_the_built_in_filter(episode: Episode, tmp
         np.testing.assert_allclose(getattr(result, name), getattr(native, name), rtol=2e-3, atol=1e-5, err_msg=name)
     checkpoint = external(PlainFilter())
     assert no_maps(checkpoint, result) is None
-    expected = MapEngine(load_checkpoint(shipped("door", "crossmodal-ekf")), native).map(50, size=41)
-    actual = MapEngine(checkpoint, result).map(50, size=41)
+    native_maps = MapEngine(load_checkpoint(shipped("door", "crossmodal-ekf")), native)
+    expected = native_maps.map(50, size=41, quantity="posterior")
+    engine = MapEngine(checkpoint, result)
+    actual = engine.map(50, size=41)
+    assert (engine.quantities, actual.quantity) == (("posterior",), "posterior")
+    assert actual.rule == "posterior reported by the filter"
+    with pytest.raises(BadInput, match="has no likelihood maps: it reports no virtual observations"):
+        engine.map(50, size=41, quantity="likelihood")
+    sensors = {name: getattr(native, name) for name in ("observation_mean", "observation_covariance")}
+    both = MapEngine(checkpoint, replace(result, **sensors))
+    assert both.quantities == ("likelihood", "posterior")
+    likelihood, reference = both.map(50, size=41), native_maps.map(50, size=41)
+    np.testing.assert_array_equal(likelihood.log_likelihood[:2], reference.log_likelihood[:2])
+    assert likelihood.rule == "product of likelihoods (the filter's own rule is unknown)"
+    product = likelihood.log_likelihood[:2].sum(axis=0)
+    np.testing.assert_allclose(np.ptp(likelihood.log_likelihood[2] - product), 0.0, atol=1e-2)
     assert actual.layers == expected.layers
     np.testing.assert_allclose(actual.normalised(), expected.normalised(), atol=6)  # out of 255
     save_trace(result, tmp_path / "made.trace")

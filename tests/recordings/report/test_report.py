@@ -22,6 +22,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.trace import Trace, save_trace, trace
 from beliefscope.recordings.report.compose import compose, write_report
 from beliefscope.recordings.report.figures import zoom_of
@@ -168,12 +169,14 @@ def test_other_folders_are_not_replaced(tmp_path: Path) -> None:
 
 def test_accuracy_equals_evaluate(run_: Trace, checkpoint: Checkpoint) -> None:
     with open_dataset(sample_path("door")) as data:
-        expected = evaluate(checkpoint.filter, [data[EPISODE]])
-    table = accuracy([run_])
-    layer, *numbers = table.rows[-1]
-    reference = [*expected.rmse.values(), expected.nees, expected.coverage95, expected.nll]
-    assert layer == "fused"
-    np.testing.assert_allclose(np.array(numbers, float), reference, rtol=1e-4)  # estimates are float32 in SI units
+        expected = evaluate(checkpoint.filter, [data[EPISODE]], modalities=True)
+    metrics = {f"{name}-only update": result for name, result in expected.updates.items()} | {"fused": expected}
+    metrics |= {f"{name} standalone": result for name, result in expected.standalone.items()}
+    rows = accuracy([run_], standalone_runs([run_], checkpoint)).rows
+    assert [row[0] for row in rows] == list(metrics)
+    for (_, *numbers), result in zip(rows, metrics.values(), strict=True):
+        reference = [*result.rmse.values(), result.nees, result.coverage95, result.nll]
+        np.testing.assert_allclose(np.array(numbers, float), reference, rtol=1e-4)  # estimates are float32 in SI units
 
 
 def test_worst_events_are_the_largest_errors_with_a_minimum_distance(new_trace: Callable[..., Trace]) -> None:
@@ -192,7 +195,7 @@ def test_event_table_has_known_errors(run_: Trace) -> None:
     error = run_.estimate_mean[40].astype(float) - run_.episode.states[40]
     assert rows["fused"]["hinge_x error (cm)"] == pytest.approx(100 * error[0])
     assert rows["fused"]["position error (cm)"] == pytest.approx(100 * np.hypot(error[0], error[1]))
-    shares = [float(rows[name]["effective weight (mean)"]) for name in run_.modalities]  # type: ignore[arg-type]
+    shares = [float(rows[f"{name}-only update"]["effective weight (mean)"]) for name in run_.modalities]  # type: ignore[arg-type]
     assert sum(shares) == pytest.approx(1.0, abs=1e-6)
 
 

@@ -1,6 +1,6 @@
 """Fuzzing of every file reader, every HTTP route and the view's socket with invalid input.
 
-    python bench/fuzz.py [part ...] --inputs 10000 --seed 0 --keep DIR
+    python tools/stress/fuzz.py [part ...] --inputs 10000 --seed 0 --keep DIR
 
 Parts are ``http``, ``socket`` and the readers in tests/fuzz/readers.py; default: all. Files are read in subprocesses
 with limited memory and time per input; a crash of a subprocess counts as a failure. Failing inputs are saved in DIR
@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fuzz"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "fuzz"))
 
 MEMORY = 1 << 30  # bytes a reader may allocate
 TIMEOUT = 5  # s of CPU time per input

@@ -1,6 +1,6 @@
 """``kill -9`` at random times during collection, training, fine-tuning, tracing, recording, studies and live runs.
 
-    python bench/kills.py --kills 200 --seed 0
+    python tools/stress/kills.py --kills 200 --seed 0
 
 Each run is killed repeatedly, at random times over the duration of an uninterrupted run, until it completes. After
 every kill, all files must be valid or identified as incomplete; the final result must equal that of the uninterrupted
@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "fuzz"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "fuzz"))
 
 import numpy as np
 import torch

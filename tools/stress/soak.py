@@ -1,6 +1,6 @@
 """Hours of use at a low rate: growth of the server's memory and descriptors.
 
-    python bench/soak.py --hours 2 --out soak.csv
+    python tools/stress/soak.py --hours 2 --out soak.csv
 
 A few simulated browsers select random filters, episodes and faults, scrub, rest, record, start and cancel jobs, and
 close their connections or abort them. Every 10 s the server's resources are added to the CSV. At the end straight
@@ -17,6 +17,8 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 
 import httpx
 import numpy as np

@@ -1,4 +1,4 @@
-"""Print the server's OpenAPI document: ``python -m beliefscope.app.server.openapi [--models]``.
+"""Print the server's OpenAPI document: ``python tools/openapi.py [--models]``.
 
 With ``--models``, only the models of requests and responses, from which the page's types are generated.
 """

@@ -64,7 +64,7 @@ class Browser:
         while (answer := await self._request("GET", path, params=query)).status_code == 202:
             await asyncio.sleep(RETRY)
         header = answer.json()
-        for part in ("columns", *(["images"] if header["pictures"] else [])):
+        for part in ("columns", *(["images"] if header["image_size"] else [])):
             tag = self._tags.get(f"{path}/{part}?{query}", "")
             response = await self._request("GET", f"{path}/{part}", params=query, headers={"If-None-Match": tag})
             self._tags[f"{path}/{part}?{query}"] = response.headers["etag"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,16 +10,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from beliefscope.filters.finetuning.settings import FineTune
     from beliefscope.inspect.trace import Trace
-
-
-def is_path(name_or_path: str) -> bool:
-    """Whether the text is the path of a checkpoint rather than a filter name."""
-    return name_or_path.endswith(".safetensors") or os.sep in name_or_path
-
-
-def is_code(name_or_path: str) -> bool:
-    """Whether the text names a build function: ``package.module:build`` or ``path/to/file.py:build``."""
-    return ":" in name_or_path and not name_or_path.endswith(".safetensors")
 
 
 def serve_command(filters: Iterable[str | Path], data: Path | None, seed: int) -> str:
@@ -61,6 +50,7 @@ def finetune_command(target: str, filter_: str | None, data: Path | None, settin
     for field in ("clean_weight", "steps", "length", "rate", "l2_sp", "patience"):
         if (value := getattr(settings, field)) != getattr(FineTune(), field):
             words += [f"--{field.replace('_', '-')}", f"{value:g}"]
+    words += ["--calibrate"] if settings.calibrate else []
     return shlex.join([*words, "--seed", str(settings.seed)])
 
 

@@ -1,8 +1,8 @@
 """Latency for 1 to 32 browsers that scrub at once, with and without a job.
 
-    python bench/load.py                        all counts
-    python bench/load.py --job                  the same with a job running
-    python bench/load.py --counts 8 --real 2    8 simulated browsers and 2 Chromium
+    python tools/stress/load.py                        all counts
+    python tools/stress/load.py --job                  the same with a job running
+    python tools/stress/load.py --counts 8 --real 2    8 simulated browsers and 2 Chromium
 
 Each browser scrubs its own episode with the default filter: 3 s at 30 moves a second, then 1 s of rest. Before that its
 page is open for 5 s (``--look``), in which the server prefetches maps.
@@ -12,9 +12,13 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 
 import httpx
 import numpy as np

@@ -1,0 +1,87 @@
+"""What can be chosen for fine-tuning a filter: modules, presets, data slices and settings, as JSON values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.finetuning.module_selection import (
+    module_change,
+    module_tree,
+    presets,
+    select_parameters,
+    within,
+)
+from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.finetuning.slices import CLEAN, standard_slices
+
+
+@dataclass(frozen=True)
+class ModuleInfo:
+    """A module of a filter. gradient, change: of the fine-tuning that wrote the checkpoint; None without one."""
+
+    name: str
+    kind: str
+    description: str
+    parameters: int
+    depth: int
+    gradient: float | None
+    change: float | None
+
+
+@dataclass(frozen=True)
+class PresetInfo:
+    """A preset. trains: names of parameters."""
+
+    name: str
+    trains: list[str]
+
+
+@dataclass(frozen=True)
+class SliceInfo:
+    """A slice of a data set (``filters.finetuning.slices``)."""
+
+    name: str
+    faults: list[dict[str, Any]]
+    contact: bool | None
+    only: list[str]
+    text: str
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Options for fine-tuning a filter. why_not: why it cannot be fine-tuned, or None. settings: the defaults."""
+
+    why_not: str | None
+    modules: Sequence[ModuleInfo]
+    presets: Sequence[PresetInfo]
+    slices: Sequence[SliceInfo]
+    settings: dict[str, Any]
+
+
+def choices(checkpoint: Checkpoint) -> Choices:
+    """The options for fine-tuning a filter."""
+    defaults = FineTune().to_json()
+    if isinstance(checkpoint, ExternalFilter):
+        return Choices("External filters cannot be fine-tuned here.", [], [], [], defaults)
+    filter_ = checkpoint.filter
+    changes = checkpoint.record.get("parts", {})  # of the fine-tuning that wrote this checkpoint
+    modules = []
+    for node in module_tree(filter_):
+        if node.name and node.parameters:
+            changed = any(within(key, node.name) for key in changes)
+            sizes = module_change(node.name, changes) if changed else {"gradient": None, "change": None}
+            modules.append(ModuleInfo(node.name, node.kind, node.description, node.parameters, node.depth, **sizes))
+    parameters = [name for name, _ in filter_.named_parameters()]
+    trained = {name: set(select_parameters(filter_, [name])) for name in presets(filter_)}
+    slices = [s for s in standard_slices(checkpoint.task) if s != CLEAN and set(s.only) <= set(filter_.names)]
+    return Choices(
+        None,
+        modules,
+        [PresetInfo(name, [key for key in parameters if key in names]) for name, names in trained.items()],
+        [SliceInfo(**slice_.to_json(), text=str(slice_)) for slice_ in slices],
+        defaults,
+    )

@@ -1,0 +1,98 @@
+"""Offset starts: a first belief beside the true state, with a covariance that matches the offset."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beliefscope.datasets.episode import Episode, FloatArray
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
+from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Gaussian
+from beliefscope.filters.filter import Filter
+from beliefscope.filters.rollout import start_at_truth
+
+UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / math.pi)}
+"""Internal unit -> unit of reported values, and the conversion factor."""
+
+
+@dataclass(frozen=True)
+class StartOffset:
+    """Distance of the first belief's mean from the true state, in a random direction.
+
+    Attributes:
+        lengths: internal unit -> length in it: ``{"m": 0.03, "rad": 0.35}``. The components of one unit form a vector
+            of this length and of uniform direction; the sign of a single component is random. Components of other units
+            start at the truth.
+    """
+
+    lengths: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, text: str, task: Task) -> StartOffset:
+        """From text such as ``3cm,20deg``. Raises BadInput for other text and for units that the task does not have."""
+        units = {UNITS[c.unit][0]: c.unit for c in task.components if c.unit in UNITS}
+        lengths: dict[str, float] = {}
+        for part in filter(None, (part.strip() for part in text.split(","))):
+            number = part.rstrip("abcdefghijklmnopqrstuvwxyz ")
+            shown = part[len(number) :].strip()
+            if shown not in units:
+                raise BadInput(f"start offset {part!r} is not in a unit of task {task.name!r}: {', '.join(units)}")
+            try:
+                value = float(number)
+            except ValueError:
+                value = math.nan
+            if not 0.0 < value < 1e6 or units[shown] in lengths:
+                raise BadInput(f"start offset {part!r} of {text!r} is not one positive length, such as 3{shown}")
+            lengths[units[shown]] = value / UNITS[units[shown]][1]
+        return cls(lengths)
+
+    def of(self, task: Task) -> StartOffset:
+        """The same offset without the units that the task does not have."""
+        return StartOffset(
+            {unit: self.lengths[unit] for unit in self.lengths if unit in {c.unit for c in task.components}}
+        )
+
+    def __bool__(self) -> bool:
+        return bool(self.lengths)
+
+    def __str__(self) -> str:
+        return ",".join(f"{UNITS[unit][1] * length:g}{UNITS[unit][0]}" for unit, length in self.lengths.items())
+
+    def vectors(self, task: Task, episodes: Sequence[Episode], seed: int) -> FloatArray:
+        """(N, n) offsets in SI units. Directions depend only on the seed and on each episode's digest."""
+        offsets = np.zeros((len(episodes), len(task.components)))
+        for row, episode in zip(offsets, episodes, strict=True):
+            rng = np.random.default_rng([seed, int(episode.digest()[:16], 16)])
+            for unit, length in sorted(self.lengths.items()):
+                members = [i for i, component in enumerate(task.components) if component.unit == unit]
+                direction = rng.standard_normal(len(members))
+                row[members] = length * direction / np.linalg.norm(direction)
+        return offsets.astype(np.float32)
+
+    def variances(self, task: Task) -> FloatArray:
+        """(n,) mean square of each component's offset, SI units: length^2 / d of d components; NaN without offset."""
+        units = [component.unit for component in task.components]
+        return np.array([self.lengths.get(unit, math.nan) ** 2 / units.count(unit) for unit in units], np.float32)
+
+
+NO_OFFSET = StartOffset()
+"""Start at the truth."""
+
+
+def shifted(start: Gaussian, offsets: Tensor, variances: Tensor) -> Gaussian:
+    """The start (N, n), (N, n, n) with offsets (N, n) and variances (n,) of its covariance; NaN keeps the variance."""
+    diagonal = torch.where(variances.isnan(), start.covariance.diagonal(dim1=-2, dim2=-1), variances)
+    return Gaussian(start.mean + offsets, torch.diag_embed(diagonal))
+
+
+def offset_start(filter_: Filter, batch: Batch, offsets: Tensor, variances: Tensor) -> Gaussian:
+    """The first belief, standardised: ``start_at_truth`` with offsets (N, n) and variances (n,) in SI units."""
+    _, std = filter_.statistics.mean_std("state")
+    return shifted(start_at_truth(filter_, batch), offsets / std, variances / std.square())

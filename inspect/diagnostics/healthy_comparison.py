@@ -1,0 +1,202 @@
+"""Comparison of trajectories with a healthy profile by a permutation test over all statistics at once.
+
+If the trajectories are healthy, they are exchangeable with those of the profile, whatever their distribution. So the
+probability of an alarm is at most ``SIGNIFICANCE`` for any number of trajectories, tails and dependent statistics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile
+from beliefscope.inspect.diagnostics.views import Table
+
+SIGNIFICANCE = 0.01
+"""Probability of an alarm of one diagnostic for healthy trajectories."""
+
+SINGLE_SIGNIFICANCE = 0.02
+"""The same for one trajectory, whose p-value is at least 1 / (1 + number of healthy trajectories)."""
+
+PERMUTATIONS = 1999
+"""Number of random divisions into tested and healthy trajectories."""
+
+MIN_EFFECT = 0.5
+"""Minimum difference of an alarm, in standard deviations between healthy trajectories."""
+
+KINDS = {
+    "nees": ("NEES/n", True, 0.05),
+    "nis": ("NIS/n", True, 0.05),
+    "autocorrelation": ("autocorrelation at lag 1 of the innovations", False, 0.02),
+    "beta": ("beta", False, 0.01),
+    "weight": ("effective weight", False, 0.01),
+    "regret": ("error relative to the oracle's weights", True, 0.02),
+    "ess": ("effective sample size", True, 0.05),
+    "outside": ("share of steps with the true state outside of the particles", False, 0.01),
+}
+"""Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
+standard deviation between trajectories, below which differences are irrelevant."""
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """A statistic of the tested trajectories compared with its healthy values.
+
+    Attributes:
+        statistic: ``KIND/SUBJECT/PHASE``.
+        value, healthy: means over the tested and over the healthy trajectories.
+        low, high: 95 % range of means over as many healthy trajectories as were tested.
+        p_value: probability of a deviation of this size in any statistic, if the trajectories are healthy.
+        alarm: whether it is significant and at least ``MIN_EFFECT``.
+    """
+
+    statistic: str
+    value: float
+    healthy: float
+    low: float
+    high: float
+    p_value: float
+    alarm: bool
+
+    @property
+    def label(self) -> str:
+        """Display name, such as ``NEES/n of fused in contact``."""
+        kind, subject, phase = self.statistic.split("/")
+        title = KINDS[kind][0] if kind in KINDS else kind
+        return f"{title}{f' of {subject}' if subject else ''}{'' if phase == 'all' else f' in {phase}'}"
+
+    @property
+    def text(self) -> str:
+        """Label, value and healthy range."""
+        numbers = (_number(x) for x in (self.value, self.healthy, self.low, self.high))
+        return "{} is {}, healthy {} ({} to {})".format(self.label, *numbers)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Result of ``compare``, largest deviation first.
+
+    Attributes:
+        trajectories, healthy_trajectories: number of tested trajectories, and of those in the profile.
+        data: of the profile.
+        deviations: by statistic.
+    """
+
+    trajectories: int
+    healthy_trajectories: int
+    data: str
+    deviations: tuple[Deviation, ...]
+
+    @property
+    def alarms(self) -> tuple[Deviation, ...]:
+        """Deviations with an alarm."""
+        return tuple(deviation for deviation in self.deviations if deviation.alarm)
+
+    @property
+    def sentence(self) -> str:
+        """``No alarm`` or the largest alarms."""
+        if self.trajectories == 1 and 1.0 / (self.healthy_trajectories + 1) > SINGLE_SIGNIFICANCE:
+            return "Too few trajectories (1; at least 2 needed) to compare with the healthy record."
+        alarms = self.alarms
+        record = f"the healthy record of {self.healthy_trajectories} trajectories"
+        if not alarms:
+            return f"No alarm: within {record}."
+        more = f", and {len(alarms) - 3} more" if len(alarms) > 3 else ""
+        return f"Alarm, compared with {record}: {'; '.join(alarm.text for alarm in alarms[:3])}{more}."
+
+    def table(self) -> Table:
+        """One row per statistic."""
+        columns = ("statistic", "value", "healthy", "95 % range from", "to", "p-value", "alarm")
+        rows = tuple(
+            (d.label, d.value, d.healthy, d.low, d.high, d.p_value, "yes" if d.alarm else "") for d in self.deviations
+        )
+        return Table("Comparison with the healthy record", columns, rows)
+
+
+def compare(profile: HealthyProfile, trajectories: Sequence[Mapping[str, float]], seed: int = 0) -> Comparison:
+    """Compare trajectory statistics with those of a profile; statistics that only one of them has are omitted.
+
+    Max-T test of Westfall and Young: in a division of all trajectories into n and the others, each statistic has a
+    t-value, the difference of the means over its standard error, with the spread of the others. ``p_value`` is the
+    share of divisions whose largest absolute t is at least that of the statistic.
+    """
+    names = [name for name in profile.statistics if any(name in values for values in trajectories)]
+    count = len(trajectories)
+    if not names:
+        return Comparison(count, profile.episodes, profile.data, ())
+    tested = np.array([[values.get(name, np.nan) for name in names] for values in trajectories]).reshape(count, -1)
+    tested = tested[np.lexsort(np.nan_to_num(tested).T)]  # the random divisions must not depend on their order
+    values = np.concatenate([tested, np.stack([profile.statistics[name] for name in names], axis=1)])
+    keep = (np.isfinite(values[:count]).any(0)) & (np.isfinite(values[count:]).sum(0) >= 10)
+    names, values = [name for name, kept in zip(names, keep, strict=True) if kept], values[:, keep]
+    if not names:
+        return Comparison(count, profile.episodes, profile.data, ())
+    settings = [KINDS.get(name.split("/")[0], ("", False, 1e-9)) for name in names]
+    logarithmic, floor = np.array([s[1] for s in settings]), np.array([s[2] for s in settings])
+    scaled = np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values)
+    divisions = np.concatenate([np.arange(len(values))[None] < count, _divisions(len(values), count, seed)])
+    t, effect = _t_values(scaled, divisions, floor)
+    # Rounding must not distinguish a division from itself.
+    largest = np.abs(t).max(1) * (1.0 + 1e-9)
+    at_least = (largest[1:, None] >= np.abs(t[0])).sum(0)
+    # All divisions with one tested trajectory are enumerated, including the actual one.
+    p_value = at_least / len(values) if count == 1 else (1.0 + at_least) / len(divisions)
+    alarm = (p_value <= (SINGLE_SIGNIFICANCE if count == 1 else SIGNIFICANCE)) & (np.abs(effect[0]) >= MIN_EFFECT)
+    low, high = _ranges(values[count:], count, seed)
+    mean, healthy = np.nanmean(values[:count], axis=0), np.nanmean(values[count:], axis=0)
+    columns = [column.tolist() for column in (mean, healthy, low, high, p_value, alarm)]
+    rows: Iterable[tuple[Any, ...]] = zip(names, *columns, strict=True)
+    deviations = [Deviation(*row) for row in rows]
+    order = np.argsort(-np.abs(t[0]), kind="stable")
+    return Comparison(count, profile.episodes, profile.data, tuple(deviations[i] for i in order))
+
+
+@lru_cache(maxsize=16)
+def _divisions(total: int, count: int, seed: int) -> np.ndarray:
+    """(B, total) masks of ``count`` tested of ``total`` trajectories: random, or all of them if one is tested."""
+    if count == 1:
+        return np.eye(total, dtype=bool)
+    order = np.random.default_rng(seed).random((PERMUTATIONS, total)).argsort(axis=1)
+    return order < count
+
+
+def _t_values(values: Array, divisions: np.ndarray, floor: Array) -> tuple[Array, Array]:
+    """(B, S) t-values and effects in standard deviations of values (N, S) for divisions (B, N). NaN is missing."""
+    known = np.isfinite(values)
+    present = known.astype(np.float64)
+    centred = np.where(known, values - np.nanmean(values, axis=0), 0.0)
+    inside = divisions.astype(np.float64)
+    count, total = inside @ present, inside @ centred
+    others = present.sum(0) - count
+    mean = total / np.maximum(count, 1.0)
+    rest = (centred.sum(0) - total) / np.maximum(others, 1.0)
+    squares = np.square(centred).sum(0) - inside @ np.square(centred)
+    variance = np.maximum(squares - others * rest**2, 0.0) / np.maximum(others - 1.0, 1.0)
+    effect = (mean - rest) / np.maximum(np.sqrt(variance), floor)
+    valid = (count >= 1.0) & (others >= 2.0)
+    effect = np.where(valid, effect, 0.0)
+    return effect / np.sqrt(1.0 / np.maximum(count, 1.0) + 1.0 / np.maximum(others, 1.0)), effect
+
+
+@lru_cache(maxsize=16)
+def _draws(total: int, count: int, seed: int) -> Array:
+    """(2000, total): how often each of ``total`` trajectories is among ``count`` drawn with replacement."""
+    return np.random.default_rng(seed).multinomial(count, np.full(total, 1.0 / total), 2000).astype(np.float64)
+
+
+def _ranges(healthy: Array, count: int, seed: int) -> tuple[Array, Array]:
+    """(S,) 95 % range of the mean of ``count`` trajectories drawn from the healthy ones (E, S)."""
+    drawn = _draws(len(healthy), count, seed)
+    known = np.isfinite(healthy)
+    size = drawn @ known.astype(np.float64)
+    means = np.where(size > 0, drawn @ np.where(known, healthy, 0.0) / np.maximum(size, 1.0), np.nan)
+    low, high = np.nanpercentile(means, [2.5, 97.5], axis=0)
+    return low, high
+
+
+def _number(value: float) -> str:
+    return f"{value:.2g}" if abs(value) < 10 else f"{value:.0f}"

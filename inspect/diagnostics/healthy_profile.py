@@ -1,0 +1,87 @@
+"""Healthy profile: trajectory statistics of a checkpoint on clean held-out episodes, which its later runs should match.
+
+New checkpoints have it in their header; shipped ones have a file beside them, which keeps their hash.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.filters.checkpoint import Checkpoint, shipped
+
+Array = NDArray[np.float64]
+
+FORMAT = 1
+SUFFIX = ".profile.json"
+"""Of the file beside a shipped checkpoint."""
+
+DIGITS = 4
+"""Significant digits of stored values."""
+
+
+@dataclass(frozen=True)
+class HealthyProfile:
+    """Values of E clean held-out trajectories.
+
+    Attributes:
+        data: where the episodes come from: a command or the name of a data set.
+        episodes: E.
+        particles: number of particles, or None.
+        statistics: ``KIND/SUBJECT/PHASE`` -> (E,) values by trajectory, SI units; NaN where there is none, such as
+            in a phase of too few steps.
+    """
+
+    data: str
+    episodes: int
+    particles: int | None
+    statistics: Mapping[str, Array]
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values, rounded to ``DIGITS``; NaN as null."""
+        rows = {
+            name: [None if np.isnan(value) else float(f"{value:.{DIGITS}g}") for value in values.tolist()]
+            for name, values in self.statistics.items()
+        }
+        head = {"format": FORMAT, "data": self.data, "episodes": self.episodes, "particles": self.particles}
+        return {**head, "statistics": rows}
+
+    @classmethod
+    def from_json(cls, document: Any) -> HealthyProfile:
+        """Inverse of ``to_json``. Raises BadInput for another format or malformed values."""
+        try:
+            if document["format"] != FORMAT:
+                raise BadInput(f"healthy profile of format {document['format']!r}; this version reads format {FORMAT}")
+            count, particles = int(document["episodes"]), document["particles"]
+            rows = {
+                str(name): np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+                for name, values in document["statistics"].items()
+            }
+            data = str(document["data"])
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise BadInput(f"the healthy profile is malformed: {error!r}") from None
+        for name, values in rows.items():
+            if values.shape != (count,) or name.count("/") != 2:
+                raise BadInput(f"the healthy profile is malformed: {name!r} has {len(values)} values of {count}")
+        return cls(data, count, None if particles is None else int(particles), rows)
+
+
+def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:
+    """Profile of a checkpoint: in its header, or in the file beside the shipped checkpoint of this hash; else None."""
+    if isinstance(checkpoint, Checkpoint) and checkpoint.healthy_profile is not None:
+        return HealthyProfile.from_json(checkpoint.healthy_profile)
+    try:
+        path = shipped(task, filter_)
+    except BadInput:
+        return None
+    path = path.with_name(path.stem + SUFFIX)
+    if not path.is_file():
+        return None
+    document = read_json(path.read_text())
+    return HealthyProfile.from_json(document["healthy_profile"]) if document["checkpoint"] == checkpoint_hash else None

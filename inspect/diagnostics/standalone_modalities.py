@@ -1,0 +1,229 @@
+"""Modalities as updates and standalone: what each contributes to the fused filter, and what it is worth by itself.
+
+The update of a modality starts at every step from the fused prior, which other modalities have informed; the standalone
+filter never uses them (``inspect/standalone.py``). Only the latter shows if fusion is better than one sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.subsets import input_modalities
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
+from beliefscope.inspect.standalone import standalone
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.intervals import jackknife, too_few
+from beliefscope.inspect.statistics.measures import Mask
+from beliefscope.inspect.trace import Trace
+
+
+@dataclass(frozen=True)
+class PhaseErrors:
+    """Root mean square errors in one phase, of the position and of each component, m and rad.
+
+    Attributes:
+        phase: phase name.
+        trajectories, steps: number of trajectories and steps in the phase.
+        fused: (1 + n,) of the filter.
+        updates: (K, 1 + n) of the single-modality updates; NaN for a modality without one.
+        standalone: (K, 1 + n) of the standalone filters.
+        ratio: (K,) position RMSE of the filter over that of each standalone filter: below 1, fusion is better.
+        low, high: (K,) 95 % intervals of ``ratio`` over trajectories; NaN for too few of them.
+    """
+
+    phase: str
+    trajectories: int
+    steps: int
+    fused: Array
+    updates: Array
+    standalone: Array
+    ratio: Array
+    low: Array
+    high: Array
+
+
+@dataclass(frozen=True)
+class StandaloneModalities(Diagnostic):
+    """Result of ``standalone_modalities``; K modalities, n components, T steps of a single trace (0 for several).
+
+    Attributes:
+        task, filter: of the traces.
+        modalities: K names.
+        trajectories: number of traces.
+        phases: errors by phase.
+        fused: (T,) m, position error of the filter.
+        updates, standalone: (T, K) m, position errors of the updates and of the standalone filters.
+        contact, blackout: (T,) masks.
+    """
+
+    task: str
+    filter: str
+    modalities: tuple[str, ...]
+    trajectories: int
+    phases: tuple[PhaseErrors, ...]
+    fused: Array
+    updates: Array
+    standalone: Array
+    contact: Mask
+    blackout: Mask
+
+    @property
+    def verdict(self) -> str:
+        total = self.phases[0]
+        numbers = []
+        for name, update, alone in zip(self.modalities, total.updates[:, 0], total.standalone[:, 0], strict=True):
+            parts = [] if math.isnan(update) else [f"{100.0 * update:.2f} cm for the {measures.layer_label(name)}"]
+            numbers.append(" and ".join([*parts, f"{100.0 * alone:.2f} cm for {name} standalone"]))
+        k = int(total.standalone[:, 0].argmin())
+        sentences = [f"Position RMSE {100.0 * total.fused[0]:.2f} cm fused; {'; '.join(numbers)}."]
+        ratio = f"fused / {self.modalities[k]} standalone {total.ratio[k]:.2f}"
+        if math.isnan(total.low[k]):
+            sentences.append(f"Ratio {ratio}; no interval: {too_few(total.trajectories)}.")
+            return " ".join(sentences)
+        low, high = total.low[k], total.high[k]
+        result = (
+            "Fusion is more accurate than every standalone modality"
+            if high < 1.0
+            else f"{self.modalities[k]} standalone is more accurate than fusion"
+            if low > 1.0
+            else f"Fusion and {self.modalities[k]} standalone do not differ significantly"
+        )
+        sentences.append(f"{result[0].upper()}{result[1:]} ({ratio}, 95 % interval {low:.2f} to {high:.2f}).")
+        return " ".join(sentences)
+
+    def tables(self) -> list[Table]:
+        task = find_task(self.task)
+        units, scale = measures.display_units(task)
+        names = [("position", "cm", 100.0), *zip([c.name for c in task.components], units, scale, strict=True)]
+        rows: list[tuple[Value, ...]] = []
+        for entry in self.phases:
+            for q, (name, unit, factor) in enumerate(names):
+                pairs = zip(entry.updates[:, q], entry.standalone[:, q], strict=True)
+                values = [float(factor * value) for value in (entry.fused[q], *(v for pair in pairs for v in pair))]
+                numbers = [None if math.isnan(value) else value for value in values]
+                rows.append((entry.phase, entry.steps, f"{name} ({unit})", *numbers))
+        heads = [head for name in self.modalities for head in (measures.layer_label(name), f"{name} standalone")]
+        ratios: list[tuple[Value, ...]] = [
+            (entry.phase, entry.steps, name, *(None if math.isnan(v) else float(v) for v in values))
+            for entry in self.phases
+            for name, *values in zip(self.modalities, entry.ratio, entry.low, entry.high, strict=True)
+        ]
+        return [
+            Table(
+                "RMSE of updates and standalone filters", ("phase", "steps", "quantity", "fused", *heads), tuple(rows)
+            ),
+            Table(
+                "Fused / standalone, position RMSE",
+                ("phase", "steps", "standalone modality", "ratio", "95 % from", "to"),
+                tuple(ratios),
+            ),
+        ]
+
+    def curves(self) -> list[Curve]:
+        if not len(self.fused):
+            return []
+        chart = "Position error"
+        curves = [Curve("fused", 100.0 * self.fused, chart, "cm", "fused")]
+        for k, name in enumerate(self.modalities):
+            if np.isfinite(self.updates[:, k]).any():
+                curves.append(Curve(measures.layer_label(name), 100.0 * self.updates[:, k], chart, "cm", name))
+            curves.append(Curve(f"{name} standalone", 100.0 * self.standalone[:, k], chart, "cm", name))
+        return curves
+
+    def bands(self) -> dict[str, Mask]:
+        return {"contact": self.contact, "blackout": self.blackout} if len(self.fused) else {}
+
+
+def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
+    """One-line reason why the diagnostic does not apply, or None."""
+    if isinstance(checkpoint, ExternalFilter):
+        return f"{trace.filter} is an external filter, whose observations cannot be masked"
+    if "standalone" in trace.settings:
+        return f"the trace is of a standalone run of {trace.settings['standalone']}"
+    if checkpoint is not None and len(input_modalities(checkpoint.filter)) < 2:
+        return f"{trace.filter} has one modality: it is the standalone filter"
+    return None
+
+
+def standalone_modalities(
+    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
+) -> StandaloneModalities:
+    """Run the standalone filter of every modality over the episodes of one or more traces, and compare all errors."""
+    first, modalities = traces[0], input_modalities(checkpoint.filter)
+    runs = len(traces) * len(modalities)
+    errors = []
+    for i, trace in enumerate(traces):
+        alone = []
+        for k, modality in enumerate(modalities):
+
+            def share(done: float, index: int = i * len(modalities) + k) -> None:
+                if progress is not None:
+                    progress((index + done) / runs)
+
+            alone.append(measures.errors(standalone(checkpoint, trace, modality, share))[:, -1])
+        errors.append(_with_position(trace, modalities, np.stack(alone, axis=1)))
+    keep = len(first) if len(traces) == 1 else 0
+    position = errors[0][:keep, :, 0]
+    return StandaloneModalities(
+        task=first.episode.task,
+        filter=first.filter,
+        modalities=modalities,
+        trajectories=len(traces),
+        phases=_phases(traces, errors, len(modalities)),
+        fused=position[:, 0],
+        updates=position[:, 1 : 1 + len(modalities)],
+        standalone=position[:, 1 + len(modalities) :],
+        contact=first.episode.contact.astype(bool)[:keep],
+        blackout=measures.blackout(first)[:keep],
+    )
+
+
+def _with_position(trace: Trace, modalities: Sequence[str], alone: Array) -> Array:
+    """(T, 1 + 2 K, 1 + n): absolute position and component errors of filter, updates and standalone runs."""
+    error = measures.errors(trace)
+    updates = np.full((len(trace), len(modalities), error.shape[-1]), np.nan)
+    for k, modality in enumerate(modalities):
+        if modality in trace.modalities_with_posterior:
+            updates[:, k] = error[:, trace.modalities.index(modality)]
+    both = np.concatenate([error[:, -1:], updates, alone], axis=1)
+    where = list(measures.task_of(trace).map_indices)
+    return np.concatenate([np.linalg.norm(both[..., where], axis=-1, keepdims=True), np.abs(both)], axis=-1)
+
+
+def _phases(traces: Sequence[Trace], errors: Sequence[Array], count: int) -> tuple[PhaseErrors, ...]:
+    """RMSE pooled over the steps of all traces, by phase."""
+    masks = [measures.phases(trace) for trace in traces]
+    result = []
+    for phase in masks[0]:
+        steps = np.array([mask[phase].sum() for mask in masks], dtype=np.float64)
+        used = steps > 0
+        if not used.any():
+            continue
+        sums = np.stack([np.square(e[mask[phase]]).sum(0) for e, mask in zip(errors, masks, strict=True)])[used]
+        rmse = np.sqrt(sums.sum(0) / steps.sum())
+        alone = rmse[1 + count :]
+        logarithms = jackknife(sums[:, :, 0], lambda s: 0.5 * np.log(s[..., :1] / s[..., 1 + count :]))
+        ratio, low, high = (np.exp(value) for value in logarithms)
+        result.append(
+            PhaseErrors(phase, int(used.sum()), int(steps.sum()), rmse[0], rmse[1 : 1 + count], alone, ratio, low, high)
+        )
+    return tuple(result)
+
+
+ENTRY = Entry(
+    name="standalone",
+    title="Standalone modalities",
+    question="How accurate is each modality by itself, and is fusion more accurate?",
+    run=standalone_modalities,
+    why_not=why_not,
+    needs="checkpoint",
+    slow=True,
+)

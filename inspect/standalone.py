@@ -1,0 +1,72 @@
+"""Standalone runs: a trace's filter with the observations of one modality only.
+
+A trace's modality columns are updates: at every step, the prior of the fused filter, which has used all modalities in
+earlier steps, is updated with one modality (``Trace.modality_mean``). The standalone filter of a modality has the same
+networks, start and random numbers, but no step of its recursion uses any other modality.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.batch import Steps
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.subsets import check_modality, input_modalities, standalone_evidence
+from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.run import assemble_trace
+
+
+def check_standalone(checkpoint: Checkpoint, modality: str) -> None:
+    """Raise BadInput for a modality that the filter does not use, and for an external filter."""
+    if isinstance(checkpoint, ExternalFilter):
+        raise BadInput(f"{checkpoint.source} is an external filter, whose observations cannot be masked")
+    check_modality(checkpoint.filter, modality)
+
+
+def standalone_runs(traces: Sequence[Trace], checkpoint: Checkpoint | None) -> dict[str, list[Trace]]:
+    """Modality -> standalone run of each trace; empty for one modality, an external filter, and without checkpoint."""
+    if checkpoint is None or isinstance(checkpoint, ExternalFilter):
+        return {}
+    modalities = input_modalities(checkpoint.filter)
+    other = any("standalone" in trace.settings or trace.checkpoint_hash != checkpoint.hash for trace in traces)
+    if other or len(modalities) < 2:
+        return {}
+    return {modality: [standalone(checkpoint, trace, modality) for trace in traces] for modality in modalities}
+
+
+@torch.no_grad()
+def standalone(
+    checkpoint: Checkpoint, trace: Trace, modality: str, progress: Callable[[float], None] | None = None
+) -> Trace:
+    """Run the filter of a trace over the same episode with one modality only.
+
+    Start, particles, seed and so the random numbers are those of the trace; its episode has the injected faults and
+    those of its interventions. At every step the evidence of all other modalities is masked (``filters/subsets.py``);
+    fusion weights, given or manual, play no part. The result is the trace of a filter with one modality: its estimate
+    is the standalone estimate, and ``settings`` name the modality as ``standalone``. For a filter of one modality, all
+    arrays but its effective weights equal those of the trace bit for bit.
+
+    Args:
+        modality: an input of the filter (``input_modalities``).
+        progress: called with the completed fraction, 0..1.
+
+    Raises:
+        BadInput: the filter does not use the modality, is external, or the trace is of another filter.
+    """
+    check_standalone(checkpoint, modality)
+    if trace.checkpoint_hash != checkpoint.hash:
+        raise BadInput(f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}")
+    filter_ = checkpoint.filter
+    batch = Steps.from_episodes(filter_.task, [trace.episode]).episode(0)
+    evidence = standalone_evidence(filter_, batch, filter_.encode(batch), modality)
+    start, generator = start_at_truth(filter_, batch), torch.Generator().manual_seed(trace.seed)
+    particles = int(trace.settings["particles"])
+    steps = rollout(filter_, evidence, start, generator, particles, keep=True, progress=progress).steps
+    settings = {key: value for key, value in trace.settings.items() if key != "edits"} | {"standalone": modality}
+    provenance = {name: getattr(trace, name) for name in ("data_hash", "episode_index", "seed", "faults")}
+    return assemble_trace(checkpoint, trace.episode, start, evidence, steps, **provenance, settings=settings)

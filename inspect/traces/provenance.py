@@ -1,0 +1,76 @@
+"""The filter and the episodes that traces are from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.open_filter import open_filter
+from beliefscope.inspect.traces.data import Trace
+
+
+def describe(trace: Trace) -> dict[str, Any]:
+    """Filter, episode, faults, seed and hashes of a trace, as JSON values."""
+    return {
+        "task": trace.episode.task,
+        "filter": trace.filter,
+        "episode": trace.episode_index,
+        "steps": len(trace),
+        "faults": trace.faults.to_json(),
+        "seed": trace.seed,
+        "checkpoint_hash": trace.checkpoint_hash,
+        "data_hash": trace.data_hash,
+    }
+
+
+def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str = "") -> Checkpoint | None:
+    """The checkpoint of traces of one filter, if available.
+
+    Args:
+        files: of the traces, for messages.
+        filter_: name or path of the filter; if empty, the built-in filter with the traces' checkpoint hash.
+
+    Raises:
+        BadInput: the traces are of different checkpoints, or not of the given filter.
+    """
+    first = traces[0]
+    for file, trace in zip(files, traces, strict=True):
+        if trace.checkpoint_hash != first.checkpoint_hash:
+            raise BadInput(f"{file} and {files[0]} are from different checkpoints; give traces of one filter")
+    if filter_:
+        checkpoint = open_filter(find_task(first.episode.task).name, filter_)
+        if checkpoint.hash != first.checkpoint_hash:
+            raise BadInput(f"{files[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}")
+        return checkpoint
+    try:
+        checkpoint = load_checkpoint(shipped(first.episode.task, first.filter))
+    except BadInput:
+        return None
+    return checkpoint if checkpoint.hash == first.checkpoint_hash else None
+
+
+def reproducible(traces: Sequence[Trace], data: Path | None) -> set[int]:
+    """Indices of the traces that a run over this data reproduces: same episode and seed, no interventions.
+
+    Args:
+        data: file or folder; None for the sample dataset. Runs have the seed of the first trace and 300 particles.
+    """
+    task = find_task(traces[0].episode.task)
+    try:
+        with open_dataset(sample_path(task.name) if data is None else data, task) as episodes:
+            return {
+                i
+                for i, trace in enumerate(traces)
+                if trace.episode_index < len(episodes)
+                and episodes[trace.episode_index].digest() == trace.data_hash
+                and trace.seed == traces[0].seed
+                and trace.settings.get("particles", 300) == 300
+                and not trace.settings.get("edits")
+            }
+    except BadInput:
+        return set()

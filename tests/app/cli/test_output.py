@@ -1,0 +1,27 @@
+"""Tests of the progress display where standard error is not a terminal."""
+
+from __future__ import annotations
+
+import pytest
+
+from beliefscope.app.cli import output
+
+
+def test_redirected_progress_prints_lines(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(output.time, "monotonic", lambda: clock[0])
+    with output.bars() as update:
+        for i in range(101):
+            clock[0] = 0.3 * i
+            update("Filtering", i / 100, "loss 0.1")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "Filtering: 10 %, 3 s, 27 s left, loss 0.1"
+    assert lines[-1] == "Filtering: 100 %, 30 s, loss 0.1"
+    assert len(lines) == 10
+
+
+def test_redirected_progress_of_a_fast_command_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with output.progress("Filtering") as advance:
+        for i in range(101):
+            advance(i / 100)
+    assert capsys.readouterr().err == "Filtering: 100 %, 0 s\n"

@@ -1,0 +1,161 @@
+"""Healthy profiles: false alarms and power by simulation, the file format, and the shipped files."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, save_checkpoint
+from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnostics.healthy_comparison import SINGLE_SIGNIFICANCE, Comparison, compare
+from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile, find_profile
+
+NAMES = [f"nees/{layer}/{phase}" for layer in ("image", "haptics", "fused") for phase in ("all", "contact")]
+NAMES += [f"weight/image/{phase}" for phase in ("all", "contact")]
+
+
+def trajectories(count: int, rng: np.random.Generator, factor: float = 1.0) -> list[dict[str, float]]:
+    """Statistics with log-normal spread between trajectories, dependent, and missing in some of them."""
+    common = rng.normal(size=(count, 1))
+    values = np.exp(0.6 * (common + rng.normal(size=(count, len(NAMES)))))
+    values[:, :6] *= factor
+    missing = rng.random(values.shape) < 0.2
+    return [
+        {name: float(v) for name, v, gone in zip(NAMES, row, hidden, strict=True) if not gone}
+        for row, hidden in zip(values, missing, strict=True)
+    ]
+
+
+def profile(rows: list[dict[str, float]]) -> HealthyProfile:
+    columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in NAMES}
+    return HealthyProfile("simulated", len(rows), None, columns)
+
+
+@pytest.mark.parametrize("count", [1, 5, 20])
+def test_healthy_trajectories_rarely_raise_an_alarm(count: int) -> None:
+    rng = np.random.default_rng(count)
+    alarms = [bool(compare(profile(trajectories(100, rng)), trajectories(count, rng)).alarms) for _ in range(150)]
+    # A rate of 2 % gives more than 9 of 150 with a probability of 0.1 %.
+    assert sum(alarms) <= 9
+
+
+def test_overconfidence_raises_an_alarm() -> None:
+    rng = np.random.default_rng(0)
+    reference = profile(trajectories(100, rng))
+    results = [compare(reference, trajectories(5, rng, factor=9.0)) for _ in range(20)]
+    assert sum(bool(result.alarms) for result in results) >= 19
+    first = results[0]
+    assert first.sentence.startswith("Alarm, compared with the healthy record of 100 trajectories: NEES/n of ")
+    assert all(alarm.statistic.startswith("nees/") for result in results for alarm in result.alarms)
+    assert first.alarms[0].value > first.alarms[0].high
+
+
+def test_one_verdict_over_20_seeds() -> None:
+    rng = np.random.default_rng(1)
+    reference = profile(trajectories(100, rng))
+    for factor, alarm in ((1.0, False), (9.0, True)):
+        tested = trajectories(5, rng, factor)
+        verdicts = {tuple(d.statistic for d in compare(reference, tested, seed).alarms) for seed in range(20)}
+        assert len(verdicts) == 1
+        assert bool(verdicts.pop()) is alarm
+
+
+def test_p_value_of_one_trajectory_is_its_rank() -> None:
+    rows = [{"nees/fused/all": value} for value in np.exp(np.random.default_rng(2).normal(size=99))]
+    reference = HealthyProfile("", 99, None, {"nees/fused/all": np.array([row["nees/fused/all"] for row in rows])})
+    (largest,) = compare(reference, [{"nees/fused/all": 1e6}]).deviations
+    assert largest.p_value == pytest.approx(0.01)
+    assert largest.alarm
+    (middle,) = compare(reference, [{"nees/fused/all": 1.0}]).deviations
+    assert middle.p_value > 0.5
+    small = HealthyProfile("", 40, None, {"nees/fused/all": reference.statistics["nees/fused/all"][:40]})
+    result = compare(small, [{"nees/fused/all": 1e6}])
+    assert result.alarms == ()
+    assert result.sentence == "Too few trajectories (1; at least 2 needed) to compare with the healthy record."
+
+
+def test_order_of_trajectories_is_irrelevant() -> None:
+    rng = np.random.default_rng(3)
+    reference, tested = profile(trajectories(60, rng)), trajectories(5, rng)
+    first, second = compare(reference, tested), compare(reference, tested[::-1])
+    key = [(d.statistic, round(d.value, 9), d.p_value) for d in sorted(first.deviations, key=lambda d: d.statistic)]
+    assert key == [
+        (d.statistic, round(d.value, 9), d.p_value) for d in sorted(second.deviations, key=lambda d: d.statistic)
+    ]
+
+
+def test_no_alarm_reads_well() -> None:
+    rng = np.random.default_rng(4)
+    result = compare(profile(trajectories(60, rng)), trajectories(5, rng))
+    assert isinstance(result, Comparison)
+    assert result.sentence == "No alarm: within the healthy record of 60 trajectories."
+    assert {row[0] for row in result.table().rows} >= {"NEES/n of fused", "effective weight of image in contact"}
+
+
+def test_json_round_trip() -> None:
+    reference = profile(trajectories(30, np.random.default_rng(5)))
+    again = HealthyProfile.from_json(json.loads(json.dumps(reference.to_json(), allow_nan=False)))
+    assert again.data == reference.data
+    for name in NAMES:
+        np.testing.assert_allclose(again.statistics[name], reference.statistics[name], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"format": 9},
+        {"episodes": 3},
+        {"statistics": {"nees": [1.0]}},
+        {"statistics": {"nees/fused/all": "abc"}},
+        {"statistics": None},
+    ],
+)
+def test_malformed_profiles_are_refused(change: dict[str, Any]) -> None:
+    document = profile(trajectories(12, np.random.default_rng(6))).to_json()
+    with pytest.raises(BadInput, match="healthy profile"):
+        HealthyProfile.from_json(document | change)
+
+
+def test_shipped_profiles_belong_to_their_checkpoints() -> None:
+    paths = sorted(PRETRAINED.glob(f"*{SUFFIX}"))
+    assert paths
+    for path in paths:
+        checkpoint = load_checkpoint(path.with_name(path.name.removesuffix(SUFFIX) + ".safetensors"))
+        document = json.loads(path.read_text())
+        assert document["checkpoint"] == checkpoint.hash
+        found = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, None)
+        assert found is not None
+        assert found.episodes >= 50
+        assert math.isfinite(np.nanmean(found.statistics["nees/fused/all"]))
+        assert find_profile(checkpoint.task.name, checkpoint.name, "other", None) is None
+        if checkpoint.kind == "pf":
+            assert "ess//all" in found.statistics
+
+
+def test_the_profile_of_a_new_checkpoint_is_in_its_header(tmp_path: Any) -> None:
+    base = load_checkpoint(PRETRAINED / "door-image-ekf.safetensors")
+    document = profile(trajectories(12, np.random.default_rng(7))).to_json()
+    path = tmp_path / "new.safetensors"
+    save_checkpoint(base.filter, base.name, base.record, path, document)
+    checkpoint = load_checkpoint(path)
+    assert checkpoint.record == base.record
+    found = find_profile("door", base.name, checkpoint.hash, checkpoint)
+    assert found is not None
+    assert found.to_json() == document
+
+
+def test_single_trace_alarms_need_a_large_profile() -> None:
+    assert SINGLE_SIGNIFICANCE >= 1.0 / (50 + 1)
+    assert [entry.name for entry in DIAGNOSTICS.values() if entry.statistics] == ["weights", "consistency", "particles"]
+
+
+def test_a_run_without_common_statistics_raises_no_alarm() -> None:
+    """A live run of a few steps has none yet."""
+    profile = HealthyProfile("simulated", 20, None, {NAMES[0]: np.ones(20)})
+    for tested in ([], [{}], [{"other/fused/all": 1.0}]):
+        assert not compare(profile, tested).alarms

@@ -1,0 +1,34 @@
+"""Build the sample sets: 140 episodes of seed 0, followed by 50 test episodes of seed 2.
+
+    python tools/sample_sets.py [FOLDER]
+
+Episodes 0 to 139 are copied from the current file, because another processor may round differently.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+from beliefscope.datasets.simulation.collect import collect
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
+
+KEPT, ADDED, STEPS, SEED = 140, 50, 100, 2
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for task in ("door", "push"):
+            path = Path(folder) / f"{task}.h5"
+            collect(task, ADDED, STEPS, SEED, None, path, split="test")
+            target = (Path(sys.argv[1]) if len(sys.argv) > 1 else sample_path(task).parent) / f"{task}.h5"
+            with open_dataset(sample_path(task)) as current, open_dataset(path) as added:
+                episodes = [current[i] for i in range(KEPT)] + list(added)
+                write_dataset(target, current.task, episodes)
+            with open_dataset(target) as data:
+                print(task, len(data), data.hash, target.stat().st_size)
+
+
+if __name__ == "__main__":
+    main()
