@@ -101,7 +101,7 @@ class CameraView:
         )
         position, target = camera_axis(camera)
         size = self._frustum.compute_canonical_frustum_size()[2]
-        self._frustum.scale = IMAGE_DISTANCE * np.linalg.norm(target - position) / size
+        self._frustum.scale = IMAGE_DISTANCE * float(np.linalg.norm(target - position)) / size
 
     def set_trace(self, trace: Trace) -> None:
         """Use the images of this trace in ``show``."""

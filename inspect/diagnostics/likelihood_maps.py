@@ -15,7 +15,7 @@ from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.likelihood import COARSE, MapEngine, Quantity, no_maps
 from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.maps.statistics import MapStatistics, measure_maps
-from beliefscope.inspect.statistics.measures import blackout, phases, trace_indices
+from beliefscope.inspect.statistics.measures import blackout, pooled_phases, trace_indices
 from beliefscope.inspect.trace import Trace
 
 Mask = NDArray[np.bool_]
@@ -190,7 +190,7 @@ def maps(
     progress: Callable[[float], None] | None = None,
 ) -> MapSurvey:
     """Evaluate the maps of all steps at the true angle. Raises BadInput for a filter without maps."""
-    parts, masks, title = [], [], ""
+    parts, title = [], ""
     for i, trace in enumerate(traces):
         engine = MapEngine(checkpoint, trace)
         for first in range(0, len(trace), STEPS_AT_ONCE):
@@ -200,7 +200,6 @@ def maps(
             parts.append(measure_maps(computed, trace))
             if progress is not None:
                 progress((i + steps.stop / len(trace)) / len(traces))
-        masks.append(phases(trace))
     joined = {
         f.name: np.concatenate([getattr(part, f.name) for part in parts])
         for f in fields(MapStatistics)
@@ -210,14 +209,13 @@ def maps(
     ridge_layers = tuple(
         name for name in parts[0].layers[:-1] if any("effector_position" in keys.get(m, ()) for m in name.split("+"))
     )
-    pooled = {phase: np.concatenate([mask[phase] for mask in masks]) for phase in masks[0]}
     contact = np.concatenate([trace.episode.contact.astype(bool) for trace in traces])
     blackouts = np.concatenate([blackout(trace) for trace in traces])
     return MapSurvey(
         numbers=MapStatistics(layers=parts[0].layers, **joined),
         title=title,
         ridge_layers=ridge_layers,
-        phases=pooled,
+        phases=pooled_phases(traces),
         trajectories=len(traces),
         trajectory=trace_indices(traces),
         size=size,

@@ -290,20 +290,14 @@ def _phases(
         np.square(np.concatenate([distance[..., None], error], axis=-1))
         for distance, error in zip(position, errors, strict=True)
     ]
-    masks = [measures.phases(trace) for trace in traces]
     values = []
-    for phase in masks[0]:
-        counts = np.array([mask[phase].sum() for mask in masks], dtype=np.float64)
-        nonempty = counts > 0
-        if not nonempty.any():
-            continue
-        sums = np.stack([square[mask[phase]].sum(0) for square, mask in zip(squares, masks, strict=True)])[nonempty]
+    for phase, (counts, sums) in measures.phase_sums(traces, squares).items():
         rmse = np.sqrt(sums.sum(0) / counts.sum())
-        steps = np.broadcast_to(counts[nonempty, None, None], (*sums.shape[:-1], 1))
+        steps = np.broadcast_to(counts[:, None, None], (*sums.shape[:-1], 1))
         phi, low, high = jackknife(
             np.concatenate([sums, steps], axis=-1), lambda table: weights @ np.sqrt(table[..., :-1] / table[..., -1:])
         )
-        values.append(PhaseValues(phase, int(nonempty.sum()), int(counts.sum()), rmse, phi, low, high))
+        values.append(PhaseValues(phase, len(counts), int(counts.sum()), rmse, phi, low, high))
     return tuple(values)
 
 

@@ -200,20 +200,14 @@ def _with_position(trace: Trace, modalities: Sequence[str], alone: Array) -> Arr
 
 def _phases(traces: Sequence[Trace], errors: Sequence[Array], count: int) -> tuple[PhaseErrors, ...]:
     """RMSE pooled over the steps of all traces, by phase."""
-    masks = [measures.phases(trace) for trace in traces]
     result = []
-    for phase in masks[0]:
-        steps = np.array([mask[phase].sum() for mask in masks], dtype=np.float64)
-        used = steps > 0
-        if not used.any():
-            continue
-        sums = np.stack([np.square(e[mask[phase]]).sum(0) for e, mask in zip(errors, masks, strict=True)])[used]
+    for phase, (steps, sums) in measures.phase_sums(traces, [np.square(e) for e in errors]).items():
         rmse = np.sqrt(sums.sum(0) / steps.sum())
         alone = rmse[1 + count :]
         logarithms = jackknife(sums[:, :, 0], lambda s: 0.5 * np.log(s[..., :1] / s[..., 1 + count :]))
         ratio, low, high = (np.exp(value) for value in logarithms)
         result.append(
-            PhaseErrors(phase, int(used.sum()), int(steps.sum()), rmse[0], rmse[1 : 1 + count], alone, ratio, low, high)
+            PhaseErrors(phase, len(steps), int(steps.sum()), rmse[0], rmse[1 : 1 + count], alone, ratio, low, high)
         )
     return tuple(result)
 

@@ -8,8 +8,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.replay import Replay
-from beliefscope.datasets.task import Camera, Task
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.figures.scene_shapes import RGB, grid
 from beliefscope.inspect.maps.particles import modality_shares
 from beliefscope.inspect.palette import colour

@@ -128,6 +128,22 @@ def pooled_phases(traces: Sequence[Trace]) -> dict[str, Mask]:
     return {phase: np.concatenate([mask[phase] for mask in masks]) for phase in masks[0]}
 
 
+def phase_sums(traces: Sequence[Trace], values: Sequence[Array]) -> dict[str, tuple[Array, Array]]:
+    """Sums of values (T, ...) over the steps of a phase.
+
+    Returns: phase -> numbers of steps (M,) and sums (M, ...) of the M trajectories that have steps in it. Phases in no
+    trajectory are absent.
+    """
+    masks = [phases(trace) for trace in traces]
+    result = {}
+    for phase in masks[0]:
+        steps = np.array([mask[phase].sum() for mask in masks], dtype=np.float64)
+        sums = np.stack([value[mask[phase]].sum(0) for value, mask in zip(values, masks, strict=True)])
+        if steps.any():
+            result[phase] = (steps[steps > 0], sums[steps > 0])
+    return result
+
+
 def trace_indices(traces: Sequence[Trace]) -> NDArray[np.int64]:
     """(sum of T,): index of the trace that each step of the concatenated traces belongs to."""
     return np.repeat(np.arange(len(traces)), [len(trace) for trace in traces])

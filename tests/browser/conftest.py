@@ -85,6 +85,14 @@ def browser(chromium: str) -> Iterator[Any]:
         browser.close()
 
 
+@pytest.fixture(scope="module")
+def context(browser: Any) -> Iterator[Any]:
+    """The pages of a file share a browser context: with an empty cache, each would load and compile all scripts."""
+    context = browser.new_context()
+    yield context
+    context.close()
+
+
 # Embedded pages of other projects are excluded: viser's scene and Rerun's canvas.
 VIOLATIONS = """async () => {
   const { violations } = await axe.run({ exclude: ['iframe', '.viewer'] }, { resultTypes: ['violations'] });
@@ -172,20 +180,32 @@ OpenPage = Callable[..., MonitoredPage]
 
 
 @pytest.fixture
-def open_page(browser: Any, server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpenPage]:
+def open_page(context: Any, server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpenPage]:
     """Opens pages. The test fails if any of them has errors at its end."""
     pages: list[MonitoredPage] = []
     folder = os.environ.get("BELIEFSCOPE_SCREENSHOTS")
     screenshots = Path(folder) if folder else tmp_path_factory.getbasetemp() / "screenshots"
 
-    def open_(link: str = "", url: str = "", **options: Any) -> MonitoredPage:
-        options = {"viewport": {"width": 1024, "height": 768}, "color_scheme": "light"} | options
-        page = MonitoredPage(browser.new_page(**options), url or server.url, screenshots)
+    def open_(
+        link: str = "",
+        url: str = "",
+        size: tuple[int, int] = (1024, 768),
+        theme: str = "light",
+        clipboard: bool = False,
+    ) -> MonitoredPage:
+        if clipboard:
+            context.grant_permissions(["clipboard-read", "clipboard-write"])
+        page = MonitoredPage(context.new_page(), url or server.url, screenshots)
+        page.page.set_viewport_size({"width": size[0], "height": size[1]})
+        page.page.emulate_media(color_scheme=theme)
         pages.append(page)
         return page.open(link)
 
     yield open_
     errors = [error for page in pages for error in page.errors]
     for page in pages:
+        page.page.evaluate("() => localStorage.clear()")  # the theme
         page.page.close()
+    context.clear_permissions()
+    context.clear_cookies()
     assert not errors

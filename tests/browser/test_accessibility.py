@@ -28,7 +28,7 @@ LAYOUT_SHIFT = """() => new Promise((resolve) => {
 
 @pytest.mark.parametrize("theme", ["light", pytest.param("dark", marks=pytest.mark.long)])
 def test_tabs_and_dialogs_are_accessible(open_page: Any, theme: str) -> None:
-    page = open_page(color_scheme=theme)
+    page = open_page(theme=theme)
     violations: dict[str, list[str]] = {}
     tabs = page.page.locator("[role=tab]").evaluate_all(TABS)
     for tab in tabs:

@@ -40,7 +40,7 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
     assert difference(page) == 0.0  # at the last step before it
     page.until("() => location.search.includes('against=') && location.search.includes('step=44')")
 
-    second = open_page("?" + page.page.url.partition("?")[2], viewport={"width": 1440, "height": 900})
+    second = open_page("?" + page.page.url.partition("?")[2], size=(1440, 900))
     second.until(READY)
     assert second.state == page.state
     assert verdict(second) == verdict(page)
@@ -56,7 +56,7 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
 
 
 def test_two_filters_are_compared(open_page: Any) -> None:
-    page = open_page(f"{RUN}&tab=compare&against=filter%3Dcrossmodal-pf", color_scheme="dark")
+    page = open_page(f"{RUN}&tab=compare&against=filter%3Dcrossmodal-pf", theme="dark")
     page.until(READY)
     filters = ["crossmodal-ekf", "crossmodal-pf"]
     assert all(name in verdict(page) for name in filters)

@@ -28,7 +28,7 @@ def wait_for_step(page: Any, episode: int, step: int) -> None:
 
 
 def test_event_is_opened_and_shared_by_permalink(open_page: Any) -> None:
-    page = open_results(open_page, "&step=40", permissions=["clipboard-read", "clipboard-write"])
+    page = open_results(open_page, "&step=40", clipboard=True)
     scores = {score["name"]: score for score in page.page.request.get(page.url + API).json()["scores"]}
     worst, second, *_ = events = scores["error"]["events"]
     rows = page.page.locator("#failures .events tbody tr")
@@ -72,7 +72,7 @@ def column(page: Any, name: str) -> list[str]:
 
 
 def test_episodes_are_sorted_and_opened(open_page: Any) -> None:
-    page = open_results(open_page, "&list=episodes", viewport={"width": 1440, "height": 900}, color_scheme="dark")
+    page = open_results(open_page, "&list=episodes", size=(1440, 900), theme="dark")
     episodes = page.page.request.get(page.url + API).json()["episodes"]
     by_worst = sorted(episodes, key=lambda episode: -episode["worst"])
     scored = [str(episode["index"]) for episode in by_worst]

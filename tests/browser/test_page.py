@@ -17,8 +17,7 @@ WINDOWS = {"wide": (1440, 900), "small": (1024, 768)}
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("window", WINDOWS)
 def test_page_fits_the_window(open_page: Any, window: str, theme: str) -> None:
-    width, height = WINDOWS[window]
-    page = open_page("?step=40", viewport={"width": width, "height": height}, color_scheme=theme)
+    page = open_page("?step=40", size=WINDOWS[window], theme=theme)
     page.until("() => document.querySelector('#scene').dataset.state === 'ready'")
     overflow = page.page.evaluate(
         "() => [document.documentElement.scrollHeight - innerHeight, document.documentElement.scrollWidth - innerWidth,"

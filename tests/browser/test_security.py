@@ -17,7 +17,7 @@ MARKUP = "<img src=x onerror=window.hacked=1>"
 
 @pytest.mark.long
 def test_access_link_opens_a_read_only_page_with_names_as_text(
-    browser: Any, start_server: Any, open_page: Any, tmp_path: Path
+    context: Any, start_server: Any, open_page: Any, tmp_path: Path
 ) -> None:
     data, checkpoint = tmp_path / f"{MARKUP}.h5", tmp_path / f"{MARKUP}.safetensors"
     shutil.copy(sample_path("door"), data)
@@ -28,7 +28,7 @@ def test_access_link_opens_a_read_only_page_with_names_as_text(
     server = start_server("--token", "--read-only", "--data", str(data), "--filter", str(checkpoint))
     address, _, token = server.url.partition("?token=")
 
-    visitor = browser.new_page()
+    visitor = context.new_page()
     assert visitor.goto(address).status == 401
     assert visitor.locator("input[name=token]").is_visible()
     visitor.fill("input[name=token]", "a wrong token")
@@ -36,10 +36,9 @@ def test_access_link_opens_a_read_only_page_with_names_as_text(
     assert "The token is wrong" in visitor.inner_text("body")
     visitor.goto(server.url)
     visitor.wait_for_url(lambda url: "token" not in url)
-    signed_in = visitor.context.storage_state()
     visitor.close()
 
-    page = open_page(url=address, storage_state=signed_in)
+    page = open_page(url=address)
     assert page.page.url.partition("?")[0] == address
     assert token not in page.page.url
     assert token not in page.page.content()

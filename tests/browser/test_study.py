@@ -9,7 +9,7 @@ LABELS = "(all) => all.map((a) => [a.getAttribute('aria-label'), a.hasAttribute(
 
 
 def test_bar_opens_the_largest_error(open_page: Any) -> None:
-    page = open_page("?tab=study&step=40", viewport={"width": 1440, "height": 900})
+    page = open_page("?tab=study&step=40", size=(1440, 900))
     page.until(READY)
     panel = page.page.locator("#study")
     (study,) = page.page.request.get(f"{page.url}api/studies").json()["studies"]

@@ -123,7 +123,7 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
 
 
 def test_event_marks_and_comparison_run(open_page: Any) -> None:
-    page = open_page(LINK + "&track=signed", color_scheme="dark")
+    page = open_page(LINK + "&track=signed", theme="dark")
     events = [{"step": s, "label": f"{s / 10} cm", "measure": "error"} for s in (70, 12, 55)]
     page.page.evaluate("(events) => beliefscope.timeline.mark(events)", events)
     marks = page.page.locator("#marks button")

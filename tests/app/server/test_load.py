@@ -294,9 +294,9 @@ def test_client_that_does_not_read_is_not_buffered(address: str, monkeypatch: py
     steps: list[int] = []
     original = TracedRun.encoded_maps
 
-    def counted(self: TracedRun, step: int, angle: float | None, size: int) -> Any:
+    def counted(self: TracedRun, step: int, *arguments: Any) -> Any:
         steps.append(step)
-        return original(self, step, angle, size)
+        return original(self, step, *arguments)
 
     monkeypatch.setattr(TracedRun, "encoded_maps", counted)
     origin = Origin(f"http://{address}")

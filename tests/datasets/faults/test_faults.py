@@ -327,7 +327,7 @@ def test_every_fault_is_documented() -> None:
 BAD = {
     "blakout": r"fault 'blakout' does not exist\. Available: blackout, image_frozen, .*drop\.",
     "blackout,,": r"fault '' does not exist\. Available",
-    "blackout:chance=1": r"parameter of blackout 'chance' does not exist\. Available: probability, from, to\.",
+    "blackout:chance=1": r"parameter of blackout 'chance' does not exist\. Available: probability, gray, from, to\.",
     "blackout=1.5": r"blackout's 'probability' is 1\.5, not a number from 0 to 1",
     "blackout=nan": r"blackout's 'probability' is nan, not a number from 0 to 1",
     "blackout=much": r"blackout's 'probability' is 'much', not a number from 0 to 1",
