@@ -95,10 +95,10 @@ def statistics(path: Path, folder: Path) -> dict[str, Rows]:
         return json.loads(stored.read_text())
     checkpoint = load_checkpoint(path)
     episodes = [] if checkpoint.task.name == "push-real" else episodes_of(checkpoint.task.name, folder)
-    result = {"healthy": rows_of(list(trace_all(checkpoint, episodes)))} if episodes else {}
+    result = {"healthy": rows_of(list(trace_all(checkpoint, episodes, range(len(episodes)))))} if episodes else {}
     for fault in FAULTS if episodes else ():
         if (faulty := planted(checkpoint, fault)) is not None:
-            result[fault] = rows_of(list(trace_all(faulty, episodes[:PLANTED_EPISODES])))
+            result[fault] = rows_of(list(trace_all(faulty, episodes, range(min(PLANTED_EPISODES, len(episodes))))))
     stored.write_text(json.dumps(result))
     return result
 

@@ -45,4 +45,4 @@ def measure_profile(filter_: Filter, name: str, episodes: Sequence[Episode], dat
     held_out = [episode for episode in episodes if episode.split != "train"][-MAX_EPISODES:]
     if not held_out:
         return None
-    return profile_of(trace_all(Checkpoint(filter_, name, "", {}), held_out), data).to_json()
+    return profile_of(trace_all(Checkpoint(filter_, name, "", {}), held_out, range(len(held_out))), data).to_json()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
@@ -12,6 +13,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.failures.step_scores import Score, Survey, scores_of
 from beliefscope.inspect.trace import Trace, trace
+from beliefscope.inspect.traces.batch import trace_all
 
 
 def survey_of(
@@ -25,21 +27,36 @@ def survey_of(
     particles: int = 300,
     progress: Callable[[float], None] | None = None,
 ) -> Survey:
-    """Run a filter over episodes of a data set.
+    """Run a filter over episodes of a data set, many at once.
+
+    A particle filter runs over one after the other, so that its random numbers are those of ``trace``.
 
     Args:
         by: a score that must apply to the filter.
 
-    Raises BadInput after the first episode if ``by`` does not apply, and as ``trace``.
+    Raises BadInput after the first trace if ``by`` does not apply, and as ``trace``.
     """
     indices = list(episodes)
+    settings: dict[str, Any] = {"seed": seed, "particles": particles, "faults": faults}
+
+    def one_by_one() -> Iterator[Trace]:
+        for done, index in enumerate(indices):
+            yield trace(
+                checkpoint,
+                data[index],
+                index,
+                **settings,
+                progress=_partial_progress(progress, done, len(indices)),
+            )
 
     def traces() -> Iterator[Trace]:
-        for done, index in enumerate(indices):
-            advance = _partial_progress(progress, done, len(indices))
-            run = trace(checkpoint, data[index], index, seed, particles, faults, advance)
+        batched = checkpoint.kind != "pf"
+        runs = trace_all(checkpoint, data, indices, **settings) if batched else one_by_one()
+        for done, run in enumerate(runs):
             if not done and by is not None:
                 check_applies(by, find_score(by, checkpoint.task).why_not(run))
+            if batched and progress is not None:
+                progress((done + 1) / len(indices))
             yield run
 
     return Survey.from_traces(traces())

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
@@ -16,7 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.rollout import rollout, start_at_truth
 from beliefscope.inspect.traces.data import Trace
-from beliefscope.inspect.traces.run import assemble_trace, trace
+from beliefscope.inspect.traces.run import assemble_trace, check_task, trace
 
 AT_ONCE = 32
 """Episodes in one run; limits memory."""
@@ -25,34 +27,37 @@ AT_ONCE = 32
 @torch.no_grad()
 def trace_all(
     checkpoint: Checkpoint,
-    episodes: Sequence[Episode],
+    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    indices: Iterable[int],
     seed: int = 0,
     particles: int = 300,
     faults: Faults = NO_FAULTS,
 ) -> Iterator[Trace]:
-    """Trace all episodes, in any order; ``episode_index`` is the position in ``episodes``.
+    """Trace the episodes with these indices, those of equal length together.
 
-    The random numbers of a particle filter differ from those of ``trace``, which has one generator per episode, so its
-    traces have the same distribution but other bits. Raises BadInput as ``trace``.
+    Traces without random numbers differ from those of ``trace`` by rounding only. The random numbers of a particle
+    filter differ, as ``trace`` has one generator per episode: same distribution, other values. Raises BadInput as
+    ``trace``.
     """
     if isinstance(checkpoint, ExternalFilter):
-        for index, episode in enumerate(episodes):
-            yield trace(checkpoint, episode, index, seed, particles, faults)
+        for index in indices:
+            yield trace(checkpoint, data[index], index, seed, particles, faults)
         return
-    filter_ = checkpoint.filter
     generator = torch.Generator().manual_seed(seed)
-    lengths: dict[int, list[int]] = {}
-    for index, episode in enumerate(episodes):
-        lengths.setdefault(len(episode), []).append(index)
-    for length, members in sorted(lengths.items()):
-        for first in range(0, len(members), AT_ONCE):
-            chosen = members[first : first + AT_ONCE]
-            inputs = [faults.apply(episodes[index], seed) for index in chosen]
-            steps = Steps.from_episodes(filter_.task, inputs)
+    settings = {"particles": particles, "torch": torch.__version__}
+    remaining = iter(indices)
+    while episodes := {index: data[index] for index in islice(remaining, AT_ONCE)}:
+        lengths: dict[int, list[int]] = {}
+        for index, episode in episodes.items():
+            check_task(checkpoint, episode)
+            lengths.setdefault(len(episode), []).append(index)
+        for length, members in sorted(lengths.items()):
+            inputs = [faults.apply(episodes[index], seed) for index in members]
+            steps = Steps.from_episodes(checkpoint.task, inputs)
             batch = steps.windows(steps.first, length)
-            evidence, start = filter_.encode(batch), start_at_truth(filter_, batch)
-            result = rollout(filter_, evidence, start, generator, particles, keep=True)
-            for i, (index, episode) in enumerate(zip(chosen, inputs, strict=True)):
+            evidence, start = checkpoint.filter.encode(batch), start_at_truth(checkpoint.filter, batch)
+            result = rollout(checkpoint.filter, evidence, start, generator, particles, keep=True)
+            for i, (index, episode) in enumerate(zip(members, inputs, strict=True)):
                 yield assemble_trace(
                     checkpoint,
                     episode,
@@ -63,7 +68,7 @@ def trace_all(
                     episode_index=index,
                     seed=seed,
                     faults=faults,
-                    settings={"particles": particles, "torch": torch.__version__},
+                    settings=settings,
                 )
 
 

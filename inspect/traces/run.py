@@ -82,10 +82,7 @@ def start_run(
     """Inject faults and encode the episode. Arguments and errors as for ``trace``."""
     if particles < 1:
         raise BadInput(f"particles must be at least 1, not {particles}")
-    if episode.task != checkpoint.task.name:
-        raise BadInput(
-            f"filter {checkpoint.name!r} is for task {checkpoint.task.name!r}, the episode is of {episode.task!r}"
-        )
+    check_task(checkpoint, episode)
     filter_ = checkpoint.filter
     provenance = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "faults": faults}
     episode = faults.apply(episode, seed)
@@ -94,6 +91,14 @@ def start_run(
     return FilterRun(
         episode, start_at_truth(filter_, batch), filter_.encode(batch), provenance | {"settings": settings}
     )
+
+
+def check_task(checkpoint: Checkpoint, episode: Episode) -> None:
+    """Raise BadInput for an episode of another task."""
+    if episode.task != checkpoint.task.name:
+        raise BadInput(
+            f"filter {checkpoint.name!r} is for task {checkpoint.task.name!r}, the episode is of {episode.task!r}"
+        )
 
 
 def assemble_trace(

@@ -131,8 +131,15 @@ class MonitoredPage:
         if parts.scheme not in ("data", "blob") and parts.netloc != urlsplit(self.url).netloc:
             self.errors.append(f"request to another host: {url}")
 
-    def open(self, link: str = "") -> MonitoredPage:
-        """Opens a permalink and waits for the maps in full resolution."""
+    def open(self, link: str = "", scene: bool = False) -> MonitoredPage:
+        """Opens a permalink and waits for the maps in full resolution.
+
+        Args:
+            scene: whether a link without a tab opens the 3D scene, whose first images take seconds of software
+                rendering.
+        """
+        if not scene and "tab=" not in link:
+            link = f"{link or '?'}&tab=compare"
         self.page.goto(self.url + link, timeout=1000 * TIMEOUT)
         self.until("() => window.beliefscope?.stats.maps?.size === 135")
         return self
@@ -164,10 +171,11 @@ class MonitoredPage:
         return self.page.evaluate(VIOLATIONS)
 
     def settle(self, step: int) -> None:
-        """Waits until maps in full resolution and the scene show the step."""
+        """Waits until maps in full resolution and the scene, if it is open, show the step."""
         self.until(
             f"() => {{ const {{ maps, drawn }} = beliefscope.stats;"
-            f" return maps.step === {step} && maps.size === 135 && drawn?.step === {step}; }}"
+            f" const scene = beliefscope.state().tab !== 'scene' || drawn?.step === {step};"
+            f" return maps.step === {step} && maps.size === 135 && scene; }}"
         )
 
     def screenshot(self, name: str) -> None:
@@ -192,6 +200,7 @@ def open_page(context: Any, server: Server, tmp_path_factory: pytest.TempPathFac
         size: tuple[int, int] = (1024, 768),
         theme: str = "light",
         clipboard: bool = False,
+        scene: bool = False,
     ) -> MonitoredPage:
         if clipboard:
             context.grant_permissions(["clipboard-read", "clipboard-write"])
@@ -199,7 +208,7 @@ def open_page(context: Any, server: Server, tmp_path_factory: pytest.TempPathFac
         page.page.set_viewport_size({"width": size[0], "height": size[1]})
         page.page.emulate_media(color_scheme=theme)
         pages.append(page)
-        return page.open(link)
+        return page.open(link, scene)
 
     yield open_
     errors = [error for page in pages for error in page.errors]

@@ -32,7 +32,7 @@ class Weighted(EstimateOnly):
 def test_missing_outputs_are_explained(open_page: Any, start_server: Any, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(FILTERS)
     filters = [f"{EXAMPLE}:build", f"{tmp_path}/mine.py:EstimateOnly", f"{tmp_path}/mine.py:Weighted"]
-    page = open_page(url=start_server(*(part for name in filters for part in ("--filter", name))).url)
+    page = open_page(url=start_server(*(part for name in filters for part in ("--filter", name))).url, scene=True)
     text = page.page.locator
 
     # With a covariance but no modalities: one map, the Gaussian of the estimate.

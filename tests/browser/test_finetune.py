@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 STATE = "document.querySelector('#finetune article')?.dataset.state"
 SELECTED = f"() => window.beliefscope && {STATE} === 'ready' && beliefscope.state().filter"
 FILTERS = "() => [...document.querySelector('#filter').options].map((option) => option.value)"
 
 
-def test_filter_is_finetuned_promoted_and_discarded(open_page: Any, start_server: Callable[..., Any]) -> None:
+def test_filter_is_finetuned_promoted_and_discarded(
+    open_page: Any, start_server: Callable[..., Any], tmp_path: Path
+) -> None:
+    with open_dataset(sample_path("door")) as data:
+        write_dataset(tmp_path / "few.h5", find_task("door"), [data[index] for index in range(0, len(data), 6)])
     # A separate server, as the test changes the default filter.
-    page = open_page("?tab=finetune&filter=crossmodal-ekf", start_server().url)
+    server = start_server("--data", str(tmp_path / "few.h5"))
+    page = open_page("?tab=finetune&filter=crossmodal-ekf&data=few", server.url)
     panel = page.page.locator("#finetune")
     page.until("() => document.querySelectorAll('#finetune .tree li').length > 20")
     assert "26,054 of 449,097" in panel.locator(".count").text_content()

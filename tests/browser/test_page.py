@@ -17,7 +17,7 @@ WINDOWS = {"wide": (1440, 900), "small": (1024, 768)}
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("window", WINDOWS)
 def test_page_fits_the_window(open_page: Any, window: str, theme: str) -> None:
-    page = open_page("?step=40", size=WINDOWS[window], theme=theme)
+    page = open_page("?step=40", size=WINDOWS[window], theme=theme, scene=True)
     page.until("() => document.querySelector('#scene').dataset.state === 'ready'")
     overflow = page.page.evaluate(
         "() => [document.documentElement.scrollHeight - innerHeight, document.documentElement.scrollWidth - innerWidth,"
@@ -256,7 +256,7 @@ def test_theme_and_key_help(open_page: Any) -> None:
 
 
 def test_back_and_forward_restore_selections(open_page: Any) -> None:
-    page = open_page("?step=7")
+    page = open_page("?step=7", scene=True)
     page.page.select_option("#episode", "19")
     page.until("() => location.search.includes('episode=19')")  # two changes in one frame are a single history entry
     page.page.keyboard.press("f")
@@ -269,7 +269,7 @@ def test_back_and_forward_restore_selections(open_page: Any) -> None:
 
 
 def test_scene_slider_changes_the_step(open_page: Any) -> None:
-    page = open_page("?step=20")
+    page = open_page("?step=20", scene=True)
     page.until("() => document.querySelector('#scene').dataset.state === 'ready'")
     scene = page.page.frame_locator("#scene iframe")
     slider = scene.locator("[role=slider]").first

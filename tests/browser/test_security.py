@@ -38,7 +38,7 @@ def test_access_link_opens_a_read_only_page_with_names_as_text(
     visitor.wait_for_url(lambda url: "token" not in url)
     visitor.close()
 
-    page = open_page(url=address)
+    page = open_page(url=address, scene=True)
     assert page.page.url.partition("?")[0] == address
     assert token not in page.page.url
     assert token not in page.page.content()

@@ -76,6 +76,7 @@ def record_and_kill(folder: Path, last: int, pause: float, when: str) -> int:
     return steps
 
 
+@pytest.mark.long
 def test_kill_keeps_every_written_step(run: Run, tmp_path: Path) -> None:
     assert record_and_kill(tmp_path, 47, 0.002, "later") == 47
     recording = tmp_path / "run.rrd"

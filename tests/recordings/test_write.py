@@ -229,7 +229,7 @@ sys.path.insert(0, {folder!r})
 from conftest import make_trace
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.write import write_recording
-trace = make_trace("pf", steps=300)
+trace = make_trace("pf", steps=100)
 for limit in {limits}:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
     try:
@@ -242,7 +242,7 @@ for limit in {limits}:
 
 def test_full_disk_raises(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    size = write_recording(new_trace("pf", steps=300), path).stat().st_size
+    size = write_recording(new_trace("pf", steps=100), path).stat().st_size
     path.unlink()
     limits = [int(share * size) for share in (0.3, 0.98)]  # chunk boundaries vary by up to 0.3 % of the size
     script = FULL.format(folder=str(Path(__file__).parent), path=str(path), limits=limits)

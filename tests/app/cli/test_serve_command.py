@@ -77,6 +77,7 @@ def test_sigterm_saves_jobs_and_is_logged(tmp_path: Path) -> None:
     assert (job.state, job.error) == ("interrupted", "the server stopped")
 
 
+@pytest.mark.long
 def test_other_signals_end_the_jobs(tmp_path: Path) -> None:
     """A closed terminal, and Ctrl-C again and again, after which uvicorn would leave out what ends the jobs."""
     workspace = tmp_path / "workspace"

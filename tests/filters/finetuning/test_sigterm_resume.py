@@ -61,7 +61,8 @@ def tuned(partial: Path | None) -> Filter:
     return result.filter
 
 
-@pytest.mark.parametrize("make", [pytest.param(trained, marks=pytest.mark.long), tuned])
+@pytest.mark.long  # test_finetune.py and test_train.py resume in their own process
+@pytest.mark.parametrize("make", [trained, tuned])
 def test_sigterm_resumes_to_identical_weights(make: Callable[[Path | None], Filter], tmp_path: Path) -> None:
     partial = tmp_path / "x.partial"
     command = [sys.executable, "-c", MAKE, str(Path(__file__).parent), make.__name__, str(partial)]
