@@ -2,7 +2,7 @@
 
 /** @import { Trace } from '../data/trace.js' */
 
-import { context2d, element, html } from '../core/dom.js';
+import { context2d, create, element, html } from '../core/dom.js';
 
 export class Camera {
   #figure;
@@ -26,7 +26,10 @@ export class Camera {
     if (!trace.header.image_size) return;
     const [height, width] = trace.header.image_size;
     Object.assign(this.#context.canvas, { height, width });
-    html('figcaption', this.#figure).textContent = `camera, ${width} × ${height}`;
+    html('figcaption', this.#figure).replaceChildren(
+      create('span', { textContent: 'camera, ' }),
+      `${width} × ${height}`,
+    );
   }
 
   /** @param {number} step */
