@@ -42,4 +42,9 @@ test('percentages, sizes, angles and names', () => {
   assert.equal(displayName('hinge_x'), 'hinge x');
   assert.equal(sentence('no maps'), 'No maps.');
   assert.equal(sentence('Really?'), 'Really?');
+  assert.equal(sentence('Loading …'), 'Loading …');
+  assert.equal(sentence('hinge_x is missing'), 'hinge_x is missing.');
+  assert.equal(sentence('door.h5 has no episodes.'), 'door.h5 has no episodes.');
+  assert.equal(sentence('nothing. at all'), 'Nothing. at all.');
+  assert.equal(sentence(''), '');
 });

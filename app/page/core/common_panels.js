@@ -8,7 +8,7 @@ import { setPanelState } from '../widgets/panel_state.js';
 import { element, html, messageOf } from './dom.js';
 import { swatch } from './palette.js';
 import { stats } from './stats.js';
-import { displayName, fixed, sentence } from './units.js';
+import { displayName, fixed } from './units.js';
 
 const LOADING_DELAY = 150; // ms until a panel shows that it loads
 
@@ -74,8 +74,7 @@ export function showProperties(trace) {
   const { classList } = html('#maps');
   classList.toggle('single', !trace.fuses);
   classList.toggle('no-effector', !trace.has('effector_position'));
-  classList.toggle('unavailable', Boolean(noMaps));
-  if (noMaps) setPanelState(html('#heatmaps'), 'empty', sentence(noMaps));
+  if (noMaps) setPanelState(html('#heatmaps'), 'empty', noMaps);
   showBlackouts(trace);
   html('#sigma-key').hidden = !trace.has('estimate_sigma');
   element('#largest-error', HTMLButtonElement).disabled = !trace.truth(0).some(Number.isFinite);

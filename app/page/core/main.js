@@ -8,6 +8,7 @@ import { html, messageOf } from './dom.js';
 import { Page } from './page.js';
 import { disableChanges } from './read_only.js';
 import { Store, parsePermalink } from './state.js';
+import { sentence } from './units.js';
 
 const messages = new Messages(html('#messages'));
 
@@ -20,7 +21,7 @@ async function start() {
     api.liveRuns().catch(() => ({ runs: [], tasks: [] })),
   ]);
   addLiveRuns(catalog, live);
-  messages.show('catalog', catalog.problems.join(' '));
+  messages.show('catalog', catalog.problems.map(sentence).join(' '));
   html('#read-only').hidden = !catalog.read_only;
   if (catalog.read_only) disableChanges(document.body);
   if (!catalog.tasks.length)

@@ -15,11 +15,13 @@ export const DISPLAY_UNITS = {
 export const displayName = (name) => name.replaceAll('_', ' ');
 
 /**
- * Adds a capital and a full stop to a text that lacks them.
+ * Adds a capital and a full stop to a text that lacks them. Names such as door.h5 or hinge_x keep their first letter.
  * @param {string} text
  */
-export const sentence = (text) =>
-  `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? '' : '.'}`;
+export function sentence(text) {
+  const start = /^[a-z](?!\S*[._=/\d]\S)/.test(text) ? text[0].toUpperCase() : text.slice(0, 1);
+  return start + text.slice(1) + (!text || /[.!?…]$/.test(text) ? '' : '.');
+}
 
 /**
  * Formats a number with fixed digits and a true minus sign; a dash for a missing number.

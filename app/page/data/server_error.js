@@ -1,2 +1,9 @@
-/** An error with a message for the user. */
-export class ServerError extends Error {}
+import { sentence } from '../core/units.js';
+
+/** An error with a message for the user, in sentences. */
+export class ServerError extends Error {
+  /** @param {string} message */
+  constructor(message) {
+    super(sentence(message));
+  }
+}

@@ -5,7 +5,7 @@
 
 import { context2d, create, element, html, messageOf } from '../core/dom.js';
 import { COLOUR_TABLES } from '../core/palette.js';
-import { fixed } from '../core/units.js';
+import { fixed, sentence } from '../core/units.js';
 import { MARGIN, drawMap } from './draw_map.js';
 import { mapTitle } from './map_summary.js';
 import { logLikelihood, rangeDigits, rangeLabels } from './map_values.js';
@@ -45,7 +45,7 @@ export function bindExport(host, displayed) {
     try {
       output.textContent = await action({ ...sheet, layers }, fileName(sheet, select.value));
     } catch (error) {
-      output.textContent = `Export failed: ${messageOf(error)}`;
+      output.textContent = sentence(`Export failed: ${messageOf(error)}`);
     }
   });
   return (layers) => {

@@ -377,7 +377,7 @@ const scoreSummary = (score) =>
 
 /** @param {Result} result */
 function statusText(result) {
-  if (result.state === 'error') return sentence(result.error);
+  if (result.state === 'error') return result.error;
   if (result.state === 'active' || result.state === 'ended') return jobSummary(result.job);
   if (result.state === 'live')
     return 'The live run is in progress. Its failures are listed when it has ended.';

@@ -8,7 +8,6 @@
 
 import { element, html, messageOf } from '../core/dom.js';
 import { permalink } from '../core/state.js';
-import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { isActive } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
@@ -91,7 +90,7 @@ export class Finetune {
       this.#form.hidden = Boolean(this.#run);
       this.#runView.show(this.#run);
       const { why_not: whyNot } = this.#offer;
-      if (whyNot && !run) setPanelState(this.#host, 'empty', sentence(whyNot));
+      if (whyNot && !run) setPanelState(this.#host, 'empty', whyNot);
       else setPanelState(this.#host, 'ready');
     } catch (error) {
       if (signal.aborted) return;

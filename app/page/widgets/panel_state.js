@@ -1,6 +1,7 @@
 /** States of a panel without content, and the messages at the top of the page. */
 
 import { create, html } from '../core/dom.js';
+import { sentence } from '../core/units.js';
 
 /**
  * Shows whether a panel is loading, empty, failed or ready. Its size stays the same.
@@ -13,7 +14,7 @@ export function setPanelState(body, state, text = '', share = null) {
   body.dataset.state = state;
   body.setAttribute('aria-busy', String(state === 'loading'));
   const note = html('.note', body);
-  note.textContent = state === 'ready' ? '' : text;
+  note.textContent = state === 'ready' ? '' : sentence(text);
   note.style.setProperty('--done', share === null ? '' : String(share));
   note.classList.toggle('measured', state === 'loading' && share !== null);
 }
@@ -35,9 +36,10 @@ export class Messages {
   show(key, text = '') {
     /** @type {HTMLElement | null} */
     const line = this.#host.querySelector(`[data-key="${key}"]`);
-    if (!text) line?.remove();
-    else if (!line) this.#append(key, text);
-    else if (html('span', line).textContent !== text) html('span', line).textContent = text;
+    const message = sentence(text);
+    if (!message) line?.remove();
+    else if (!line) this.#append(key, message);
+    else if (html('span', line).textContent !== message) html('span', line).textContent = message;
   }
 
   /**

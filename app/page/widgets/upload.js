@@ -3,7 +3,8 @@
 /** @import { RecordingEntry } from '../types/server.js' */
 
 import { create, messageOf } from '../core/dom.js';
-import { formatBytes, percent, sentence } from '../core/units.js';
+import { formatBytes, percent } from '../core/units.js';
+import { ServerError } from '../data/server_error.js';
 
 export class Uploads {
   #host;
@@ -58,7 +59,7 @@ export class Uploads {
     try {
       if (file.size > limit) {
         const [size, maximum] = [formatBytes(file.size), formatBytes(limit)];
-        throw new Error(`it has ${size}; the limit is ${maximum}`);
+        throw new ServerError(`it has ${size}; the limit is ${maximum}`);
       }
       const recording = await send(request, file, name, (share) => {
         bar.value = share;
@@ -68,7 +69,7 @@ export class Uploads {
       this.#done(recording);
     } catch (error) {
       line.dataset.state = 'error';
-      text.textContent = `${file.name} was not added: ${sentence(messageOf(error))}`;
+      text.textContent = `${file.name} was not added: ${messageOf(error)}`;
       bar.remove();
       [button.textContent, button.ariaLabel] = ['×', 'Dismiss'];
     }
@@ -104,9 +105,12 @@ function send(request, file, name, progress) {
     );
     request.addEventListener('load', () => {
       if (request.status === 201) resolve(request.response);
-      else reject(new Error(request.response?.error ?? `the server responded ${request.status}`));
+      else
+        reject(
+          new ServerError(request.response?.error ?? `the server responded ${request.status}`),
+        );
     });
-    request.addEventListener('error', () => reject(new Error('the server does not respond')));
+    request.addEventListener('error', () => reject(new ServerError('the server does not respond')));
     request.send(file);
   });
 }
