@@ -19,7 +19,8 @@ import numpy as np
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.datasets.faults.faults import FAULTS, Fault, Readings, parameters
+from beliefscope.datasets.faults.fault import Fault, Readings, parameters
+from beliefscope.datasets.faults.faults import FAULTS
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.simulation.simulate import hand_controls
 from beliefscope.datasets.task import Task

@@ -14,7 +14,8 @@ import pytest
 import beliefscope
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.faults import FAULTS, Fault, parameters
+from beliefscope.datasets.faults.fault import Fault, parameters
+from beliefscope.datasets.faults.faults import FAULTS
 from beliefscope.datasets.faults.injection import FAULT_PRESETS, NO_FAULTS, Faults, fault_catalog, faulty_copies
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.simulate import hand_controls
@@ -26,7 +27,10 @@ AFFECTED = {
     "blackout": {"image"},
     "force_bias=5": {"force"},
     "force_drift=1": {"force"},
+    "torque_bias=0.3": {"torque"},
+    "torque_noise": {"torque"},
     "effector_offset=0.02": {"effector_position"},
+    "effector_noise": {"effector_position"},
     "contact_flipped": {"contact"},
     "contact_delayed": {"contact"},
     "delay=haptics": {"effector_position", "force", "torque", "contact"},

@@ -9,13 +9,14 @@ import torch
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.faults.faults import FAULTS, parameters
+from beliefscope.datasets.faults.fault import parameters
+from beliefscope.datasets.faults.faults import FAULTS
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.finetuning.slices import CLEAN, Slice, standard_slices
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 
 TEXTS = {
     "black-in-contact:faults=blackout=1:contact=yes:only=haptics": Slice(
@@ -92,7 +93,7 @@ def test_single_modality_equals_one_hot_beta(name: str) -> None:
 
     def means(evidence: object) -> torch.Tensor:
         generator = torch.Generator().manual_seed(0)
-        return rollout(filter_, evidence, start_at_truth(filter_, batch), generator, 20).estimate.mean  # type: ignore[arg-type]
+        return rollout(filter_, evidence, first_belief(filter_, batch), generator, 20).estimate.mean  # type: ignore[arg-type]
 
     with torch.no_grad():
         evidence = filter_.encode(batch)
