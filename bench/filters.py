@@ -31,7 +31,7 @@ from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.catalog import NETWORKS, architecture, build, filters_of
 from beliefscope.filters.evaluate import run
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.trace import trace
 
 REPETITIONS = 5
@@ -103,13 +103,13 @@ def noise(steps: int, trajectories: int) -> Batch:
 @torch.no_grad()
 def forward(filter_: Filter, batch: Batch, particles: int = 300) -> None:
     generator = torch.Generator().manual_seed(0)
-    rollout(filter_, filter_.encode(batch), start_at_truth(filter_, batch), generator, particles)
+    rollout(filter_, filter_.encode(batch), first_belief(filter_, batch), generator, particles)
 
 
 def backward(filter_: Filter, batch: Batch, particles: int = 30) -> None:
     filter_.zero_grad(set_to_none=True)
     generator = torch.Generator().manual_seed(0)
-    estimate = rollout(filter_, filter_.encode(batch), start_at_truth(filter_, batch), generator, particles).estimate
+    estimate = rollout(filter_, filter_.encode(batch), first_belief(filter_, batch), generator, particles).estimate
     loss = (estimate.mean - batch.states).square().mean()
     if filter_.has_covariance:
         loss = loss + estimate.covariance.square().mean()

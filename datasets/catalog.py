@@ -8,10 +8,12 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io import user_code
 from beliefscope.datasets.readers.push_real_task import PUSH_REAL_TASKS
 from beliefscope.datasets.simulation.door import DOOR
+from beliefscope.datasets.simulation.door_field import DOOR_FIELD
 from beliefscope.datasets.simulation.push import PUSH
+from beliefscope.datasets.simulation.push_field import PUSH_FIELD
 from beliefscope.datasets.task import Task
 
-TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, *PUSH_REAL_TASKS)}
+TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, DOOR_FIELD, PUSH_FIELD, *PUSH_REAL_TASKS)}
 
 
 def find_task(name: str) -> Task:

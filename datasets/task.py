@@ -26,6 +26,18 @@ class Component:
 
 
 @dataclass(frozen=True)
+class Ingredient:
+    """A source of variation between the episodes of a simulated task, which can be switched off.
+
+    Attributes:
+        meaning: one line, with units. ranges: parameter -> smallest and largest value, drawn uniformly per episode.
+    """
+
+    meaning: str
+    ranges: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
 class Outline:
     """Outline of the object at true or estimated states, for drawing.
 
@@ -65,6 +77,11 @@ class Task:
             (haptics) in contact do not determine the position, so that their likelihood has a ridge; None if there is
             no such direction.
         simulate: (seed, index, steps) -> episode ``index`` of the collection with this seed; None for recorded tasks.
+            With ingredients, it also takes ``without``: names of those to switch off.
+        ingredients: name -> what varies between simulated episodes; their values are in each episode's provenance.
+        start_distance: unit -> range of the distance between the first belief's mean and the true state; units that
+            are missing start at the truth. An episode's provenance has the difference, ``start_offset``.
+        warmup: first steps that are excluded from metrics, because runs start at the truth.
     """
 
     name: str
@@ -80,7 +97,10 @@ class Task:
     outline: Callable[[ArrayLike], Outline] | None = None
     camera: Camera | None = None
     ridge_direction: Callable[[ArrayLike], Array] | None = None
-    simulate: Callable[[int, int, int], Episode] | None = None
+    simulate: Callable[..., Episode] | None = None
+    ingredients: Mapping[str, Ingredient] = field(default_factory=dict)
+    start_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    warmup: int = 30
 
     def index(self, component: str) -> int:
         """Index of a component in the state vector. Raises BadInput for an unknown name."""
@@ -88,6 +108,20 @@ class Task:
         if component not in names:
             raise unknown_name(f"component of task {self.name!r}", component, names)
         return names.index(component)
+
+    def start_variance(self) -> Array:
+        """(n,) mean square of each component's start offset, SI units; NaN for components that start at the truth.
+
+        A uniform distance from a to b has the mean square (a^2 + a b + b^2) / 3, shared by the d components of a unit.
+        """
+        units = [component.unit for component in self.components]
+        ends = np.array([self.start_distance.get(unit, (np.nan, np.nan)) for unit in units])
+        a, b = ends.T
+        return (a**2 + a * b + b**2) / 3.0 / [units.count(unit) for unit in units]
+
+    def first_counted(self, steps: int) -> int:
+        """First step that metrics of an episode of this length include: at least its last one."""
+        return min(self.warmup, steps - 1)
 
     @property
     def map_indices(self) -> tuple[int, int]:

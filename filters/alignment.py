@@ -14,7 +14,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.data_check import findings
-from beliefscope.filters.evaluate import WARMUP, run
+from beliefscope.filters.evaluate import run
 from beliefscope.filters.external.load import ExternalFilter
 
 ITERATIONS = 3
@@ -114,6 +114,6 @@ def _mean_errors(checkpoint: Checkpoint, episodes: Sequence[Episode], particles:
     for length in np.unique(lengths):
         members = np.flatnonzero(lengths == length)
         error, _ = run(filter_, steps.windows(steps.first[members], int(length)), None, particles, seed)
-        late = error[min(WARMUP, int(length) - 1) :, :, list(filter_.task.map_indices)]
+        late = error[filter_.task.first_counted(int(length)) :, :, list(filter_.task.map_indices)]
         errors[members] = late.mean(0).numpy()
     return errors

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 
@@ -26,6 +26,7 @@ class Batch:
             the encoders' tables (``Steps.with_image_indices``), -1 for a blacked-out one.
         controls: (T, N, c). states: (T, N, n). contact: (T, N) bool.
         previous: (N, n) true state one step before the first (of step 0 if the trajectory starts there).
+        start: (N, n) mean of the first belief; None: ``previous``.
     """
 
     observations: Mapping[str, Tensor]
@@ -33,6 +34,7 @@ class Batch:
     states: Tensor
     contact: Tensor
     previous: Tensor
+    start: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.states)
@@ -44,6 +46,7 @@ class Steps:
 
     Attributes: as in ``Batch`` but (S, ...), S steps in total.
         first: (E,) index of each episode's step 0. length: (E,).
+        start_offset: (E, n) mean of each episode's first belief, relative to the true state of step 0.
     """
 
     observations: Mapping[str, Tensor]
@@ -52,10 +55,11 @@ class Steps:
     contact: Tensor
     first: Tensor
     length: Tensor
+    start_offset: Tensor
 
     @classmethod
     def from_episodes(cls, task: Task, episodes: Sequence[Episode], device: torch.device | str = "cpu") -> Steps:
-        """Raises BadInput if there is no episode, or an array does not have the task's shape."""
+        """Raises BadInput if there is no episode, or an array or start offset does not have the task's shape."""
         if not episodes:
             raise BadInput("no episodes: the data set's split is empty")
         for number, episode in enumerate(episodes):
@@ -72,18 +76,22 @@ class Steps:
             contact=_join([e.contact for e in episodes], device),
             first=length.cumsum(0) - length,
             length=length,
+            start_offset=torch.from_numpy(np.stack([start_offset(task, e) for e in episodes])).to(device),
         )
 
     def windows(self, starts: Tensor, steps: int) -> Batch:
         """Windows of ``steps`` steps that start at the given steps (N,)."""
         index = starts + torch.arange(steps, device=starts.device)[:, None]
-        at_start = torch.isin(starts, self.first)
+        episode = torch.searchsorted(self.first, starts, right=True) - 1
+        at_start = self.first[episode] == starts
+        previous = self.states[torch.where(at_start, starts, starts - 1)]
         return Batch(
             observations={m: values[index] for m, values in self.observations.items()},
             controls=self.controls[index],
             states=self.states[index],
             contact=self.contact[index],
-            previous=self.states[torch.where(at_start, starts, starts - 1)],
+            previous=previous,
+            start=previous + at_start.unsqueeze(-1) * self.start_offset[episode],
         )
 
     def sample(self, count: int, steps: int, generator: torch.Generator) -> Batch:
@@ -98,7 +106,8 @@ class Steps:
 
     def part(self, first: int, last: int) -> Steps:
         """Episodes ``first`` to ``last - 1``, as views of the same arrays."""
-        return replace(self, first=self.first[first:last], length=self.length[first:last])
+        part = slice(first, last)
+        return replace(self, first=self.first[part], length=self.length[part], start_offset=self.start_offset[part])
 
     def rows(self) -> Tensor:
         """(R,) indices of these episodes' steps in the arrays."""
@@ -136,6 +145,19 @@ def single_step(task: Task, observations: Mapping[str, np.ndarray], control: np.
         seed=-1,
     )
     return Steps.from_episodes(task, [row]).episode(0)
+
+
+def start_offset(task: Task, episode: Episode) -> FloatArray:
+    """(n,) mean of the episode's first belief, relative to the true state of step 0.
+
+    Raises BadInput if ``start_offset`` in its provenance does not have n finite numbers.
+    """
+    n = len(task.components)
+    value = episode.provenance.get("start_offset", [0.0] * n)
+    valid = isinstance(value, list) and len(value) == n and all(isinstance(v, float | int) for v in value)
+    if not valid or not np.isfinite(value).all():
+        raise BadInput(f"'start_offset' in the provenance is {value!r:.200}, expected {n} finite numbers")
+    return np.array(value, np.float32)
 
 
 def check_shapes(task: Task, episode: Episode, where: str) -> None:

@@ -21,13 +21,10 @@ from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.rollout import rollout, start_at_truth
-from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start, shifted
+from beliefscope.filters.rollout import first_belief, rollout
+from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start, shifted, without_start_offset
 from beliefscope.filters.start_offset import UNITS as UNITS
 from beliefscope.filters.subsets import input_modalities, standalone_evidence
-
-WARMUP = 30
-"""First steps of each trajectory, which are excluded from metrics, as in the paper's evaluation."""
 
 FILTER, STAY, DYNAMICS = "filter", "stay", "dynamics"
 UPDATE, STANDALONE = "{}-only update", "{} standalone"
@@ -49,7 +46,7 @@ CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815, 4: 9.488}
 
 @dataclass(frozen=True)
 class Metrics:
-    """Metrics over the evaluated steps of all episodes: those from step ``WARMUP``, unless stated otherwise.
+    """Metrics over the evaluated steps of all episodes: those from ``Task.warmup`` on, unless stated otherwise.
 
     Attributes:
         rmse: ``hinge_x_cm``, ``angle_deg``, ... and ``position_cm``, the root mean square distance on the map.
@@ -57,6 +54,8 @@ class Metrics:
         nees: mean normalised estimation error squared over n: 1 if consistent, more if overconfident.
         coverage95: share of steps whose true state lies in the 95 % ellipsoid.
         rmse_from_step_0: as ``rmse``, over all steps.
+        rmse_before_contact, rmse_after_contact: as ``rmse``, before and from each episode's first contact; empty if
+            there are no such steps.
         baselines: name in ``BASELINES`` -> its metrics; None for a filter that cannot run without observations.
         updates: modality -> metrics of its single-modality updates, which start at every step from the fused prior.
         standalone: modality -> metrics of the filter with the observations of this modality only.
@@ -70,6 +69,8 @@ class Metrics:
     nees: float
     coverage95: float
     rmse_from_step_0: dict[str, float] = field(default_factory=dict)
+    rmse_before_contact: dict[str, float] = field(default_factory=dict)
+    rmse_after_contact: dict[str, float] = field(default_factory=dict)
     baselines: Mapping[str, Metrics | None] = field(default_factory=dict)
     updates: Mapping[str, Metrics] = field(default_factory=dict)
     standalone: Mapping[str, Metrics] = field(default_factory=dict)
@@ -79,8 +80,9 @@ class Metrics:
         consistency = {"nll": self.nll, "nees": self.nees, "coverage95": self.coverage95}
         document: dict[str, Any] = {"rmse": self.rmse}
         document |= {k: None if math.isnan(value) else value for k, value in consistency.items()}
-        if self.rmse_from_step_0:
-            document["rmse_from_step_0"] = self.rmse_from_step_0
+        for key in ("rmse_from_step_0", "rmse_before_contact", "rmse_after_contact"):
+            if getattr(self, key):
+                document[key] = getattr(self, key)
         if self.baselines:
             document["baselines"] = {name: result and result._errors() for name, result in self.baselines.items()}
         for key, by_modality in (("updates", self.updates), ("standalone", self.standalone)):
@@ -105,12 +107,12 @@ def evaluate(
     modalities: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Metrics:
-    """Runs the filter over whole episodes, each from the true state with covariance 0.1 I (standardised).
+    """Runs the filter over whole episodes, each from its first belief (``rollout.first_belief``).
 
     Args:
         faults: to inject into the sensors. only: name of a modality: its standalone filter.
         particles: number of particles; an external filter uses its own. seed: of filter, faults and start offsets.
-        start_offset: of the first belief from the true state; its covariance matches the offset.
+        start_offset: of the first belief from the true state; its covariance matches the offset. Default: as the task.
         baselines: whether to evaluate ``BASELINES`` as well, with the same starts, faults and random numbers.
         modalities: whether to evaluate the single-modality updates and standalone filters as well, in the same way.
             None of an external filter.
@@ -124,6 +126,8 @@ def evaluate(
     offsets = torch.from_numpy(start_offset.vectors(filter_.task, episodes, seed)).to(device)
     variances = torch.from_numpy(start_offset.variances(filter_.task)).to(device)
     episodes = [faults.apply(episode, seed) for episode in episodes]
+    if start_offset:
+        episodes = [without_start_offset(episode) for episode in episodes]
     steps = Steps.from_episodes(filter_.task, episodes, device)
     groups: dict[int, list[int]] = {}
     for number, length in enumerate(steps.length.tolist()):
@@ -141,7 +145,7 @@ def evaluate(
             by_episode |= {number: (error[:, i], covariance[:, i]) for i, number in enumerate(members)}
         if progress is not None:
             progress(done / len(groups))
-    pooled = {name: _pool(filter_.task, [by[i] for i in range(len(by))]) for name, by in runs.items()}
+    pooled = {name: _pool(filter_.task, [by[i] for i in range(len(by))], episodes) for name, by in runs.items()}
     names = () if isinstance(filter_, ExternalFilter) else input_modalities(filter_)
     return replace(
         pooled[FILTER],
@@ -152,8 +156,8 @@ def evaluate(
 
 
 def run(filter_: Filter, batch: Batch, only: str | None, particles: int, seed: int) -> Run:
-    """Errors and covariances of a run from the true state."""
-    return _filter_runs(filter_, batch, start_at_truth(filter_, batch), only, particles, seed)[FILTER]
+    """Errors and covariances of a run from the first belief."""
+    return _filter_runs(filter_, batch, first_belief(filter_, batch), only, particles, seed)[FILTER]
 
 
 @torch.no_grad()
@@ -211,13 +215,22 @@ def _stay(mean: Tensor, states: Tensor) -> Run:
     return mean - states, torch.full((*states.shape, states.shape[-1]), torch.nan)
 
 
-def _pool(task: Task, trajectories: Sequence[Run]) -> Metrics:
+def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) -> Metrics:
     """Metrics of errors (T, n) and covariances (T, n, n), SI units, of each trajectory."""
-    late = [(e[first:], c[first:]) for e, c in trajectories for first in [min(WARMUP, len(e) - 1)]]
+    late = [(e[first:], c[first:]) for e, c in trajectories for first in [task.first_counted(len(e))]]
     result = metrics(task, torch.cat([e for e, _ in late]), torch.cat([c for _, c in late]))
     sums = [[float(len(e)), *(float(values.sum()) for values in _squares(task, e).values())] for e, _ in late]
     everything = _squares(task, torch.cat([e for e, _ in trajectories]))
-    return replace(result, rmse_from_step_0=_root_mean(everything), squares=np.array(sums))
+    touched = np.concatenate([np.maximum.accumulate(e.contact)[task.first_counted(len(e)) :] for e in episodes])
+    squares = _squares(task, torch.cat([e for e, _ in late]))
+    before, after = (_root_mean({key: values[mask] for key, values in squares.items()}) for mask in (~touched, touched))
+    return replace(
+        result,
+        rmse_from_step_0=_root_mean(everything),
+        rmse_before_contact=before if not touched.all() else {},
+        rmse_after_contact=after if touched.any() else {},
+        squares=np.array(sums),
+    )
 
 
 def _squares(task: Task, error: Tensor) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
 from beliefscope.filters.filter import Filter
 
 START_VARIANCE = 0.1
-"""Variance of the first belief around the true state, in standardised units, as in the paper's evaluation."""
+"""Variance of a first belief at the true state, in standardised units, as in the paper's evaluation."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,17 @@ class Rollout:
     updates: Gaussian | None = None
 
 
-def start_at_truth(filter_: Filter, batch: Batch) -> Gaussian:
-    """The first belief: the true state before step 0 with covariance 0.1 I, standardised; (N, n), (N, n, n)."""
-    mean = filter_.statistics.standardise("state", batch.previous)
-    eye = torch.eye(filter_.n, device=mean.device)
-    return Gaussian(mean, (START_VARIANCE * eye).expand(len(mean), -1, -1))
+def first_belief(filter_: Filter, batch: Batch) -> Gaussian:
+    """The belief before step 0, standardised: mean (N, n), covariance (N, n, n).
+
+    At the true state with covariance 0.1 I, unless the task starts beside it (``Task.start_distance``).
+    """
+    statistics = filter_.statistics
+    mean = statistics.standardise("state", batch.previous if batch.start is None else batch.start)
+    variance = torch.from_numpy(filter_.task.start_variance()).to(mean)
+    variance = variance / statistics.mean_std("state")[1].square()
+    variance = torch.where(variance.isnan(), START_VARIANCE, variance)
+    return Gaussian(mean, torch.diag(variance).expand(len(mean), -1, -1))
 
 
 def rollout(

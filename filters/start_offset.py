@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.rollout import start_at_truth
+from beliefscope.filters.rollout import first_belief
 
 UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / math.pi)}
 """Internal unit -> unit of reported values, and the conversion factor."""
@@ -77,13 +77,13 @@ class StartOffset:
         return offsets.astype(np.float32)
 
     def variances(self, task: Task) -> FloatArray:
-        """(n,) mean square of each component's offset, SI units: length^2 / d of d components; NaN without offset."""
-        units = [component.unit for component in task.components]
-        return np.array([self.lengths.get(unit, math.nan) ** 2 / units.count(unit) for unit in units], np.float32)
+        """(n,) mean square of each component's offset, SI units; NaN without offset."""
+        distances = {unit: (length, length) for unit, length in self.lengths.items()}
+        return replace(task, start_distance=distances).start_variance().astype(np.float32)
 
 
 NO_OFFSET = StartOffset()
-"""Start at the truth."""
+"""Start as the task does."""
 
 
 def shifted(start: Gaussian, offsets: Tensor, variances: Tensor) -> Gaussian:
@@ -93,6 +93,12 @@ def shifted(start: Gaussian, offsets: Tensor, variances: Tensor) -> Gaussian:
 
 
 def offset_start(filter_: Filter, batch: Batch, offsets: Tensor, variances: Tensor) -> Gaussian:
-    """The first belief, standardised: ``start_at_truth`` with offsets (N, n) and variances (n,) in SI units."""
+    """The first belief, standardised: ``first_belief`` with offsets (N, n) and variances (n,) in SI units."""
     _, std = filter_.statistics.mean_std("state")
-    return shifted(start_at_truth(filter_, batch), offsets / std, variances / std.square())
+    return shifted(first_belief(filter_, batch), offsets / std, variances / std.square())
+
+
+def without_start_offset(episode: Episode) -> Episode:
+    """The episode with its first belief at the true state."""
+    provenance = {key: value for key, value in episode.provenance.items() if key != "start_offset"}
+    return replace(episode, provenance=provenance)

@@ -85,4 +85,5 @@ def _without(batch: Batch, filter_: Filter, has: Tensor) -> Batch:
         states=expand(batch.states),
         contact=expand(batch.contact),
         previous=batch.previous.expand(len(has), -1),
+        start=None if batch.start is None else batch.start.expand(len(has), -1),
     )

@@ -15,7 +15,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.subsets import check_modality, input_modalities, standalone_evidence
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.run import assemble_trace
@@ -64,7 +64,7 @@ def standalone(
     filter_ = checkpoint.filter
     batch = Steps.from_episodes(filter_.task, [trace.episode]).episode(0)
     evidence = standalone_evidence(filter_, batch, filter_.encode(batch), modality)
-    start, generator = start_at_truth(filter_, batch), torch.Generator().manual_seed(trace.seed)
+    start, generator = first_belief(filter_, batch), torch.Generator().manual_seed(trace.seed)
     particles = int(trace.settings["particles"])
     steps = rollout(filter_, evidence, start, generator, particles, keep=True, progress=progress).steps
     settings = {key: value for key, value in trace.settings.items() if key != "edits"} | {"standalone": modality}

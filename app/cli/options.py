@@ -104,7 +104,9 @@ TRACE_FILTER = option(
 )
 
 OPTIONS: dict[str, Any] = {
-    "task": argument("TASK", "Task: door, push, push-real, a variant, or your own (docs/data.md)."),
+    "task": argument(
+        "TASK", "Task: door, push, door-field, push-field, push-real, a variant, or your own (docs/data.md)."
+    ),
     "filter": option(
         "NAME|CHECKPOINT|MODULE:BUILD",
         "Built-in filter such as crossmodal-pf, path of a .safetensors file, or external filter given by its "

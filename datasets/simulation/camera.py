@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Image = NDArray[np.uint8]
 
@@ -43,6 +43,25 @@ class Camera:
         half = np.tan(self.field_of_view / 2)
         directions = forward + half * (ticks[None, :, None] * right - ticks[:, None, None] * up)
         return (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3)
+
+    def moved(self, shift: ArrayLike, turn: ArrayLike) -> Camera:
+        """The camera moved by ``shift`` (3,), m, and turned by the rotation vector ``turn`` (3,), rad, world axes."""
+        axis, quaternion, matrix = np.array(turn, float), np.zeros(4), np.zeros(9)
+        angle = mujoco.mju_normalize(axis)
+        mujoco.mju_axisAngle2Quat(quaternion, axis, angle)
+        mujoco.mju_quat2Mat(matrix, quaternion)
+        rotation = matrix.reshape(3, 3)
+        return replace(
+            self,
+            position=_triple(np.add(self.position, shift)),
+            forward=_triple(rotation @ self.forward),
+            up=_triple(rotation @ self.up),
+        )
+
+
+def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
 
 
 class RayCaster:

@@ -7,7 +7,7 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Collection, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import replace
@@ -36,6 +36,7 @@ def collect(
     path: str | Path,
     progress: Progress | None = None,
     split: str | None = None,
+    without: Collection[str] = (),
 ) -> None:
     """Simulate ``episodes`` trajectories of ``steps`` steps into the HDF5 file ``path``.
 
@@ -49,10 +50,11 @@ def collect(
         workers: number of processes; None: one per core.
         progress: called with (finished episodes, all episodes) at the start and after each episode.
         split: of all episodes. None: by their number, 8 of 10 ``train``, 1 ``val``, 1 ``test``.
+        without: ingredients of the task to switch off.
 
     Raises:
-        BadInput: for an unknown or recorded task, an unknown split, a count that is too small, or a path that cannot
-            be written.
+        BadInput: for an unknown or recorded task, an unknown split or ingredient, a count that is too small, or a path
+            that cannot be written.
     """
     path = Path(path)
     if load_task(task).simulate is None:
@@ -63,7 +65,10 @@ def collect(
             raise BadInput(f"{name} is {value}, expected at least {minimum}.")
     if split not in (None, *SPLITS):
         raise unknown_name("split", str(split), SPLITS)
-    parts = _PartialCollection(path, task, steps, seed, split)
+    for name in without:
+        if name not in load_task(task).ingredients:
+            raise unknown_name(f"ingredient of task {task!r}", name, load_task(task).ingredients)
+    parts = _PartialCollection(path, task, steps, seed, split, sorted(without))
     missing = [i for i in range(episodes) if not parts.contains(i)]
     done = episodes - len(missing)
     report = progress or (lambda done, count: None)
@@ -79,8 +84,8 @@ def collect(
 class _PartialCollection:
     """Folder of finished episodes, one file each. File names contain everything the episode depends on."""
 
-    def __init__(self, path: Path, task: str, steps: int, seed: int, split: str | None) -> None:
-        self.task, self.steps, self.seed, self.split = task, steps, seed, split
+    def __init__(self, path: Path, task: str, steps: int, seed: int, split: str | None, without: Sequence[str]) -> None:
+        self.task, self.steps, self.seed, self.split, self.without = task, steps, seed, split, without
         self._path, self._folder = path, path.with_name(path.name + ".partial")
         if path.is_dir():
             raise BadInput(f"{path} is a folder, expected a file to write.")
@@ -106,7 +111,8 @@ class _PartialCollection:
         """Simulate an episode and store it."""
         task = load_task(self.task)
         assert task.simulate is not None
-        episode = task.simulate(self.seed, index, self.steps)
+        settings = {"without": self.without} if self.without else {}
+        episode = task.simulate(self.seed, index, self.steps, **settings)
         write_dataset(self._part(index), task, [replace(episode, split=self.split or episode.split)])
 
     def join(self, episodes: int) -> None:
@@ -119,7 +125,8 @@ class _PartialCollection:
 
     def _part(self, index: int) -> Path:
         versions = f"{self.split or 'all'}-{beliefscope.__version__}-mujoco{mujoco.__version__}"
-        return self._folder / f"{load_task(self.task).name}-seed{self.seed}-steps{self.steps}-{index}-{versions}.h5"
+        name = "-without-".join([load_task(self.task).name, *self.without])
+        return self._folder / f"{name}-seed{self.seed}-steps{self.steps}-{index}-{versions}.h5"
 
     def _read(self, index: int) -> Episode:
         with open_dataset(self._part(index)) as part:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from beliefscope.datasets.episode import Episode
@@ -15,23 +16,23 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.controller import FORWARD, Impedance, add_controller
 from beliefscope.datasets.simulation.door_physics import (
-    BAR_OFFSET,
     HINGE_CENTRE,
     HINGE_HALF_RANGE,
     MAX_ANGLE,
+    PANEL_WIDTH,
     DoorPhysics,
 )
-from beliefscope.datasets.simulation.door_policies import PullDoor, PushDoor
-from beliefscope.datasets.simulation.panda import ROBOT_BIT, STIFF, WORLD_BIT, add_panda, new_spec
+from beliefscope.datasets.simulation.door_policies import POLICIES
+from beliefscope.datasets.simulation.panda import ROBOT_BIT, STIFF, WORLD_BIT, Sleeve, add_panda, new_spec
 from beliefscope.datasets.simulation.panda_meshes import add_visual_meshes
 from beliefscope.datasets.simulation.sensors import add_touch
 from beliefscope.datasets.simulation.simulate import DT, POSITION_BITS, Scene, episode_rng, quantise, simulate
 from beliefscope.datasets.task import Array, Component, Outline, Task
 
-PANEL_SIZE = (0.04, 0.5, 0.86)  # thickness, width, height; m
+PANEL_SIZE = (0.04, PANEL_WIDTH, 0.86)  # thickness, width, height; m
 PANEL_BOTTOM = 0.02  # m above the floor
 BAR_HEIGHTS = (0.55, 0.69)  # range, m
-BAR_RADII = (0.20, 0.46)  # m from the hinge to both ends of the bar
+BAR_START, BAR_MARGIN = 0.20, 0.04  # m, distance of the bar's ends from the hinge and from the panel's other side
 SPRING = 1.6  # N m/rad, opens a pushed door for the next push
 SPRING_REST = 2.0  # rad; friction stops the door earlier
 
@@ -62,16 +63,18 @@ def panel_direction(states: ArrayLike) -> Array:
     return np.asarray(states, float)[..., 2] + np.pi / 2.0
 
 
-def door_model(physics: DoorPhysics, visual: bool = False) -> mujoco.MjModel:
+def door_model(
+    physics: DoorPhysics, visual: bool = False, frame: bool = True, sleeve: Sleeve | None = None
+) -> mujoco.MjModel:
     """Model of robot, door, frame and floor. Joint ``door`` is last in qpos.
 
     Args:
-        visual: add the robot's meshes, if installed.
+        visual: add the robot's meshes, if installed. frame: whether the frame is visible.
     """
     spec = new_spec()
-    add_panda(spec)
+    add_panda(spec, sleeve)
     add_controller(spec, IMPEDANCE)
-    _add_environment(spec, physics.hinge)
+    _add_environment(spec, physics, frame)
     _add_door(spec, physics)
     add_touch(spec, "door")
     if visual:
@@ -79,7 +82,7 @@ def door_model(physics: DoorPhysics, visual: bool = False) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _add_environment(spec: mujoco.MjSpec, hinge: tuple[float, float]) -> None:
+def _add_environment(spec: mujoco.MjSpec, physics: DoorPhysics, visible: bool) -> None:
     world = spec.worldbody
     world.add_light(pos=(0, 0, 3.5), dir=(0, 0, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     world.add_geom(
@@ -90,11 +93,11 @@ def _add_environment(spec: mujoco.MjSpec, hinge: tuple[float, float]) -> None:
         contype=0,
         conaffinity=0,
     )
-    frame = world.add_body(name="frame", pos=(hinge[0], hinge[1], 0))
-    width, top = PANEL_SIZE[1], PANEL_BOTTOM + PANEL_SIZE[2]
+    frame = world.add_body(name="frame", pos=(*physics.hinge, 0))
+    width, top = physics.width, PANEL_BOTTOM + PANEL_SIZE[2]
     beam = {
         "type": mujoco.mjtGeom.mjGEOM_BOX,
-        "rgba": (0.16, 0.17, 0.2, 1),
+        "rgba": (0.16, 0.17, 0.2, float(visible)),  # rays pass through geoms of opacity 0
         "contype": WORLD_BIT,
         "conaffinity": ROBOT_BIT,
     }
@@ -111,14 +114,14 @@ def _add_door(spec: mujoco.MjSpec, physics: DoorPhysics) -> None:
         axis=(0, 0, 1),
         limited=True,
         range=(0, MAX_ANGLE),
-        damping=8.0,
-        frictionloss=1.5,
+        damping=physics.damping,
+        frictionloss=physics.friction,
         stiffness=physics.spring,
         springref=SPRING_REST,
         armature=0.02,
     )
     touch = {"contype": WORLD_BIT, "conaffinity": ROBOT_BIT, "condim": 4, **STIFF}
-    thickness, width, height = PANEL_SIZE
+    thickness, width, height = PANEL_SIZE[0], physics.width, PANEL_SIZE[2]
     door.add_geom(
         name="panel",
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -128,22 +131,22 @@ def _add_door(spec: mujoco.MjSpec, physics: DoorPhysics) -> None:
         mass=3.0,
         **touch,
     )
-    (near, far), z = BAR_RADII, physics.bar_height
+    ends, offset, z = (BAR_START, width - BAR_MARGIN), physics.bar_offset, physics.bar_height
     capsule, steel = mujoco.mjtGeom.mjGEOM_CAPSULE, (0.88, 0.89, 0.92, 1)
     door.add_geom(
         name="bar",
         type=capsule,
-        fromto=(-BAR_OFFSET, near, z, -BAR_OFFSET, far, z),
+        fromto=(-offset, ends[0], z, -offset, ends[1], z),
         size=(0.014, 0, 0),
         rgba=steel,
         mass=0.3,
         **touch,
     )
-    for i, radius in enumerate(BAR_RADII):
+    for i, radius in enumerate(ends):
         door.add_geom(
             name=f"bracket{i}",
             type=capsule,
-            fromto=(-BAR_OFFSET, radius, z, 0, radius, z),
+            fromto=(-offset, radius, z, 0, radius, z),
             size=(0.01, 0, 0),
             rgba=steel,
             mass=0.05,
@@ -167,17 +170,22 @@ def policy_name(index: int) -> str:
     return ("pull", "push")[(index + index // 10) % 2]
 
 
+def draw_door(rng: Generator, policy: str) -> DoorPhysics:
+    """A door with a random hinge and bar height; a spring opens pushed doors."""
+    hinge = quantise(HINGE_CENTRE + rng.uniform(-HINGE_HALF_RANGE, HINGE_HALF_RANGE, 2), POSITION_BITS)
+    spring = 0.0 if policy == "pull" else SPRING
+    return DoorPhysics((float(hinge[0]), float(hinge[1])), float(rng.uniform(*BAR_HEIGHTS)), spring)
+
+
 def simulate_door(seed: int, index: int, steps: int) -> Episode:
     """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
-    rng = episode_rng(seed, index)
-    hinge = quantise(HINGE_CENTRE + rng.uniform(-HINGE_HALF_RANGE, HINGE_HALF_RANGE, 2), POSITION_BITS)
-    name = policy_name(index)
-    spring = 0.0 if name == "pull" else SPRING
-    door = DoorPhysics((float(hinge[0]), float(hinge[1])), float(rng.uniform(*BAR_HEIGHTS)), spring)
+    rng, name = episode_rng(seed, index), policy_name(index)
+    door = draw_door(rng, name)
+    hinge = np.array(door.hinge, np.float32)
     return simulate(
         "door",
         Scene(door_model(door), IMPEDANCE, CAMERA),
-        {"pull": PullDoor, "push": PushDoor}[name](door, rng),
+        POLICIES[name](door, rng),
         lambda qpos: np.concatenate([np.broadcast_to(hinge, (steps, 2)), qpos[:, -1:]], axis=1),
         seed,
         index,

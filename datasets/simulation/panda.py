@@ -6,6 +6,8 @@ Link frames follow Craig's modified Denavit-Hartenberg convention: frame i is re
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 
@@ -13,6 +15,7 @@ ARM_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 FINGERS = ("finger_left", "finger_right")
 GRIPPER_OPEN = 0.04  # m, travel of each finger
 GRIP_FORCE = 70.0  # N on each finger
+SLEEVE_LENGTH = 0.25  # m
 GRIP_OFFSET = 0.1034  # m, from the hand's frame to the point between the fingertips
 
 # Stiff contacts: with default parameters the light fingers would sink centimetres into a grasped object.
@@ -84,6 +87,7 @@ _WHITE = (0.93, 0.94, 0.95, 1.0)
 _SILVER = (0.72, 0.75, 0.78, 1.0)
 _DARK = (0.22, 0.24, 0.27, 1.0)
 _PAD = (0.95, 0.55, 0.15, 1.0)
+_FABRIC = (0.55, 0.57, 0.6, 1.0)
 
 
 def new_spec() -> mujoco.MjSpec:
@@ -98,7 +102,19 @@ def new_spec() -> mujoco.MjSpec:
     return spec
 
 
-def add_panda(spec: mujoco.MjSpec) -> None:
+@dataclass(frozen=True)
+class Sleeve:
+    """A sleeve around the hand that hides what is behind it. Without mass or contact.
+
+    Attributes:
+        radius: m. end: m along the hand's axis from its frame; the point between the fingertips is at ``GRIP_OFFSET``.
+    """
+
+    radius: float
+    end: float
+
+
+def add_panda(spec: mujoco.MjSpec, sleeve: Sleeve | None = None) -> None:
     """Add the arm with hand, fingers and wrist sensors at the world's origin.
 
     Bodies ``link0`` .. ``link7``, ``hand``, ``finger_left``, ``finger_right``; joints ``joint1`` .. ``joint7``,
@@ -129,6 +145,16 @@ def add_panda(spec: mujoco.MjSpec) -> None:
         )
         _add_capsules(body, i + 1)
     _add_hand(spec, body)
+    if sleeve is not None:
+        spec.body("hand").add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            fromto=(0, 0, sleeve.end - SLEEVE_LENGTH, 0, 0, sleeve.end),
+            size=(sleeve.radius, 0, 0),
+            rgba=_FABRIC,
+            contype=0,
+            conaffinity=0,
+            mass=0,
+        )
 
 
 def _add_capsules(body: mujoco.MjsBody, link: int) -> None:

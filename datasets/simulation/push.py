@@ -5,6 +5,8 @@ World frame: the robot's base, x forward, y left, z up; m.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 from numpy.random import Generator
@@ -13,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.controller import DOWN, Impedance, add_controller
-from beliefscope.datasets.simulation.panda import ROBOT_BIT, WORLD_BIT, add_panda, new_spec
+from beliefscope.datasets.simulation.panda import ROBOT_BIT, WORLD_BIT, Sleeve, add_panda, new_spec
 from beliefscope.datasets.simulation.panda_meshes import add_visual_meshes
 from beliefscope.datasets.simulation.sensors import add_touch
 from beliefscope.datasets.simulation.simulate import (
@@ -34,7 +36,7 @@ from beliefscope.datasets.task import Component, Outline, Task
 Vector = NDArray[np.float64]
 
 RADIUS, HEIGHT = 0.05, 0.06  # m
-MASS, FRICTION = 0.6, 0.45  # kg, -
+FRICTION = 0.45
 CENTRE = np.array([0.55, 0.0])
 HALF_RANGE = 0.105  # half side length of the square around CENTRE of start and target positions, m
 
@@ -56,6 +58,15 @@ CAMERA = Camera(
 IMPEDANCE = Impedance(DOWN, (700, 700, 900), lead=0.03)
 
 
+@dataclass(frozen=True)
+class PuckPhysics:
+    """Parameters of the puck: radius, m; mass, kg; friction coefficient on the ground."""
+
+    radius: float = RADIUS
+    mass: float = 0.6
+    friction: float = FRICTION
+
+
 class PushPuck(Policy):
     """Repeatedly descends behind the puck, pushes it to a random target, retracts and rises.
 
@@ -64,9 +75,10 @@ class PushPuck(Policy):
 
     fingers = 0.0
     squeeze = False
+    clearance = (0.01, 0.03)  # range of the distance between fingers and puck before a push, m
 
-    def __init__(self, rng: Generator) -> None:
-        self._rng = rng
+    def __init__(self, rng: Generator, puck: PuckPhysics = PuckPhysics()) -> None:
+        self._rng, self._reach = rng, puck.radius + TIP
         start = quantise(self._around(HALF_RANGE), POSITION_BITS)
         self.object_start = np.array([*start, HEIGHT / 2, 1.0, 0.0, 0.0, 0.0])
         self._queue: list[str] = []
@@ -92,7 +104,7 @@ class PushPuck(Policy):
             case "descend":
                 return Waypoint(self._at(self._behind), self._speed(0.08), 2)
             case "push":
-                gap = float((puck - self._behind) @ self._direction) - RADIUS - TIP
+                gap = float((puck - self._behind) @ self._direction) - self._reach
                 self._height += rng.normal(0.0, 0.006)
                 return Waypoint(self._at(self._behind + (gap + self._length) * self._direction), self._speed(0.05), 0)
             case "retract":
@@ -108,7 +120,7 @@ class PushPuck(Policy):
         while (length := float(np.linalg.norm(direction := self._around(HALF_RANGE) - puck))) < MIN_PUSH:
             pass
         self._direction, self._length = direction / length, length
-        self._behind = puck - (RADIUS + TIP + rng.uniform(0.01, 0.03)) * self._direction
+        self._behind = puck - (self._reach + rng.uniform(*self.clearance)) * self._direction
         self._behind += rng.normal(0.0, 0.012) * _left(self._direction)
         self._height = float(rng.uniform(*PUSH_HEIGHTS))
 
@@ -144,14 +156,18 @@ def puck_outline(states: ArrayLike) -> Outline:
     )
 
 
-def push_model(visual: bool = False) -> mujoco.MjModel:
+def push_model(
+    visual: bool = False,
+    puck: PuckPhysics = PuckPhysics(),
+    sleeve: Sleeve | None = None,
+) -> mujoco.MjModel:
     """Model of robot, puck and ground. The puck's free joint is last in qpos.
 
     Args:
         visual: add the robot's meshes, if installed.
     """
     spec = new_spec()
-    add_panda(spec)
+    add_panda(spec, sleeve)
     add_controller(spec, IMPEDANCE)
     world = spec.worldbody
     world.add_light(pos=(0, 0, 3.5), dir=(0, 0, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
@@ -160,19 +176,19 @@ def push_model(visual: bool = False) -> mujoco.MjModel:
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=(3, 3, 0.1),
         rgba=(0.32, 0.35, 0.38, 1),
-        friction=(FRICTION, 5e-3, 1e-4),
+        friction=(puck.friction, 5e-3, 1e-4),
         contype=WORLD_BIT,
         conaffinity=ROBOT_BIT,
     )
-    puck = world.add_body(name="puck", pos=(*CENTRE, HEIGHT / 2))
-    puck.add_freejoint(name="puck")
-    puck.add_geom(
+    body = world.add_body(name="puck", pos=(*CENTRE, HEIGHT / 2))
+    body.add_freejoint(name="puck")
+    body.add_geom(
         name="puck",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=(RADIUS, HEIGHT / 2, 0),
+        size=(puck.radius, HEIGHT / 2, 0),
         rgba=(0.9, 0.75, 0.3, 1),
-        mass=MASS,
-        friction=(FRICTION, 5e-3, 1e-4),
+        mass=puck.mass,
+        friction=(puck.friction, 5e-3, 1e-4),
         condim=4,
         contype=WORLD_BIT,
         conaffinity=ROBOT_BIT | WORLD_BIT,  # supported by the ground

@@ -79,11 +79,17 @@ class Scene:
 
     Attributes:
         model: robot and object. impedance: as passed to ``add_controller``. camera: camera of the images.
+        open_loop: whether the commanded path ignores the measured hand, and is the control: (T, 6) previous commanded
+            position and its change. Else the set point stays within the lead of the hand, and the control derives from
+            the measured hand (``hand_controls``).
+        disturb: called with step and simulation state before each step.
     """
 
     model: mujoco.MjModel
     impedance: Impedance
     camera: Camera
+    open_loop: bool = False
+    disturb: Callable[[int, mujoco.MjData], None] = lambda step, data: None
 
 
 def episode_rng(seed: int, index: int) -> Generator:
@@ -115,7 +121,9 @@ def simulate(
     return Episode(
         task=task,
         states=states(qpos),
-        controls=hand_controls(effector, touch),
+        controls=path_controls(quantise(np.stack(log.path), POSITION_BITS))
+        if scene.open_loop
+        else hand_controls(effector, touch),
         observations={
             "image": np.stack(log.image),
             "effector_position": effector,
@@ -153,6 +161,12 @@ def hand_controls(position: FloatArray, touch: FloatArray) -> FloatArray:
     return np.concatenate([previous, position - previous, touch], axis=1)
 
 
+def path_controls(path: FloatArray) -> FloatArray:
+    """(T, 6): previous commanded position, its change, of path (T, 3). The position before step 0 equals step 0."""
+    previous = np.concatenate([path[:1], path[:-1]])
+    return np.concatenate([previous, path - previous], axis=1)
+
+
 def random_speed(rng: Generator) -> float:
     """3 to 25 cm/s, log-uniform."""
     return float(0.03 * np.exp(rng.uniform(0.0, np.log(25 / 3))))
@@ -165,10 +179,14 @@ def random_wait(rng: Generator) -> int:
 
 @dataclass
 class _Log:
-    """One entry per step. ``wrench`` is the mean over the step; ``contact`` is true for any contact during the step."""
+    """One entry per step. ``wrench`` is the mean over the step; ``contact`` is true for any contact during the step.
+
+    ``path`` is the commanded position of the hand.
+    """
 
     image: list[Image] = field(default_factory=list)
     effector: list[Vector] = field(default_factory=list)
+    path: list[Vector] = field(default_factory=list)
     wrench: list[Vector] = field(default_factory=list)
     contact: list[bool] = field(default_factory=list)
     qpos: list[Vector] = field(default_factory=list)
@@ -193,13 +211,16 @@ def _run(scene: Scene, policy: Policy, steps: int) -> _Log:
         mujoco.mj_step(model, data, substeps)
 
     waypoint, remaining = Waypoint(set_point, 0.0, 0), 0
-    for _ in range(steps):
+    for step in range(steps):
+        scene.disturb(step, data)
         joints = np.array(data.qpos[ROBOT_JOINTS:])
         if remaining == 0:
             waypoint = policy.next(joints)
             remaining = waypoint.steps(set_point)
         remaining -= 1
-        set_point = controller.command(waypoint.approach(set_point, DT), yaw)
+        commanded = waypoint.approach(set_point, DT)
+        limited = controller.command(commanded, yaw)
+        set_point = commanded if scene.open_loop else limited
         yaw += float(np.clip(policy.yaw(joints) - yaw, -MAX_TURN, MAX_TURN))
         wrench, touched = np.zeros(6), False
         for _ in range(substeps):
@@ -209,6 +230,7 @@ def _run(scene: Scene, policy: Policy, steps: int) -> _Log:
         mujoco.mj_kinematics(model, data)
         log.image.append(camera.render(data))
         log.effector.append(controller.position)
+        log.path.append(set_point)
         log.wrench.append(wrench)
         log.contact.append(touched)
         log.qpos.append(np.array(data.qpos))

@@ -27,7 +27,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io import user_code
 from beliefscope.datasets.task import Task
-from beliefscope.filters.batch import check_shapes
+from beliefscope.filters.batch import check_shapes, start_offset
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -79,14 +79,17 @@ class ExternalFilter(Checkpoint):
         return "external"
 
     def start(self, episodes: Sequence[Episode]) -> Gaussian:
-        """The first belief, as in ``rollout.start_at_truth``: (N, n), (N, n, n), SI units.
+        """The first belief, as in ``rollout.first_belief``: (N, n), (N, n, n), SI units.
 
-        The covariance is 0.1 I in the adapter's standardised units, or in those of the task's pretrained filters. It is
-        NaN if there are neither.
+        The variance 0.1 of components that start at the truth is in the adapter's standardised units, or in those of
+        the task's pretrained filters. It is NaN if there are neither.
         """
-        mean = torch.from_numpy(np.stack([episode.states[0] for episode in episodes])).float()
+        means = [episode.states[0] + start_offset(self._task, episode) for episode in episodes]
+        mean = torch.from_numpy(np.stack(means)).float()
         std = self._units.std if self.adapter.std else _state_std(self._task)
-        return Gaussian(mean, torch.diag(START_VARIANCE * std.float() ** 2).expand(len(mean), -1, -1))
+        variance = torch.from_numpy(self._task.start_variance()).float()
+        variance = torch.where(variance.isnan(), START_VARIANCE * std.float() ** 2, variance)
+        return Gaussian(mean, torch.diag(variance).expand(len(mean), -1, -1))
 
     def run(
         self,

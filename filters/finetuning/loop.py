@@ -11,13 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from beliefscope.filters.evaluate import WARMUP, metrics
+from beliefscope.filters.evaluate import metrics
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.batch_mix import Mix, evenly_spaced
 from beliefscope.filters.finetuning.module_selection import matching
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.models.networks import ImageEncoder
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.training import losses
 
 MAX_LENGTH, MAX_WINDOWS, PARTICLES = 100, 32, 100
@@ -48,14 +48,14 @@ class Validation:
 
 @torch.no_grad()
 def validate(filter_: Filter, mix: Mix, step: int, loss: float | None, settings: FineTune) -> Validation:
-    """Metrics over windows spaced evenly over each slice's episodes, without the first 30 steps (a third if short)."""
+    """Metrics over windows spaced evenly over each slice's episodes, without the task's warm-up (a third if short)."""
     length = min(MAX_LENGTH, int(mix.steps.length.min()))
-    warmup = min(WARMUP, length // 3)
+    warmup = min(filter_.task.warmup, length // 3)
     windows = mix.windows(evenly_spaced(mix.starts(length, warmup), MAX_WINDOWS), length, warmup)
     batch = windows.batch
     generator = torch.Generator(batch.states.device).manual_seed(settings.seed)
     evidence = windows.select_evidence(filter_.encode(batch))
-    estimate = rollout(filter_, evidence, start_at_truth(filter_, batch), generator, PARTICLES).estimate
+    estimate = rollout(filter_, evidence, first_belief(filter_, batch), generator, PARTICLES).estimate
     error = filter_.statistics.state_to_si(estimate.mean) - batch.states
     covariance = filter_.statistics.covariance_to_si(estimate.covariance)
     standardised = (estimate.mean - losses.true_states(filter_, batch)).square().sum(-1)

@@ -13,7 +13,7 @@ from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.pf import MeasurementModel
-from beliefscope.filters.rollout import START_VARIANCE, rollout, start_at_truth
+from beliefscope.filters.rollout import START_VARIANCE, first_belief, rollout
 
 
 def true_states(filter_: Filter, batch: Batch) -> Tensor:
@@ -97,7 +97,7 @@ def through_filter(
         noise: generator of the first belief and of the filter's own samples.
         weight: (T, N) of each step of each trajectory, sum 1; uniform if None.
     """
-    start = perturbed(start_at_truth(filter_, batch), noise)
+    start = perturbed(first_belief(filter_, batch), noise)
     estimate = rollout(filter_, evidence, start, noise, particles).estimate
     error = estimate.mean - true_states(filter_, batch)
     total = averaged(error.square().sum(-1), weight)
@@ -114,7 +114,7 @@ def averaged(values: Tensor, weight: Tensor | None) -> Tensor:
 def perturbed(start: Gaussian, noise: torch.Generator) -> Gaussian:
     """The first belief with its mean drawn from its own distribution, so that the filter learns to recover."""
     unit = torch.randn(start.mean.shape, generator=noise, device=start.mean.device)
-    return replace(start, mean=start.mean + START_VARIANCE**0.5 * unit)
+    return replace(start, mean=start.mean + start.covariance.diagonal(dim1=-2, dim2=-1).sqrt() * unit)
 
 
 def negative_log_likelihood(error: Tensor, covariance: Tensor) -> Tensor:

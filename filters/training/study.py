@@ -26,7 +26,7 @@ from beliefscope.datasets.store import has_sample, open_dataset, sample_path
 from beliefscope.filters import legacy_names
 from beliefscope.filters.catalog import architecture, filters_of
 from beliefscope.filters.checkpoint import save_checkpoint
-from beliefscope.filters.evaluate import WARMUP, metrics
+from beliefscope.filters.evaluate import metrics
 from beliefscope.filters.filter import Architecture
 from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Report
 from beliefscope.filters.training.study_table import Document, Row, rows_of, to_csv, to_markdown
@@ -201,7 +201,7 @@ def trivial(task: str, episodes: Sequence[Episode]) -> dict[str, float]:
     """RMSE of always predicting the mean training state, on held-out episodes without their first steps."""
     states = {s: [torch.from_numpy(e.states).double() for e in episodes if e.split == s] for s in ("val", "test")}
     mean = torch.cat([torch.from_numpy(e.states).double() for e in episodes if e.split == "train"]).mean(0)
-    evaluated = [truth[min(WARMUP, len(truth) - 1) :] for truth in states["test"] or states["val"]]
+    evaluated = [truth[find_task(task).first_counted(len(truth)) :] for truth in states["test"] or states["val"]]
     error = mean - torch.cat(evaluated)
     return metrics(find_task(task), error, torch.full((*error.shape, error.shape[-1]), math.nan)).rmse
 

@@ -248,7 +248,7 @@ def compare_checkpoints(
         differences=differences(sums.sums, [slice_.name for slice_ in selected], measures_of(task)),
         levels=LEVELS,
         calibration=calibration(sums.sums.sum(0)).swapaxes(0, 1),
-        events=find_regressions(sums, selected, indices, members, task.dt),
+        events=find_regressions(sums, selected, indices, members, task),
         modules=module_changes(
             *filters, sample_steps(members, task, OUTPUT_STEPS), after.record.get("parts") if finetuned else None
         ),

@@ -10,7 +10,8 @@ from functools import partial
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.filters.evaluate import UNITS, WARMUP
+from beliefscope.datasets.task import Task
+from beliefscope.filters.evaluate import UNITS
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.inspect.failures.events import event_spans
 from beliefscope.inspect.failures.step_scores import RECENT
@@ -129,15 +130,15 @@ def _effect(measure: Measure, sums: Array) -> Array:
 
 
 def find_regressions(
-    sums: EpisodeSums, slices: Sequence[Slice], indices: Sequence[int], episodes: Sequence[Episode], dt: float
+    sums: EpisodeSums, slices: Sequence[Slice], indices: Sequence[int], episodes: Sequence[Episode], task: Task
 ) -> tuple[Regression, ...]:
     """Find intervals of steps with a larger position error, largest increase first."""
     episode = np.concatenate([np.full(len(e), i) for i, e in enumerate(episodes)])
     step = np.concatenate([np.arange(len(e)) for e in episodes])
-    last = np.concatenate([np.full(len(e), len(e) - 1) for e in episodes])
+    first = np.concatenate([np.full(len(e), task.first_counted(len(e))) for e in episodes])
     contact = np.concatenate([e.contact.astype(bool) for e in episodes])
-    counted = step >= np.minimum(WARMUP, last)
-    gap = max(1, round(RECENT / dt))
+    counted = step >= first
+    gap = max(1, round(RECENT / task.dt))
     events: list[Regression] = []
     for (faults, only), distance in sums.distance.items():
         before, after = np.concatenate(distance, axis=1)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.module_selection import digest, module_change, within
-from beliefscope.filters.rollout import start_at_truth
+from beliefscope.filters.rollout import first_belief
 
 PARTICLES = 30
 """Number of particles when recording module outputs."""
@@ -88,7 +88,7 @@ def module_outputs(filter_: Filter, batch: Batch) -> dict[str, list[Tensor]]:
     """Module -> flattened outputs by call, over one step (T = 1) from the true state of N trajectories."""
     generator = torch.Generator().manual_seed(0)
     with _output_hooks(filter_) as outputs:
-        evidence, start = filter_.encode(batch), start_at_truth(filter_, batch)
+        evidence, start = filter_.encode(batch), first_belief(filter_, batch)
         filter_.step(filter_.start(start, PARTICLES, generator), evidence[0], generator)
         if hasattr(filter_, "dynamics"):  # Kalman filters call its Jacobian, not the module
             filter_.dynamics(start.mean, evidence.control[0])

@@ -206,7 +206,7 @@ def saliency(
         traces: of several traces, the one with the largest position error (at the step) is used.
         target: a component of the estimate, ``log-likelihood:MODEL`` or ``beta:MODEL``; by default the component with
             the largest error in training standard deviations.
-        step: by default the step with the largest position error after ``WARMUP``.
+        step: by default the step with the largest position error after the task's warm-up.
         at: position at which the log-likelihood is evaluated.
         window: side of the occluded square in pixels.
 

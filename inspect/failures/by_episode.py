@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beliefscope.filters.evaluate import WARMUP
 from beliefscope.inspect.failures.step_scores import Survey
 from beliefscope.inspect.statistics.measures import Array, Mask
 
@@ -21,7 +20,7 @@ class EpisodeErrors:
     Attributes:
         index: index in the data set.
         steps: T.
-        rmse: over the counted steps, from ``WARMUP`` on.
+        rmse: over all steps but those of the task's warm-up.
         worst, worst_step: maximum over all steps; NaN and None without known errors.
         error: (P,) maximum in each of P equal parts of the episode.
         contact: (P,) whether there is contact in each part.
@@ -46,7 +45,7 @@ def by_episode(survey: Survey) -> list[EpisodeErrors]:
 def _errors(survey: Survey, part: slice) -> EpisodeErrors:
     error, contact = survey.error[part, -1], survey.phases["steady contact"][part]
     steps = len(error)
-    counted = error[min(WARMUP, steps - 1) :]
+    counted = error[min(int(survey.phases["start"][part].sum()), steps - 1) :]
     has_errors = np.isfinite(error).any()
     starts = np.linspace(0, steps, min(steps, POINTS), endpoint=False).astype(int)
     return EpisodeErrors(

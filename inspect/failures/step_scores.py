@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
-from beliefscope.filters.evaluate import WARMUP
 from beliefscope.inspect.diagnostics.weight_steps import position_regret
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array, Mask
@@ -212,7 +211,7 @@ def _columns(trace: Trace) -> dict[str, NDArray[Any]]:
         "made": _recently(contact[1:] & ~contact[:-1], recent),
         "lost": _recently(~contact[1:] & contact[:-1], recent),
         "blackout": measures.blackout(trace),
-        "start": steps < WARMUP,
+        "start": steps < task.warmup,
         "speed": _speeds(trace, task),
     }
     if trace.effective_sample_size is not None:

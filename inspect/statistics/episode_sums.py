@@ -13,10 +13,9 @@ from torch import Tensor
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
-from beliefscope.filters.evaluate import WARMUP
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import Slice
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.statistics.calibration import LEVELS, gaussian_level
 from beliefscope.inspect.statistics.measures import FLOOR, Array, wrapped
 
@@ -116,7 +115,7 @@ def sum_episodes(
 ) -> EpisodeSums:
     """Run filters of one task over complete episodes as ``evaluate`` does, once per condition.
 
-    All filters draw the same random numbers. The first ``WARMUP`` steps are not counted. Raises BadInput for episodes
+    All filters draw the same random numbers. Steps of the task's warm-up are not counted. Raises BadInput for episodes
     that do not fit the task.
     """
     task = filters[0].task
@@ -133,7 +132,7 @@ def sum_episodes(
     for faults, fault_slices in by_faults.items():
         steps = Steps.from_episodes(task, slices[fault_slices[0]].apply_faults(episodes, seed))
         for length, members in sorted(by_length.items()):
-            batch = steps.windows(steps.first[members], length)
+            batch, first = steps.windows(steps.first[members], length), task.first_counted(length)
             for f, filter_ in enumerate(filters):
                 evidence = filter_.encode(batch)
                 for only in dict.fromkeys(slices[s].only for s in fault_slices):
@@ -141,7 +140,7 @@ def sum_episodes(
                     estimate = rollout(
                         filter_,
                         slices[run_slices[0]].select_evidence(evidence, filter_.names),
-                        start_at_truth(filter_, batch),
+                        first_belief(filter_, batch),
                         torch.Generator().manual_seed(seed),
                         particles,
                         progress=_scaled_progress(progress, done, len(members), total),
@@ -152,7 +151,7 @@ def sum_episodes(
                         filter_.statistics.covariance_to_si(estimate.covariance),
                     )
                     for s in run_slices:
-                        sums[members, f, s] = _sum_steps(columns, slices[s].mask(batch))
+                        sums[members, f, s] = _sum_steps(columns[first:], slices[s].mask(batch)[first:])
                     for i, number in enumerate(members):
                         distance[faults, only][number][f] = np.sqrt(columns[:, i, n + 1])
                     done += len(members)
@@ -179,9 +178,8 @@ def _columns(task: Task, error: Tensor, covariance: Tensor) -> Array:
 
 
 def _sum_steps(columns: Array, mask: Tensor) -> Array:
-    """(N, Q): sums over the counted steps of the mask (T, N)."""
-    first = min(WARMUP, len(columns) - 1)
-    return np.where(mask.numpy()[first:, :, None], columns[first:], 0.0).sum(0)
+    """(N, Q): sums of columns (T, N, Q) over the steps of the mask (T, N)."""
+    return np.where(mask.numpy()[..., None], columns, 0.0).sum(0)
 
 
 def _scaled_progress(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.task import Task
-from beliefscope.filters.evaluate import UNITS, WARMUP
+from beliefscope.filters.evaluate import UNITS
 from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
@@ -107,8 +107,8 @@ def blackout(trace: Trace) -> Mask:
 
 
 def counted(trace: Trace) -> Mask:
-    """(T,): steps used by metrics; the first ``WARMUP`` steps are excluded because runs start at the true state."""
-    return np.arange(len(trace)) >= min(WARMUP, len(trace) - 1)
+    """(T,): steps used by metrics; all but those of the task's warm-up."""
+    return np.arange(len(trace)) >= task_of(trace).first_counted(len(trace))
 
 
 def phases(trace: Trace) -> dict[str, Mask]:

@@ -16,7 +16,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.run import assemble_trace, check_task, trace
 
@@ -55,7 +55,7 @@ def trace_all(
             inputs = [faults.apply(episodes[index], seed) for index in members]
             steps = Steps.from_episodes(checkpoint.task, inputs)
             batch = steps.windows(steps.first, length)
-            evidence, start = checkpoint.filter.encode(batch), start_at_truth(checkpoint.filter, batch)
+            evidence, start = checkpoint.filter.encode(batch), first_belief(checkpoint.filter, batch)
             result = rollout(checkpoint.filter, evidence, start, generator, particles, keep=True)
             for i, (index, episode) in enumerate(zip(members, inputs, strict=True)):
                 yield assemble_trace(

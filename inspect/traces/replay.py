@@ -17,7 +17,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Belief, Evidence, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.rollout import start_at_truth
+from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.subsets import standalone_evidence
 from beliefscope.inspect.traces.data import ARRAYS, Trace
 from beliefscope.inspect.traces.run import assemble_trace
@@ -155,7 +155,7 @@ class Replay:
             self.evidence = self.apply_weights(self.evidence, Edit.from_json(edit))
         if self._standalone:
             self.evidence = standalone_evidence(filter_, self.batch, self.evidence, self._standalone)
-        self.start = start_at_truth(filter_, self.batch)
+        self.start = first_belief(filter_, self.batch)
         generator = torch.Generator().manual_seed(trace.seed)
         belief = filter_.start(self.start, int(trace.settings["particles"]), generator)
         self.beliefs: list[Belief] = []

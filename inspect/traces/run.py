@@ -19,7 +19,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.models.pf import ParticleFilter
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.external import trace_external
 
@@ -88,9 +88,7 @@ def start_run(
     episode = faults.apply(episode, seed)
     batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
     settings = {"particles": particles, "torch": torch.__version__}
-    return FilterRun(
-        episode, start_at_truth(filter_, batch), filter_.encode(batch), provenance | {"settings": settings}
-    )
+    return FilterRun(episode, first_belief(filter_, batch), filter_.encode(batch), provenance | {"settings": settings})
 
 
 def check_task(checkpoint: Checkpoint, episode: Episode) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.evaluate import WARMUP
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.trace import Trace
 
@@ -145,17 +145,15 @@ def _external(trace: Trace) -> Passage:
 
 
 def _run(trace: Trace) -> Passage:
-    return Passage(
-        "Evaluation",
-        "Runs start at the true state"
-        + (
-            ", with covariance 0.1 $I$ in units of the training set's standard deviations"
-            if trace.has_covariance
-            else ""
-        )
-        + f". Tables exclude the first {WARMUP} steps of each episode, which depend on the start; "
-        f"curves show all steps. A step is {trace.episode.dt:g} s.",
-    )
+    task = find_task(trace.episode.task)
+    start = "Runs start at the true state"
+    if task.start_distance:
+        start = "Runs start beside the true state, with a covariance that matches the distance"
+    elif trace.has_covariance:
+        start += ", with covariance 0.1 $I$ in units of the training set's standard deviations"
+    excluded = f"exclude the first {task.warmup} steps of each episode, which depend on the start"
+    tables = f"Tables {excluded}; curves show all steps." if task.warmup else "Tables and curves show all steps."
+    return Passage("Evaluation", f"{start}. {tables} A step is {trace.episode.dt:g} s.")
 
 
 def definitions(task: Task, trace: Trace) -> list[Passage]:

@@ -19,7 +19,7 @@ from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate, metrics, nees_bounds
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.rollout import start_at_truth
+from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start
 
 DOOR = find_task("door")
@@ -143,9 +143,58 @@ def test_offset_start_is_where_stay_stays() -> None:
         torch.from_numpy(offset.variances(DOOR)),
     )
     covariance = filter_.statistics.covariance_to_si(start.covariance)[0]
-    truth = filter_.statistics.covariance_to_si(start_at_truth(filter_, batch).covariance)[0]
+    truth = filter_.statistics.covariance_to_si(first_belief(filter_, batch).covariance)[0]
     np.testing.assert_allclose(covariance[:2, :2], np.eye(2) * 0.03**2 / 2, rtol=1e-4, atol=1e-12)
     assert covariance[2, 2] == pytest.approx(float(truth[2, 2])), "no offset of the angle"
+
+
+def field_episodes() -> list[Episode]:
+    task = find_task("door-field")
+    assert task.simulate is not None
+    return [task.simulate(3, index, 12) for index in (0, 1, 3)]
+
+
+def test_field_tasks_start_where_their_episodes_say_and_count_from_step_0() -> None:
+    episodes = field_episodes()
+    task = find_task("door-field")
+    filter_ = build(architecture("door-field", "crossmodal-ekf"), seed=0).eval()
+    filter_.statistics.fit(Steps.from_episodes(task, episodes))
+    offsets = np.array([episode.provenance["start_offset"] for episode in episodes])
+    stay = evaluate(filter_, episodes, baselines=True).baselines["stay"]
+    assert stay is not None
+    hinge = np.sqrt((offsets[:, :2] ** 2).sum(1).mean()) * 100
+    assert stay.rmse["position_cm"] == pytest.approx(hinge, rel=1e-4)
+    assert stay.rmse == stay.rmse_from_step_0
+    batch = Steps.from_episodes(task, episodes).windows(torch.tensor([0, 5, 12]), 4)
+    start = first_belief(filter_, batch)
+    mean, covariance = filter_.statistics.state_to_si(start.mean), filter_.statistics.covariance_to_si(start.covariance)
+    truth = [episodes[0].states[0] + offsets[0], episodes[0].states[4], episodes[1].states[0] + offsets[1]]
+    np.testing.assert_allclose(mean, np.array(truth, np.float32), atol=1e-5)
+    variance = [np.mean(np.linspace(*task.start_distance[u], 10_001) ** 2) / d for u, d in (("m", 2), ("rad", 1))]
+    np.testing.assert_allclose(torch.diagonal(covariance[0]), [variance[0], *variance], rtol=1e-3)
+    # An explicit offset replaces that of the episode.
+    moved = evaluate(filter_, episodes, start_offset=StartOffset.parse("1cm", task), baselines=True).baselines["stay"]
+    assert moved is not None
+    assert moved.rmse["position_cm"] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_invalid_start_offset_in_provenance() -> None:
+    episode = field_episodes()[0]
+    for value in ([1.0], "x", [0.0, float("nan"), 0.0]):
+        with pytest.raises(BadInput, match="'start_offset' in the provenance"):
+            Steps.from_episodes(find_task("door-field"), [replace(episode, provenance={"start_offset": value})])
+
+
+def test_errors_before_and_after_first_contact_make_up_the_total() -> None:
+    episodes = short(count=8, steps=80)
+    filter_ = fitted("image-ekf", episodes)
+    result = evaluate(filter_, episodes)
+    touched = np.concatenate([np.maximum.accumulate(episode.contact)[DOOR.warmup :] for episode in episodes])
+    share = touched.mean()
+    assert 0 < share < 1
+    for key, rmse in result.rmse.items():
+        parts = (1 - share) * result.rmse_before_contact[key] ** 2 + share * result.rmse_after_contact[key] ** 2
+        assert rmse**2 == pytest.approx(parts)
 
 
 @pytest.mark.parametrize("text", ["3", "3N", "cm", "-3cm", "3cm,4cm", "nancm"])

@@ -10,11 +10,16 @@ from beliefscope.app.cli import output as console
 
 @opt.with_options(
     output=opt.DATASET,
-    episodes=opt.option("N", "Episodes. Default as in the paper: door 600, push 1000.", parser=opt.integer(1)),
+    episodes=opt.option(
+        "N", "Episodes. Default as in the paper: door 600, push 1000; others 100.", parser=opt.integer(1)
+    ),
     steps=opt.option(
-        "T", "Steps of 0.1 s per episode. Default as in the paper: door 800, push 250.", parser=opt.integer(2)
+        "T",
+        "Steps of 0.1 s per episode. Default as in the paper: door 800, push 250; others 200.",
+        parser=opt.integer(2),
     ),
     split=opt.option("NAME", "train, val or test: split of all episodes. Default: by number."),
+    without=opt.option("INGREDIENT", "Ingredient of a field task to switch off (docs/field_tasks.md). Repeatable."),
     workers=opt.option("W", "Processes. Default: one per CPU core.", parser=opt.integer(1)),
 )
 def collect(
@@ -25,6 +30,7 @@ def collect(
     workers: int | None = None,
     seed: int = 0,
     split: str | None = None,
+    without: list[str] | None = None,
     json: str | None = None,
 ) -> None:
     """Simulate episodes and write them to an HDF5 file.
@@ -37,6 +43,7 @@ def collect(
     Examples:
       beliefscope collect door --episodes 60 --steps 800 --seed 0 -o door.h5
       beliefscope collect door --episodes 50 --steps 100 --seed 2 --split test -o test.h5
+      beliefscope collect push-field --episodes 300 --steps 200 --without outages --without nudges -o field.h5
     """
     from beliefscope.datasets.catalog import load_task
     from beliefscope.datasets.simulation.collect import collect as simulate
@@ -46,7 +53,9 @@ def collect(
     name = load_task(task).name
     count, length = (value or default for value, default in zip((episodes, steps), default_size(name), strict=True))
     with console.progress(f"Simulating {name}") as advance:
-        simulate(task, count, length, seed, workers, output, lambda done, total: advance(done / total), split)
+        simulate(
+            task, count, length, seed, workers, output, lambda done, total: advance(done / total), split, without or ()
+        )
     with open_dataset(output) as data:
         ours, paper = statistics(data.task, data), PAPER_DATA[name].statistics if name in PAPER_DATA else {}
         document = {
@@ -54,6 +63,7 @@ def collect(
             "episodes": len(data),
             "steps": length,
             "seed": seed,
+            "without": without or [],
             "contact_fraction": ours["contact_fraction"],
             "statistics": ours,
             "authors": paper,

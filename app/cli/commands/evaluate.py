@@ -79,6 +79,15 @@ def evaluate(
     output.result(document, _table(title, metrics), json)
 
 
+LABELS = {
+    "rmse": "",
+    "rmse_from_step_0": ", from step 0",
+    "rmse_before_contact": ", before first contact",
+    "rmse_after_contact": ", after first contact",
+}
+"""Key of the metrics -> label of its rows in the table."""
+
+
 def _table(title: str, metrics: dict[str, Any]) -> str:
     """The metrics of the filter and of its baselines, a row for each measure; then those of its modalities."""
     from beliefscope.filters.evaluate import STANDALONE, UPDATE
@@ -86,8 +95,8 @@ def _table(title: str, metrics: dict[str, Any]) -> str:
     columns = [metrics, *(baseline or {} for baseline in metrics["baselines"].values())]
     rows = [
         [f"rmse {name}{label}", *(_number(column.get(key, {}).get(name)) for column in columns)]
-        for key, label in (("rmse", ""), ("rmse_from_step_0", ", from step 0"))
-        for name in metrics["rmse"]
+        for key, label in LABELS.items()
+        for name in metrics.get(key, {})
     ]
     rows += [[name, _number(metrics[name]), "", ""] for name in ("nll", "nees", "coverage95")]
     table = output.grid(title, ["measure", "filter", *metrics["baselines"]], rows)

@@ -94,3 +94,12 @@ def test_shading_is_lambertian() -> None:
     assert (RayCaster(model, down).render(data) == round(255 * 0.5 * (0.35 + 0.65 * 0.82))).all()
     up = Camera((0, 0, 1), (0, 0, 1), (1, 0, 0), 0.5, size=4)
     assert (RayCaster(model, up).render(data) == round(255 * 0.05)).all()
+
+
+def test_moved_camera_turns_about_its_axes_and_shifts() -> None:
+    camera = Camera((1.0, 2.0, 3.0), (1, 0, 0), (0, 0, 1), 0.5)
+    moved = camera.moved((0.1, 0.0, -0.2), (0.0, 0.0, np.pi / 2))
+    np.testing.assert_allclose(moved.position, (1.1, 2.0, 2.8))
+    np.testing.assert_allclose([moved.forward, moved.up], [(0, 1, 0), (0, 0, 1)], atol=1e-12)
+    still = camera.moved((0, 0, 0), (0, 0, 0))
+    np.testing.assert_allclose(still.rays(), camera.rays())

@@ -22,7 +22,7 @@ from beliefscope.filters.models.lstm import Lstm
 from beliefscope.filters.models.networks import ImageEncoder, SpatialSoftmax
 from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.filters.models.ukf import sigma_points, unscented
-from beliefscope.filters.rollout import Rollout, rollout, start_at_truth
+from beliefscope.filters.rollout import Rollout, first_belief, rollout
 
 MakeWindow = Callable[..., Batch]
 NAMES = tuple(filters_of(DOOR))
@@ -31,7 +31,7 @@ FUSED = [name for name in NAMES if name.startswith("crossmodal")]
 
 def run(filter_: Filter, batch: Batch, evidence: Evidence | None = None, keep: bool = False) -> Rollout:
     evidence = filter_.encode(batch) if evidence is None else evidence
-    start = start_at_truth(filter_, batch)
+    start = first_belief(filter_, batch)
     return rollout(filter_, evidence, start, torch.Generator().manual_seed(0), particles=20, keep=keep)
 
 
@@ -197,7 +197,7 @@ def banks(feedback: bool, window: MakeWindow) -> tuple[Gaussian, Gaussian]:
     assert isinstance(filter_, ExtendedKalmanFilter)
     batch = window(1, 3)
     with torch.no_grad():
-        start = filter_.start(start_at_truth(filter_, batch), 0, torch.Generator())
+        start = filter_.start(first_belief(filter_, batch), 0, torch.Generator())
         bank, trace = filter_.step(start, filter_.encode(batch)[0], torch.Generator())
     return bank, trace.estimate
 
@@ -288,7 +288,7 @@ def test_lstm_equals_pytorchs(lstm: Lstm, window: MakeWindow) -> None:
         getattr(reference, f"bias_hh_l{i}").zero_()
     batch = window(10, 3)
     evidence = lstm.encode(batch)
-    hidden = lstm.start(start_at_truth(lstm, batch), 0, torch.Generator()).hidden
+    hidden = lstm.start(first_belief(lstm, batch), 0, torch.Generator()).hidden
     first = tuple(hidden[:, :, i].transpose(0, 1).contiguous() for i in range(2))
     expected = lstm.output(reference(evidence.observation.squeeze(2), first)[0])
     torch.testing.assert_close(run(lstm, batch, evidence).estimate.mean, expected, rtol=1e-5, atol=1e-6)
@@ -297,7 +297,7 @@ def test_lstm_equals_pytorchs(lstm: Lstm, window: MakeWindow) -> None:
 def test_lstm_steps_equal_the_batched_ones(lstm: Lstm, window: MakeWindow) -> None:
     batch, generator = window(10, 3), torch.Generator()
     evidence = lstm.encode(batch)
-    belief = lstm.start(start_at_truth(lstm, batch), 0, generator)
+    belief = lstm.start(first_belief(lstm, batch), 0, generator)
     batched = list(lstm.steps(belief, evidence, generator))
     for t, trace in enumerate(batched):
         assert trace.predicted.hidden.equal(belief.hidden)  # type: ignore[union-attr]

@@ -12,7 +12,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.catalog import NETWORKS, architecture, build
 from beliefscope.filters.filter import vector_groups
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 
 PUBLISHED = {
     "crossmodal-pf": {
@@ -76,7 +76,7 @@ def test_filters_run_and_train(task: str, name: str, trained: set[str]) -> None:
         torch.zeros(shape, dtype=torch.bool),
         torch.randn(2, n),
     )
-    start = start_at_truth(filter_, batch)
+    start = first_belief(filter_, batch)
     mean = rollout(filter_, filter_.encode(batch), start, torch.Generator().manual_seed(0), 8).estimate.mean
     assert mean.shape == (*shape, n)
     mean.square().sum().backward()

@@ -14,7 +14,7 @@ from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.common_random_numbers import Common, normal, uniform
-from beliefscope.filters.rollout import rollout, start_at_truth
+from beliefscope.filters.rollout import first_belief, rollout
 
 STEPS, PARTICLES = 6, 50
 SUBSETS = torch.tensor([[False, False], [True, False], [False, True], [True, True]])
@@ -37,7 +37,7 @@ def setup(name: str, window: Callable[..., Batch]) -> tuple[Filter, Evidence, Ga
     """An untrained filter, one trajectory's evidence, and its first belief."""
     filter_ = build(architecture("door", name)).eval().requires_grad_(False)
     batch = window(STEPS, 1)
-    return filter_, filter_.encode(batch), start_at_truth(filter_, batch)
+    return filter_, filter_.encode(batch), first_belief(filter_, batch)
 
 
 def run(filter_: Filter, evidence: Evidence, start: Gaussian) -> Tensor:

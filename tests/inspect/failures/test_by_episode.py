@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.evaluate import WARMUP, evaluate
+from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.failures.by_episode import POINTS, by_episode
 from beliefscope.inspect.failures.step_scores import Survey
@@ -38,7 +39,7 @@ def survey(checkpoint: Checkpoint, episodes: dict[int, Episode]) -> Survey:
 
 def test_pooled_errors_equal_evaluate(survey: Survey, checkpoint: Checkpoint, episodes: dict[int, Episode]) -> None:
     summaries = by_episode(survey)
-    counted = np.array([summary.steps - WARMUP for summary in summaries])
+    counted = np.array([summary.steps - DOOR.warmup for summary in summaries])
     pooled = np.sqrt((counted * np.array([summary.rmse for summary in summaries]) ** 2).sum() / counted.sum())
     expected = evaluate(checkpoint.filter, list(episodes.values())).rmse["position_cm"]
     assert 100 * pooled == pytest.approx(expected, rel=1e-4)  # float32 filters, in a batch and one by one

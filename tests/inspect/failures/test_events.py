@@ -164,7 +164,7 @@ def test_regret_in_the_warm_up_is_no_failure(survey: Survey) -> None:
     """The belief starts at the truth, so small weights errors there are a large share of the regret."""
     failures = failures_of(survey, "regret")
     assert "start" not in {phase.name for phase in failures.phases}
-    assert min(event.step for event in failures.events) >= measures.WARMUP
+    assert min(event.step for event in failures.events) >= 30
     assert sum(phase.share for phase in failures.phases) == pytest.approx(1.0)
     assert "start" in {phase.name for phase in failures_of(survey, "error").phases}
 

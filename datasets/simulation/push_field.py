@@ -1,0 +1,139 @@
+"""Field version of the push task: pucks, sensors and starts that differ between episodes, and open-loop controls."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.ingredients import (
+    SENSOR_INGREDIENTS,
+    Draws,
+    camera_pose,
+    draw,
+    drawn_sleeve,
+    finish,
+    moved_camera,
+    nudge_steps,
+    start_ingredient,
+    wrist,
+)
+from beliefscope.datasets.simulation.push import CAMERA, CENTRE, IMPEDANCE, PUSH, PuckPhysics, PushPuck, push_model
+from beliefscope.datasets.simulation.simulate import DT, ROBOT_JOINTS, Scene, Waypoint, episode_rng, simulate
+from beliefscope.datasets.task import Ingredient
+
+Vector = NDArray[np.float64]
+
+GRAVITY = 9.81  # m/s^2
+
+
+class PushPuckWithAimError(PushPuck):
+    """Estimates the puck's position with an error at the beginning of each push, and does not correct it."""
+
+    clearance = (0.03, 0.05)  # wider, so that the fingers seldom descend onto the puck
+
+    def __init__(self, rng: Generator, puck: PuckPhysics, aim: float) -> None:
+        """aim: standard deviation of the error along each axis, m."""
+        super().__init__(rng, puck)
+        self._aim = aim
+        self._estimate = np.zeros(2)
+
+    def next(self, joints: Vector) -> Waypoint:
+        if not self._queue:
+            self._estimate = joints[:2] + self._rng.normal(0.0, self._aim, 2)
+        return super().next(self._estimate)
+
+
+class Nudges:
+    """Gives the puck the velocity at which it slides 2 to 4 cm towards the middle of the workspace."""
+
+    def __init__(self, draws: Draws, friction: float, steps: int) -> None:
+        self._friction = friction
+        self._begins, self._numbers = nudge_steps(draws["nudges"], steps, DT)
+        self._distance = draws["nudges"].values["distance"]
+        self.steps = np.flatnonzero(self._begins).tolist()
+
+    def __call__(self, step: int, data: mujoco.MjData) -> None:
+        if not self._begins[step]:
+            return
+        joint = data.joint("puck")
+        to_middle = CENTRE - joint.qpos[:2]
+        turn = np.pi * (self._numbers[step, 0] - 0.5)
+        direction = np.arctan2(to_middle[1], to_middle[0]) + turn
+        distance = self._distance * (0.5 + self._numbers[step, 1])
+        speed = np.sqrt(2.0 * self._friction * GRAVITY * distance)
+        joint.qvel[:2] += speed * np.array([np.cos(direction), np.sin(direction)])
+
+
+def simulate_push_field(seed: int, index: int, steps: int, without: Collection[str] = ()) -> Episode:
+    """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic.
+
+    Args:
+        without: names of ingredients to switch off. The draws of the others do not change.
+    """
+    draws = draw(PUSH_FIELD, seed, index, without)
+    puck = PuckPhysics(**draws["puck"].values) if "puck" in draws else PuckPhysics()
+    aim = draws["aim"].values["std"] if "aim" in draws else 0.0
+    nudges = Nudges(draws, puck.friction, steps) if "nudges" in draws else None
+    scene = Scene(
+        push_model(puck=puck, sleeve=drawn_sleeve(draws)), IMPEDANCE, moved_camera(CAMERA, draws), open_loop=True
+    )
+    episode = simulate(
+        "push-field",
+        scene if nudges is None else replace(scene, disturb=nudges),
+        PushPuckWithAimError(episode_rng(seed, index), puck, aim),
+        lambda qpos: qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 2],
+        seed,
+        index,
+        steps,
+        {"policy": "push"},
+    )
+    return finish(PUSH_FIELD, episode, draws, {"nudges": [] if nudges is None else nudges.steps})
+
+
+def _replay(episode: Episode) -> mujoco.MjModel:
+    try:
+        values = episode.provenance["ingredients"].get("puck", {})
+        puck = PuckPhysics(**{key: float(value) for key, value in values.items()})
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise BadInput(
+            "The episode's provenance does not describe its puck: expected 'ingredients': {'puck': {'radius': m, "
+            "'mass': kg, 'friction': number}}."
+        ) from None
+    return push_model(visual=True, puck=puck)
+
+
+START = {"m": (0.03, 0.05)}
+
+PUSH_FIELD = replace(
+    PUSH,
+    name="push-field",
+    control_size=6,
+    replay=_replay,
+    simulate=simulate_push_field,
+    start_distance=START,
+    warmup=0,
+    ingredients={
+        "puck": Ingredient(
+            "radius (m), mass (kg) and friction of the puck",
+            {"radius": (0.042, 0.058), "mass": (0.4, 0.9), "friction": (0.2, 0.8)},
+        ),
+        "camera-pose": camera_pose(0.015, float(np.deg2rad(1.0))),
+        "wrist": wrist(0.5),
+        **SENSOR_INGREDIENTS,
+        "aim": Ingredient(
+            "error of the position at which the policy aims, standard deviation in m", {"std": (0.01, 0.02)}
+        ),
+        "nudges": Ingredient(
+            "impulses from outside on the puck: number per s, mean distance in m",
+            {"per_second": (0.05, 0.12), "distance": (0.02, 0.04)},
+        ),
+        "start": start_ingredient(START),
+    },
+)
