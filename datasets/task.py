@@ -17,12 +17,22 @@ Unit = Literal["m", "rad"]
 Array = NDArray[np.float64]
 
 
+def display_name(name: str) -> str:
+    """A name with spaces instead of underscores: ``hinge x``."""
+    return name.replace("_", " ")
+
+
 @dataclass(frozen=True)
 class Component:
     """A state component. Components in rad are angles."""
 
     name: str
     unit: Unit
+
+    @property
+    def label(self) -> str:
+        """Display name, such as ``hinge x``."""
+        return display_name(self.name)
 
 
 @dataclass(frozen=True)

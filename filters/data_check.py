@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.batch import Statistics
 from beliefscope.filters.checkpoint import PRETRAINED, Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
@@ -77,7 +77,7 @@ class Finding:
 
 def channels(task: Task) -> list[Channel]:
     """All vector channels, in the order of ``_values``."""
-    result = [Channel("state", "state", c.name, c.unit) for c in task.components]
+    result = [Channel("state", "state", c.label, c.unit) for c in task.components]
     result += [Channel("control", "control", f"control {i}") for i in range(task.control_size)]
     for modality, keys in task.modalities.items():
         for key in keys:
@@ -89,7 +89,7 @@ def channels(task: Task) -> list[Channel]:
                 if shape == (3,)
                 else [f" {i}" for i in range(*shape[:1])]
             )
-            result += [Channel(modality, key, key.replace("_", " ") + axis) for axis in axes if len(shape) == 1]
+            result += [Channel(modality, key, display_name(key) + axis) for axis in axes if len(shape) == 1]
     return result
 
 

@@ -15,7 +15,7 @@ from viser.transforms import SO3
 from beliefscope.app.protocol.messages import SceneLayers
 from beliefscope.app.protocol.trace_format import camera_images
 from beliefscope.datasets.simulation.replay import Replay
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.figures.scene_belief import camera_axis, rgb
 from beliefscope.inspect.figures.scene_shapes import RGB, Array, framed, grid, map_pixels, movable_meshes
 from beliefscope.inspect.likelihood import LikelihoodMap
@@ -214,5 +214,5 @@ def add_grid(server: ViserServer, task: Task, trace: Trace) -> None:
     for path, lines, thickness in (("/plane", floor.lines, 1.0), ("/plane/axes", floor.axes, 3.0)):
         server.scene.add_line_segments(path, lines, GRAY, thickness=thickness, thickness_units="screen")
     for name, axis, edge in zip(task.map_components, floor.axes, floor.high, strict=True):
-        text = f"{name.replace('_', ' ')} {100 * edge:.0f} cm"
+        text = f"{display_name(name)} {100 * edge:.0f} cm"
         server.scene.add_label(f"/plane/{name}", text, position=axis[1], **SMALL_LABEL)

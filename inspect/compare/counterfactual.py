@@ -128,7 +128,7 @@ class Counterfactual(Diagnostic):
 
     def _mapped(self) -> tuple[str, ...]:
         task = find_task(self.task)
-        return tuple(task.components[i].name for i in task.map_indices)
+        return tuple(task.components[i].label for i in task.map_indices)
 
     def _peaks(self) -> dict[str, tuple[float, int, str]]:
         """Component -> largest difference in display units, step, unit."""
@@ -137,7 +137,7 @@ class Counterfactual(Diagnostic):
         difference = np.abs(wrapped(task, self.edited - self.original)) * factors
         steps = difference.argmax(0)
         return {
-            component.name: (float(difference[steps[i], i]), int(steps[i]), units[i])
+            component.label: (float(difference[steps[i], i]), int(steps[i]), units[i])
             for i, component in enumerate(task.components)
         }
 
@@ -195,7 +195,7 @@ class Counterfactual(Diagnostic):
                 (self.original, "original", "fused"),
                 (self.edited, "edited", "fused"),
             ):
-                curves.append(Curve(name, factors[i] * values[:, i], component.name, units[i], layer))
+                curves.append(Curve(name, factors[i] * values[:, i], component.label, units[i], layer))
         return curves
 
     def bands(self) -> dict[str, NDArray[np.bool_]]:

@@ -114,7 +114,7 @@ class Comparison(Diagnostic):
         task = find_task(self.task)
         units, factors = display_units(task)
         return "".join(
-            f"; {c.name} {factors[i] * self.rmse[0, i, 0]:.2f} -> {factors[i] * self.rmse[0, i, 1]:.2f} {units[i]}"
+            f"; {c.label} {factors[i] * self.rmse[0, i, 0]:.2f} -> {factors[i] * self.rmse[0, i, 1]:.2f} {units[i]}"
             for i, c in enumerate(task.components)
             if i not in task.map_indices
         )
@@ -148,7 +148,7 @@ class Comparison(Diagnostic):
             rows += [
                 _row(label, "position RMSE (cm)", 100 * self.position[s], relative=True),
                 *(
-                    _row(label, f"{c.name} RMSE ({units[i]})", factors[i] * self.rmse[s, i], relative=True)
+                    _row(label, f"{c.label} RMSE ({units[i]})", factors[i] * self.rmse[s, i], relative=True)
                     for i, c in enumerate(task.components)
                 ),
                 _row(label, "NEES/n", self.nees[s]),
@@ -182,7 +182,7 @@ class Comparison(Diagnostic):
         curves += both(100 * self.error, "Position error", "cm")
         for i, component in enumerate(task.components):
             if i not in task.map_indices:
-                curves += both(factors[i] * np.abs(self.component_error[:, i]), f"{component.name} error", units[i])
+                curves += both(factors[i] * np.abs(self.component_error[:, i]), f"{component.label} error", units[i])
         if np.isfinite(self.nees_at).any():
             curves += both(np.sqrt(self.nees_at), CONSISTENCY, "standard deviations")
         if self.effective_weights_at is not None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
@@ -124,7 +125,8 @@ class Consistency(Diagnostic):
             return "Innovations are white."
         strongest = max(colored, key=lambda test: abs(test.autocorrelation))
         size = number(math.sqrt(self.entry(strongest.modality).nis))
-        where = f"{strongest.modality}, {strongest.component}: autocorrelation {strongest.autocorrelation:.2f} at lag 1"
+        subject = f"{strongest.modality}, {display_name(strongest.component)}"
+        where = f"{subject}: autocorrelation {strongest.autocorrelation:.2f} at lag 1"
         text = f"Innovations are not white ({where}) and {size} times as large as predicted"
         if strongest.autocorrelation > 0.2:
             text += ": errors persist over steps, but the filter treats them as independent"
@@ -147,7 +149,7 @@ class Consistency(Diagnostic):
         columns = ("layer", "phase", "trajectories", "steps", "NEES/n", "95 % interval", "NIS/n", "95 % coverage")
         tables = [Table("Consistency", (*columns, "miscalibration", "NLL (nats)", "result"), tuple(rows))]
         names = [
-            f"{c.name} ({unit}): {quantity}"
+            f"{c.label} ({unit}): {quantity}"
             for c, unit in zip(task.components, units, strict=True)
             for quantity in ERROR_QUANTITIES
         ]
@@ -155,8 +157,8 @@ class Consistency(Diagnostic):
         tables.append(Table(title, ("layer", "phase", *names), tuple(error_rows)))
         if self.whiteness:
             tests = tuple(
-                (test.modality, test.component, test.autocorrelation, *test.ends, test.statistic, test.p_value)
-                for test in self.whiteness
+                (t.modality, display_name(t.component), t.autocorrelation, *t.ends, t.statistic, t.p_value)
+                for t in self.whiteness
             )
             heads = (
                 "modality",

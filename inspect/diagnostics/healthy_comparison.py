@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from beliefscope.datasets.task import display_name
 from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile
 from beliefscope.inspect.diagnostics.views import Table
 
@@ -64,9 +65,10 @@ class Deviation:
 
     @property
     def label(self) -> str:
-        """Display name, such as ``NEES/n of fused in contact``."""
+        """Display name, such as ``effective weight of image, hinge x in contact``."""
         kind, subject, phase = self.statistic.split("/")
         title = KINDS[kind][0] if kind in KINDS else kind
+        subject = display_name(subject.replace(" ", ", "))  # modality, component
         return f"{title}{f' of {subject}' if subject else ''}{'' if phase == 'all' else f' in {phase}'}"
 
     @property
@@ -98,7 +100,7 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        """``No alarm`` or the largest alarms."""
+        """``No alarm`` or the largest alarms. One trajectory alone is no evidence of a fault and at most unusual."""
         if self.trajectories == 1 and 1.0 / (self.healthy_trajectories + 1) > SINGLE_SIGNIFICANCE:
             return "Too few trajectories (1; at least 2 needed) to compare with the healthy record."
         alarms = self.alarms
@@ -106,11 +108,16 @@ class Comparison:
         if not alarms:
             return f"No alarm: within {record}."
         more = f", and {len(alarms) - 3} more" if len(alarms) > 3 else ""
-        return f"Alarm, compared with {record}: {'; '.join(alarm.text for alarm in alarms[:3])}{more}."
+        texts = f"compared with {record}: {'; '.join(alarm.text for alarm in alarms[:3])}{more}."
+        if self.trajectories > 1:
+            return f"Alarm, {texts}"
+        rarity = f"Up to 1 in {1.0 / SINGLE_SIGNIFICANCE:.0f} healthy episodes deviates this much"
+        return f"Unusual episode, {texts} {rarity}: compare several episodes before concluding a fault."
 
     def table(self) -> Table:
         """One row per statistic."""
-        columns = ("statistic", "value", "healthy", "95 % range from", "to", "p-value", "alarm")
+        verdict = "alarm" if self.trajectories > 1 else "unusual"
+        columns = ("statistic", "value", "healthy", "95 % range from", "to", "p-value", verdict)
         rows = tuple(
             (d.label, d.value, d.healthy, d.low, d.high, d.p_value, "yes" if d.alarm else "") for d in self.deviations
         )

@@ -11,6 +11,7 @@ import torch
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
@@ -116,7 +117,8 @@ class Saliency(Diagnostic):
     @property
     def _title(self) -> str:
         kind, _, name = self.target.partition(":")
-        return {"log-likelihood": f"the log-likelihood of {name}", "beta": f"beta of {name}"}.get(kind, kind)
+        titles = {"log-likelihood": f"the log-likelihood of {name}", "beta": f"beta of {name}"}
+        return titles.get(kind, display_name(kind))
 
     def _format(self, value: float, sign: str = "") -> str:
         rounded = round(self.factor * value, self._digits) + 0.0  # avoids -0

@@ -125,7 +125,7 @@ class Shapley(Diagnostic):
     def tables(self) -> list[Table]:
         task = find_task(self.task)
         units, scale = measures.display_units(task)
-        names = ["position", *(component.name for component in task.components)]
+        names = ["position", *(component.label for component in task.components)]
         titles = [f"{name} ({unit})" for name, unit in zip(names, ("cm", *units), strict=True)]
         factors = np.array([100.0, *scale])
         # With many modalities, list single modalities and leave-one-out subsets only.
@@ -178,7 +178,7 @@ class Shapley(Diagnostic):
                 chart = "Position error by subset"
                 curves.append(Curve(self._title(subset), 100.0 * self.position_error[:, i], chart, "cm", layer))
         for c, (component, unit, factor) in enumerate(zip(task.components, *measures.display_units(task), strict=True)):
-            chart = f"Shapley values of the estimate: {component.name}"
+            chart = f"Shapley values of the estimate: {component.label}"
             curves += [
                 Curve(name, factor * self.estimate_values[:, k, c], chart, unit, name)
                 for k, name in enumerate(self.modalities)

@@ -102,7 +102,7 @@ class StandaloneModalities(Diagnostic):
     def tables(self) -> list[Table]:
         task = find_task(self.task)
         units, scale = measures.display_units(task)
-        names = [("position", "cm", 100.0), *zip([c.name for c in task.components], units, scale, strict=True)]
+        names = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
         rows: list[tuple[Value, ...]] = []
         for entry in self.phases:
             for q, (name, unit, factor) in enumerate(names):

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
@@ -182,7 +183,7 @@ class WeightAudit(Diagnostic):
     @property
     def _columns(self) -> tuple[str | None, ...]:
         """Names of the W columns: components, or None for a scalar weight."""
-        names = tuple(c.name for c in find_task(self.task).components)
+        names = tuple(c.label for c in find_task(self.task).components)
         return names if self.oracle.shape[-1] == len(names) else (None,)
 
     @property
@@ -199,7 +200,7 @@ class WeightAudit(Diagnostic):
     def tables(self) -> list[Table]:
         task = find_task(self.task)
         units, scale = measures.display_units(task)
-        quantities = [("position", "cm", 100.0), *zip([c.name for c in task.components], units, scale, strict=True)]
+        quantities = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
         means: list[tuple[Value, ...]] = []
         errors: list[tuple[Value, ...]] = []
         for entry in self.phases:
@@ -229,7 +230,7 @@ class WeightAudit(Diagnostic):
             ),
         ]
         rows = [
-            (c.modality, LABELS[c.weight], c.component or "all", c.other, c.value, *_interval(c))
+            (c.modality, LABELS[c.weight], display_name(c.component or "all"), c.other, c.value, *_interval(c))
             for c in self.correlations
             if math.isfinite(c.value) and c.modality in self._independent and c.weight in self._sources
         ]
@@ -312,7 +313,7 @@ def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightA
 
 
 def _description(correlation: Correlation) -> str:
-    where = f" in {correlation.component}" if correlation.component else ""
+    where = f" in {display_name(correlation.component)}" if correlation.component else ""
     interval = (
         "" if math.isnan(correlation.low) else f" (95 % interval {correlation.low:.2f} to {correlation.high:.2f})"
     )

@@ -13,6 +13,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import UNITS
 from beliefscope.inspect.diagnostics.base import Diagnostic
@@ -186,7 +187,7 @@ class Failures(Diagnostic):
         """One row per event with the values at its peak."""
         columns: tuple[str, ...] = ("episode", "step", "from", "to", self._label, "phase")
         columns += tuple(f"{layer_label(layer)} cm" for layer in self.layers)
-        columns += tuple(f"{name.replace('_', ' ')} deg" for name in self.angles)
+        columns += tuple(f"{display_name(name)} deg" for name in self.angles)
         columns += ("NEES", *(("ESS",) if self.particles else ()))
         columns += tuple(f"{layer} effective weight %" for layer in self.layers[:-1] if len(self.layers) > 2)
         return Table("Worst events", columns, tuple(map(self._row, events)))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.diagnostics.weight_steps import position_regret
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array, Mask
@@ -150,7 +150,7 @@ def disagreement(trace: Trace) -> Array:
 
 
 def _angle(index: int, name: str) -> Score:
-    return Score(f"{name.replace('_', ' ')} error", "rad", lambda trace: np.abs(measures.errors(trace)[:, -1, index]))
+    return Score(f"{display_name(name)} error", "rad", lambda trace: np.abs(measures.errors(trace)[:, -1, index]))
 
 
 def _degeneracy(trace: Trace) -> Array:

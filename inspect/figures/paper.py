@@ -15,7 +15,7 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import weight_audit
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
@@ -124,10 +124,10 @@ def maps_figure(
                 f"{letter}{panel.modality} {quantity}\n{STATES[panel.contact]}, step {panel.step}", fontsize=7.5
             )
             if i + columns >= len(layout):
-                axes.set_xlabel(f"{_display_name(checkpoint.task.map_components[0])} offset (cm)")
+                axes.set_xlabel(f"{display_name(checkpoint.task.map_components[0])} offset (cm)")
                 axes.tick_params(labelbottom=True)
             if i % columns == 0:
-                axes.set_ylabel(f"{_display_name(checkpoint.task.map_components[1])} offset (cm)")
+                axes.set_ylabel(f"{display_name(checkpoint.task.map_components[1])} offset (cm)")
         for axes in grid.flat[len(layout) :]:
             axes.set_visible(False)
         figure.colorbar(image, ax=list(grid.flat), label=f"{quantity} / maximum", shrink=0.8, aspect=25)
@@ -196,10 +196,6 @@ def _draw_effector(axes: Axes, effector: NDArray[np.float32]) -> None:
     axes.plot(*map(float, effector), marker="o", ms=4, ls="", color="white", path_effects=EDGE, label="end effector")
 
 
-def _display_name(component: str) -> str:
-    return component.replace("_", " ")
-
-
 def weights_figure(trace: Trace) -> Figure:
     """Estimates of the map components, and the weights below, over steps with shaded contact.
 
@@ -217,10 +213,10 @@ def weights_figure(trace: Trace) -> Figure:
         charts = figure.subplots(2 + len(columns), 1, sharex=True)
         for axes, i in zip(charts, task.map_indices, strict=False):
             _draw_estimates(axes, trace, i)
-            axes.set_ylabel(f"{_display_name(task.components[i].name)} (cm)")
+            axes.set_ylabel(f"{display_name(task.components[i].name)} (cm)")
         for axes, i in zip(charts[2:], columns, strict=True):
             _draw_weights(axes, trace, i)
-            axes.set_ylabel(f"weight, {_display_name(task.components[i].name)}" if component_wise else "weight")
+            axes.set_ylabel(f"weight, {display_name(task.components[i].name)}" if component_wise else "weight")
         for axes in charts:
             _shade_phases(axes, trace)
         charts[-1].set_xlabel("step")

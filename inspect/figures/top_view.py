@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.simulation.shapes import shapes
-from beliefscope.datasets.task import Outline, Task
+from beliefscope.datasets.task import Outline, Task, display_name
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.palette import COLOURS, colour, colour_table
@@ -137,7 +137,7 @@ def _draw_belief(axes: Axes, trace: Trace, task: Task, step: int, map_: Likeliho
         reach = max(reach, float(np.abs(at - centre).max()) + spread)
     _draw_positions(axes, trace, task, step, size=5.0)
     half = min(1.25 * reach, 100.0 * task.map_half_width)
-    x_name, y_name = (f"{name.replace('_', ' ')} (cm)" for name in task.map_components)
+    x_name, y_name = (f"{display_name(name)} (cm)" for name in task.map_components)
     axes.set(xlim=centre[0] + np.array([-half, half]), ylim=centre[1] + np.array([-half, half]), aspect="equal")
     axes.set(xlabel=x_name, ylabel=y_name)
     axes.set_title("belief" if map_ is None else f"belief, on the {map_.layers[-1]} {map_.quantity}", loc="left")

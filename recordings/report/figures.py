@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from beliefscope.datasets.task import display_name
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.palette import COLOURS, colour
@@ -129,8 +130,8 @@ def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None,
             _draw_estimate(axes, positions[layer], colour(layer, trace.modalities), layer)
     axes.set(xlim=(-half / zoom, half / zoom), ylim=(-half / zoom, half / zoom), aspect="equal")
     axes.set_title(layer if map_ is None else f"{layer} {map_.quantity}", loc="left", fontsize=7.5)
-    axes.set_xlabel(f"{task.map_components[0].replace('_', ' ')} offset (cm)")
-    axes.set_ylabel(f"{task.map_components[1].replace('_', ' ')} offset (cm)")
+    axes.set_xlabel(f"{display_name(task.map_components[0])} offset (cm)")
+    axes.set_ylabel(f"{display_name(task.map_components[1])} offset (cm)")
 
 
 def _draw_estimate(axes: Axes, position: np.ndarray, hue: str, name: str) -> None:

@@ -138,7 +138,7 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
         if layer != "fused" and layer not in first.modalities_with_posterior:
             continue
         result = metrics(task, error[:, i], covariance[:, i])
-        names = [*(f"{c.name} ({UNITS[c.unit][0]})" for c in task.components), "position (cm)"]
+        names = [*(f"{c.label} ({UNITS[c.unit][0]})" for c in task.components), "position (cm)"]
         values: dict[str, Value] = dict(zip(names, result.rmse.values(), strict=True))
         if first.has_covariance:
             values |= {"NEES/n": result.nees, "95 % coverage": result.coverage95, "NLL (nats)": result.nll}
@@ -154,7 +154,7 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     error, nees = measures.errors(trace)[step] * factors, measures.nees(trace)[step]
     distance = 100.0 * measures.position_error(trace)[step]
     statistics = None if map_ is None else measure_maps([map_], trace)
-    columns = ["estimate", *(f"{c.name} error ({u})" for c, u in zip(task.components, units, strict=True))]
+    columns = ["estimate", *(f"{c.label} error ({u})" for c, u in zip(task.components, units, strict=True))]
     columns += ["position error (cm)"]
     columns += ["NEES/n"] if trace.has_covariance else []
     for name, weights in (("beta", trace.weights), ("effective weight", trace.effective_weights)):

@@ -79,6 +79,16 @@ def test_p_value_of_one_trajectory_is_its_rank() -> None:
     assert result.sentence == "Too few trajectories (1; at least 2 needed) to compare with the healthy record."
 
 
+def test_one_deviating_trajectory_is_unusual_but_no_alarm_in_words() -> None:
+    healthy = np.random.default_rng(7).normal(0.0, 0.05, 99)
+    reference = HealthyProfile("", 99, None, {"autocorrelation/haptics hinge_y/all": healthy})
+    one, five = (compare(reference, count * [{"autocorrelation/haptics hinge_y/all": 0.9}]) for count in (1, 5))
+    subject = "autocorrelation at lag 1 of the innovations of haptics, hinge y is 0.9"
+    assert one.sentence.startswith(f"Unusual episode, compared with the healthy record of 99 trajectories: {subject}")
+    assert "Up to 1 in 50 healthy episodes deviates this much" in one.sentence
+    assert five.sentence.startswith(f"Alarm, compared with the healthy record of 99 trajectories: {subject}")
+
+
 def test_order_of_trajectories_is_irrelevant() -> None:
     rng = np.random.default_rng(3)
     reference, tested = profile(trajectories(60, rng)), trajectories(5, rng)

@@ -308,7 +308,7 @@ def test_views_match_the_fields() -> None:
         row = next(row for row in sums.rows if x.baseline in str(row[0]))
         assert 100 * x.integrated["image"].sum() == pytest.approx(row[1], abs=1e-4)
     assert occlusion.unit == "cm"
-    assert result.verdict.startswith(f"At step {VISIBLE} of episode 9, hinge_y is ")
+    assert result.verdict.startswith(f"At step {VISIBLE} of episode 9, hinge y is ")
     assert "complete within" in result.verdict
     incomplete = replace(result, attributions=(replace(result.attributions[0], gap=0.05), result.attributions[1]))
     assert "Relative to gray, the integrated gradients miss 5.0 % of the change" in incomplete.verdict

@@ -193,7 +193,7 @@ def test_event_table_has_known_errors(run_: Trace) -> None:
     table = event_table(run_, 40, None)
     rows = {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
     error = run_.estimate_mean[40].astype(float) - run_.episode.states[40]
-    assert rows["fused"]["hinge_x error (cm)"] == pytest.approx(100 * error[0])
+    assert rows["fused"]["hinge x error (cm)"] == pytest.approx(100 * error[0])
     assert rows["fused"]["position error (cm)"] == pytest.approx(100 * np.hypot(error[0], error[1]))
     shares = [float(rows[f"{name}-only update"]["effective weight (mean)"]) for name in run_.modalities]  # type: ignore[arg-type]
     assert sum(shares) == pytest.approx(1.0, abs=1e-6)
