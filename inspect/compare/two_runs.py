@@ -94,8 +94,8 @@ class Comparison(Diagnostic):
             return f"The estimates of {self.names[0]} and {self.names[1]} are identical."
         first, second = (100 * float(value) for value in self.position[0])
         change = second / first - 1.0 if first else math.inf
-        text = f"{self.names[0]}: {first:.2f} cm RMSE over {self.steps[0]} steps; {self.names[1]}: {second:.2f}"
-        parts = [f"{text}, {_change(change)}{self._other_components()}."]
+        text = f"RMSE over {self.steps[0]} steps: {self.names[0]} {first:.2f} cm, {self.names[1]} {second:.2f} cm"
+        parts = [f"{text} ({_change(change)}){self._other_components()}."]
         if abs(change) >= LEVEL and (phase := self._dominant_phase()) is not None:
             before, after = (100 * float(value) for value in self.position[phase])
             parts.append(

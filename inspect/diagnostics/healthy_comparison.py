@@ -111,8 +111,8 @@ class Comparison:
         texts = f"compared with {record}: {'; '.join(alarm.text for alarm in alarms[:3])}{more}."
         if self.trajectories > 1:
             return f"Alarm, {texts}"
-        rarity = f"Up to 1 in {1.0 / SINGLE_SIGNIFICANCE:.0f} healthy episodes deviates this much"
-        return f"Unusual episode, {texts} {rarity}: compare several episodes before concluding a fault."
+        rarity = f"as up to 1 in {1.0 / SINGLE_SIGNIFICANCE:.0f} healthy ones"
+        return f"Unusual episode ({rarity}), {texts} Test several episodes before concluding a fault."
 
     def table(self) -> Table:
         """One row per statistic."""

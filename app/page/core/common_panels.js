@@ -8,7 +8,7 @@ import { setPanelState } from '../widgets/panel_state.js';
 import { element, html, messageOf } from './dom.js';
 import { swatch } from './palette.js';
 import { stats } from './stats.js';
-import { displayName, fixed } from './units.js';
+import { displayName, fixed, sentence } from './units.js';
 
 const LOADING_DELAY = 150; // ms until a panel shows that it loads
 
@@ -55,8 +55,16 @@ export function showError(error) {
   if (!isReadable) console.error(error);
   const text = isReadable ? error.message : `The page failed: ${messageOf(error)}`;
   html('#step-summary').textContent = '';
+  showDataWarning(null);
   for (const body of bodies) setPanelState(body, 'error', text);
   return text;
+}
+
+/** @param {string | null | undefined} warning how the data differ from the training data */
+function showDataWarning(warning) {
+  const line = html('#data-warning');
+  line.hidden = !warning;
+  line.textContent = warning ? sentence(`Warning: ${warning}`) : '';
 }
 
 /**
@@ -66,9 +74,7 @@ export function showError(error) {
 export function showProperties(trace) {
   for (const body of bodies.slice(1)) setPanelState(body, 'ready');
   const { no_maps: noMaps, data_warning: warning } = trace.header;
-  const line = html('#data-warning');
-  line.textContent = line.title = warning ? `Warning: ${warning}` : '';
-  line.hidden = !warning;
+  showDataWarning(warning);
   const position = displayName(trace.task.map.x).replace(/(^| )x$/, '');
   html('#maps-quantity').textContent = position || 'position';
   const { classList } = html('#maps');

@@ -43,7 +43,11 @@ const COLUMNS = [
     content: ({ summary }) => percent(summary.contact_fraction),
   },
   {
-    ...errorColumn('rmse', 'Position RMSE, without the first 30 steps (field tasks: all steps)', (e) => e?.rmse),
+    ...errorColumn(
+      'rmse',
+      'Position RMSE, without the first 30 steps (field tasks: all steps)',
+      (e) => e?.rmse,
+    ),
     title: 'RMSE cm',
   },
   {
