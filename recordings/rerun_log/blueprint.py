@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task import Component, Task, display_name
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
@@ -83,7 +83,7 @@ def _scene(trace: Trace, task: Task) -> rrb.Container:
     above = rrb.Spatial3DView(
         origin="world",
         contents="world/plane/**",
-        name=f"Belief: {task.map_components[0]}, {task.map_components[1]}",
+        name=f"Belief: {', '.join(map(display_name, task.map_components))}",
         eye_controls=_eye(anchor, anchor + np.array([0.0, 0.0, 3.4 * task.map_half_width]), (0, 1, 0)),
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
@@ -141,7 +141,7 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
         low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
         margin = 0.1 * (high - low) or 1.0
         limits = (low - margin, high + margin)
-    name = f"{component.name} ({SHOWN_UNIT[component.unit]}): truth green, fused red"
+    name = f"{component.label} ({SHOWN_UNIT[component.unit]}): truth green, fused red"
     name += ", thin lines 2 sigma" if trace.has_covariance else ""
     return _plot(f"states/{component.name}", name, limits, legend=False)
 

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Component, Outline, Task
+from beliefscope.datasets.task import Component, Outline, Task, display_name
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours, layer_label
 from beliefscope.inspect.trace import Trace
@@ -137,7 +137,7 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
         for modality in trace.modalities:
             names = [modality]
             if values.shape[2] > 1:
-                names = [f"{modality}, {component.name}" for component in task.components]
+                names = [f"{modality}, {component.label}" for component in task.components]
             # Components of a modality share its colour and differ in opacity.
             opacity = np.linspace(1.0, 0.35, len(names))
             yield f"{name}/{modality}", line(_hex(modality, trace), 2.0, *names, opacity=opacity)
@@ -276,7 +276,8 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
     """
     modalities = " and ".join(task.modalities if not trace.modalities else trace.modalities).replace("+", " with ")
     weighted = ". It weights its modalities at every step" if trace.weights is not None else ""
-    components = ", ".join(component.name for component in task.components)
+    components = ", ".join(component.label for component in task.components)
+    x, y = map(display_name, task.map_components)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
     length = f"{steps} steps" if steps >= 0 else "a live run, in steps"
@@ -292,11 +293,11 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
 {legend}
 
 * **Scene**: the true and the estimated pose of the object. Contours are 2 sigma in
-  {task.map_components[0]} and {task.map_components[1]}. Brighter particles have larger weights. Gray: the end
+  {x} and {y}. Brighter particles have larger weights. Gray: the end
   effector and its recent path.
 * **Likelihood maps**: likelihood or posterior (see the titles) of positions around the true one, relative to the
   maximum of each map;
-  {200 * task.map_half_width:g} cm per side, {task.map_components[0]} to the right. Squares
+  {200 * task.map_half_width:g} cm per side, {x} to the right. Squares
   frame the true position (large) and the estimate (small).
 * **Plots**: in centimetres and degrees. Thin lines around the fused estimate are the 2 sigma band.
 

@@ -55,6 +55,7 @@ export function showError(error) {
   if (!isReadable) console.error(error);
   const text = isReadable ? error.message : `The page failed: ${messageOf(error)}`;
   html('#step-summary').textContent = '';
+  [html('#readout b').textContent, html('#readout span').textContent] = ['–', ''];
   showDataWarning(null);
   for (const body of bodies) setPanelState(body, 'error', text);
   return text;

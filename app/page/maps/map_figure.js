@@ -5,6 +5,7 @@
 
 import { create } from '../core/dom.js';
 import { cssVariable, gradient } from '../core/palette.js';
+import { fixed } from '../core/units.js';
 import { rangeDigits, rangeLabels } from './map_values.js';
 
 /**
@@ -60,7 +61,9 @@ export function createFigure(name, fuses) {
  * @param {string} title of the quantity
  */
 export function updateColourBar({ bar, shade, colourMap }, title) {
-  const [low, high] = rangeLabels(shade, rangeDigits(shade));
+  const digits = rangeDigits(shade);
+  const isRatio = shade.low === -shade.high;
+  const [low, high] = isRatio ? ['', `±${fixed(shade.high, digits)}`] : rangeLabels(shade, digits);
   [bar.low.textContent, bar.high.textContent] = [low, high];
   bar.gradient.style.background = gradient(colourMap);
   const [from, to] = rangeLabels(shade, 2);
