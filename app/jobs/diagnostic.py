@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
-from beliefscope.app.jobs.worker import Report
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.worker import Report
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.trace import Trace
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
-from beliefscope.app.jobs.worker import Report
 from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.inspect.failures.events import Event
 from beliefscope.inspect.failures.step_scores import Survey

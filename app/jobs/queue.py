@@ -1,7 +1,7 @@
 """Queue of long tasks, each in a process of its own: progress, cancellation and results in the workspace.
 
-A job is a function listed in ``KINDS``, with JSON arguments and a JSON result; ``app/jobs/worker.py`` runs it.
-Its folder ``jobs/ID`` holds ``job.json``, ``arguments.json``, ``log.txt`` and, once it is done, ``result.json``.
+A job is a function listed in ``KINDS``, with JSON arguments and a JSON result; ``app/runs/worker.py`` runs it.
+Its folder ``jobs/ID`` holds ``job.json``, ``log.txt`` and, once it is done, ``result.json``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -21,13 +20,14 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
 from pydantic import AliasChoices, ConfigDict, Field, TypeAdapter, with_config
 
 from beliefscope import __version__
 from beliefscope.app.runs.errors import QueueFull
-from beliefscope.app.runs.subprocesses import exit_description
+from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess
 from beliefscope.app.workspace.json_files import read_record
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput, unknown_name
@@ -42,7 +42,7 @@ KINDS: dict[str, str] = {
     "report": "beliefscope.app.jobs.report:run",
     "study": "beliefscope.app.jobs.study:run",
 }
-"""Kind of job -> ``module:function`` of (arguments, report) -> result; see ``worker.Report``."""
+"""Kind of job -> ``module:function`` of (arguments, report) -> result; see ``app/runs/worker.py``."""
 
 MAX_RUNNING, MAX_WAITING, MAX_ENDED = 2, 16, 100  # jobs; the oldest ended ones are deleted
 GRACE = 3.0  # s between SIGTERM and SIGKILL
@@ -50,7 +50,6 @@ LOG_TAIL = 8000  # bytes
 
 State = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
 ACTIVE = ("waiting", "running")
-WORKER = "beliefscope.app.jobs.worker"
 
 log = logging.getLogger("beliefscope.app")
 
@@ -108,7 +107,8 @@ class Jobs:
         self._folder, self._kinds, self._max_running, self._max_waiting = folder, kinds, max_running, max_waiting
         self._lock = threading.RLock()
         self._queue: deque[str] = deque()
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._arguments: dict[str, Mapping[str, Any]] = {}  # of the jobs in the queue
+        self._processes: dict[str, WorkerProcess] = {}
         self._watchers: dict[str, threading.Thread] = {}
         self._stopping: dict[str, State] = {}  # job being stopped -> its final state
         self._closing = False
@@ -183,11 +183,11 @@ class Jobs:
                 folder.mkdir(parents=True)
             except OSError as error:
                 raise write_error(folder, error) from None
-            write_atomically(folder / "arguments.json", json.dumps(arguments).encode())
             # Keeps the order if the clock was set back.
             submitted = max([time.time(), *(job.submitted + 1e-3 for job in self._jobs.values())])
             self._put(Job(id, kind, title, submitted=submitted, server=os.getpid(), link=link))
             self._queue.append(id)
+            self._arguments[id] = arguments
             self._start_waiting()
             for job in [job for job in self.all() if not job.active][MAX_ENDED:]:
                 self._delete(job.id)
@@ -199,6 +199,7 @@ class Jobs:
             job = self._jobs[id]
             if job.state == "waiting":
                 self._queue.remove(id)
+                del self._arguments[id]
                 self._put(replace(job, state="cancelled", error="cancelled", ended=time.time()))
             elif job.state == "running":
                 self._stop(id, "cancelled")
@@ -234,49 +235,47 @@ class Jobs:
     def _start_waiting(self) -> None:
         while self._queue and len(self._processes) < self._max_running:
             id = self._queue.popleft()
-            job = self._jobs[id]
+            job, arguments = self._jobs[id], self._arguments.pop(id)
             try:
-                process = self._processes[id] = self._start_process(job)
+                with (self._folder / id / "log.txt").open("wb") as output:
+                    process = WorkerProcess(__name__, output, OMP_NUM_THREADS="1")
             except OSError as error:  # deleted folder, or no memory or file descriptors left
                 message = f"it could not be started: {error.strerror or error}"
                 self._put(replace(job, state="failed", error=message, ended=max(time.time(), job.submitted)))
                 continue
-            self._put(replace(job, state="running", started=max(time.time(), job.submitted)))
+            self._processes[id] = process
+            self._put(replace(job, state="running", message="starting", started=max(time.time(), job.submitted)))
             log.info("job started", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
-            self._watchers[id] = threading.Thread(target=self._watch, args=(id, process), name=f"job {id}")
+            call = {"function": self._kinds[job.kind], "folder": str(self._folder / id), "arguments": arguments}
+            self._watchers[id] = threading.Thread(target=self._watch, args=(id, process, call), name=f"job {id}")
             self._watchers[id].start()
 
-    def _start_process(self, job: Job) -> subprocess.Popen[bytes]:
-        # A session of its own: Ctrl-C in the terminal stops the server only, and the job's subprocesses end with it.
-        with (self._folder / job.id / "log.txt").open("wb") as output:
-            return subprocess.Popen(
-                [sys.executable, "-P", "-m", WORKER, self._kinds[job.kind], self._folder / job.id],
-                stdin=subprocess.PIPE,  # closes when the server ends
-                stdout=subprocess.PIPE,
-                stderr=output,
-                start_new_session=True,
-                env=os.environ | {"OMP_NUM_THREADS": "1"},
-            )
+    def _watch(self, id: str, process: WorkerProcess, call: Mapping[str, Any]) -> None:
+        def report(progress: float, message: str) -> None:
+            with self._lock:
+                self._jobs[id] = replace(self._jobs[id], progress=progress, message=message)
 
-    def _watch(self, id: str, process: subprocess.Popen[bytes]) -> None:
-        reader = threading.Thread(target=self._read_reports, args=(id, process), name=f"reports of job {id}")
-        reader.start()
-        code = process.wait()
-        _signal_group(process, signal.SIGKILL)  # remaining subprocesses
-        reader.join()
-        assert process.stdin is not None
-        process.stdin.close()
+        error = ""
+        with process:
+            try:
+                process.call("run_job", call, report)
+            except WorkerDied as died:
+                last_line = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "").strip()
+                error = f"{died}; last output: {last_line}" if last_line else str(died)
+            except (BadInput, RuntimeError) as failure:
+                error = str(failure)
+            process.signal_group(signal.SIGKILL)
         with self._lock:
             del self._processes[id], self._watchers[id]
             job = self._jobs[id]
             job = replace(job, ended=max(time.time(), job.started or 0.0))
             stopped = self._stopping.pop(id, None)
-            if code == 0 and self.result(id):
-                job = replace(job, state="done", progress=1.0, message="", error="")
+            if not error and self.result(id):
+                job = replace(job, state="done", progress=1.0, message="")
             elif stopped:
                 job = replace(job, state=stopped, error="cancelled" if stopped == "cancelled" else "the server stopped")
             else:
-                job = replace(job, state="failed", error=job.error or self._exit_reason(id, code))
+                job = replace(job, state="failed", error=error or "its result was deleted")
             self._put(job)
             seconds = round((job.ended or 0.0) - (job.started or 0.0), 1)
             event = {"job": id, "kind": job.kind, "state": job.state, "seconds": seconds, "error": job.error}
@@ -284,28 +283,20 @@ class Jobs:
             if not self._closing:
                 self._start_waiting()
 
-    def _read_reports(self, id: str, process: subprocess.Popen[bytes]) -> None:
-        """Apply the process's reports (JSON lines of job fields) until it ends."""
-        assert process.stdout is not None
-        with process.stdout as lines:
-            for line in lines:
-                # The last line of a killed process may be incomplete.
-                with suppress(ValueError), self._lock:
-                    self._jobs[id] = replace(self._jobs[id], **json.loads(line))
-
-    def _exit_reason(self, id: str, code: int) -> str:
-        """Describe the end of a process that reported no error."""
-        last_line = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "").strip()
-        reason = f"its process {exit_description(code)}"
-        return f"{reason}; last output: {last_line}" if last_line else reason
-
     def _stop(self, id: str, state: State) -> None:
         if id in self._stopping:
             return
         self._stopping[id] = state
         process = self._processes[id]
-        _signal_group(process, signal.SIGTERM)
+        process.signal_group(signal.SIGTERM)
         threading.Thread(target=_kill_after_grace, args=(process,), name=f"stopping job {id}", daemon=True).start()
+
+
+def run_job(arguments: Mapping[str, Any], report: Report) -> None:
+    """Run the function of a job in its process and write the result."""
+    result = resolve_name(arguments["function"])(arguments["arguments"], report)
+    path = Path(arguments["folder"]) / "result.json"
+    write_atomically(path, json.dumps(result, allow_nan=False).encode())
 
 
 def _id(kind: str, key: str) -> str:
@@ -336,14 +327,8 @@ def _is_other_process(pid: int) -> bool:
     return True
 
 
-def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
-    """Signal the process and its subprocesses."""
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, number)
-
-
-def _kill_after_grace(process: subprocess.Popen[bytes]) -> None:
+def _kill_after_grace(process: WorkerProcess) -> None:
     with suppress(subprocess.TimeoutExpired):
         process.wait(GRACE)
         return
-    _signal_group(process, signal.SIGKILL)
+    process.signal_group(signal.SIGKILL)

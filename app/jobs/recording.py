@@ -7,11 +7,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from beliefscope.app.jobs.worker import Report
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
+from beliefscope.app.runs.worker import Report
 from beliefscope.app.workspace.recordings import RecordingFolder
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.likelihood import LikelihoodMap, Quantity

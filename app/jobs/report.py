@@ -7,11 +7,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from beliefscope.app.jobs.worker import Report
 from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.worker import Report
 from beliefscope.inspect.likelihood import missing_quantities
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 from beliefscope.recordings.report.pdf import browser, print_page

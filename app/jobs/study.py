@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from beliefscope.app.jobs.worker import Report
+from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.training.study import Cell, run_local
 

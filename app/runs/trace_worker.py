@@ -1,27 +1,17 @@
-"""Worker process that runs filters, so that the server stays responsive and survives a crash.
-
-    python -m beliefscope.app.runs.trace_worker
-
-Standard input carries one request a line, JSON; standard output carries progress and the outcome of each.
-"""
+"""Worker process that runs filters and writes their traces."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 import threading
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.subprocesses import NICENESS, REPORT_INTERVAL, exit_description, redirect_stdout
+from beliefscope.app.runs.worker import WorkerDied, WorkerProcess
 from beliefscope.datasets.catalog import find_task, load_task
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
@@ -91,58 +81,28 @@ class TraceWorker:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._closed = False
-        self._process: subprocess.Popen[str] | None = None
+        self._process: WorkerProcess | None = None
 
     @property
     def started(self) -> bool:
         """Whether the process has been started."""
         return self._process is not None
 
-    def start(self) -> None:
+    def start(self) -> WorkerProcess:
         """Start the process, unless it is running. Does not wait until it is ready."""
         with self._lock:
             if self._closed:
                 raise RuntimeError("the server is stopping")
             if self._process is None or self._process.poll() is not None:
-                self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", __name__],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    text=True,
-                    bufsize=1,
-                    start_new_session=True,  # Ctrl+C in the terminal stops the server only
-                )
+                self._process = WorkerProcess(__name__)
+            return self._process
 
     def run(self, request: RunRequest, progress: Progress) -> None:
-        """Run a filter and write its trace to ``request.output``. An exception of ``progress`` kills the process.
-
-        Raises:
-            BadInput: the request does not fit the filter.
-            RuntimeError: any other failure, such as the death of the process.
-        """
-        self.start()
-        process = self._process
-        assert process is not None
-        assert process.stdin is not None
-        assert process.stdout is not None
-        outcome = None
+        """Run a filter and write its trace to ``request.output``. Raises as ``WorkerProcess.call``."""
         try:
-            process.stdin.write(json.dumps(request.to_json()) + "\n")
-            for line in process.stdout:
-                message = json.loads(line)
-                if "progress" not in message:
-                    outcome = message
-                    break
-                progress(message["progress"])
-        except OSError:
-            pass  # the process has died
-        except BaseException:
-            process.kill()
-            raise
-        if outcome is None:
-            raise RuntimeError(f"the filter could not be run: its process {exit_description(process.wait())}")
-        if outcome["error"] is not None:
-            raise (BadInput if outcome["bad_input"] else RuntimeError)(outcome["error"])
+            self.start().call("run_filter", request.to_json(), lambda fraction, _: progress(fraction))
+        except WorkerDied as error:
+            raise RuntimeError(f"the filter could not be run: {error}") from None
 
     def close(self) -> None:
         """End the process, also during a run."""
@@ -175,38 +135,15 @@ def _episode(request: RunRequest) -> Episode:
     return _dataset(request.data, request.selection.task)[request.selection.episode]
 
 
-def _execute(request: RunRequest, runs: StoredRuns, output: TextIO) -> None:
-    last_report = time.monotonic()
+_runs = StoredRuns()
 
-    def progress(fraction: float) -> None:
-        nonlocal last_report
-        if time.monotonic() - last_report >= REPORT_INTERVAL:
-            last_report = time.monotonic()
-            output.write(json.dumps({"progress": fraction}) + "\n")
 
+def run_filter(arguments: Mapping[str, Any], report: Callable[[float], None]) -> None:
+    """Carry out a ``RunRequest`` in the worker process."""
+    request = RunRequest.from_json(arguments)
     for task in request.user_tasks:
         _load_user_task(task)
     checkpoint = _checkpoint(request.checkpoint, request.external_task)
-    trace = runs.run(checkpoint, _episode(request), progress=progress, **request.settings())
+    trace = _runs.run(checkpoint, _episode(request), progress=report, **request.settings())
     if request.output != request.original:
         save_trace(trace, Path(request.output))
-
-
-def main() -> None:
-    """Carry out requests until standard input ends."""
-    os.nice(NICENESS)
-    output, runs = redirect_stdout(), StoredRuns()
-    for line in sys.stdin:
-        outcome: dict[str, Any] = {"error": None, "bad_input": False}
-        try:
-            _execute(RunRequest.from_json(json.loads(line)), runs, output)
-        except BadInput as error:
-            outcome = {"error": str(error), "bad_input": True}
-        except Exception as error:
-            outcome["error"] = f"{type(error).__name__}: {error}"
-        output.write(json.dumps(outcome) + "\n")
-    os._exit(0)  # faster than the regular shutdown of PyTorch
-
-
-if __name__ == "__main__":
-    main()

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from beliefscope.app.jobs.worker import Report
+from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.errors import BadInput
 
 

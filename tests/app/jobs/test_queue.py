@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def open_jobs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[OpenJobs]:
     """Opens the folder like a starting server."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
     opened: list[Jobs] = []
 
     def open_(**limits: int) -> Jobs:
