@@ -1,5 +1,7 @@
 """Errors caused by user input."""
 
+from collections.abc import Container
+
 
 class BadInput(ValueError):
     """An error the user can fix: an invalid name, file, shape or value.
@@ -10,6 +12,12 @@ class BadInput(ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__(message.encode(errors="backslashreplace").decode())
+
+
+def check_name(kind: str, name: str, available: Container[str]) -> None:
+    """Raise the error of ``unknown_name`` for a name that is not available."""
+    if name not in available:
+        raise unknown_name(kind, name, available)
 
 
 def unknown_name(kind: str, name: str, available: object) -> BadInput:

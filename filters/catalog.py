@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.errors import check_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
@@ -65,10 +65,8 @@ paper's published networks for the door task."""
 def architecture(task: str, name: str, networks: str = "default") -> Architecture:
     """The named filter's architecture for a task. Raises BadInput for an unknown name."""
     filters = filters_of(find_task(task))
-    if name not in filters:
-        raise unknown_name("filter", name, filters)
-    if networks not in NETWORKS:
-        raise unknown_name("set of networks", networks, NETWORKS)
+    check_name("filter", name, filters)
+    check_name("set of networks", networks, NETWORKS)
     return replace(filters[name], **NETWORKS[networks])
 
 

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.inspect.diagnostics.views import as_json
 from beliefscope.inspect.trace import Trace, arrays_of, header_of
@@ -37,8 +37,7 @@ def export_trace(trace: Trace, path: Path) -> None:
 def export_format(path: Path) -> str:
     """``parquet``, ``mcap`` or ``npz``. Raises BadInput for another suffix or if the package is not installed."""
     suffix = path.suffix.removeprefix(".").lower()
-    if suffix not in FORMATS:
-        raise unknown_name("export format", suffix, FORMATS)
+    check_name("export format", suffix, FORMATS)
     if suffix == "mcap":
         try:
             import mcap  # noqa: F401

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import threading
 from collections.abc import Mapping
@@ -123,10 +122,10 @@ def _selections(store: TraceStore, selection: Selection, episodes: Episodes) -> 
     return store.held_out(selection) if episodes else [selection]
 
 
-def _key(store: TraceStore, entry: Entry, selections: list[Selection], options: Mapping[str, Any]) -> str:
-    """Hash of everything the result depends on, including the indices of the episodes."""
+def _key(store: TraceStore, entry: Entry, selections: list[Selection], options: Mapping[str, Any]) -> object:
+    """Everything the result depends on, including the indices of the episodes."""
     traces = [(selection.episode, store.key(selection)) for selection in selections]
-    return hashlib.sha256(repr((entry.name, traces, sorted(options.items()))).encode()).hexdigest()
+    return entry.name, traces, sorted(options.items())
 
 
 def _link(entry: Entry, run: Selection, options: Mapping[str, Any], episodes: Episodes) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal
@@ -93,9 +92,9 @@ def _arguments(store: TraceStore, request: SurveyRequest) -> dict[str, Any]:
     }
 
 
-def _key(store: TraceStore, arguments: Mapping[str, Any]) -> str:
-    """Hash of everything the result depends on; names occur in its links."""
-    task, filter_, data = (arguments[name] for name in ("task", "filter", "data"))
-    named = tuple(arguments[name] for name in ("task", "filter", "data", "among", "faults", "episodes"))
-    hashes = (store.checkpoint(task, filter_).hash, store.data_hash(task, data))
-    return hashlib.sha256(repr((named, hashes, store.settings.seed, store.settings.particles)).encode()).hexdigest()
+def _key(store: TraceStore, arguments: Mapping[str, Any]) -> object:
+    """Everything the result depends on; names occur in its links."""
+    task, filter_, data = names = [arguments[name] for name in ("task", "filter", "data")]
+    hashes = (store.checkpoint(task, filter_).hash, store.dataset(task, data)[1].hash)
+    others = [arguments[name] for name in ("among", "faults", "episodes")]
+    return names, others, hashes, store.settings.seed, store.settings.particles

@@ -41,8 +41,8 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         select_parameters(checkpoint.filter, tuning.train, tuning.freeze)
         for slice_, _ in tuning.mix:
             slice_.check(checkpoint.task, checkpoint.filter.names)
-        data, _ = store.dataset(task, data)
-        key = [filter, data, checkpoint.hash, store.data_hash(task, data), tuning.to_json(), store.settings.particles]
+        data, episodes = store.dataset(task, data)
+        key = [filter, data, checkpoint.hash, episodes.hash, tuning.to_json(), store.settings.particles]
         id = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
         run = runs.add(id, task, filter, data, tuning)
         arguments = {name: getattr(run, name) for name in ("run", "task", "filter", "data", "settings")}

@@ -50,7 +50,7 @@ def routes(jobs: Jobs) -> APIRouter:
     return router
 
 
-def result_or_job(jobs: Jobs, kind: str, key: str) -> Response:
+def result_or_job(jobs: Jobs, kind: str, key: object) -> Response:
     """The result of a finished job; else the response 202 with the job, or without one if it was not requested."""
     job = jobs.find(kind, key)
     if path := jobs.finished_result(job):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from beliefscope.app.runs.catalog import short_names
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.studies import FILE, SHIPPED, Results, Study
 from beliefscope.datasets.catalog import load_task
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.training.plan import PLANS
@@ -141,8 +140,7 @@ def _job_arguments(study: Study, results: Results, store: TraceStore) -> dict[st
     """Arguments of the job that finishes a study. Raises BadInput if this server lacks its preset or data."""
     if not study.has_checkpoints:
         raise BadInput("the built-in study cannot be continued; create one with beliefscope study")
-    if results.preset not in PLANS:
-        raise unknown_name("preset", results.preset, PLANS)
+    check_name("preset", results.preset, PLANS)
     settings = store.settings
     sources = {load_task(source).name: source for source in settings.tasks}
     files: dict[str, tuple[str, str]] = {}
@@ -165,9 +163,8 @@ def _job_arguments(study: Study, results: Results, store: TraceStore) -> dict[st
     return {"folder": str(study.folder.resolve()), "preset": results.preset, "cells": cells}
 
 
-def _key(study: Study, results: Results) -> str:
-    parts = (str(study.folder.resolve()), results.preset, sorted(results.cells))
-    return hashlib.sha256(repr(parts).encode()).hexdigest()
+def _key(study: Study, results: Results) -> object:
+    return str(study.folder.resolve()), results.preset, sorted(results.cells)
 
 
 def _catalog_names(store: TraceStore) -> CatalogNames:

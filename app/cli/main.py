@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from beliefscope import __version__
-from beliefscope.app.cli import output
+from beliefscope.app.cli import console
 from beliefscope.datasets.errors import BadInput
 
 COMMANDS = (
@@ -44,22 +44,22 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # like standard error: file names may not be valid text
     try:
         code = cli(prog_name="beliefscope", standalone_mode=False)
-        output.flush()
+        console.flush()
     except typer.TyperException as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "beliefscope")
-        output.fail(f"{error.format_message().rstrip('.')}. See: {command} --help", error.exit_code)
+        console.fail(f"{error.format_message().rstrip('.')}. See: {command} --help", error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
-        output.fail("interrupted", 130)
+        console.fail("interrupted", 130)
     except Exception as error:
         if debug:
             raise
         if isinstance(error, BadInput):
-            output.fail(str(error), 2)
+            console.fail(str(error), 2)
         with suppress(OSError):
-            output.flush()
+            console.flush()
         if isinstance(error, BrokenPipeError):  # the reader has closed the pipe, as ``head`` does
             raise SystemExit(1) from None
-        output.fail(f"{type(error).__name__}: {error} (run beliefscope --debug ... for a traceback)", 1)
+        console.fail(f"{type(error).__name__}: {error} (run beliefscope --debug ... for a traceback)", 1)
     raise SystemExit(code)
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 
 import typer
 
-from beliefscope.app.cli import output as console
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.app.cli import console
+from beliefscope.datasets.errors import BadInput, check_name
 
 if TYPE_CHECKING:
     from beliefscope.datasets.dataset import Dataset
@@ -44,8 +44,7 @@ Quantity = Literal["likelihood", "posterior"]
 
 
 def _parse_quantity(text: str) -> str:
-    if text not in get_args(Quantity):
-        raise unknown_name("quantity of maps", text, get_args(Quantity))
+    check_name("quantity of maps", text, get_args(Quantity))
     return text
 
 
@@ -153,27 +152,37 @@ OPTIONS: dict[str, Any] = {
 """Parameter of a command -> its description; ``with_options`` adds those of a single command."""
 
 
-def with_options(**own: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Describe the parameters of a command: by ``own``, else by ``OPTIONS``.
+Command = Callable[..., console.Result | None]
+
+
+def with_options(**own: Any) -> Callable[[Command], Callable[..., None]]:
+    """Describe the parameters of a command: by ``own``, else by ``OPTIONS``; print its result, with option ``--json``.
 
     A parameter whose type is a dataclass, such as ``Run``, stands for an option for each of its fields.
     """
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+    def decorate(command: Command) -> Callable[..., None]:
         descriptions, hints = OPTIONS | own, get_type_hints(command)
+        has_result = hints.pop("return") is console.Result
         groups: dict[str, Any] = {name: type_ for name, type_ in hints.items() if is_dataclass(type_)}
         parameters: list[inspect.Parameter] = []
         for name, parameter in inspect.signature(command).parameters.items():
             group = groups.get(name)
             parameters += inspect.signature(group).parameters.values() if group else [parameter]
             hints |= get_type_hints(group) if group else {}
+        if has_result:
+            parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=None))
+            hints["json"] = str | None
         annotations = {p.name: Annotated[hints[p.name], descriptions[p.name]] for p in parameters}
 
         @wraps(command)
-        def run(**values: Any) -> None:
+        def run(json: str | None = None, **values: Any) -> None:
             for name, group in groups.items():
                 values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
-            command(**values)
+            if (result := command(**values)) is not None:
+                result.print(json)
+                if result.code:
+                    raise typer.Exit(result.code)
 
         run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
             [p.replace(kind=p.KEYWORD_ONLY, annotation=annotations[p.name]) for p in parameters]
@@ -314,24 +323,18 @@ def open_traces(paths: Sequence[Path], filter_: str) -> tuple[list[Trace], Check
     return traces, checkpoint_of(traces, paths, filter_)
 
 
-def print_trace(trace: Trace, path: Path, json: str | None, **extra: Any) -> None:
-    """Print the description of a file created from a trace. extra: additional values of the JSON document."""
+def trace_result(trace: Trace, path: Path, **extra: Any) -> console.Result:
+    """Description of a file created from a trace. extra: additional values of the JSON document."""
     from beliefscope.inspect.traces.provenance import describe
 
-    document = describe(trace) | {"path": str(path), "bytes": path.stat().st_size}
     run = f"{trace.filter} over {len(trace)} steps of {trace.episode.task} episode {trace.episode_index}"
-    text = f"{path_and_size(path)}: {run}" + (f" with {trace.faults}" if trace.faults else "")
-    console.result(document | extra, text, json)
+    text = run + (f" with {trace.faults}" if trace.faults else "")
+    return console.Result(describe(trace) | extra, text, path)
 
 
-def print_checkpoint(
-    path: Path, task: str, name: str, digest: str, record: dict[str, Any], text: str, json: str | None
-) -> None:
-    """Print the description of a trained checkpoint. text: printed instead of the JSON document."""
-    document = {"task": task, "filter": name, "checkpoint_hash": digest, "path": str(path)}
-    console.result(document | {"bytes": path.stat().st_size, "record": record}, text, json)
-
-
-def path_and_size(path: Path) -> str:
-    """``run.trace (1.2 MB)``"""
-    return f"{path} ({path.stat().st_size / 1e6:.1f} MB)"
+def checkpoint_result(
+    path: Path, task: str, name: str, digest: str, record: dict[str, Any], lines: Sequence[str]
+) -> console.Result:
+    """Description of a trained checkpoint."""
+    document = {"task": task, "filter": name, "checkpoint_hash": digest, "record": record}
+    return console.Result(document, "\n".join(lines), path)

@@ -53,7 +53,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             result = finetune(
                 base,
                 episodes,
-                data_hash=store.data_hash(arguments["task"], data_name),
+                data_hash=data.hash,
                 settings=tuning,
                 command=f"fine-tuned on the page from {arguments['filter']}",
                 report=on_step,

@@ -30,7 +30,7 @@ from beliefscope.app.runs.errors import QueueFull
 from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess
 from beliefscope.app.workspace.json_files import read_record
 from beliefscope.app.workspace.paths import file_within
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.io.atomic_write import write_atomically, write_error
 
 KINDS: dict[str, str] = {
@@ -129,7 +129,7 @@ class Jobs:
         with self._lock:
             return self._jobs[id]
 
-    def find(self, kind: str, key: str) -> Job | None:
+    def find(self, kind: str, key: object) -> Job | None:
         """The job submitted with this kind and key, if any."""
         with self._lock:
             return self._jobs.get(_id(kind, key))
@@ -154,20 +154,19 @@ class Jobs:
         kind: str,
         title: str,
         arguments: Mapping[str, Any],
-        key: str,
+        key: object,
         link: str = "",
         output_exists: bool = True,
     ) -> Job:
         """Queue a job, or return the existing one with the same kind and key if it is active or done.
 
         Args:
-            arguments: JSON, passed to the kind's function. key: identifies everything the result depends on.
+            arguments: JSON, passed to the kind's function. key: everything the result depends on; compared by ``repr``.
             link: page address of the result. output_exists: False if files that the job wrote have been deleted.
 
         Raises BadInput for an unknown kind, and QueueFull.
         """
-        if kind not in self._kinds:
-            raise unknown_name("kind of job", kind, self._kinds)
+        check_name("kind of job", kind, self._kinds)
         id = _id(kind, key)
         with self._lock:
             existing = self._jobs.get(id)
@@ -299,7 +298,7 @@ def run_job(arguments: Mapping[str, Any], report: Report) -> None:
     write_atomically(path, json.dumps(result, allow_nan=False).encode())
 
 
-def _id(kind: str, key: str) -> str:
+def _id(kind: str, key: object) -> str:
     return hashlib.sha256(repr((kind, key, __version__)).encode()).hexdigest()[:16]
 
 

@@ -7,7 +7,7 @@ from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.inspect.diagnostics.base import Entry
 
 
@@ -19,8 +19,7 @@ def parse_options(entry: Entry, texts: Mapping[str, str]) -> dict[str, Any]:
     hints = get_type_hints(entry.run)
     options: dict[str, Any] = {}
     for name, text in texts.items():
-        if name not in entry.options:
-            raise unknown_name(f"option of {entry.name}", name, entry.options)
+        check_name(f"option of {entry.name}", name, entry.options)
         if not text:
             continue
         try:

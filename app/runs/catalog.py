@@ -13,15 +13,19 @@ from typing import Any
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name, unknown_name
 from beliefscope.datasets.faults.injection import available_presets
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.open_filter import is_path
 
 SAMPLE = "sample"
 """Name of the data set that ships with a task."""
+
+PRETRAINED = frozenset(name for task in TASKS.values() for name in filters_of(task))
+"""Names of the pretrained filters of all tasks."""
 
 DEFAULT_FILTER = "crossmodal-pf"
 """The pretrained filter that is listed first."""
@@ -72,8 +76,7 @@ class TaskCatalog:
 
     def filter(self, name: str) -> Checkpoint:
         """Raises BadInput for an unknown name."""
-        if name not in self.filters:
-            raise unknown_name("filter", name, self.filters)
+        check_name("filter", name, self.filters)
         return self.filters[name]
 
     def dataset(self, name: str) -> Dataset:
@@ -178,10 +181,11 @@ def short_names(paths: Iterable[Path], reserved: Collection[str] = ()) -> dict[s
     return {name(path): path for path in parts}
 
 
-def served_names(filters: Iterable[str | Path], data: Path | None) -> tuple[dict[str, str], str]:
-    """The names that ``serve`` gives to filter files, by path, and to the data; the sample set if data is None."""
-    pretrained = {name for task in TASKS.values() for name in filters_of(task)}
-    names = {str(path): name for name, path in short_names(map(Path, filters), pretrained).items()}
+def served_names(filters: Iterable[str], data: Path | None) -> tuple[list[str], str]:
+    """The names that ``serve`` gives to filters, of which some are files, and to the data (None: the sample set)."""
+    files = short_names(map(Path, filter(is_path, filters)), PRETRAINED)
+    paths = {path.resolve(): name for name, path in files.items()}
+    names = [paths[Path(text).resolve()] if is_path(text) else text for text in filters]
     return names, SAMPLE if data is None else next(iter(short_names([data], {SAMPLE})))
 
 

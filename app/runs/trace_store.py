@@ -23,7 +23,7 @@ from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.standalone import check_standalone
@@ -169,10 +169,6 @@ class TraceStore:
             catalog = self._catalog(task)
             return name or next(iter(catalog.data)), catalog.dataset(name)
 
-    def data_hash(self, task: str, name: str) -> str:
-        """Hash of a data set. Not under the lock: some formats have to read every episode once."""
-        return self.dataset(task, name)[1].hash
-
     def add_filter(self, task: str, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
         """Add a filter to the catalog and the settings, so that jobs find it by its name."""
         with self._lock:
@@ -199,8 +195,7 @@ class TraceStore:
 
     def _catalog(self, task: str) -> TaskCatalog:
         catalogs, _ = self._catalogs
-        if task not in catalogs:
-            raise unknown_name("task", task, catalogs)
+        check_name("task", task, catalogs)
         return catalogs[task]
 
     def _live_run(self, selection: Selection) -> TracedRun | None:

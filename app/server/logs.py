@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -76,21 +75,9 @@ class RefusalLimit(logging.Filter):
         return self._count <= MAX_REFUSALS
 
 
-class _StandardError(logging.StreamHandler[TextIO]):
-    """Writes to the current ``sys.stderr``."""
-
-    @property
-    def stream(self) -> TextIO:
-        return sys.stderr
-
-    @stream.setter
-    def stream(self, _: TextIO) -> None:
-        pass
-
-
 def configure(level: str = "warning", form: str = "text", secret: str = "", stream: TextIO | None = None) -> None:
     """Send the server's log to ``stream``, by default standard error."""
-    handler = _StandardError() if stream is None else logging.StreamHandler(stream)
+    handler = logging.StreamHandler(stream)
     handler.setFormatter(LineFormatter(form == "json", secret))
     handler.addFilter(RefusalLimit())
     for name in ("beliefscope", "uvicorn.error"):

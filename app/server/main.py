@@ -9,7 +9,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import CancelledError
 from pathlib import Path
 from types import FrameType
@@ -173,6 +173,9 @@ def serve(
             log.info("started", extra={"event": event})
             on_start(access.link(url))
 
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup; sent when the terminal closes
+            handled = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+            uvicorn.server.HANDLED_SIGNALS = handled  # type: ignore[assignment]
         # A response passes through several threads, which may each wait this long for the GIL; the default is 5 ms.
         sys.setswitchinterval(0.001)
         _Server(_uvicorn_config(app), started).run(sockets=[listener])
@@ -209,20 +212,6 @@ class _Server(uvicorn.Server):
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin the shutdown. Unlike uvicorn's, a second signal does not skip the lifespan, which ends the jobs."""
         self.should_exit = True
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Also capture SIGHUP, sent when the terminal closes, unless it is ignored (nohup)."""
-        capture = threading.current_thread() is threading.main_thread() and (
-            signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
-        )
-        previous = signal.signal(signal.SIGHUP, self.handle_exit) if capture else None
-        try:
-            with super().capture_signals():
-                yield
-        finally:
-            if capture:
-                signal.signal(signal.SIGHUP, previous)
 
 
 def _add_files(app: FastAPI, viewer: WebViewer) -> None:

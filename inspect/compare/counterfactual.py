@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
-from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics.measures import (
@@ -24,7 +23,7 @@ from beliefscope.inspect.statistics.measures import (
     wrapped,
 )
 from beliefscope.inspect.trace import Trace
-from beliefscope.inspect.traces.replay import Edit, Replay
+from beliefscope.inspect.traces.replay import Edit
 
 RECOVERED = 1.0
 """The edited run has recovered once its estimate stays within this many standard deviations of the original."""
@@ -201,12 +200,6 @@ class Counterfactual(Diagnostic):
     def bands(self) -> dict[str, NDArray[np.bool_]]:
         steps = np.arange(len(self.distance))
         return {"contact": self.contact, "edit": (steps >= self.first) & (steps < self.to)}
-
-
-def counterfactual(checkpoint: Checkpoint, trace: Trace, edit: Edit) -> Counterfactual:
-    """Compare the run of a trace with an edited replay. Raises BadInput as ``Replay.edited``."""
-    replay = Replay(checkpoint, trace)
-    return compare(replay.original, replay.edited(edit), edit)
 
 
 def compare(original: Trace, edited: Trace, edit: Edit) -> Counterfactual:

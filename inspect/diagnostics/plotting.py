@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.errors import check_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.inspect.diagnostics.views import Curve, ImagePanel, Plot, Views
 from beliefscope.inspect.palette import COLOURS, colour
@@ -70,8 +70,7 @@ def write_figure(figure: Figure, path: Path) -> None:
 def figure_format(path: Path) -> str:
     """``svg``, ``pdf`` or ``png`` depending on the suffix. Raises BadInput for other suffixes."""
     suffix = path.suffix.removeprefix(".").lower()
-    if suffix not in FORMATS:
-        raise unknown_name("format of a figure", suffix, FORMATS)
+    check_name("format of a figure", suffix, FORMATS)
     return suffix
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.errors import check_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace
@@ -98,8 +98,7 @@ class SingleStep:
 
     def target(self, name: str) -> Target:
         """Return a target. Raises BadInput for a target that the filter does not have."""
-        if name not in self.targets:
-            raise unknown_name(f"target of filter {self.replay.checkpoint.name!r}", name, self.targets)
+        check_name(f"target of filter {self.replay.checkpoint.name!r}", name, self.targets)
         return self.targets[name]
 
     def baseline(self, black: bool) -> tuple[Tensor, ...]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
@@ -65,8 +65,7 @@ def survey_of(
 def find_score(by: str, task: Task) -> Score:
     """The named score. Raises BadInput for a name that is not a score of the task."""
     scores = scores_of(task)
-    if by not in scores:
-        raise unknown_name(f"score of task {task.name!r}", by, scores)
+    check_name(f"score of task {task.name!r}", by, scores)
     return scores[by]
 
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Belief, Evidence, StepTrace
@@ -63,8 +63,7 @@ class Edit:
         values = dict(parse_qsl(text, keep_blank_values=True))
         keys = ("from", "to", "faults", "weights")
         for key in values:
-            if key not in keys:
-                raise unknown_name("part of an edit", key, keys)
+            check_name("part of an edit", key, keys)
         edit = cls(
             _step(text, values, "from"),
             _step(text, values, "to"),
@@ -228,8 +227,7 @@ class Replay:
             return evidence
         names = self.checkpoint.filter.names
         for name in edit.weights:
-            if name not in names:
-                raise unknown_name(f"modality of filter {self.checkpoint.name!r}", name, names)
+            check_name(f"modality of filter {self.checkpoint.name!r}", name, names)
         if self._standalone:
             raise BadInput(f"{self._standalone} standalone has no fusion weights: it uses one modality")
         if evidence.log_weights is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,6 @@ from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import STEP, TIME
 
 Array = NDArray[Any]
-Columns = Iterable[tuple[str, Any]]
-"""Pairs of an entity path and its columns with one row per step."""
 
 SHOWN_UNIT = {"m": "cm", "rad": "deg"}
 SHOWN_SCALE = {"m": 100.0, "rad": 180.0 / np.pi}

@@ -1,11 +1,9 @@
-"""``beliefscope change``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import serve_command
 
@@ -28,8 +26,7 @@ def change(
     particles: int = 300,
     seed: int = 0,
     output: Path | None = None,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Report improvements and regressions between checkpoints.
 
     Runs both checkpoints over the held-out episodes with the same sensor faults and random numbers. Reports every
@@ -68,9 +65,7 @@ def change(
             progress=advance,
         )
         data_hash = episodes.hash
-    paths = [Path(text) for text in (before, after) if is_path(text)]
-    names, data_name = served_names(paths, data)
-    first, second = (names.get(str(Path(text)), text) for text in (before, after))
+    (first, second), data_name = served_names((before, after), data)
     links = [
         comparison_permalink(permalink(target, second, data_name, m.episode, m.step, m.faults), m, first)
         for m in report.events
@@ -81,9 +76,9 @@ def change(
         "improved": as_json(report.improvements()),
         "regressed": as_json(report.regressions()),
         "events": [as_json(m) | {"link": link} for m, link in zip(report.events, links, strict=True)],
-        "serve": serve_command(paths, data, seed),
+        "serve": serve_command([text for text in (before, after) if is_path(text)], data, seed),
     }
     text = "\n\n".join([report.verdict, *console.grids(report.tables())])
     if output is not None:
         write_comparison(output, document, text, report.plot())
-    console.result(document, text, json)
+    return console.Result(document, text)

@@ -1,11 +1,9 @@
-"""``beliefscope collect``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 
 
 @opt.with_options(
@@ -31,8 +29,7 @@ def collect(
     seed: int = 0,
     split: str | None = None,
     without: list[str] | None = None,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Simulate episodes and write them to an HDF5 file.
 
     The same seed gives the same data with any number of workers. An interrupted run resumes when the same command is
@@ -68,11 +65,7 @@ def collect(
             "statistics": ours,
             "authors": paper,
             "data_hash": data.hash,
-            "path": str(output),
-            "bytes": output.stat().st_size,
         }
-    summary = (
-        f"{opt.path_and_size(output)}: {count} episodes of {length} steps, {ours['contact_fraction']:.0%} in contact"
-    )
+    summary = f"{count} episodes of {length} steps, {ours['contact_fraction']:.0%} in contact"
     table = console.grid("Statistics", ["", "this dataset", "paper", "ratio"], comparison_rows(ours, paper))
-    console.result(document, f"{summary}\n\n{table}", json)
+    return console.Result(document, f"{summary}\n\n{table}", output)

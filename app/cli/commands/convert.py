@@ -1,20 +1,18 @@
-"""``beliefscope convert``"""
-
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 
 if TYPE_CHECKING:
     from beliefscope.datasets.episode import Episode
 
 
 @opt.with_options(data=opt.option("FILE|DIR", "Files in a supported format (docs/data.md)."), output=opt.DATASET)
-def convert(task: str, data: Path, output: Path, skip_bad: bool = False, json: str | None = None) -> None:
+def convert(task: str, data: Path, output: Path, skip_bad: bool = False) -> console.Result:
     """Convert external data to a Beliefscope HDF5 file.
 
     Every command also reads the external files directly; a converted file opens faster and has the same hash.
@@ -42,7 +40,5 @@ def convert(task: str, data: Path, output: Path, skip_bad: bool = False, json: s
             "episodes": len(episodes),
             "left_out": list(episodes.skipped),
             "data_hash": episodes.hash,
-            "path": str(output),
-            "bytes": output.stat().st_size,
         }
-    console.result(document, f"{opt.path_and_size(output)}: {document['episodes']} episodes of {target.name}", json)
+    return console.Result(document, f"{document['episodes']} episodes of {target.name}", output)

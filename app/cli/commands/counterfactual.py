@@ -1,11 +1,9 @@
-"""``beliefscope counterfactual``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 from beliefscope.datasets.errors import BadInput
 
 
@@ -26,8 +24,7 @@ def counterfactual(
     weights: str = "",
     output: Path | None = None,
     trace_path: Path | None = None,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Rerun a filter with a temporary intervention.
 
     Injects sensor faults or replaces fusion weights between two steps, starting from the belief before the first of
@@ -72,4 +69,4 @@ def counterfactual(
         **result.to_dict(),
         "edit": edit.to_json(),
     }
-    console.result(document, "\n\n".join([result.verdict, *console.grids(result.tables())]), json)
+    return console.Result(document, "\n\n".join([result.verdict, *console.grids(result.tables())]))

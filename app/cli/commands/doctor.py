@@ -1,13 +1,9 @@
-"""``beliefscope doctor``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
-import typer
-
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output
 
 
 @opt.with_options(
@@ -15,9 +11,7 @@ from beliefscope.app.cli import output
     host=opt.option("ADDRESS", "Address the server would listen on."),
     port=opt.option("N", "Port the server would listen on.", parser=opt.integer(0, 65535)),
 )
-def doctor(
-    workspace: Path = Path("workspace"), host: str = "127.0.0.1", port: int = 8000, json: str | None = None
-) -> None:
+def doctor(workspace: Path = Path("workspace"), host: str = "127.0.0.1", port: int = 8000) -> console.Result:
     """Check the installation and suggest fixes.
 
     Checks packages and their versions, PyTorch, the simulation and its camera, hashes of the built-in filters and
@@ -39,6 +33,4 @@ def doctor(
         lines += [f"{'':<19}-> {finding.advice}"] if finding.advice else []
     failed = sum(finding.state == "failed" for finding in findings.values())
     lines += ["", f"{failed} of {len(findings)} checks failed" if failed else "All required checks passed."]
-    output.result(report(findings), "\n".join(lines), json)
-    if failed:
-        raise typer.Exit(1)
+    return console.Result(report(findings), "\n".join(lines), code=min(1, failed))

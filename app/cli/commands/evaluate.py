@@ -1,11 +1,9 @@
-"""``beliefscope evaluate``"""
-
 from __future__ import annotations
 
 from typing import Any
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output
 
 
 @opt.with_options(
@@ -14,9 +12,7 @@ from beliefscope.app.cli import output
         "OFFSET", "Distance of the first belief from the true state, in a random direction, such as 3cm,20deg."
     ),
 )
-def evaluate(
-    runs: opt.Runs, only: str | None = None, start_offset: str = "", align: bool = False, json: str | None = None
-) -> None:
+def evaluate(runs: opt.Runs, only: str | None = None, start_offset: str = "", align: bool = False) -> console.Result:
     """Measure the accuracy of a filter on held-out episodes.
 
     Uses the test episodes; if there are none, the validation episodes or all. Each run starts at the true state with
@@ -48,7 +44,7 @@ def evaluate(
     with runs.episodes(checkpoint.task) as data:
         data_hash, held_out = data.hash, [data[i] for i in data.held_out()]
     held_out = runs.check(checkpoint, held_out, align)
-    with output.progress("Evaluating") as advance:
+    with console.progress("Evaluating") as advance:
         metrics = measure(
             checkpoint if isinstance(checkpoint, ExternalFilter) else checkpoint.filter,
             held_out,
@@ -76,7 +72,7 @@ def evaluate(
     }
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}) on {len(held_out)} episodes"
     title += (f", start offset {offset}" if offset else "") + (f", with {faults}" if faults else "")
-    output.result(document, _table(title, metrics), json)
+    return console.Result(document, _table(title, metrics))
 
 
 LABELS = {
@@ -99,7 +95,7 @@ def _table(title: str, metrics: dict[str, Any]) -> str:
         for name in metrics.get(key, {})
     ]
     rows += [[name, _number(metrics[name]), "", ""] for name in ("nll", "nees", "coverage95")]
-    table = output.grid(title, ["measure", "filter", *metrics["baselines"]], rows)
+    table = console.grid(title, ["measure", "filter", *metrics["baselines"]], rows)
     errors = {
         label.format(name): metrics[key][name]["rmse"]
         for name in metrics.get("standalone", {})
@@ -109,7 +105,7 @@ def _table(title: str, metrics: dict[str, Any]) -> str:
     if not errors:
         return table
     rows = [[f"rmse {name}", *(_number(rmse[name]) for rmse in errors.values())] for name in metrics["rmse"]]
-    return f"{table}\n\n{output.grid('Modalities', ['measure', *errors], rows)}"
+    return f"{table}\n\n{console.grid('Modalities', ['measure', *errors], rows)}"
 
 
 def _number(value: float | None) -> str | None:

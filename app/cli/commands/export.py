@@ -1,9 +1,8 @@
-"""``beliefscope export``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
 
 
@@ -11,7 +10,7 @@ from beliefscope.app.cli import options as opt
     source=opt.argument("TRACE|RUN.rrd", "Trace file or recording."),
     output=opt.output_file("FILE", "Output file: .parquet, .mcap or .npz."),
 )
-def export(source: Path, output: Path, json: str | None = None) -> None:
+def export(source: Path, output: Path) -> console.Result:
     """Export a trace to Parquet, MCAP or NumPy.
 
     Parquet has one row per step and one column per number, for pandas and similar tools. MCAP has one topic per array,
@@ -27,4 +26,4 @@ def export(source: Path, output: Path, json: str | None = None) -> None:
     export_format(output)
     trace = opt.open_trace(source)
     export_trace(trace, output)
-    opt.print_trace(trace, output, json)
+    return opt.trace_result(trace, output)

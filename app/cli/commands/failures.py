@@ -1,11 +1,7 @@
-"""``beliefscope failures``"""
-
 from __future__ import annotations
 
-from pathlib import Path
-
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.recordings.report.command_lines import serve_command
 
@@ -28,8 +24,7 @@ def failures(
     phase: str | None = None,
     every: bool = False,
     url: str | None = None,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Find the events at which a filter fails.
 
     Searches the held-out episodes for stretches of steps with a score in the worst 10 %, and ranks these events by
@@ -54,24 +49,22 @@ def failures(
         raise unknown_name("phase", phase, PHASES)
     checkpoint, faults = runs.open()
     particles, seed = runs.particles, runs.seed
-    with runs.episodes(checkpoint.task) as episodes, output.progress("Filtering") as advance:
+    with runs.episodes(checkpoint.task) as episodes, console.progress("Filtering") as advance:
         indices = range(len(episodes)) if every else episodes.held_out()
         report = find_failures(
             checkpoint, episodes, indices, by=by, faults=faults, seed=seed, particles=particles, progress=advance
         )
-    files = [runs.filter] if is_path(runs.filter) else []
-    names, data_name = served_names(files, runs.data)
-    name = names.get(str(Path(runs.filter)), runs.filter)
+    (name,), data_name = served_names([runs.filter], runs.data)
     events = report.worst(top, phase)
     base = "" if url is None else url.rstrip("/") + "/"
     links = [base + permalink(checkpoint.task, name, data_name, e.episode, e.step, str(faults), by) for e in events]
     document = report.to_dict() | {
         "events": [as_json(event) | {"link": link} for event, link in zip(events, links, strict=True)],
-        "serve": serve_command(files, runs.data, seed),
+        "serve": serve_command([runs.filter] if is_path(runs.filter) else [], runs.data, seed),
     }
-    text = "\n\n".join([report.verdict, *output.grids([report.phase_table(), report.event_table(events)])])
+    text = "\n\n".join([report.verdict, *console.grids([report.phase_table(), report.event_table(events)])])
     if url is not None:
         text = "\n".join([text, f"Permalinks, for {document['serve']}", *links])
     if particles != 300 and report.particles:
-        output.note("note: the dashboard uses 300 particles, so its values at these events differ")
-    output.result(document, text, json)
+        console.note("note: the dashboard uses 300 particles, so its values at these events differ")
+    return console.Result(document, text)

@@ -1,13 +1,11 @@
-"""``beliefscope faults``"""
-
 from __future__ import annotations
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output
 
 
 @opt.with_options()
-def faults(json: str | None = None) -> None:
+def faults() -> console.Result:
     """List the sensor faults available for --faults.
 
     Several faults are separated by commas and applied in order. The value after a fault's name is its first
@@ -30,4 +28,4 @@ def faults(json: str | None = None) -> None:
             usage = name if default is None else f"{name}={default}".removesuffix(".0")
             lines.append(f"  {usage:<18}{parameter['unit']}: {parameter['meaning']}")
     lines += ["", "Presets:", *(f"  {text:<30}{name}" for name, text in FAULT_PRESETS.items())]
-    output.result({"faults": catalog, "presets": FAULT_PRESETS}, "\n".join(lines), json)
+    return console.Result({"faults": catalog, "presets": FAULT_PRESETS}, "\n".join(lines))

@@ -1,13 +1,11 @@
-"""``beliefscope figure``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 
 KINDS = ("maps", "weights")
 
@@ -29,8 +27,7 @@ def figure(
     output: Path,
     steps: list[int] | None = None,
     quantity: opt.Quantity | None = None,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Draw a figure of the paper from a filter run.
 
     maps: likelihood or posterior of each modality around the true position, in free motion and in contact.
@@ -47,8 +44,7 @@ def figure(
     from beliefscope.inspect.figures import paper
     from beliefscope.inspect.likelihood import no_maps
 
-    if kind not in KINDS:
-        raise unknown_name("figure", kind, KINDS)
+    check_name("figure", kind, KINDS)
     figure_format(output)
     if kind == "weights" and steps:
         raise BadInput(f"--step {steps[0]}: the figure of weights covers all steps; only maps have a step")
@@ -66,4 +62,4 @@ def figure(
         extra["shown"] = {paper.STATES[state]: step for state, step in selection.items()}
     else:
         write_figure(paper.weights_figure(trace), output)
-    opt.print_trace(trace, output, json, figure=kind, **extra)
+    return opt.trace_result(trace, output, figure=kind, **extra)

@@ -1,12 +1,10 @@
-"""``beliefscope finetune``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import finetune_command
 
@@ -57,8 +55,7 @@ def finetune(
     seed: int = 0,
     log: Path | None = None,
     rerun: str = "",
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Fine-tune modules of a filter.
 
     Continues training the selected modules from a base checkpoint; all others stay frozen, verified by hash. The loss
@@ -109,11 +106,11 @@ def finetune(
     profile = measure_profile(tuned.filter, base.name, members, command)
     checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
     frozen = tuned.record["frozen"]
-    lines = [f"{opt.path_and_size(output)}: {training_summary(tuned.record)}", ""]
+    lines = [training_summary(tuned.record), ""]
     lines += [console.grid("On held-out episodes", ["", "before", "after", "change"], held_out_rows(tuned.record)), ""]
     unchanged = f"Frozen: {frozen['tensors']} tensors, unchanged (hash {frozen['after'][:12]})."
     lines.append(unchanged if frozen["tensors"] else "No tensor was frozen.")
-    opt.print_checkpoint(output, base.task.name, base.name, checkpoint_hash, tuned.record, "\n".join(lines), json)
+    return opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
 
 
 def _run(

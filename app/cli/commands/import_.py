@@ -1,9 +1,8 @@
-"""``beliefscope import``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
 
 
@@ -11,7 +10,7 @@ from beliefscope.app.cli import options as opt
     recording=opt.argument("RUN.rrd|RUN.live", "Recording, or file of a live run."),
     output=opt.TRACE,
 )
-def import_(recording: Path, output: Path, json: str | None = None) -> None:
+def import_(recording: Path, output: Path) -> console.Result:
     """Extract the trace from a recording.
 
     The arrays equal those of the recorded trace, including their types, so all diagnostics give the same results. Of
@@ -26,4 +25,4 @@ def import_(recording: Path, output: Path, json: str | None = None) -> None:
 
     trace = opt.open_recording(recording)
     save_trace(trace, output)
-    opt.print_trace(trace, output, json)
+    return opt.trace_result(trace, output)

@@ -1,12 +1,10 @@
-"""``beliefscope inspect``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 
 
 @opt.with_options(
@@ -26,8 +24,7 @@ def inspect(
     every: bool = False,
     figures: Path | None = None,
     format: str = "svg",
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Run diagnostics on traces of a filter.
 
     Prints the verdict and tables of every applicable diagnostic, and why the others do not apply. Several traces of
@@ -46,23 +43,20 @@ def inspect(
     from beliefscope.inspect.diagnostics.plotting import FORMATS, write_figure
 
     for name in only or ():
-        if name not in DIAGNOSTICS:
-            raise unknown_name("diagnostic", name, DIAGNOSTICS)
+        check_name("diagnostic", name, DIAGNOSTICS)
     entries = {name: entry for name, entry in DIAGNOSTICS.items() if not only or name in only}
     values = opt.key_values(options or (), "--option", "NAME=VALUE, such as step=68")
     available = sorted({name for entry in entries.values() for name in entry.options})
     for name in values:
-        if name not in available:
-            raise unknown_name("option", name, available)
+        check_name("option", name, available)
     parsed = {
         name: parse_options(entry, {option: values[option] for option in entry.options if option in values})
         for name, entry in entries.items()
     }
-    if format not in FORMATS:
-        raise unknown_name("figure format", format, FORMATS)
+    check_name("figure format", format, FORMATS)
     opt.check_folder(figures, "--figures")
     traces, checkpoint = opt.open_traces(paths, filter)
-    with output.progress("Inspecting") as advance:
+    with console.progress("Inspecting") as advance:
         results, reasons = run_diagnostics(traces, checkpoint, parsed, bool(every or only), advance)
     if not results:
         raise BadInput("; ".join(reasons.values()))
@@ -71,7 +65,7 @@ def inspect(
         for name, result in results.items():
             write_figure(result.plot(), figures / f"{name}.{format}")
     text = [
-        "\n\n".join([f"{DIAGNOSTICS[name].title}: {result.verdict}", *output.grids(result.tables())])
+        "\n\n".join([f"{DIAGNOSTICS[name].title}: {result.verdict}", *console.grids(result.tables())])
         for name, result in results.items()
     ]
     text += [f"{DIAGNOSTICS[name].title}: not available: {reason}" for name, reason in reasons.items()]
@@ -83,4 +77,4 @@ def inspect(
         "diagnostics": {name: result.to_dict() for name, result in results.items()},
         "not_made": reasons,
     }
-    output.result(document, "\n\n".join(text), json)
+    return console.Result(document, "\n\n".join(text))

@@ -1,11 +1,9 @@
-"""``beliefscope lineage``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 from beliefscope.datasets.errors import BadInput
 
 
@@ -14,7 +12,7 @@ from beliefscope.datasets.errors import BadInput
     export=opt.option("CHECKPOINT", "Copy this checkpoint (path or hash) and its ancestors to -o."),
     output=opt.option("DIR", "New folder for --export.", "-o"),
 )
-def lineage(paths: list[Path], export: str | None = None, output: Path | None = None, json: str | None = None) -> None:
+def lineage(paths: list[Path], export: str | None = None, output: Path | None = None) -> console.Result:
     """Show which checkpoint was fine-tuned from which.
 
     Prints the tree of all checkpoints in the folders, based on their headers, with the command that created each one
@@ -37,9 +35,8 @@ def lineage(paths: list[Path], export: str | None = None, output: Path | None = 
     for line in checkpoints.left_out:
         console.note(f"skipped: {line}")
     if export is None or output is None:
-        console.result(checkpoints.to_dict(), str(checkpoints), json)
-        return
+        return console.Result(checkpoints.to_dict(), str(checkpoints))
     checkpoint = checkpoints.find(export)
     files = copy(checkpoints, checkpoint.hash, output, __version__)
     document = {"checkpoint": checkpoint.hash, "path": str(output), "files": [path.name for path in files]}
-    console.result(document, "\n".join([f"{output}:", *(f"  {path.name}" for path in files)]), json)
+    return console.Result(document, "\n".join([f"{output}:", *(f"  {path.name}" for path in files)]))

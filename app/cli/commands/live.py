@@ -1,5 +1,3 @@
-"""``beliefscope live``"""
-
 from __future__ import annotations
 
 import math
@@ -7,8 +5,8 @@ import os
 import shlex
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output
 from beliefscope.datasets.errors import BadInput
 
 
@@ -21,8 +19,7 @@ def live(
     rate: float | None = None,
     workspace: Path = Path("workspace"),
     name: str = "",
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Run a filter in real time and stream it to the dashboard.
 
     Runs the filter over one episode step by step, at the robot's rate. The dashboard (beliefscope serve --workspace
@@ -48,9 +45,9 @@ def live(
     arguments = checkpoint, recorded, index, run.seed, run.particles, faults
     recorder, steps = record_steps(*arguments, name, workspace / "live")
     watch = shlex.join(["beliefscope", "serve", "--workspace", str(workspace)])
-    output.note(f"{recorder.path}: view it with {watch}")
+    console.note(f"{recorder.path}: view it with {watch}")
     count = len(recorded)
-    with output.bars() as update:
+    with console.bars() as update:
         timing = run_steps(
             recorder,
             steps,
@@ -69,12 +66,10 @@ def live(
         "late": timing.late,
         "waited": recorder.waited,
         "behind": recorder.behind,
-        "path": str(recorder.path),
         "recording": str(recorder.path.with_suffix(".rrd")),
     }
     if not recorder.steps:
-        output.result(document, "stopped before the first step; no file was written", json)
-        return
+        return console.Result(document, "stopped before the first step; no file was written")
     summary = f"{recorder.steps} steps at {document['hz']:.1f} Hz, {timing.late} of them late"
     summary += ", stopped early" if timing.stopped else ""
-    output.result(document, f"{opt.path_and_size(recorder.path)}: {summary}", json)
+    return console.Result(document, summary, recorder.path)

@@ -1,9 +1,7 @@
-"""``beliefscope modules``"""
-
 from __future__ import annotations
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output
 
 
 @opt.with_options(depth=opt.option("N", "Levels to print.", parser=opt.integer(0)))
@@ -13,8 +11,7 @@ def modules(
     train: list[str] | None = None,
     freeze: list[str] | None = None,
     depth: int = 3,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Show the modules of a filter.
 
     Lists every module by its dotted name with its number of parameters, its purpose, and whether beliefscope finetune
@@ -53,6 +50,6 @@ def modules(
                 [label, node.kind, node.parameters or None, node.state, *(changes if parts else []), node.description]
             )
     title = f"{checkpoint.name} ({checkpoint.hash[:12]}): {nodes[0].parameters:,} parameters"
-    lines = [output.grid(title, columns, rows), "", "Presets for --train"]
+    lines = [console.grid(title, columns, rows), "", "Presets for --train"]
     lines += [f"  {name}: {', '.join(patterns)}" for name, patterns in groups.items()]
-    output.result(document, "\n".join(lines), json)
+    return console.Result(document, "\n".join(lines))

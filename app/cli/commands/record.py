@@ -1,11 +1,9 @@
-"""``beliefscope record``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 from beliefscope.datasets.errors import BadInput
 
 
@@ -22,8 +20,7 @@ def record(
     map_size: int = 135,
     quantity: opt.Quantity | None = None,
     diagnostics: bool = True,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Record a filter run over one episode as a Rerun recording.
 
     Contains images, particles or covariance ellipses, estimates with the true state, fusion weights, contact, errors,
@@ -50,4 +47,4 @@ def record(
     results = quick(trace, checkpoint) if diagnostics else {}
     with console.progress("Recording") as advance:
         write_recording(trace, output, maps=layers, progress=advance, diagnostics=results)
-    opt.print_trace(trace, output, json, maps=maps, map_size=map_size, diagnostics=list(results))
+    return opt.trace_result(trace, output, maps=maps, map_size=map_size, diagnostics=list(results))

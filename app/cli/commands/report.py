@@ -1,13 +1,11 @@
-"""``beliefscope report``"""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import report_command, serve_command, trace_command
 
@@ -44,8 +42,7 @@ def report(
     every: bool = False,
     url: str = URL,
     pdf: bool = False,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Write a report of filter runs.
 
     Creates a folder with a self-contained page, report.html: accuracy, verdicts, events with the largest error,
@@ -99,7 +96,7 @@ def report(
     lines += [f"{title}: not available: {reason}" for title, reason in document["not_made"].items()]
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
     lines.append(f"{output / 'report.html'} ({len(document['files'])} files, {size / 1e6:.1f} MB)")
-    console.result(document | {"path": str(output)}, "\n\n".join(lines), json)
+    return console.Result(document | {"path": str(output)}, "\n\n".join(lines))
 
 
 def _permalinks(
@@ -120,8 +117,7 @@ def _permalinks(
         source = "the sample episodes" if data is None else str(data)
         return lambda index, step: "", f"No permalinks: the dashboard cannot reproduce these runs over {source}."
     files = [filter_] if is_path(filter_) or is_code(filter_) else []
-    names, data_name = served_names(files, data)
-    name = names.get(str(Path(filter_)), filter_ or first.filter)
+    (name,), data_name = served_names([filter_ if is_path(filter_) else first.filter], data)
 
     def link(index: int, step: int) -> str:
         trace = traces[index]

@@ -1,5 +1,3 @@
-"""``beliefscope serve``"""
-
 from __future__ import annotations
 
 import os
@@ -9,9 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output
-from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.errors import check_name
 
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
@@ -80,8 +78,7 @@ def serve(
 
     opt.check_workspace(workspace)
     for kind, value, available in (("log level", log_level, logs.LEVELS), ("log format", log_format, logs.FORMATS)):
-        if value not in available:
-            raise unknown_name(kind, value, available)
+        check_name(kind, value, available)
     access = Access(token_for(host, token, os.environ), read_only)
     logs.configure(log_level, log_format, access.token)
     settings = Settings(
@@ -100,7 +97,7 @@ def serve(
 
         def listening(url: str) -> None:
             if host not in LOOPBACK:
-                output.note("warning: anyone with the link can use this server, and the connection is not encrypted")
+                console.note("warning: anyone with the link can use this server, and the connection is not encrypted")
             print(f"Beliefscope is at {url} (press Ctrl-C to stop)", flush=True)
             if open_page:
                 open_in_browser(url)
@@ -112,9 +109,8 @@ def serve(
 
 def _checkpoints(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path | Checkpoint]:
     """Displayed name -> checkpoint file or external filter, of the filters and tasks on the command line."""
-    from beliefscope.app.runs.catalog import short_names
-    from beliefscope.datasets.catalog import TASKS, load_task
-    from beliefscope.filters.catalog import filters_of
+    from beliefscope.app.runs.catalog import PRETRAINED, short_names
+    from beliefscope.datasets.catalog import load_task
     from beliefscope.filters.external.load import load_external
     from beliefscope.filters.open_filter import is_code
 
@@ -122,8 +118,7 @@ def _checkpoints(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path
     default_task = names[0] if len(names) == 1 else ""
     external = [load_external(name, default_task=default_task) for name in filters if is_code(name)]
     paths = [Path(name) for name in filters if not is_code(name)]
-    pretrained = {name for task in TASKS.values() for name in filters_of(task)}
-    return {**short_names(paths, pretrained), **{checkpoint.name: checkpoint for checkpoint in external}}
+    return {**short_names(paths, PRETRAINED), **{checkpoint.name: checkpoint for checkpoint in external}}
 
 
 @contextmanager

@@ -1,13 +1,11 @@
-"""``beliefscope study``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 
 if TYPE_CHECKING:
     from beliefscope.filters.training.plan import Report
@@ -34,8 +32,7 @@ def study(
     data: list[str] | None = None,
     skip_bad: bool = False,
     engine: str = "local",
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Train and compare filters over many conditions.
 
     Trains each filter once per seed and evaluates it with 0, 40 and 80 % image blackout on the test episodes. Writes
@@ -53,8 +50,7 @@ def study(
     from beliefscope.filters.training.study_table import to_markdown
     from beliefscope.recordings.study_figures import write_study
 
-    if engine not in ENGINES:
-        raise unknown_name("engine", engine, ENGINES)
+    check_name("engine", engine, ENGINES)
     opt.check_folder(output, "output")
     opt.check_output(output / "table.md" if output.is_dir() else output)
     paths = opt.key_values(data or (), "--data", "TASK=FILE, such as door=door.h5")
@@ -91,7 +87,7 @@ def study(
             rows, overview = write_study(folder, cells, preset)
     failed = {name: state for name, state in overview["cells"].items() if state != "finished"}
     title = f"{folder / 'table.md'}: {total - len(failed)} of {total} cells finished"
-    console.result(overview | {"path": str(output)}, f"{title}\n\n{to_markdown(rows)}", json)
-    if failed:
-        name, state = next(iter(failed.items()))
-        console.fail(f"{len(failed)} of {total} cells failed; the first: {name}: {state}", 1)
+    for name, state in list(failed.items())[:1]:
+        console.note(f"error: {len(failed)} of {total} cells failed; the first: {name}: {state}")
+    document = overview | {"path": str(output)}
+    return console.Result(document, f"{title}\n\n{to_markdown(rows)}", code=min(1, len(failed)))

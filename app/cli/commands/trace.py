@@ -1,14 +1,13 @@
-"""``beliefscope trace``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
 
 
 @opt.with_options(output=opt.TRACE)
-def trace(run: opt.Run, output: Path, align: bool = False, json: str | None = None) -> None:
+def trace(run: opt.Run, output: Path, align: bool = False) -> console.Result:
     """Save all internal quantities of a filter run.
 
     A trace contains, for every step, the beliefs before and after the observation, each modality's own update, fusion
@@ -24,4 +23,4 @@ def trace(run: opt.Run, output: Path, align: bool = False, json: str | None = No
 
     _, trace = run.trace(align)
     save_trace(trace, output)
-    opt.print_trace(trace, output, json)
+    return opt.trace_result(trace, output)

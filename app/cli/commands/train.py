@@ -1,12 +1,10 @@
-"""``beliefscope train``"""
-
 from __future__ import annotations
 
 from pathlib import Path
 
+from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.app.cli import output as console
-from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.errors import check_name
 
 ARCHITECTURES = "{crossmodal,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf or lstm (docs/filters.md)."
 NETWORKS = "default, or authors: layers and image resolution of the paper's published code (docs/filters.md)."
@@ -33,8 +31,7 @@ def train(
     faults: str = "",
     seed: int = 0,
     log: Path | None = None,
-    json: str | None = None,
-) -> None:
+) -> console.Result:
     """Train a filter and write its checkpoint.
 
     Trains in the order of the paper: dynamics, measurement models, unimodal filters, weight model, end to end. Uses a
@@ -61,8 +58,7 @@ def train(
     target = load_task(task)
     settings = architecture(target.name, filter, networks)
     probabilities = parse_blackouts(blackouts)
-    if preset not in PLANS:
-        raise unknown_name("preset", preset, PLANS)
+    check_name("preset", preset, PLANS)
     injected = read_faults(faults, target)
     partial = output.with_name(f"{output.name}.partial")
     # The record has the name and hash of the data, but not their folder.
@@ -93,7 +89,7 @@ def train(
     record = trained.record | {"faults": injected.to_json()}
     profile = measure_profile(trained.filter, filter, episodes, record["command"])
     checkpoint_hash = save_checkpoint(trained.filter, filter, record, output, profile)
-    lines = [f"{opt.path_and_size(output)}: {filter}, trained in {record['seconds']:.0f} s"]
+    lines = [f"{filter}, trained in {record['seconds']:.0f} s"]
     for name, metrics in record["metrics"].get("0", {}).items():
         lines.append(f"{name}: " + ", ".join(f"{key} {value:.2f}" for key, value in metrics["rmse"].items()))
-    opt.print_checkpoint(output, task, filter, checkpoint_hash, record, "\n".join(lines), json)
+    return opt.checkpoint_result(output, task, filter, checkpoint_hash, record, lines)

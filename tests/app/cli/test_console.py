@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from beliefscope.app.cli import output
+from beliefscope.app.cli import console
 
 
 def test_redirected_progress_prints_lines(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
-    monkeypatch.setattr(output.time, "monotonic", lambda: clock[0])
-    with output.bars() as update:
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    with console.bars() as update:
         for i in range(101):
             clock[0] = 0.3 * i
             update("Filtering", i / 100, "loss 0.1")
@@ -21,7 +21,7 @@ def test_redirected_progress_prints_lines(capsys: pytest.CaptureFixture[str], mo
 
 
 def test_redirected_progress_of_a_fast_command_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with output.progress("Filtering") as advance:
+    with console.progress("Filtering") as advance:
         for i in range(101):
             advance(i / 100)
     assert capsys.readouterr().err == "Filtering: 100 %, 0 s\n"

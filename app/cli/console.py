@@ -8,6 +8,8 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
@@ -35,11 +37,29 @@ def note(line: str) -> None:
     print(line, file=sys.stderr)
 
 
-def result(document: Mapping[str, Any], text: str, destination: str | None) -> None:
-    """Print the result of a command: the text, or the JSON document if ``destination`` is ``-``."""
-    from beliefscope.inspect.diagnostics.views import as_json
+@dataclass(frozen=True)
+class Result:
+    """What a command returns: it is printed as text, or as one JSON document with ``--json -``.
 
-    print(text if destination is None else json.dumps(as_json(document), indent=2, allow_nan=False))
+    Attributes:
+        path: the written file; named before the text, and in the document with its size. code: exit code.
+    """
+
+    document: Mapping[str, Any]
+    text: str
+    path: Path | None = None
+    code: int = 0
+
+    def print(self, json_destination: str | None) -> None:
+        """Print the text, or the JSON document to the destination ``-``."""
+        from beliefscope.inspect.diagnostics.views import as_json
+
+        document, text = dict(self.document), self.text
+        if self.path is not None:
+            size = self.path.stat().st_size
+            document |= {"path": str(self.path), "bytes": size}
+            text = f"{self.path} ({size / 1e6:.1f} MB): {text}"
+        print(text if json_destination is None else json.dumps(as_json(document), indent=2, allow_nan=False))
 
 
 def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int | float | None]]) -> str:
