@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
@@ -144,7 +144,8 @@ class MapEngine:
             BadInput: step, angle or size out of range, or the filter does not have the quantity.
         """
         quantity = quantity or self.quantities[0]
-        check_name("quantity of a map", quantity, QUANTITIES)
+        if quantity not in QUANTITIES:
+            raise unknown_name("quantity of a map", quantity, QUANTITIES)
         if quantity not in self.quantities:
             raise BadInput(no_maps(self.checkpoint, self.trace, quantity) or "")
         trace = self.trace

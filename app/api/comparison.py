@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope.app.api.models.results import Comparison
-from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, in_progress
+from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.inspect.compare.counterfactual import compare
@@ -22,9 +22,8 @@ def routes(store: TraceStore) -> APIRouter:
     @router.get("/api/compare/{task}/{filter}/{episode}", response_model=Comparison, responses=IN_PROGRESS)
     def comparison(selection: RequestedRun, against: Annotated[str, Query(min_length=1)]) -> Response:
         other = selection.comparison(against)
-        run, other_run = store.request(selection), store.request(other)
-        if response := in_progress(run, other_run):
-            return response
+        store.request(other)  # starts it
+        run, other_run = finished_run(store, selection), finished_run(store, other)
         names, edit = _names(selection, other), other.edit
         if edit is None:
             views = compare_runs(run.trace, other_run.trace, names).views()

@@ -14,9 +14,10 @@ from fastapi.responses import JSONResponse, Response
 from beliefscope.app.api.jobs import result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
 from beliefscope.app.api.models.results import DiagnosticInfo, DiagnosticResult, TraceDiagnosticInfo
-from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, in_progress
+from beliefscope.app.api.traces import IN_PROGRESS, RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.protocol.diagnostic_options import parse_options
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
@@ -30,7 +31,7 @@ RUN_PARAMETERS = ("faults", "data", "episodes")
 
 def _entry(name: str) -> Entry:
     if name not in DIAGNOSTICS:
-        raise HTTPException(404, str(unknown_name("diagnostic", name, DIAGNOSTICS)))
+        raise NotFound(str(unknown_name("diagnostic", name, DIAGNOSTICS)))
     return DIAGNOSTICS[name]
 
 
@@ -58,9 +59,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         responses=IN_PROGRESS,
     )
     def list_trace_diagnostics(selection: RequestedRun) -> Response:
-        run = store.request(selection)
-        if response := in_progress(run):
-            return response
+        run = finished_run(store, selection)
         entries = DIAGNOSTICS.values()
         return JSONResponse(
             [entry.to_json() | {"why_not": entry.refusal(run.trace, run.checkpoint)} for entry in entries]
@@ -74,9 +73,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def get_result(
         entry: RequestedEntry, selection: RequestedRun, options: Options, episodes: Episodes = None
     ) -> Response:
-        run = store.request(selection)
-        if response := in_progress(run):
-            return response
+        run = finished_run(store, selection)
         _check(entry, run)
         if not (entry.slow or episodes):
             with computing:

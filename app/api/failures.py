@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse, Response
 from beliefscope.app.api.jobs import result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
 from beliefscope.app.api.models.results import Failures
-from beliefscope.app.api.traces import in_progress
+from beliefscope.app.api.traces import finished_run
 from beliefscope.app.jobs.failures import failure_document
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.live_runs import LIVE_PREFIX
@@ -72,9 +72,7 @@ def _live_failures(store: TraceStore, request: SurveyRequest) -> Response:
     """Failures of an ended live run, from its stored trace. Raises BadInput if it is still running."""
     faults = Faults.parse(request.faults)
     episode = store.live.ended_run(request.data).template.episode_index
-    run = store.request(Selection(request.task, request.filter, episode, faults, request.data))
-    if response := in_progress(run):
-        return response
+    run = finished_run(store, Selection(request.task, request.filter, episode, faults, request.data))
     survey = Survey.from_traces([run.trace])
     return JSONResponse(failure_document(survey, asdict(request) | {"faults": str(faults)}))
 

@@ -7,12 +7,13 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from fastapi import APIRouter, HTTPException
+from fastapi import APIRouter
 from fastapi.responses import Response
 
 from beliefscope import __version__
 from beliefscope.app.api.models.training import Lineage as LineageReply
 from beliefscope.app.api.models.training import LineageMember
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.finetune_runs import FineTuneRuns
 from beliefscope.datasets.errors import BadInput
@@ -33,7 +34,7 @@ def routes(store: TraceStore) -> APIRouter:
     def archive(task: str, hash: str) -> Response:
         lineage = _lineage(store, task)
         if hash not in lineage.members:
-            raise HTTPException(404, f"No checkpoint of task {task!r} has hash {hash!r}.")
+            raise NotFound(f"No checkpoint of task {task!r} has hash {hash!r}.")
         name = f"{task}-{lineage.members[hash].name}-{hash[:12]}"
         content = io.BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(content, "w") as archive:

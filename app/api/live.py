@@ -13,11 +13,12 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from fastapi import APIRouter, HTTPException, WebSocket, WebSocketDisconnect
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
 from beliefscope.app.api.models.traces import LiveList
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.messages import close_reason, describe_error
 from beliefscope.app.protocol.trace_format import camera_images, columns
 from beliefscope.app.runs.live_runs import LiveRuns, describe, resolve_filter
@@ -106,7 +107,7 @@ def routes(store: TraceStore) -> APIRouter:
         while (path := file_within(runs.folder, f"{run.name}.rrd")) is None and time.monotonic() < end:
             await asyncio.sleep(POLL_INTERVAL)
         if path is None:
-            raise HTTPException(404, f"Live run {name!r} has no recording.")
+            raise NotFound(f"Live run {name!r} has no recording.")
         return StreamingResponse(_follow_file(run, path), media_type="application/octet-stream")
 
     return router

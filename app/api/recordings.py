@@ -15,11 +15,11 @@ from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, NonNegativeInt
+from pydantic import NonNegativeInt
 from starlette.requests import ClientDisconnect
 
 from beliefscope import __version__
-from beliefscope.app.api.models.catalog import JobReply
+from beliefscope.app.api.models.catalog import JobReply, RequestBody
 from beliefscope.app.api.models.files import DeletedId, Freed, RecordingEntry, RecordingList, RunNames, WrittenRecording
 from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.jobs.recording import write
@@ -45,10 +45,9 @@ MAGIC = b"RRF"  # first bytes of all versions of Rerun's files
 FREE_ROUNDING = 10**7  # bytes; keeps the ETag of the list stable
 
 
-class RecordingRequest(BaseModel):
+class RecordingRequest(RequestBody):
     """Body of ``POST /api/recordings``. maps: steps between maps of ``quantity``; 0 for none."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
     task: str
     filter: str
     episode: int
@@ -58,10 +57,9 @@ class RecordingRequest(BaseModel):
     quantity: Quantity = "likelihood"
 
 
-class NewName(BaseModel):
+class NewName(RequestBody):
     """Body of ``PATCH /api/recordings/{name}.rrd``."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
     name: str
 
 

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from fastapi import APIRouter, Body, Request
 from fastapi.responses import FileResponse, Response
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt
+from pydantic import Field, NonNegativeInt
 
-from beliefscope.app.api.models.catalog import JobReply
+from beliefscope.app.api.models.catalog import JobReply, RequestBody
 from beliefscope.app.api.models.files import DeletedId, Freed, Name, ReportList
 from beliefscope.app.api.traces import RequestedRun
 from beliefscope.app.jobs.queue import Jobs
@@ -29,7 +29,7 @@ PAGE_POLICY = (
 MAX_EVENTS, MAX_TITLE = 20, 200
 
 
-class ReportRequest(BaseModel):
+class ReportRequest(RequestBody):
     """Body of ``POST /api/reports/...``; the same options as ``beliefscope report``.
 
     Attributes:
@@ -37,8 +37,7 @@ class ReportRequest(BaseModel):
         quantity: of the maps; the other one if the filter does not have it.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=True)
-    events: Annotated[list[NonNegativeInt], Field(max_length=MAX_EVENTS)] = []
+    events: list[NonNegativeInt] = Field(default=[], max_length=MAX_EVENTS)
     slow: bool = False
     pdf: bool = False
     title: Annotated[str, Field(max_length=MAX_TITLE)] = ""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from fastapi import APIRouter, HTTPException
+from fastapi import APIRouter
 
 from beliefscope.app.api.models.catalog import JobReply
 from beliefscope.app.api.models.training import (
@@ -19,6 +19,7 @@ from beliefscope.app.api.models.training import (
     TrainedSeed,
 )
 from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.catalog import short_names
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.studies import FILE, SHIPPED, Results, Study
@@ -62,7 +63,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     def run_cells(name: str) -> JobReply:
         study = studies().get(name)
         if study is None:
-            raise HTTPException(404, f"Study {name!r} does not exist.")
+            raise NotFound(f"Study {name!r} does not exist.")
         results = study.read()
         if not results.unfinished:
             raise BadInput(f"all cells of study {name!r} are finished")
@@ -76,7 +77,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         cell = f"{task}/{filter}/seed{seed}"
         hash_ = None if study is None else study.read().checkpoints.get(cell)
         if study is None or hash_ is None:
-            raise HTTPException(404, f"Study {name!r} has no checkpoint {cell!r}.")
+            raise NotFound(f"Study {name!r} has no checkpoint {cell!r}.")
         catalog_name = _catalog_names(store).get((task, hash_))
         if catalog_name is None:
             path = study.checkpoint(cell)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, HTTPException, Request
+from fastapi import APIRouter, Depends, Request
 from fastapi.responses import JSONResponse, Response
 
 from beliefscope import __version__
 from beliefscope.app.api.models.catalog import Catalog, Health, Progress
 from beliefscope.app.api.models.traces import TraceHeader
+from beliefscope.app.protocol.errors import InProgress, NotFound
 from beliefscope.app.protocol.etag import tagged
 from beliefscope.app.protocol.trace_format import camera_images
 from beliefscope.app.runs.selection import Selection
@@ -59,35 +60,38 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
         responses=IN_PROGRESS,
     )
     def trace_header(selection: RequestedRunOrComparison) -> Any:
-        run = store.request(selection)
-        return in_progress(run) or run.header() | {"filter": selection.filter}
+        return finished_run(store, selection).header() | {"filter": selection.filter}
 
     @router.get("/api/trace/{task}/{filter}/{episode}/columns", response_class=Response, responses=IN_PROGRESS)
     def trace_columns(selection: RequestedRunOrComparison, request: Request) -> Response:
-        run = store.request(selection)
-        return in_progress(run) or _immutable(request, run, "columns", lambda: run.columns[1])
+        run = finished_run(store, selection)
+        return _immutable(request, run, "columns", lambda: run.columns[1])
 
     @router.get("/api/trace/{task}/{filter}/{episode}/images", response_class=Response, responses=IN_PROGRESS)
     def trace_images(selection: RequestedRunOrComparison, request: Request) -> Response:
-        run = store.request(selection)
-        if response := in_progress(run):
-            return response
+        run = finished_run(store, selection)
         images = camera_images(run.trace)
         if images is None:
-            raise HTTPException(404, f"Task {selection.task!r} has no images.")
+            raise NotFound(f"Task {selection.task!r} has no images.")
         return _immutable(request, run, "images", images.tobytes)
 
     return router
 
 
-def in_progress(*runs: TracedRun) -> JSONResponse | None:
-    """The response 202 with the mean progress if a run is not finished within a short time; None if all are.
+def finished_run(store: TraceStore, selection: Selection) -> TracedRun:
+    """The run. Raises InProgress if it is not finished within a short time.
 
     Requests do not wait until the end: they would occupy the worker threads.
     """
-    if all(run.ready(TRACE_TIMEOUT) for run in runs):
-        return None
-    return JSONResponse({"progress": sum(run.progress for run in runs) / len(runs)}, status_code=202)
+    run = store.request(selection)
+    if not run.ready(TRACE_TIMEOUT):
+        raise InProgress(run.progress)
+    return run
+
+
+def in_progress(_: Request, error: Exception) -> Response:
+    """The response to a request that raises InProgress."""
+    return JSONResponse({"progress": error.args[0]}, 202)
 
 
 def _immutable(request: Request, run: TracedRun, part: str, content: Callable[[], bytes]) -> Response:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 from typing import Annotated
 
-from fastapi import APIRouter, Body, HTTPException, Request, WebSocket
+from fastapi import APIRouter, Body, Request, WebSocket
 from fastapi.responses import Response
-from pydantic import BaseModel, ConfigDict
 
+from beliefscope.app.api.models.catalog import RequestBody
 from beliefscope.app.api.models.traces import ViewAddresses
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.etag import tagged
 from beliefscope.app.protocol.messages import close_reason
 from beliefscope.app.views.embedded_viser import client_page
@@ -17,10 +18,9 @@ from beliefscope.app.views.registry import Views
 from beliefscope.app.views.view import View
 
 
-class ViewRequest(BaseModel):
+class ViewRequest(RequestBody):
     """Body of ``POST /api/views``."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
     dark: bool = False
 
 
@@ -42,10 +42,7 @@ def routes(views: Views) -> APIRouter:
 
     @router.get("/scene/{name}/")
     async def scene_page(name: str, request: Request) -> Response:
-        try:
-            views[name]
-        except KeyError:
-            raise HTTPException(404, f"View {name!r} is not open.") from None
+        views[name]  # raises NotFound
         return tagged(request, scene_tag, lambda: scene, "text/html; charset=utf-8")
 
     @router.websocket("/scene/{name}")
@@ -59,8 +56,8 @@ def routes(views: Views) -> APIRouter:
 async def _find_view(views: Views, websocket: WebSocket, name: str) -> View | None:
     try:
         return views[name]
-    except KeyError:
+    except NotFound as error:
         # Browsers do not expose the response to a refused handshake, but they do expose a close code.
         await websocket.accept()
-        await websocket.close(4004, close_reason(f"View {name!r} is not open."))
+        await websocket.close(4004, close_reason(str(error)))
         return None

@@ -47,7 +47,8 @@ def main() -> None:
         console.flush()
     except typer.TyperException as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "beliefscope")
-        console.fail(f"{error.format_message().rstrip('.')}. See: {command} --help", error.exit_code)
+        message = error.format_message().rstrip(".").replace("Value error, ", "")
+        console.fail(f"{message}. See: {command} --help", error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
         console.fail("interrupted", 130)
     except Exception as error:

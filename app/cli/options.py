@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
 from beliefscope.app.cli import console
-from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
     from beliefscope.datasets.dataset import Dataset
@@ -41,11 +41,6 @@ def integer(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
 
 
 Quantity = Literal["likelihood", "posterior"]
-
-
-def _parse_quantity(text: str) -> str:
-    check_name("quantity of maps", text, get_args(Quantity))
-    return text
 
 
 def check_output(path: Path | None, *suffixes: str) -> Path | None:
@@ -134,7 +129,6 @@ OPTIONS: dict[str, Any] = {
         "Quantity of the maps: likelihood of each observation, or posterior of the state. Default: likelihood, or "
         "posterior for an external filter that reports no virtual observations.",
         "--map",
-        parser=_parse_quantity,
     ),
     "particles": option("M", "Number of particles (particle filters).", parser=integer(1)),
     "seed": option("S", "Random seed.", parser=integer(0)),

@@ -26,7 +26,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AliasChoices, ConfigDict, Field, TypeAdapter, with_config
 
 from beliefscope import __version__
-from beliefscope.app.runs.errors import QueueFull
+from beliefscope.app.protocol.errors import NotFound, QueueFull
 from beliefscope.app.runs.worker import Report, WorkerDied, WorkerProcess
 from beliefscope.app.workspace.json_files import read_record
 from beliefscope.app.workspace.paths import file_within
@@ -125,8 +125,10 @@ class Jobs:
             return sorted(self._jobs.values(), key=lambda job: -job.submitted)
 
     def __getitem__(self, id: str) -> Job:
-        """The job with this id. Raises KeyError if there is none."""
+        """The job with this id. Raises NotFound."""
         with self._lock:
+            if id not in self._jobs:
+                raise NotFound(f"Job {id!r} does not exist.")
             return self._jobs[id]
 
     def find(self, kind: str, key: object) -> Job | None:
@@ -193,9 +195,9 @@ class Jobs:
             return self._jobs[id]
 
     def cancel(self, id: str) -> Job:
-        """Cancel an active job; delete an ended one with its files. Raises KeyError for an unknown id."""
+        """Cancel an active job; delete an ended one with its files. Raises NotFound."""
         with self._lock:
-            job = self._jobs[id]
+            job = self[id]
             if job.state == "waiting":
                 self._queue.remove(id)
                 del self._arguments[id]

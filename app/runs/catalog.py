@@ -13,7 +13,7 @@ from typing import Any
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, check_name, unknown_name
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import available_presets
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
@@ -76,7 +76,8 @@ class TaskCatalog:
 
     def filter(self, name: str) -> Checkpoint:
         """Raises BadInput for an unknown name."""
-        check_name("filter", name, self.filters)
+        if name not in self.filters:
+            raise unknown_name("filter", name, self.filters)
         return self.filters[name]
 
     def dataset(self, name: str) -> Dataset:

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
 
+from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
-from beliefscope.app.runs.errors import QueueFull
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
@@ -23,7 +23,7 @@ from beliefscope.app.runs.trace_worker import RunRequest, TraceWorker
 from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.standalone import check_standalone
@@ -45,7 +45,7 @@ class TraceStore:
         self.live = LiveRuns(settings.workspace / "live")
         self._worker = worker
         self._lock = threading.RLock()
-        self._keys: OrderedDict[Selection, str] = OrderedDict()
+        self._key = lru_cache(MAX_KEYS)(self._compute_key)
         self._recent: OrderedDict[str, TracedRun] = OrderedDict()
         self._in_use: WeakValueDictionary[str, TracedRun] = WeakValueDictionary()  # includes runs that only views hold
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="tracing")
@@ -115,7 +115,7 @@ class TraceStore:
         if (live_run := self._live_run(selection)) is not None:
             return live_run
         with self._lock:
-            run = self._in_use.get(self._keys.get(selection, ""))
+            run = self._in_use.get(self._key(selection))
             if run is None or not run.future.done() or run.future.exception() is not None:
                 return None
             self._remember(run)
@@ -126,19 +126,7 @@ class TraceStore:
         if (live_run := self._live_run(selection)) is not None:
             return live_run.key
         with self._lock:
-            if selection not in self._keys:
-                checkpoint, episode = self._resolve(selection)
-                seed, particles = self.settings.seed, self.settings.particles
-                parts = [checkpoint.hash, episode.digest(), seed, particles, str(selection.faults)]
-                if selection.edit is not None:
-                    parts.append(selection.edit.to_json())
-                if selection.only:
-                    parts.append(f"only {selection.only}")
-                self._keys[selection] = hashlib.sha256(repr(tuple(parts)).encode()).hexdigest()
-                while len(self._keys) > MAX_KEYS:
-                    self._keys.popitem(last=False)
-            self._keys.move_to_end(selection)
-            return self._keys[selection]
+            return self._key(selection)
 
     def held_out(self, selection: Selection) -> list[Selection]:
         """The same run for each held-out episode. Raises BadInput for an unknown task or data set."""
@@ -195,7 +183,8 @@ class TraceStore:
 
     def _catalog(self, task: str) -> TaskCatalog:
         catalogs, _ = self._catalogs
-        check_name("task", task, catalogs)
+        if task not in catalogs:
+            raise unknown_name("task", task, catalogs)
         return catalogs[task]
 
     def _live_run(self, selection: Selection) -> TracedRun | None:
@@ -215,6 +204,16 @@ class TraceStore:
         if selection.only:
             check_standalone(checkpoint, selection.only)
         return checkpoint, episode
+
+    def _compute_key(self, selection: Selection) -> str:
+        checkpoint, episode = self._resolve(selection)
+        seed, particles = self.settings.seed, self.settings.particles
+        parts = [checkpoint.hash, episode.digest(), seed, particles, str(selection.faults)]
+        if selection.edit is not None:
+            parts.append(selection.edit.to_json())
+        if selection.only:
+            parts.append(f"only {selection.only}")
+        return hashlib.sha256(repr(tuple(parts)).encode()).hexdigest()
 
     def _remember(self, run: TracedRun) -> None:
         """Make a run the most recent one, and drop the oldest ones that exceed the limits."""

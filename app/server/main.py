@@ -37,8 +37,8 @@ from beliefscope.app.api import jobs as api_jobs
 from beliefscope.app.api import views as api_views
 from beliefscope.app.api.models.catalog import Error
 from beliefscope.app.jobs.queue import Jobs
+from beliefscope.app.protocol.errors import InProgress, NameTaken, NotFound, QueueFull
 from beliefscope.app.protocol.messages import MAP_SIZES, describe_error
-from beliefscope.app.runs.errors import QueueFull
 from beliefscope.app.runs.saved_filters import with_saved_filters
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
@@ -53,7 +53,6 @@ from beliefscope.app.views.memory import freeze_heap, limit_malloc_arenas
 from beliefscope.app.views.registry import Views
 from beliefscope.app.workspace.partial_files import delete_abandoned_parts
 from beliefscope.app.workspace.recordings import RecordingFolder
-from beliefscope.app.workspace.trash import NameTaken, NotFound
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.web_viewer import WebViewer, installed
 
@@ -127,6 +126,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
     app.add_middleware(Guard, hosts=settings.hosts, access=access)
     for error, status in ((BadInput, 400), (QueueFull, 429), (NotFound, 404), (NameTaken, 409)):
         app.add_exception_handler(error, _error_handler(status))
+    app.add_exception_handler(InProgress, traces.in_progress)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(OSError, _file_error)

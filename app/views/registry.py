@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.views.memory import release_memory
 from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
@@ -33,7 +34,9 @@ class Views:
         return len(self._views)
 
     def __getitem__(self, name: str) -> View:
-        """Raises KeyError if the view is not open."""
+        """Raises NotFound."""
+        if name not in self._views:
+            raise NotFound(f"View {name!r} is not open.")
         return self._views[name]
 
     def overdue(self) -> float:

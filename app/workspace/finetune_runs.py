@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 from pydantic import AliasChoices, Field, TypeAdapter
 
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.workspace.json_files import content, read_record, write_record
-from beliefscope.app.workspace.trash import NotFound
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.legacy_names import rename_keys

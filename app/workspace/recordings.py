@@ -22,8 +22,9 @@ from typing import Annotated, NoReturn
 
 from pydantic import AliasChoices, Field, TypeAdapter
 
+from beliefscope.app.protocol.errors import NameTaken, NotFound
 from beliefscope.app.workspace.json_files import RecordCache, read_record
-from beliefscope.app.workspace.trash import NameTaken, NotFound, Trash
+from beliefscope.app.workspace.trash import Trash
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.probe import RecordingInfo, RecordingProbe
 

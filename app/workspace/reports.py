@@ -10,9 +10,10 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, TypeAdapter
 
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.workspace.json_files import RecordCache, read_record
 from beliefscope.app.workspace.paths import file_within
-from beliefscope.app.workspace.trash import NotFound, Trash, disk_usage
+from beliefscope.app.workspace.trash import Trash, disk_usage
 from beliefscope.datasets.faults.injection import Faults
 
 NAME = re.compile(r"[\w.+-]+-episode\d+-[0-9a-f]{8}")

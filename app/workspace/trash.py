@@ -12,21 +12,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from beliefscope.datasets.errors import BadInput
+from beliefscope.app.protocol.errors import NameTaken, NotFound
 
 RETENTION_DAYS = 14
 
 ID = re.compile(r"(?P<milliseconds>[0-9a-f]{1,16})-[0-9a-f]{8}")
 METADATA = ".about"
 """Name under which earlier versions stored the metadata of a deleted file."""
-
-
-class NotFound(BadInput):
-    """The file does not exist, or no longer."""
-
-
-class NameTaken(BadInput):
-    """Another file has the name."""
 
 
 @dataclass(frozen=True)

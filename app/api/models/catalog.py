@@ -28,6 +28,12 @@ class Reply(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
+class RequestBody(BaseModel):
+    """Base of all request bodies; unknown fields and other types are errors."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
 R = TypeVar("R", bound=Reply)
 
 

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.datasets.errors import BadInput, check_name
-
-KINDS = ("maps", "weights")
+from beliefscope.datasets.errors import BadInput
 
 
 @opt.with_options(
@@ -22,7 +20,7 @@ KINDS = ("maps", "weights")
     ),
 )
 def figure(
-    kind: str,
+    kind: Literal["maps", "weights"],
     run: opt.Run,
     output: Path,
     steps: list[int] | None = None,
@@ -44,7 +42,6 @@ def figure(
     from beliefscope.inspect.figures import paper
     from beliefscope.inspect.likelihood import no_maps
 
-    check_name("figure", kind, KINDS)
     figure_format(output)
     if kind == "weights" and steps:
         raise BadInput(f"--step {steps[0]}: the figure of weights covers all steps; only maps have a step")

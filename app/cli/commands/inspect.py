@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
@@ -23,7 +24,7 @@ def inspect(
     options: list[str] | None = None,
     every: bool = False,
     figures: Path | None = None,
-    format: str = "svg",
+    format: Literal["svg", "pdf", "png"] = "svg",
 ) -> console.Result:
     """Run diagnostics on traces of a filter.
 
@@ -40,7 +41,7 @@ def inspect(
     """
     from beliefscope.app.protocol.diagnostic_options import parse_options
     from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
-    from beliefscope.inspect.diagnostics.plotting import FORMATS, write_figure
+    from beliefscope.inspect.diagnostics.plotting import write_figure
 
     for name in only or ():
         check_name("diagnostic", name, DIAGNOSTICS)
@@ -53,7 +54,6 @@ def inspect(
         name: parse_options(entry, {option: values[option] for option in entry.options if option in values})
         for name, entry in entries.items()
     }
-    check_name("figure format", format, FORMATS)
     opt.check_folder(figures, "--figures")
     traces, checkpoint = opt.open_traces(paths, filter)
     with console.progress("Inspecting") as advance:

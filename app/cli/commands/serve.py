@@ -5,11 +5,10 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.datasets.errors import check_name
 
 if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
@@ -47,8 +46,8 @@ def serve(
     study: list[Path] | None = None,
     views: int = 32,
     open_page: bool = False,
-    log_level: str = "warning",
-    log_format: str = "text",
+    log_level: Literal["debug", "info", "warning", "error"] = "warning",
+    log_format: Literal["text", "json"] = "text",
     seed: int = 0,
 ) -> None:
     """Serve the dashboard: replay, maps and weights.
@@ -77,8 +76,6 @@ def serve(
     from beliefscope.app.workspace.studies import SHIPPED, Study
 
     opt.check_workspace(workspace)
-    for kind, value, available in (("log level", log_level, logs.LEVELS), ("log format", log_format, logs.FORMATS)):
-        check_name(kind, value, available)
     access = Access(token_for(host, token, os.environ), read_only)
     logs.configure(log_level, log_format, access.token)
     settings = Settings(

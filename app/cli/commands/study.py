@@ -1,17 +1,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
     from beliefscope.filters.training.plan import Report
     from beliefscope.filters.training.study import Cell
-
-ENGINES = ("local", "ray")
 
 
 @opt.with_options(
@@ -31,7 +29,7 @@ def study(
     seeds: int = 3,
     data: list[str] | None = None,
     skip_bad: bool = False,
-    engine: str = "local",
+    engine: Literal["local", "ray"] = "local",
 ) -> console.Result:
     """Train and compare filters over many conditions.
 
@@ -50,7 +48,6 @@ def study(
     from beliefscope.filters.training.study_table import to_markdown
     from beliefscope.recordings.study_figures import write_study
 
-    check_name("engine", engine, ENGINES)
     opt.check_folder(output, "output")
     opt.check_output(output / "table.md" if output.is_dir() else output)
     paths = opt.key_values(data or (), "--data", "TASK=FILE, such as door=door.h5")

@@ -14,11 +14,12 @@ from typing import Any
 
 import pytest
 from fastapi import FastAPI
+from fastapi.responses import JSONResponse
 from starlette.testclient import TestClient
 
 from beliefscope.app.api.jobs import routes
 from beliefscope.app.jobs.queue import KINDS, Job, Jobs
-from beliefscope.app.runs.errors import QueueFull
+from beliefscope.app.protocol.errors import NotFound, QueueFull
 from beliefscope.datasets.errors import BadInput
 
 pytestmark = pytest.mark.slow
@@ -218,6 +219,7 @@ def test_routes(open_jobs: OpenJobs, tmp_path: Path) -> None:
     jobs = open_jobs()
     app = FastAPI()
     app.include_router(routes(jobs))
+    app.add_exception_handler(NotFound, lambda _, error: JSONResponse({"error": str(error)}, 404))
     with TestClient(app) as client:
         assert client.get("/api/jobs").json() == []
         done = wait_for(jobs, jobs.submit("add", "Add up", {"numbers": [1]}, "").id)

@@ -88,9 +88,11 @@ def test_trace_in_use_is_kept_and_shared(store: TraceStore) -> None:
 
 def test_number_of_cached_keys_is_limited(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trace_store, "MAX_KEYS", 3)
+    store = TraceStore(store.settings)
     keys = [store.key(faulty_run(number)) for number in range(1, 8)]
-    assert len(store._keys) == 3
+    assert store._key.cache_info().currsize == 3
     assert [store.key(faulty_run(number)) for number in range(1, 8)] == keys
+    store.close()
 
 
 def test_number_of_waiting_runs_is_limited(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -287,7 +287,7 @@ def test_cell_locked_by_another_process_is_skipped(data: Path, tmp_path: Path) -
     ("words", "message"),
     [
         ("--preset fast", "preset 'fast' does not exist. Available: cpu, full, smoke"),
-        ("--engine slurm", "engine 'slurm' does not exist. Available: local, ray"),
+        ("--engine slurm", "'slurm' is not one of 'local', 'ray'"),
         ("--task dor", "task 'dor' does not exist"),
         ("--task door --filter lstmm", "filter 'lstmm' does not exist. Available: crossmodal-ekf"),
         ("--seeds 0", "'0' is not an integer of at least 1"),
