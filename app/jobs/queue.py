@@ -15,8 +15,8 @@ import signal
 import subprocess
 import threading
 import time
-from collections import deque
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -104,12 +104,11 @@ class Jobs:
         max_running: int = MAX_RUNNING,
         max_waiting: int = MAX_WAITING,
     ) -> None:
-        self._folder, self._kinds, self._max_running, self._max_waiting = folder, kinds, max_running, max_waiting
+        self._folder, self._kinds, self._max_active = folder, kinds, max_running + max_waiting
+        self._max_running = max_running
         self._lock = threading.RLock()
-        self._queue: deque[str] = deque()
-        self._arguments: dict[str, Mapping[str, Any]] = {}  # of the jobs in the queue
+        self._executor = ThreadPoolExecutor(max_running, "job")
         self._processes: dict[str, WorkerProcess] = {}
-        self._watchers: dict[str, threading.Thread] = {}
         self._stopping: dict[str, State] = {}  # job being stopped -> its final state
         self._closing = False
         self._jobs: dict[str, Job] = {}
@@ -176,8 +175,10 @@ class Jobs:
                 return existing
             if self._closing:
                 raise BadInput("the server is stopping")
-            if len(self._queue) >= self._max_waiting:
-                raise QueueFull(f"{len(self._queue)} jobs are already waiting; cancel one or try again later")
+            active = sum(job.active for job in self._jobs.values())
+            if active >= self._max_active:
+                waiting = active - self._max_running
+                raise QueueFull(f"{waiting} jobs are already waiting; cancel one or try again later")
             folder = self._folder / id
             shutil.rmtree(folder, ignore_errors=True)
             try:
@@ -187,9 +188,7 @@ class Jobs:
             # Keeps the order if the clock was set back.
             submitted = max([time.time(), *(job.submitted + 1e-3 for job in self._jobs.values())])
             self._put(Job(id, kind, title, submitted=submitted, server=os.getpid(), link=link))
-            self._queue.append(id)
-            self._arguments[id] = arguments
-            self._start_waiting()
+            self._executor.submit(self._run, id, arguments)
             for job in [job for job in self.all() if not job.active][MAX_ENDED:]:
                 self._delete(job.id)
             return self._jobs[id]
@@ -199,8 +198,6 @@ class Jobs:
         with self._lock:
             job = self[id]
             if job.state == "waiting":
-                self._queue.remove(id)
-                del self._arguments[id]
                 self._put(replace(job, state="cancelled", error="cancelled", ended=time.time()))
             elif job.state == "running":
                 self._stop(id, "cancelled")
@@ -213,14 +210,12 @@ class Jobs:
         """Stop all active jobs; their state becomes ``interrupted``."""
         with self._lock:
             self._closing = True
-            for id in self._queue:
-                self._put(replace(self._jobs[id], state="interrupted", error="the server stopped", ended=time.time()))
-            self._queue.clear()
-            for id in list(self._processes):
+            for job in self.all():
+                if job.state == "waiting":
+                    self._put(replace(job, state="interrupted", error="the server stopped", ended=time.time()))
+            for id in self._processes:
                 self._stop(id, "interrupted")
-            watchers = list(self._watchers.values())
-        for thread in watchers:
-            thread.join(2 * GRACE)
+        self._executor.shutdown()
 
     def _put(self, job: Job) -> None:
         self._jobs[job.id] = job
@@ -233,41 +228,24 @@ class Jobs:
         del self._jobs[id]
         shutil.rmtree(self._folder / id, ignore_errors=True)
 
-    def _start_waiting(self) -> None:
-        while self._queue and len(self._processes) < self._max_running:
-            id = self._queue.popleft()
-            job, arguments = self._jobs[id], self._arguments.pop(id)
+    def _run(self, id: str, arguments: Mapping[str, Any]) -> None:
+        """Run a job in a process, unless it has been cancelled."""
+        with self._lock:
+            job = self._jobs.get(id)
+            if job is None or job.state != "waiting":
+                return
             try:
                 with (self._folder / id / "log.txt").open("wb") as output:
-                    process = WorkerProcess(__name__, output, OMP_NUM_THREADS="1")
+                    process = self._processes[id] = WorkerProcess(__name__, output, OMP_NUM_THREADS="1")
             except OSError as error:  # deleted folder, or no memory or file descriptors left
                 message = f"it could not be started: {error.strerror or error}"
                 self._put(replace(job, state="failed", error=message, ended=max(time.time(), job.submitted)))
-                continue
-            self._processes[id] = process
+                return
             self._put(replace(job, state="running", message="starting", started=max(time.time(), job.submitted)))
             log.info("job started", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
-            call = {"function": self._kinds[job.kind], "folder": str(self._folder / id), "arguments": arguments}
-            self._watchers[id] = threading.Thread(target=self._watch, args=(id, process, call), name=f"job {id}")
-            self._watchers[id].start()
-
-    def _watch(self, id: str, process: WorkerProcess, call: Mapping[str, Any]) -> None:
-        def report(progress: float, message: str) -> None:
-            with self._lock:
-                self._jobs[id] = replace(self._jobs[id], progress=progress, message=message)
-
-        error = ""
-        with process:
-            try:
-                process.call("run_job", call, report)
-            except WorkerDied as died:
-                last_line = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "").strip()
-                error = f"{died}; last output: {last_line}" if last_line else str(died)
-            except (BadInput, RuntimeError) as failure:
-                error = str(failure)
-            process.signal_group(signal.SIGKILL)
+        error = self._call(id, process, arguments)
         with self._lock:
-            del self._processes[id], self._watchers[id]
+            del self._processes[id]
             job = self._jobs[id]
             job = replace(job, ended=max(time.time(), job.started or 0.0))
             stopped = self._stopping.pop(id, None)
@@ -278,11 +256,29 @@ class Jobs:
             else:
                 job = replace(job, state="failed", error=error or "its result was deleted")
             self._put(job)
-            seconds = round((job.ended or 0.0) - (job.started or 0.0), 1)
-            event = {"job": id, "kind": job.kind, "state": job.state, "seconds": seconds, "error": job.error}
-            log.log(logging.WARNING if job.state == "failed" else logging.INFO, "job ended", extra={"event": event})
-            if not self._closing:
-                self._start_waiting()
+        seconds = round((job.ended or 0.0) - (job.started or 0.0), 1)
+        event = {"job": id, "kind": job.kind, "state": job.state, "seconds": seconds, "error": job.error}
+        log.log(logging.WARNING if job.state == "failed" else logging.INFO, "job ended", extra={"event": event})
+
+    def _call(self, id: str, process: WorkerProcess, arguments: Mapping[str, Any]) -> str:
+        """Run the job's function in the process, and end the process. Returns the error, or an empty text."""
+
+        def report(progress: float, message: str) -> None:
+            with self._lock:
+                self._jobs[id] = replace(self._jobs[id], progress=progress, message=message)
+
+        call = {"function": self._kinds[self._jobs[id].kind], "folder": str(self._folder / id), "arguments": arguments}
+        with process:
+            try:
+                process.call("run_job", call, report)
+            except WorkerDied as error:
+                last_line = next((line for line in reversed(self.log(id).splitlines()) if line.strip()), "").strip()
+                return f"{error}; last output: {last_line}" if last_line else str(error)
+            except (BadInput, RuntimeError) as error:
+                return str(error)
+            finally:
+                process.signal_group(signal.SIGKILL)  # remaining subprocesses
+        return ""
 
     def _stop(self, id: str, state: State) -> None:
         if id in self._stopping:

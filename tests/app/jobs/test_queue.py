@@ -155,6 +155,7 @@ def test_killed_process_does_not_affect_others(open_jobs: OpenJobs, tmp_path: Pa
 def test_limits_of_running_and_waiting_jobs(open_jobs: OpenJobs, tmp_path: Path) -> None:
     jobs = open_jobs(max_running=1, max_waiting=2)
     first, second, third = (Waiting(jobs, tmp_path, name) for name in "abc")
+    wait_until(lambda: jobs[first.id].started)
     assert [jobs[job.id].state for job in (first, second, third)] == ["running", "waiting", "waiting"]
     with pytest.raises(QueueFull, match="2 jobs are already waiting"):
         Waiting(jobs, tmp_path, "d")
