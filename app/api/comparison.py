@@ -16,7 +16,6 @@ from beliefscope.inspect.compare.two_runs import compare_runs
 
 
 def routes(store: TraceStore) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
 
     @router.get("/api/compare/{task}/{filter}/{episode}", response_model=Comparison, responses=IN_PROGRESS)

@@ -45,7 +45,6 @@ Episodes = Literal["held-out"] | None
 
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
     computing = threading.Lock()  # one fast diagnostic at a time
 

@@ -41,7 +41,6 @@ RequestedSurvey = Annotated[SurveyRequest, Depends()]
 
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
 
     @router.get(

@@ -25,7 +25,6 @@ Action = Literal["promote", "save", "discard"]
 
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
     runs = FineTuneRuns(store.settings.workspace)
 

@@ -19,7 +19,6 @@ class JobWithLog(Job):
 
 
 def routes(jobs: Jobs) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
 
     @router.get("/api/jobs")

@@ -21,7 +21,6 @@ from beliefscope.inspect.compare.lineage import Ancestor, Lineage, export, linea
 
 
 def routes(store: TraceStore) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
 
     @router.get("/api/lineage/{task}")

@@ -69,7 +69,6 @@ def block(run: LiveRun, first: int) -> bytes:
 
 
 def routes(store: TraceStore) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
     runs = store.live
 

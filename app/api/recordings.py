@@ -64,7 +64,6 @@ class NewName(RequestBody):
 
 
 def routes(store: TraceStore, files: RecordingFolder, jobs: Jobs) -> APIRouter:
-    """Create the router."""
     writer = ThreadPoolExecutor(1, "writing recordings")  # one thread: matplotlib keeps fonts open per thread
 
     @asynccontextmanager

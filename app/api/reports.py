@@ -45,7 +45,6 @@ class ReportRequest(RequestBody):
 
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
     reports = ReportFolder(store.settings.workspace / "reports")
 

@@ -42,7 +42,6 @@ def all_studies(folders: Mapping[str, Path], workspace: Path) -> list[Study]:
 
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
 
     def studies() -> dict[str, Study]:

@@ -25,7 +25,6 @@ class ViewRequest(RequestBody):
 
 
 def routes(views: Views) -> APIRouter:
-    """Create the router."""
     router = APIRouter()
     scene = client_page("/static/scene/viser_frame_throttle.js")
     scene_tag = hashlib.sha256(scene).hexdigest()[:24]

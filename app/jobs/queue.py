@@ -243,18 +243,18 @@ class Jobs:
                 return
             self._put(replace(job, state="running", message="starting", started=max(time.time(), job.submitted)))
             log.info("job started", extra={"event": {"job": id, "kind": job.kind, "title": job.title}})
-        error = self._call(id, process, arguments)
+        failure = self._call(id, process, arguments)
         with self._lock:
             del self._processes[id]
             job = self._jobs[id]
             job = replace(job, ended=max(time.time(), job.started or 0.0))
             stopped = self._stopping.pop(id, None)
-            if not error and self.result(id):
+            if not failure and self.result(id):
                 job = replace(job, state="done", progress=1.0, message="")
             elif stopped:
                 job = replace(job, state=stopped, error="cancelled" if stopped == "cancelled" else "the server stopped")
             else:
-                job = replace(job, state="failed", error=error or "its result was deleted")
+                job = replace(job, state="failed", error=failure or "its result was deleted")
             self._put(job)
         seconds = round((job.ended or 0.0) - (job.started or 0.0), 1)
         event = {"job": id, "kind": job.kind, "state": job.state, "seconds": seconds, "error": job.error}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -103,7 +104,7 @@ def test_number_of_logged_refusals_is_limited() -> None:
 def test_start_and_end_of_jobs_are_logged(
     log_text: io.StringIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "jobs"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "jobs"), prepend=os.pathsep)
     jobs = Jobs(tmp_path / "jobs", {"crash": "job_functions:crash"})
     job = jobs.submit("crash", "Dividing", {"numbers": []}, "key")
     end = time.monotonic() + 60.0
