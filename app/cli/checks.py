@@ -10,7 +10,6 @@ import importlib.metadata
 import os
 import platform
 import shutil
-import socket
 import stat
 import tempfile
 import time
@@ -146,19 +145,15 @@ def page(_: Place) -> Finding:
 
 def port(place: Place) -> Finding:
     """Check that the address is valid and the port is free."""
-    family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
-    try:
-        with socket.socket(family) as probe:
-            probe.bind((place.host, 0))
-    except OSError as error:
-        return Finding(f"cannot listen on {place.host}: {error.strerror}", "failed", "choose another --host")
-    with socket.socket(family) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    from beliefscope.app.server.main import listen
+
+    busy = "serve with --port 0, or stop the process that uses the port"
+    trials: list[tuple[int, State, str]] = [(0, "failed", "choose another --host"), (place.port, "warning", busy)]
+    for number, state, advice in trials:
         try:
-            probe.bind((place.host, place.port))
-        except OSError as error:
-            message = f"{place.host} port {place.port}: {error.strerror}"
-            return Finding(message, "warning", "serve with --port 0, or stop the process that uses the port")
+            listen(place.host, number).close()
+        except BadInput as error:
+            return Finding(str(error), state, advice)
     return Finding(f"{place.host} port {place.port} is free")
 
 

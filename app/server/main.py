@@ -154,7 +154,7 @@ def serve(
     if host not in LOOPBACK and not access.token:
         raise BadInput(f"Others can reach {host}: a server there needs a token, in Access or in {VARIABLE}.")
     limit_malloc_arenas()
-    with _listen(host, port) as listener:  # before anything is created
+    with listen(host, port) as listener:  # before anything is created
         app = create_app(settings, subprocess=True, access=access)
         problems = app.state.store.problems()
         if problems:
@@ -275,7 +275,7 @@ def _file_error(_: Request, error: Exception) -> JSONResponse:
     return JSONResponse({"error": f"{str(error.filename)!r} cannot be used: {error.strerror}."}, 400)
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def listen(host: str, port: int) -> socket.socket:
     """A listening socket. Raises BadInput if the address is not available."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # asyncio sets TCP_NODELAY only if the protocol is given; without it, small messages are delayed by 40 ms.

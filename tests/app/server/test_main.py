@@ -18,7 +18,7 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 
 from beliefscope.app.server.auth import Access
-from beliefscope.app.server.main import PAGE, Settings, _listen, serve
+from beliefscope.app.server.main import PAGE, Settings, listen, serve
 from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.vendor_files import viewer_wasm
 from beliefscope.datasets.errors import BadInput
@@ -136,7 +136,7 @@ def test_busy_port_is_reported(settings: Settings) -> None:
 
 def test_small_messages_are_not_delayed() -> None:
     # asyncio disables Nagle's algorithm only for this protocol.
-    with _listen("127.0.0.1", 0) as listener:
+    with listen("127.0.0.1", 0) as listener:
         assert listener.proto == socket.IPPROTO_TCP
 
 

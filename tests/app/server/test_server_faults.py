@@ -25,6 +25,7 @@ from websockets.sync.client import connect
 
 from beliefscope.app.jobs import queue as jobs_module
 from beliefscope.app.jobs.queue import Job, Jobs
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.server.main import create_app
 from beliefscope.app.views.registry import Views
@@ -325,5 +326,5 @@ async def test_idle_view_is_closed(settings: Settings) -> None:
     assert len(views) == 1
     await views._close_idle(keep=0, idle_for=0.0)
     assert len(views) == 0
-    with pytest.raises(KeyError):
+    with pytest.raises(NotFound):
         views[view.name]

@@ -43,7 +43,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[uvicorn.Server]:
     """A server like that of ``serve``, with small buffers and a short timeout for unread data."""
     monkeypatch.setattr(main, "UNREAD_TIMEOUT", 500)
     config = uvicorn.Config(_application, log_level="critical", http=HTTPProtocol, ws=WebSocketProtocol, lifespan="off")
-    with main._listen("127.0.0.1", 0) as listener:
+    with main.listen("127.0.0.1", 0) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 14)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})

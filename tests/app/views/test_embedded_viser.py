@@ -21,6 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.views.embedded_viser import MAX_CLIENTS, EmbeddedViser
@@ -254,7 +255,7 @@ async def test_idle_views_are_replaced_at_the_limit(settings: Settings) -> None:
     third = await views.open(dark=False)
     assert len(views) == 2
     assert views[first.name] is first
-    with pytest.raises(KeyError):
+    with pytest.raises(NotFound):
         views[second.name]
     third.idle_since = None
     with pytest.raises(BadInput, match="maximum number of pages is open, 2"):
