@@ -183,7 +183,7 @@ def short_names(paths: Iterable[Path], reserved: Collection[str] = ()) -> dict[s
 
 
 def served_names(filters: Iterable[str], data: Path | None) -> tuple[list[str], str]:
-    """The names that ``serve`` gives to filters, of which some are files, and to the data (None: the sample set)."""
+    """Names, as on the page, of filters (files or built-in ones) and of the data; None: the sample set."""
     files = short_names(map(Path, filter(is_path, filters)), PRETRAINED)
     paths = {path.resolve(): name for name, path in files.items()}
     names = [paths[Path(text).resolve()] if is_path(text) else text for text in filters]
