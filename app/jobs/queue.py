@@ -165,7 +165,7 @@ class Jobs:
             arguments: JSON, passed to the kind's function. key: everything the result depends on; compared by ``repr``.
             link: page address of the result. output_exists: False if files that the job wrote have been deleted.
 
-        Raises BadInput for an unknown kind, and QueueFull.
+        Raises BadInput for an unknown kind or a full disk, and QueueFull.
         """
         check_name("kind of job", kind, self._kinds)
         id = _id(kind, key)
@@ -187,7 +187,9 @@ class Jobs:
                 raise write_error(folder, error) from None
             # Keeps the order if the clock was set back.
             submitted = max([time.time(), *(job.submitted + 1e-3 for job in self._jobs.values())])
-            self._put(Job(id, kind, title, submitted=submitted, server=os.getpid(), link=link))
+            job = Job(id, kind, title, submitted=submitted, server=os.getpid(), link=link)
+            self._save(job)
+            self._jobs[id] = job
             self._executor.submit(self._run, id, arguments)
             for job in [job for job in self.all() if not job.active][MAX_ENDED:]:
                 self._delete(job.id)
@@ -217,10 +219,13 @@ class Jobs:
                 self._stop(id, "interrupted")
         self._executor.shutdown()
 
+    def _save(self, job: Job) -> None:
+        write_atomically(self._folder / job.id / "job.json", json.dumps(asdict(job)).encode())
+
     def _put(self, job: Job) -> None:
         self._jobs[job.id] = job
         try:
-            write_atomically(self._folder / job.id / "job.json", json.dumps(asdict(job)).encode())
+            self._save(job)
         except BadInput as error:  # a full disk or a deleted folder: only a later server misses the job
             log.warning("job %s cannot be saved: %s", job.id, error)
 

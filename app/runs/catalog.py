@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -182,7 +182,7 @@ def short_names(paths: Iterable[Path], reserved: Collection[str] = ()) -> dict[s
     return {name(path): path for path in parts}
 
 
-def served_names(filters: Iterable[str], data: Path | None) -> tuple[list[str], str]:
+def served_names(filters: Sequence[str], data: Path | None) -> tuple[list[str], str]:
     """Names, as on the page, of filters (files or built-in ones) and of the data; None: the sample set."""
     files = short_names(map(Path, filter(is_path, filters)), PRETRAINED)
     paths = {path.resolve(): name for name, path in files.items()}

@@ -266,7 +266,7 @@ def test_filter_that_overflows(settings: Settings, open_client: Callable[..., Te
 
 @contextmanager
 def open_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, max_running: int = 2) -> Iterator[Jobs]:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "jobs"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "jobs"), prepend=os.pathsep)
     kinds = {name: f"job_functions:{name}" for name in ("add", "wait", "exhaust_memory")}
     jobs = Jobs(tmp_path / "jobs", kinds, max_running)
     try:
