@@ -19,11 +19,11 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, shipped
 from beliefscope.filters.evaluate import Metrics, evaluate
-from beliefscope.filters.start_offset import StartOffset
+from beliefscope.filters.start_offset import STUDY_OFFSET
+from beliefscope.filters.training.plan import EVALUATED_BLACKOUTS
+from beliefscope.filters.training.study_table import headline_keys, label
 
 RESAMPLES = 2000
-BLACKOUTS = (0.0, 0.4, 0.8, 0.95)
-OFFSET = StartOffset({"m": 0.03, "rad": float(np.deg2rad(20.0))})
 
 
 def interval(result: Metrics, key: str) -> str:
@@ -45,20 +45,17 @@ def main(names: list[str]) -> None:
         task, filter_ = checkpoint.task, checkpoint.filter
         with open_dataset(sample_path(task.name)) as data:
             episodes = [data[index] for index in data.held_out()]
-        keys = ["position_cm", *(f"{c.name}_deg" for c in task.components if c.unit == "rad")]
         baselines = {}
-        for blackout in BLACKOUTS:
+        for blackout in EVALUATED_BLACKOUTS:
             faults = Faults.parse(f"blackout={blackout}")
-            first = blackout == BLACKOUTS[0]  # a blackout does not change the baselines
-            result = evaluate(filter_, episodes, faults=faults, start_offset=OFFSET.of(task), baselines=first)
+            first = blackout == EVALUATED_BLACKOUTS[0]  # a blackout does not change the baselines
+            result = evaluate(filter_, episodes, faults=faults, start_offset=STUDY_OFFSET.of(task), baselines=first)
             baselines = result.baselines or baselines
-            for key in keys:
+            for key in headline_keys(task.name):
                 values = [interval(result, key), f"{result.rmse_from_step_0[key]:.2f}"]
                 values += [f"{m.rmse[key]:.2f}" if (m := baselines[b]) else "" for b in ("dynamics", "stay")]
-                label = "{} ({})".format(*key.rsplit("_", 1))
-                print(
-                    f"| {task.name} | {checkpoint.name} | {blackout:.0%} | {label} | {' | '.join(values)} |", flush=True
-                )
+                condition = f"{task.name} | {checkpoint.name} | {blackout:.0%} | {label(key)}"
+                print(f"| {condition} | {' | '.join(values)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Compare the results of a study with expectations, as a Markdown table.
+"""Compare the results of a study, from starts at the truth, with expectations, as a Markdown table.
 
 python bench/study.py filters/pretrained/study.json
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.filters.training.study_table import TRIVIAL
+from beliefscope.filters.training.study_table import TRIVIAL, label
 
 TIMES_BETTER = 5.0
 """Than the training mean: required position error of fusing filters on clean data."""
@@ -26,7 +26,7 @@ TIMES_WORSE = 2.0
 
 def main(path: Path) -> None:
     study = json.loads(path.read_text())
-    rows = [row for row in study["rows"] if row["seeds"] or row["filter"] == TRIVIAL]
+    rows = [row for row in study["rows"] if (row["seeds"] or row["filter"] == TRIVIAL) and not row.get("start")]
     print("| task | expectation | filter | image blackout | bound | measured | met |")
     print("| --- | --- | --- | ---: | ---: | ---: | --- |")
     for task in dict.fromkeys(row["task"] for row in rows):
@@ -73,11 +73,6 @@ def expectations(task: str, errors: Errors, alone: Errors) -> Iterator[Expectati
         for key in ("position_cm", *angles):
             best = min(errors[name, 0.0][key] for name in names)
             yield f"within {TIMES_WORSE:g} x of the best filter", key, "lstm", 0.0, TIMES_WORSE * best
-
-
-def label(key: str) -> str:
-    name, unit = key.rsplit("_", 1)
-    return f"{name} ({unit})"
 
 
 if __name__ == "__main__":

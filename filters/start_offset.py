@@ -85,6 +85,9 @@ class StartOffset:
 NO_OFFSET = StartOffset()
 """Start as the task does."""
 
+STUDY_OFFSET = StartOffset({"m": 0.03, "rad": math.radians(20.0)})
+"""Offset of studies. A start at the truth hides how well a filter finds a state that does not move."""
+
 
 def shifted(start: Gaussian, offsets: Tensor, variances: Tensor) -> Gaussian:
     """The start (N, n), (N, n, n) with offsets (N, n) and variances (n,) of its covariance; NaN keeps the variance."""

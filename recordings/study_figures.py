@@ -19,6 +19,7 @@ from matplotlib.patches import Patch
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import Task
+from beliefscope.filters.evaluate import STAY
 from beliefscope.filters.training.study import Cell, write_tables
 from beliefscope.filters.training.study_table import TRIVIAL, Document, Row
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH
@@ -66,32 +67,47 @@ def write_results(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 
 def results(rows: Sequence[Row]) -> Figure:
-    """RMSE by probability of image blackout: one panel per task and quantity, one bar with spread per filter.
+    """RMSE by probability of image blackout: one panel per task, start and quantity, one bar with spread per filter.
 
-    The dashed line is the error of predicting the training mean; if far above all bars, it is given in the title. A
-    cross marks a filter without results.
+    The dashed line is the error of a predictor without observations (``reference``); if far above all bars, it is given
+    in the title. A cross marks a filter without results.
     """
     filters = list(dict.fromkeys(row.filter for row in rows if row.filter != TRIVIAL))
-    panels = [(task, key, title) for task in dict.fromkeys(r.task for r in rows) for key, title in panels_of(task)]
+    conditions = dict.fromkeys((r.task, r.start) for r in rows if r.filter != TRIVIAL)
+    panels = [(task, start, key, title) for task, start in conditions for key, title in panels_of(task)]
     columns = min(2, len(panels))
     lines = -(-len(panels) // columns)
     legend_lines = -(-(len(filters) + 2) // 5)
-    figure = Figure(figsize=(WIDTH, 1.85 * lines + 0.17 * legend_lines + 0.1), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 2.0 * lines + 0.17 * legend_lines + 0.1), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(lines, columns, squeeze=False).flatten()
     for unused in axes[len(panels) :]:
         unused.set_axis_off()
     styles = bar_styles(filters)
-    for axis, (task, key, title) in zip(axes, panels, strict=False):
-        bars(axis, [r for r in rows if r.task == task], key, styles)
-        axis.set_title(f"{task}: {title}", loc="left")
+    offsets = any(start for _, start in conditions)
+    for axis, (task, start, key, title) in zip(axes, panels, strict=False):
+        members = [r for r in rows if r.task == task and (r.start == start or r.filter == TRIVIAL)]
+        bars(axis, members, key, styles)
+        name = ("", ", offset start" if start else ", true start")[offsets]
+        axis.set_title(f"{task}: {title}{name}", loc="left")
     handles: list[Patch | Line2D] = [Patch(label=name, **styles[name]) for name in filters]
     if any(line.get_linestyle() == "--" for axis in axes for line in axis.lines):
-        handles.append(Line2D([], [], color="black", linestyle="--", linewidth=0.8, label=TRIVIAL))
+        dashed = f"{TRIVIAL}; {STAY} with offset" if offsets else TRIVIAL
+        handles.append(Line2D([], [], color="black", linestyle="--", linewidth=0.8, label=dashed))
     if any(not row.seeds for row in rows if row.filter != TRIVIAL):
         handles.append(Line2D([], [], color="gray", linestyle="", marker="x", markersize=3, label="missing"))
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, handlelength=1.6)
     return figure
+
+
+def reference(rows: Sequence[Row], key: str) -> tuple[str, float | None]:
+    """Name and error of a predictor without observations, for the rows of one start.
+
+    With offset starts the baseline that keeps the start; at the truth the training mean.
+    """
+    if any(row.start for row in rows):
+        return STAY, next((row.baselines[STAY].get(key) for row in rows if STAY in row.baselines), None)
+    return TRIVIAL, next((row.mean[key] for row in rows if row.filter == TRIVIAL), None)
 
 
 def panels_of(task_name: str) -> list[tuple[str, str]]:
@@ -122,7 +138,7 @@ def bars(axis: Axes, rows: Sequence[Row], key: str, styles: Mapping[str, Mapping
     filters = [name for name in styles if any(row.filter == name for row in rows)]
     blackouts = list(dict.fromkeys(row.blackout for row in rows if row.blackout is not None))
     width = 0.84 / len(filters)
-    mean = next((row.mean[key] for row in rows if row.filter == TRIVIAL), None)
+    name, mean = reference(rows, key)
     unit = key.rsplit("_", 1)[1]
     rows = [row for row in rows if row.filter != TRIVIAL]
     tops = [value + (row.spread.get(key) or 0.0) for row in rows if (value := row.mean.get(key)) is not None]
@@ -132,7 +148,7 @@ def bars(axis: Axes, rows: Sequence[Row], key: str, styles: Mapping[str, Mapping
         if mean <= top:
             axis.axhline(mean, color="black", linestyle="--", linewidth=0.8, zorder=3)
         else:
-            axis.set_title(f"{TRIVIAL}: {mean:.1f} {unit}", loc="right", fontsize=7, color="#555555")
+            axis.set_title(f"{name}: {mean:.1f} {unit}", loc="right", fontsize=7, color="#555555")
     for row in rows:
         if row.blackout is None:
             continue
@@ -149,7 +165,8 @@ def bars(axis: Axes, rows: Sequence[Row], key: str, styles: Mapping[str, Mapping
             axis.text(x, 1.03 * top, f"{value:.0f}", rotation=90, ha="center", va="top", fontsize=6, zorder=5, bbox=box)
     axis.set_xlim(-0.5, len(blackouts) - 0.5)
     axis.set_ylim(0, 1.06 * top)
-    axis.set_xticks(range(len(blackouts)), [f"{b:.0%} image blackout" for b in blackouts])
+    axis.set_xticks(range(len(blackouts)), [f"{b:.0%}" for b in blackouts])
+    axis.set_xlabel("image blackout")
     axis.tick_params(axis="x", length=0)
     axis.tick_params(axis="y", width=0.6, length=2)
     axis.set_ylabel(f"RMSE ({unit})")

@@ -129,6 +129,7 @@ def _tasks(study: Study, results: Results, names: CatalogNames) -> list[StudyTas
             StudyTask(
                 name=task,
                 data=results.tasks.get(task, {}).get("data", ""),
+                offset_data=results.tasks.get(task, {}).get("offset_data", ""),
                 filters=[StudyFilter(name=name, trained=list(trained(task, name))) for name in filters],
                 rows=rows,
             )

@@ -26,7 +26,7 @@ CellName = Annotated[str, Field(pattern=r"^[\w.+-]+/[\w.+-]+/seed\d+$")]
 """TASK/FILTER/seedK."""
 
 
-OLD_KEYS = {"asked": "requested", "each": "by_seed"}
+OLD_KEYS = {"asked": "requested", "each": "by_seed", "alone": "standalone"}
 """Keys of rows in files of earlier versions."""
 
 

@@ -11,7 +11,10 @@ Report = Callable[[str, int, int, float], None]
 """Progress callback, called with the stage's name, steps done, total steps, and the loss."""
 
 BLACKOUTS = (0.0, 0.4, 0.8)
-"""Probabilities of an image blackout: one is drawn for each training window, and all are evaluated."""
+"""Probabilities of an image blackout: one is drawn for each training window."""
+
+EVALUATED_BLACKOUTS = (*BLACKOUTS, 0.95)
+"""Probabilities of an image blackout at which a trained filter is evaluated."""
 
 
 @dataclass(frozen=True)

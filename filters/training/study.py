@@ -25,12 +25,13 @@ from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.store import has_sample, open_dataset, sample_path
 from beliefscope.filters import legacy_names
 from beliefscope.filters.catalog import architecture, filters_of
-from beliefscope.filters.checkpoint import save_checkpoint
+from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
 from beliefscope.filters.evaluate import metrics
-from beliefscope.filters.filter import Architecture
+from beliefscope.filters.filter import Architecture, Filter
+from beliefscope.filters.start_offset import STUDY_OFFSET
 from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Report
-from beliefscope.filters.training.study_table import Document, Row, rows_of, to_csv, to_markdown
-from beliefscope.filters.training.train import train, versions
+from beliefscope.filters.training.study_table import OFFSET, TRUTH, Document, Row, rows_of, to_csv, to_markdown
+from beliefscope.filters.training.train import measure, train, versions
 
 
 @dataclass(frozen=True)
@@ -84,15 +85,22 @@ class Cell:
                 checkpoint = self.path(folder, ".safetensors").read_bytes()
                 if hashlib.sha256(checkpoint).hexdigest() != document["checkpoint_hash"]:
                     return None
+                if not {f"{blackout:g}" for blackout in BLACKOUTS} <= document[TRUTH].keys():
+                    return None
                 to_markdown(rows_of({self: document}))  # fails for an incomplete document
         except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError):
             return None
         return document
 
-    def finished(self, folder: Path) -> Document | None:
-        """The document of the finished cell, else None."""
+    def trained(self, folder: Path) -> Document | None:
+        """The document of the trained cell, else None. Earlier versions did not evaluate offset starts."""
         document = self.document(folder)
         return None if document is None or "error" in document else document
+
+    def finished(self, folder: Path) -> Document | None:
+        """The document of the trained and completely evaluated cell, else None."""
+        document = self.trained(folder)
+        return None if document is None or OFFSET not in document else document
 
 
 def study_cells(
@@ -143,8 +151,8 @@ def study_cells(
 def run_cell(cell: Cell, folder: Path, report: Report | None = None, wait: bool = True) -> Document | None:
     """Trains and evaluates a cell unless it is finished; resumes an interrupted one. Writes checkpoint and document.
 
-    If another process runs the cell, waits for it, or with ``wait=False`` returns None. An error is stored in the
-    document; the next study tries the cell again.
+    A cell trained by an earlier version is evaluated only. If another process runs the cell, waits for it, or with
+    ``wait=False`` returns None. An error is stored in the document; the next study tries the cell again.
     """
     path = cell.path(folder)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -157,7 +165,8 @@ def run_cell(cell: Cell, folder: Path, report: Report | None = None, wait: bool 
         if (document := cell.finished(folder)) is not None:
             return document
         try:
-            document = _train_cell(cell, folder, report)
+            document = cell.trained(folder)
+            document = _train_cell(cell, folder, report) if document is None else _evaluate_cell(cell, folder, document)
         except Exception as error:
             document = _failure(cell, error)
         write_atomically(path, json.dumps(_finite(document), indent=1).encode())
@@ -186,7 +195,25 @@ def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:
     )
     checkpoint_hash = save_checkpoint(trained.filter, cell.filter, trained.record, checkpoint)
     results = {"checkpoint_hash": checkpoint_hash, "trivial": trivial(cell.task, episodes)}
-    return trained.record | cell.inputs() | results
+    return trained.record | cell.inputs() | results | {OFFSET: offset_metrics(trained.filter, episodes)}
+
+
+def _evaluate_cell(cell: Cell, folder: Path, document: Document) -> Document:
+    """The document of a trained cell with its metrics from both starts."""
+    episodes = _episodes(cell.source, cell.data, cell.skip_bad, cell.data_hash)
+    filter_ = load_checkpoint(cell.path(folder, ".safetensors")).filter
+    return document | {TRUTH: measure(filter_, held_out(episodes)), OFFSET: offset_metrics(filter_, episodes)}
+
+
+def held_out(episodes: Sequence[Episode]) -> list[Episode]:
+    """The test episodes, or the validation episodes if there are none."""
+    by_split = {split: [e for e in episodes if e.split == split] for split in ("test", "val")}
+    return by_split["test"] or by_split["val"]
+
+
+def offset_metrics(filter_: Filter, episodes: Sequence[Episode]) -> Document:
+    """As ``measure``, on held-out episodes, from starts with ``STUDY_OFFSET``."""
+    return measure(filter_, held_out(episodes), STUDY_OFFSET.of(filter_.task))
 
 
 @lru_cache(maxsize=1)
@@ -199,9 +226,9 @@ def _episodes(source: str, data: Path, skip_bad: bool, data_hash: str) -> tuple[
 
 def trivial(task: str, episodes: Sequence[Episode]) -> dict[str, float]:
     """RMSE of always predicting the mean training state, on held-out episodes without their first steps."""
-    states = {s: [torch.from_numpy(e.states).double() for e in episodes if e.split == s] for s in ("val", "test")}
     mean = torch.cat([torch.from_numpy(e.states).double() for e in episodes if e.split == "train"]).mean(0)
-    evaluated = [truth[find_task(task).first_counted(len(truth)) :] for truth in states["test"] or states["val"]]
+    states = [torch.from_numpy(e.states).double() for e in held_out(episodes)]
+    evaluated = [truth[find_task(task).first_counted(len(truth)) :] for truth in states]
     error = mean - torch.cat(evaluated)
     return metrics(find_task(task), error, torch.full((*error.shape, error.shape[-1]), math.nan)).rmse
 

@@ -10,11 +10,16 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from beliefscope.datasets.catalog import find_task
-from beliefscope.filters.evaluate import nees_bounds
-from beliefscope.filters.training.plan import BLACKOUTS
+from beliefscope.filters.evaluate import BASELINES, nees_bounds
+from beliefscope.filters.start_offset import STUDY_OFFSET
+from beliefscope.filters.training.plan import EVALUATED_BLACKOUTS
 
 TRIVIAL = "training mean"
 """In place of a filter's name: the predictor that always returns the mean of the training states."""
+
+OFFSET, TRUTH = "offset_metrics", "metrics"
+"""Keys of a cell's metrics from starts with ``STUDY_OFFSET``, and at the truth. Offset starts come first in tables: at
+the truth, an estimator that keeps the start has no error where the state does not move."""
 
 CONSISTENCY = ("nll", "nees", "coverage95", "seconds")
 
@@ -41,6 +46,7 @@ class Row:
     Attributes:
         task, filter: names; ``TRIVIAL`` for the trivial predictor. blackout: probability of an image blackout; None
             for the trivial predictor.
+        start: offset of the first belief, such as ``3cm,20deg``; empty at the truth.
         seeds: number of finished seeds. requested, failed: number of requested and failed ones.
         mean, spread: over the seeds, by quantity: RMSE (``hinge_x_cm``, ..., ``position_cm``), ``nll``, ``nees``,
             ``coverage95``, ``seconds`` of training. The spread is the standard deviation (n - 1). None if a seed lacks
@@ -49,6 +55,8 @@ class Row:
         updates: modality -> mean RMSE over the seeds of its single-modality updates, which start from the fused prior;
             empty for studies of earlier versions. standalone: the same for the filter with only that modality. Both for
             filters of several models only. by_seed: seed -> quantity -> value.
+        from_step_0: mean RMSE over the seeds without omitting the first steps. baselines: name in ``BASELINES`` -> mean
+            RMSE over the seeds from the same starts. Both empty for studies of earlier versions.
     """
 
     task: str
@@ -63,52 +71,71 @@ class Row:
     standalone: Mapping[str, Numbers] = field(default_factory=dict)
     updates: Mapping[str, Numbers] = field(default_factory=dict)
     by_seed: Mapping[str, Numbers] = field(default_factory=dict)
+    start: str = ""
+    from_step_0: Numbers = field(default_factory=dict)
+    baselines: Mapping[str, Numbers] = field(default_factory=dict)
 
 
 def rows_of(documents: Mapping[Any, Document | None]) -> list[Row]:
-    """The rows of the requested cells (each a ``Condition``), computed from the finished ones."""
+    """The rows of the requested cells (each a ``Condition``), computed from the finished ones.
+
+    Conditions of which no finished cell of the task has metrics are omitted, such as offset starts of earlier versions.
+    """
     rows = []
     cells: Sequence[Condition] = list(documents)
     for task in dict.fromkeys(cell.task for cell in cells):
-        finished: list[Document] = []
-        for name in dict.fromkeys(cell.filter for cell in cells if cell.task == task):
-            requested = [documents[cell] for cell in cells if (cell.task, cell.filter) == (task, name)]
-            finished += [d for d in requested if d is not None and "error" not in d]
-            rows += _filter_rows(task, name, requested)
+        requested: dict[str, list[Document | None]] = {}
+        for cell in cells:
+            if cell.task == task:
+                requested.setdefault(cell.filter, []).append(documents[cell])
+        finished = [d for members in requested.values() for d in members if d is not None and "error" not in d]
+        for key in (OFFSET, TRUTH):
+            blackouts = [
+                b for b in EVALUATED_BLACKOUTS if not finished or any(f"{b:g}" in d.get(key, {}) for d in finished)
+            ]
+            for name, members in requested.items():
+                rows += [_row(task, name, key, blackout, members) for blackout in blackouts]
         if finished:
             rows.append(Row(task, TRIVIAL, None, 0, 0, 0, finished[0]["trivial"], {}))
     return rows
 
 
-def _filter_rows(task: str, name: str, documents: Sequence[Document | None]) -> list[Row]:
-    """One row for each probability of an image blackout."""
-    finished = [d for d in documents if d is not None and "error" not in d]
-    failed = sum(d is not None and "error" in d for d in documents)
-    rows = []
-    for blackout in BLACKOUTS:
-        by_seed = {str(d["seed"]): _numbers(d, blackout) for d in finished}
-        mean, spread = _over_seeds(list(by_seed.values()))
-        bounds = None
-        if mean.get("nees") is not None:
-            trajectories = finished[0]["episodes"]["test"] or finished[0]["episodes"]["val"]
-            bounds = nees_bounds(len(find_task(task).components), trajectories)
-        metrics = [d["metrics"][f"{blackout:g}"] for d in finished]
-        standalone = _over_modalities([{k: m for k, m in by_name.items() if k != "fused"} for by_name in metrics])
-        updates = _over_modalities([by_name["fused"].get("updates", {}) for by_name in metrics])
-        counts = len(finished), len(documents), failed
-        rows.append(Row(task, name, blackout, *counts, mean, spread, bounds, standalone, updates, by_seed))
-    return rows
+def _row(task: str, name: str, key: str, blackout: float, requested: Sequence[Document | None]) -> Row:
+    """The row of one condition: the seeds with metrics ``key`` at this probability of an image blackout."""
+    failed = sum(d is not None and "error" in d for d in requested)
+    finished = [d for d in requested if d is not None and f"{blackout:g}" in d.get(key, {})]
+    metrics = [d[key][f"{blackout:g}"] for d in finished]
+    fused = [by_name["fused"] for by_name in metrics]
+    by_seed = {str(d["seed"]): _numbers(m, d["seconds"]) for d, m in zip(finished, fused, strict=True)}
+    mean, spread = _over_seeds(list(by_seed.values()))
+    bounds = None
+    if mean.get("nees") is not None:
+        trajectories = finished[0]["episodes"]["test"] or finished[0]["episodes"]["val"]
+        bounds = nees_bounds(len(find_task(task).components), trajectories)
+    return Row(
+        task,
+        name,
+        blackout,
+        *(len(finished), len(requested), failed),
+        mean,
+        spread,
+        bounds,
+        standalone=_rmse_by_name([{k: m for k, m in by_name.items() if k != "fused"} for by_name in metrics]),
+        updates=_rmse_by_name([m.get("updates", {}) for m in fused]),
+        by_seed=by_seed,
+        start=str(STUDY_OFFSET.of(find_task(task))) if key == OFFSET else "",
+        from_step_0=_over_seeds([m.get("rmse_from_step_0", {}) for m in fused])[0],
+        baselines=_rmse_by_name([{k: m for k, m in f.get("baselines", {}).items() if m} for f in fused]),
+    )
 
 
-def _numbers(document: Document, blackout: float) -> dict[str, float | None]:
-    fused = document["metrics"][f"{blackout:g}"]["fused"]
-    consistency = {key: fused[key] for key in ("nll", "nees", "coverage95")}
-    rmse = {key: fused["rmse"][key] for key in document["trivial"]}
-    return rmse | consistency | {"seconds": document["seconds"]}
+def _numbers(metrics: Document, seconds: float) -> dict[str, float | None]:
+    consistency = {key: metrics[key] for key in ("nll", "nees", "coverage95")}
+    return {**metrics["rmse"], **consistency, "seconds": seconds}
 
 
-def _over_modalities(metrics: Sequence[Document]) -> dict[str, dict[str, float | None]]:
-    """Mean RMSE over the seeds by modality; a modality that a seed lacks is omitted."""
+def _rmse_by_name(metrics: Sequence[Document]) -> dict[str, dict[str, float | None]]:
+    """Mean RMSE over the seeds by modality or baseline; one that a seed lacks is omitted."""
     names = [name for name in (metrics[0] if metrics else ()) if all(name in by_name for by_name in metrics)]
     return {name: _over_seeds([by_name[name]["rmse"] for by_name in metrics])[0] for name in names}
 
@@ -117,7 +144,7 @@ def _over_seeds(numbers: Sequence[Numbers]) -> tuple[dict[str, Any], dict[str, A
     mean: dict[str, float | None] = {}
     spread: dict[str, float | None] = {}
     for key in numbers[0] if numbers else ():
-        values = [value for by_key in numbers if (value := by_key[key]) is not None]
+        values = [value for by_key in numbers if (value := by_key.get(key)) is not None]
         complete = len(values) == len(numbers)
         mean[key] = statistics.fmean(values) if complete else None
         spread[key] = statistics.stdev(values) if complete and len(values) > 1 else None
@@ -130,34 +157,43 @@ def quantities(rows: Sequence[Row]) -> list[str]:
     return [*rmse, *CONSISTENCY]
 
 
+def _errors(keys: Sequence[str]) -> list[str]:
+    return [key for key in keys if key not in CONSISTENCY]
+
+
 def to_csv(rows: Sequence[Row]) -> str:
     """The table with unrounded values; missing ones are empty."""
     keys = quantities(rows)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     columns = [f"{key}_{part}" for key in keys for part in ("mean", "spread")]
+    others = [f"{key}_{part}" for key in _errors(keys) for part in ("from_step_0", *BASELINES)]
     counts = ("seeds", "seeds_requested", "seeds_failed")
-    writer.writerow(["task", "filter", "blackout", *counts, *columns, "nees_low", "nees_high"])
+    names = ["task", "filter", "start_offset", "blackout", *counts, *columns, *others, "nees_low", "nees_high"]
+    writer.writerow(names)
     for row in rows:
         values = [part.get(key) for key in keys for part in (row.mean, row.spread)]
+        parts = (row.from_step_0, *(row.baselines.get(name, {}) for name in BASELINES))
+        values += [part.get(key) for key in _errors(keys) for part in parts]
         bounds = row.bounds or (None, None)
         seeds = (row.seeds, row.requested, row.failed) if row.filter != TRIVIAL else (None, None, None)
-        writer.writerow([row.task, row.filter, row.blackout, *seeds, *values, *bounds])
+        writer.writerow([row.task, row.filter, row.start, row.blackout, *seeds, *values, *bounds])
     return text.getvalue()
 
 
 def to_markdown(rows: Sequence[Row]) -> str:
-    """A table for each task: mean ± spread over the seeds."""
-    return "\n".join(_task_table(task, [r for r in rows if r.task == task]) for task in {r.task: 0 for r in rows})
+    """A table for each task and start: mean ± spread over the seeds."""
+    conditions = dict.fromkeys((row.task, row.start) for row in rows)
+    return "\n".join(_table(*pair, [r for r in rows if (r.task, r.start) == pair]) for pair in conditions)
 
 
-def _task_table(task: str, rows: Sequence[Row]) -> str:
+def _table(task: str, start: str, rows: Sequence[Row]) -> str:
     keys = quantities(rows)
     titles = {"nll": "NLL", "nees": "NEES/n", "coverage95": "coverage", "seconds": "training (s)"}
-    names = [titles.get(key) or "{} ({})".format(*key.rsplit("_", 1)) for key in keys]
+    names = [titles.get(key) or label(key) for key in keys]
     names.insert(keys.index("nees") + 1, "consistent NEES/n")
     lines = [
-        f"## {task}\n",
+        f"## {task}, {start_label(start)}\n",
         f"| filter | image blackout | seeds | {' | '.join(names)} |",
         "| --- |" + " ---: |" * (len(names) + 2),
     ]
@@ -172,7 +208,38 @@ def _task_table(task: str, rows: Sequence[Row]) -> str:
         elif not row.seeds:
             values = ["failed" if row.failed == row.requested else "missing"] + [""] * (len(values) - 1)
         lines.append(f"| {row.filter} | {blackout} | {seeds} | {' | '.join(values)} |")
-    return "\n".join(lines) + "\n" + _modality_table(rows)
+    return "\n".join(lines) + "\n" + _baseline_table(rows) + _modality_table(rows)
+
+
+def label(key: str) -> str:
+    """``angle (deg)`` for ``angle_deg``."""
+    return "{} ({})".format(*key.rsplit("_", 1))
+
+
+def start_label(start: str) -> str:
+    """Of ``Row.start``: ``start offset 3cm,20deg``."""
+    return f"start offset {start}" if start else "start at the truth"
+
+
+def headline_keys(task: str) -> list[str]:
+    """Keys of the RMSE of the position and of each angle."""
+    return ["position_cm", *(f"{c.name}_deg" for c in find_task(task).components if c.unit == "rad")]
+
+
+def _baseline_table(rows: Sequence[Row]) -> str:
+    """RMSE from step 0 and of the baselines, for position and angles; empty without any."""
+    lines = []
+    for row in rows:
+        parts = [row.mean, row.from_step_0, *(row.baselines.get(name, {}) for name in BASELINES)]
+        for key in headline_keys(row.task) if row.baselines else ():
+            values = ["" if (value := part.get(key)) is None else f"{value:.2f}" for part in parts]
+            lines.append(f"| {row.filter} | {row.blackout:.0%} | {label(key)} | {' | '.join(values)} |")
+    if not lines:
+        return ""
+    head = ["\nRMSE beside that from step 0 and beside the baselines, from the same starts.\n"]
+    head.append(f"| filter | image blackout | quantity | filter | from step 0 | {' | '.join(BASELINES)} |")
+    head.append("| --- | ---: | --- |" + " ---: |" * (2 + len(BASELINES)))
+    return "\n".join(head + lines) + "\n"
 
 
 def _modality_table(rows: Sequence[Row]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,10 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import build
 from beliefscope.filters.data_check import summarise
-from beliefscope.filters.evaluate import evaluate
+from beliefscope.filters.evaluate import Metrics, evaluate
 from beliefscope.filters.filter import Architecture, Filter
-from beliefscope.filters.training.plan import BLACKOUTS, PLANS, Plan, Report
+from beliefscope.filters.start_offset import NO_OFFSET, StartOffset
+from beliefscope.filters.training.plan import BLACKOUTS, EVALUATED_BLACKOUTS, PLANS, Plan, Report
 from beliefscope.filters.training.resume import Partial, SharedModules, cache_key
 from beliefscope.filters.training.stages import Trainer
 
@@ -134,16 +135,25 @@ def versions() -> dict[str, str]:
     return {"beliefscope": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}
 
 
-def measure(filter_: Filter, episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Metrics by probability of an image blackout (``"0"``, ``"0.4"``, ``"0.8"``).
+def measure(filter_: Filter, episodes: Sequence[Episode], start_offset: StartOffset = NO_OFFSET) -> dict[str, Any]:
+    """Metrics by probability of an image blackout (``"0"``, ``"0.4"``, ``"0.8"``, ``"0.95"``).
 
-    ``fused``: of the filter, with its single-modality ``updates``; a modality's name: of its standalone filter.
+    ``fused``: of the filter, with its ``baselines``, which a blackout does not change, and its single-modality
+    ``updates``; a modality's name: of its standalone filter.
     """
     several = len(filter_.names) > 1
-    results = {
-        f"{blackout:g}": evaluate(filter_, episodes, faults=Faults.parse(f"blackout={blackout}"), modalities=several)
-        for blackout in BLACKOUTS
-    }
+    results: dict[str, Metrics] = {}
+    for blackout in EVALUATED_BLACKOUTS:
+        first = next(iter(results.values()), None)
+        result = evaluate(
+            filter_,
+            episodes,
+            faults=Faults.parse(f"blackout={blackout}"),
+            start_offset=start_offset,
+            baselines=first is None,
+            modalities=several,
+        )
+        results[f"{blackout:g}"] = result if first is None else replace(result, baselines=first.baselines)
     return {
         blackout: {"fused": result.to_dict()} | {name: alone.to_dict() for name, alone in result.standalone.items()}
         for blackout, result in results.items()

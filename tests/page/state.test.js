@@ -29,7 +29,7 @@ test('a permalink restores every key', () => {
     '&track=nees&tab=compare&faults=blackout%3D0.4&against=filter%3Dx&window=1-3&diagnostic=consistency' +
     '&options=size%3D21&run=r&study=s&quantity=q&pin=step%3D2&by=angle&phase=contact&hide=map' +
     '&ground=image&height=belief&tint=share&scale=log&range=same&colours=cividis&over=held-out' +
-    '&list=episodes&among=all&axes=world&regions=hidden&zoom=4&cloud=shown&beside=gain&angle=0.5236';
+    '&list=episodes&among=all&axes=world&regions=hidden&zoom=4&cloud=shown&beside=gain&start=truth&angle=0.5236';
   const { state, problems } = parsePermalink(search, CATALOG);
   assert.deepEqual(problems, []);
   const [expected, written] = [search, permalink(state)].map((text) => [

@@ -127,12 +127,17 @@ class StudyFilter(Reply):
 
 
 class StudyTask(Reply):
-    """The part of a study for one task. data: file of the training and evaluation data."""
+    """The part of a study for one task.
+
+    data: file of the training and evaluation data. offset_data: description of the data that rows with an offset start
+    were evaluated on; empty: as the others.
+    """
 
     model_config = ConfigDict(json_schema_serialization_defaults_required=True)  # optional fields of rows are sent
 
     name: str
     data: str
+    offset_data: str
     filters: list[StudyFilter]
     rows: list[Row]
 

@@ -44,6 +44,7 @@ import { displayName } from './units.js';
  * @property {string} run selected fine-tuning run, empty for a new one
  * @property {string} study selected study, empty for the first one
  * @property {string} quantity of the study, empty for the first one
+ * @property {string} start of the study's runs: `offset` from the truth, if the study has such runs, or at the `truth`
  * @property {string} pin step whose maps are the reference of the displayed ones, URL-encoded; empty for none
  * @property {boolean} playing
  * @property {number} speed
@@ -77,6 +78,7 @@ const CHOICES = {
   zoom: ['fit', '1', '4'],
   cloud: ['hidden', 'shown'],
   beside: ['alone', 'gain'],
+  start: ['offset', 'truth'],
 };
 /** Keys with any text, and their defaults. */
 const TEXTS = {

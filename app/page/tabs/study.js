@@ -16,7 +16,7 @@ import { BarChart } from '../widgets/bar_chart.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
-import { blackoutLabel, failuresOf, studyQuantities } from './study_quantities.js';
+import { blackoutLabel, failuresOf, startLabel, studyQuantities } from './study_quantities.js';
 import { StudyTable } from './study_table.js';
 
 const SHIPPED = 'shipped'; // name of the study that comes with the software
@@ -27,6 +27,7 @@ const BODY = `
   <div class="top">
     <label class="picker">Study <select aria-label="Study"></select></label>
     <div id="quantity" class="choice" role="radiogroup" aria-label="Quantity"></div>
+    <div id="start" class="choice" role="radiogroup" aria-label="Start of the runs"></div>
   </div>
   <p class="about"></p>
   <p class="problems" role="status"></p>
@@ -79,7 +80,8 @@ export class Study {
     html('.cells button', host).addEventListener('click', () => this.#trainOrCancel());
     jobs.listen(() => this.#followJobs());
     store.listen((_, changed) => {
-      if (['task', 'study', 'quantity', 'data'].some((key) => changed.has(key))) this.#draw();
+      if (['task', 'study', 'quantity', 'start', 'data'].some((key) => changed.has(key)))
+        this.#draw();
     });
   }
 
@@ -151,7 +153,15 @@ export class Study {
       quantity.key,
       (key) => this.#store.set({ quantity: key }),
     );
-    const view = this.#view(results, task, quantity);
+    const starts = [...new Set(results.rows.filter(isOfFilter).map((row) => row.start))];
+    const start = (state.start === 'truth' && starts.find((text) => !text)) || starts[0];
+    choice(
+      html('#start', this.#host),
+      starts.map((text) => [text ? 'offset' : 'truth', startLabel(text)]),
+      start ? 'offset' : 'truth',
+      (key) => this.#store.set({ start: key }),
+    );
+    const view = this.#view(results, task, quantity, start);
     html('.about', this.#host).textContent = summary(study, results, view);
     this.#drawChart(view);
     this.#table.show(view);
@@ -209,23 +219,23 @@ export class Study {
    * @param {StudyTask} results
    * @param {Task} task
    * @param {Quantity} quantity
+   * @param {string} start
    * @returns {StudyView}
    */
-  #view(results, task, quantity) {
-    const shares = results.rows.map(({ blackout }) => blackout).filter((share) => share !== null);
-    const blackouts = [...new Set(shares)];
+  #view(results, task, quantity, start) {
+    const ofStart = results.rows.filter((row) => isOfFilter(row) && row.start === start);
+    const blackouts = [...new Set(ofStart.map(({ blackout }) => blackout))];
     this.#targets.clear();
     const filters = results.filters.map(({ name, trained }) => {
       const checkpoint =
         trained.find((seed) => seed.catalog_name) ?? trained.find(({ file }) => file) ?? null;
-      const ofFilter = results.rows.filter(({ filter }) => filter === name);
+      const ofFilter = ofStart.filter(({ filter }) => filter === name);
       const rows = blackouts.flatMap((share) => ofFilter.filter((row) => row.blackout === share));
       const bars = rows.map((row) => this.#bar(row, checkpoint, task, quantity));
       return { name, checkpoint, rows, bars };
     });
-    const trainingMean = results.rows.find(({ blackout }) => blackout === null);
-    const level = trainingMean?.mean[quantity.key] ?? null;
-    return { task: task.name, quantity, blackouts, filters, level };
+    const level = referenceLevel(results.rows, start, quantity);
+    return { task: task.name, quantity, start, blackouts, filters, level };
   }
 
   /**
@@ -268,17 +278,12 @@ export class Study {
   }
 
   /** @param {StudyView} view */
-  #drawChart({ quantity, blackouts, filters, level }) {
+  #drawChart({ quantity, start, blackouts, filters, level }) {
     html('.chart', this.#host).dataset.row = String(filters.length);
     this.#chart.show({
-      label: `${quantity.description} by filter and share of image blackout`,
+      label: `${quantity.description} by filter and share of image blackout, start ${startLabel(start)}`,
       unit: quantity.unit && `RMSE, ${quantity.unit}`,
-      level:
-        quantity.key === 'nees'
-          ? { name: 'consistent', value: 1 }
-          : level === null
-            ? null
-            : { name: 'training mean', value: level },
+      level: quantity.key === 'nees' ? { name: 'consistent', value: 1 } : level,
       groups: blackouts.map((share, i) => ({
         name: blackoutLabel(share),
         bars: filters.map(({ bars }) => bars[i]),
@@ -326,17 +331,37 @@ export class Study {
   }
 }
 
+/** Whether a row has results of a filter, not those of the training mean. @param {StudyTask['rows'][number]} row */
+const isOfFilter = ({ blackout }) => blackout !== null;
+
+/**
+ * Returns the error of a predictor without observations: from offset starts the baseline that keeps the start, at the
+ * truth the training mean.
+ * @param {StudyTask['rows']} rows
+ * @param {string} start
+ * @param {Quantity} quantity
+ */
+function referenceLevel(rows, start, { key }) {
+  const reference = start
+    ? rows.find((row) => row.start === start && row.baselines.stay)?.baselines.stay
+    : rows.find((row) => !isOfFilter(row))?.mean;
+  const value = reference?.[key] ?? null;
+  return value === null ? null : { name: start ? 'stay' : 'training mean', value };
+}
+
 /**
  * Describes how the filters were trained and evaluated, and what a click opens.
  * @param {StudyInfo} study
  * @param {StudyTask} results
  * @param {StudyView} view
  */
-function summary({ seeds, preset }, { data }, { quantity, filters }) {
+function summary({ preset }, results, { quantity, start, filters }) {
   const opened = filters.flatMap(({ checkpoint }) => (checkpoint ? [checkpoint.seed] : []));
   const missing = filters.filter(({ checkpoint }) => !checkpoint).map(({ name }) => name);
-  const training = `${seeds} seed${seeds > 1 ? 's' : ''} per filter, trained on ${data || 'unknown data'} (preset ${preset})`;
-  const text = `${quantity.description}: ${training} and evaluated on its test episodes.`;
+  const seeds = Math.max(...filters.flatMap(({ rows }) => rows.map((row) => row.seeds)));
+  const training = `${seeds} seed${seeds === 1 ? '' : 's'} per filter, trained on ${results.data || 'unknown data'} (preset ${preset})`;
+  const evaluation = (start && results.offset_data) || 'its test episodes';
+  const text = `${quantity.description}, runs that start ${startLabel(start)}: ${training} and evaluated on ${evaluation}.`;
   if (!opened.length) return `${text} The weights are not available here.`;
   const seedList = [...new Set(opened)].sort().join(' or ');
   const link = `A click opens the failures of seed ${seedList} on the held-out episodes of the catalog`;

@@ -72,5 +72,14 @@ export function failuresOf(state, task, filter, blackout, { key, component }) {
   };
 }
 
+/**
+ * Describes where the runs of a row start.
+ * @param {string} start of a row: `3cm,20deg`, or empty
+ */
+export const startLabel = (start) =>
+  start
+    ? `${start.replaceAll('deg', '°').replaceAll('cm', ' cm').replaceAll(',', ', ')} off`
+    : 'at the truth';
+
 /** @param {number | null} share */
 export const blackoutLabel = (share) => `${percent(share)} blackout`;

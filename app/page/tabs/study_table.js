@@ -24,9 +24,10 @@ import { blackoutLabel } from './study_quantities.js';
  * @typedef {object} StudyView
  * @property {string} task
  * @property {Quantity} quantity
+ * @property {string} start offset of the first belief from the truth, or empty
  * @property {(number | null)[]} blackouts shares of image blackout
  * @property {FilterResults[]} filters
- * @property {number | null} level value of the predictor that always returns the training mean
+ * @property {{name: string, value: number} | null} level error of a predictor without observations
  */
 
 /**
@@ -38,6 +39,24 @@ import { blackoutLabel } from './study_quantities.js';
  * @property {(filter: FilterResults) => string | Node} content
  */
 
+/** Other errors without image blackout; missing in studies of earlier versions. */
+const ERRORS = [
+  {
+    title: 'from step 0',
+    help: 'On clean images, including the first 30 steps',
+    values: (/** @type {StudyRow} */ row) => row.from_step_0,
+  },
+  {
+    title: 'dynamics',
+    help: 'Baseline: the same filter with all observations masked',
+    values: (/** @type {StudyRow} */ row) => row.baselines.dynamics,
+  },
+  {
+    title: 'stay',
+    help: 'Baseline: the start as the estimate of all steps',
+    values: (/** @type {StudyRow} */ row) => row.baselines.stay,
+  },
+];
 /** Metrics without image blackout. */
 const METRICS = [
   {
@@ -102,7 +121,7 @@ export class StudyTable {
     body.dataset.row = String(blackouts.length);
     body.replaceChildren(
       ...sortRows(filters, value, sort.down).map((filter) => tableRow(columns, filter)),
-      ...trainingMeanRow(view, columns),
+      ...referenceRow(view, columns),
     );
     body.querySelectorAll('a').forEach((link, i) => (link.tabIndex = i ? -1 : 0));
   }
@@ -131,6 +150,12 @@ export class StudyTable {
  * @returns {StudyColumn[]}
  */
 function studyColumns({ quantity, blackouts, filters }) {
+  const errors = ERRORS.map(({ title, help, values }) => ({
+    name: title,
+    title,
+    help,
+    value: (/** @type {FilterResults} */ { rows }) => values(rows[0])?.[quantity.key] ?? null,
+  })).filter(({ value }) => filters.some((filter) => value(filter) !== null));
   const metrics = METRICS.filter(({ key }) =>
     filters.some(({ rows }) => typeof rows[0].mean[key] === 'number'),
   );
@@ -148,6 +173,10 @@ function studyColumns({ quantity, blackouts, filters }) {
       help: quantity.description,
       value: (/** @type {FilterResults} */ { bars }) => bars[i].mean,
       content: (/** @type {FilterResults} */ { bars }) => barValue(bars[i]),
+    })),
+    ...errors.map((column) => ({
+      ...column,
+      content: (/** @type {FilterResults} */ filter) => fixed(column.value(filter), 2),
     })),
     ...metrics.map(({ key, title, help, format }) => ({
       name: key,
@@ -197,17 +226,17 @@ function barValue({ mean, spread, href, label }) {
 }
 
 /**
- * Returns the row of the predictor that always returns the training mean.
+ * Returns the row of the predictor without observations.
  * @param {StudyView} view
  * @param {StudyColumn[]} columns
  */
-function trainingMeanRow({ level, blackouts }, columns) {
+function referenceRow({ level, blackouts }, columns) {
   if (level === null) return [];
-  const row = create('tr', {}, create('th', { scope: 'row', textContent: 'training mean' }));
+  const row = create('tr', {}, create('th', { scope: 'row', textContent: level.name }));
   columns.slice(1).forEach((_, i) => {
     const cell = row.insertCell();
     cell.className = 'number';
-    if (i < blackouts.length) cell.textContent = significant(level);
+    if (i < blackouts.length) cell.textContent = significant(level.value);
   });
   return [row];
 }

@@ -1179,6 +1179,7 @@ export interface components {
          *     Attributes:
          *         task, filter: names; ``TRIVIAL`` for the trivial predictor. blackout: probability of an image blackout; None
          *             for the trivial predictor.
+         *         start: offset of the first belief, such as ``3cm,20deg``; empty at the truth.
          *         seeds: number of finished seeds. requested, failed: number of requested and failed ones.
          *         mean, spread: over the seeds, by quantity: RMSE (``hinge_x_cm``, ..., ``position_cm``), ``nll``, ``nees``,
          *             ``coverage95``, ``seconds`` of training. The spread is the standard deviation (n - 1). None if a seed lacks
@@ -1187,6 +1188,8 @@ export interface components {
          *         updates: modality -> mean RMSE over the seeds of its single-modality updates, which start from the fused prior;
          *             empty for studies of earlier versions. standalone: the same for the filter with only that modality. Both for
          *             filters of several models only. by_seed: seed -> quantity -> value.
+         *         from_step_0: mean RMSE over the seeds without omitting the first steps. baselines: name in ``BASELINES`` -> mean
+         *             RMSE over the seeds from the same starts. Both empty for studies of earlier versions.
          */
         Row: {
             /** Task */
@@ -1228,6 +1231,21 @@ export interface components {
             };
             /** By Seed */
             by_seed: {
+                [key: string]: {
+                    [key: string]: number | null;
+                };
+            };
+            /**
+             * Start
+             * @default
+             */
+            start: string;
+            /** From Step 0 */
+            from_step_0: {
+                [key: string]: number | null;
+            };
+            /** Baselines */
+            baselines: {
                 [key: string]: {
                     [key: string]: number | null;
                 };
@@ -1305,13 +1323,18 @@ export interface components {
         };
         /**
          * StudyTask
-         * @description The part of a study for one task. data: file of the training and evaluation data.
+         * @description The part of a study for one task.
+         *
+         *     data: file of the training and evaluation data. offset_data: description of the data that rows with an offset start
+         *     were evaluated on; empty: as the others.
          */
         StudyTask: {
             /** Name */
             name: string;
             /** Data */
             data: string;
+            /** Offset Data */
+            offset_data: string;
             /** Filters */
             filters: components["schemas"]["StudyFilter"][];
             /** Rows */

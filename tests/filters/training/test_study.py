@@ -31,9 +31,9 @@ from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
 from beliefscope.filters.training import study
-from beliefscope.filters.training.plan import BLACKOUTS
+from beliefscope.filters.training.plan import BLACKOUTS, EVALUATED_BLACKOUTS
 from beliefscope.filters.training.study import Cell, run_cell, run_ray
-from beliefscope.filters.training.study_table import TRIVIAL, Row, rows_of, to_markdown
+from beliefscope.filters.training.study_table import OFFSET, TRIVIAL, TRUTH, Row, rows_of, to_markdown
 from beliefscope.recordings.study_figures import bar_styles, results
 
 pytestmark = pytest.mark.slow
@@ -143,14 +143,24 @@ def test_killed_study_resumes_to_the_same_results(data: Path, finished: Path, tm
 def test_tables_contain_the_results_of_the_cells(finished: Path) -> None:
     with (finished / "table.csv").open() as file:
         table = list(csv.DictReader(file))
-    assert [(row["filter"], row["blackout"]) for row in table] == [
-        *((name, str(b)) for name in FILTERS for b in BLACKOUTS),
-        (TRIVIAL, ""),
+    assert [(row["start_offset"], row["filter"], row["blackout"]) for row in table] == [
+        *((start, name, str(b)) for start in ("3cm,20deg", "") for name in FILTERS for b in EVALUATED_BLACKOUTS),
+        ("", TRIVIAL, ""),
     ]
     markdown = (finished / "table.md").read_text()
     for row in table[:-1]:
         cells = [document(finished, f"door/{row['filter']}/seed{seed}") for seed in range(2)]
-        fused = [cell["metrics"][f"{float(row['blackout']):g}"]["fused"] for cell in cells]
+        start = OFFSET if row["start_offset"] else TRUTH
+        fused = [cell[start][f"{float(row['blackout']):g}"]["fused"] for cell in cells]
+        for part, of in {
+            "from_step_0": lambda metrics: metrics["rmse_from_step_0"],
+            "stay": lambda metrics: metrics["baselines"]["stay"]["rmse"],
+            "dynamics": lambda metrics: (metrics["baselines"]["dynamics"] or {}).get("rmse"),
+        }.items():
+            values = [of(metrics) for metrics in fused]
+            expected = "" if values[0] is None else statistics.fmean(value["angle_deg"] for value in values)
+            written = row[f"angle_deg_{part}"]
+            assert written == expected or float(written) == pytest.approx(expected, rel=1e-12), part
         numbers = {key: [metrics["rmse"][key] for metrics in fused] for key in fused[0]["rmse"]}
         numbers |= {key: [metrics[key] for metrics in fused] for key in ("nll", "nees", "coverage95")}
         numbers["seconds"] = [cell["seconds"] for cell in cells]
@@ -174,6 +184,46 @@ def test_tables_contain_the_results_of_the_cells(finished: Path) -> None:
             assert [float(bound) for bound in bounds] == pytest.approx(expected, rel=1e-12)
 
 
+def test_stay_baseline_has_the_error_of_the_start(finished: Path) -> None:
+    """The hinge does not move: keeping a start 3 cm off it has an error of 3 cm, and keeping the truth has none."""
+    with (finished / "table.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["filter"] != TRIVIAL]
+    assert {row["start_offset"] for row in rows} == {"3cm,20deg", ""}
+    for row in rows:
+        expected = 3.0 if row["start_offset"] else 0.0
+        assert float(row["position_cm_stay"]) == pytest.approx(expected, abs=1e-3)
+    tables = (finished / "table.md").read_text().split("## ")[1:]
+    assert [table.split("\n")[0] for table in tables] == [
+        "door, start offset 3cm,20deg",
+        "door, start at the truth",
+    ], "offset starts do not come first"
+    assert "| 3.00 |" in tables[0]
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_cell_of_an_earlier_version_is_shown_and_only_evaluated(data: Path, finished: Path, tmp_path: Path) -> None:
+    """Earlier versions had no offset starts, no baselines and no 95 % blackout."""
+    folder, old = tmp_path / "study", cell(data)
+    shutil.copytree(finished, folder)
+    complete = document(folder, str(old))
+    earlier = document(folder, str(old))
+    del earlier[OFFSET], earlier[TRUTH]["0.95"]
+    for metrics in earlier[TRUTH].values():
+        del metrics["fused"]["baselines"], metrics["fused"]["rmse_from_step_0"]
+    old.path(folder).write_text(json.dumps(earlier))
+    rows = rows_of({old: old.document(folder)})
+    assert [(row.filter, row.start, row.blackout) for row in rows] == [
+        *((old.filter, "", blackout) for blackout in BLACKOUTS),
+        (TRIVIAL, "", None),
+    ]
+    assert not any(row.baselines or row.from_step_0 for row in rows)
+    assert "stay" not in to_markdown(rows)
+    assert old.finished(folder) is None
+    before = old.path(folder, ".safetensors").stat().st_mtime_ns
+    assert run_cell(old, folder) == complete
+    assert old.path(folder, ".safetensors").stat().st_mtime_ns == before, "the cell was trained again"
+
+
 def test_trivial_predictor_returns_the_training_mean(finished: Path, data: Path) -> None:
     with open_dataset(data) as dataset:
         mean = np.concatenate([e.states for e in dataset if e.split == "train"]).mean(0, dtype=float)
@@ -190,7 +240,7 @@ def test_figure_contains_filters_and_quantities(finished: Path) -> None:
     assert image.shape[1] == round(300 * 7.16)
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 20
     text = (finished / "results.svg").read_text()
-    for word in ("door: hinge", "door: angle", "RMSE (cm)", "RMSE (deg)", "40% image blackout", *FILTERS, TRIVIAL):
+    for word in ("door: hinge", "door: angle", "RMSE (cm)", "RMSE (deg)", "image blackout", "40%", *FILTERS, TRIVIAL):
         assert word in text, word
 
 
