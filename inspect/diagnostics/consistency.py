@@ -116,7 +116,7 @@ class Consistency(Diagnostic):
         where = "all steps" if worst.phase == ALL else worst.phase
         return (
             f"Least consistent single-modality update: {worst.layer} in {where}, {worst.assessment} "
-            f"(NEES/n {number(worst.nees)})."
+            f"(NEES/n {number(worst.nees)}). {measures.UPDATES_NOTE}"
         )
 
     def _innovation_sentence(self) -> str:

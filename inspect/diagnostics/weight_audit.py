@@ -161,7 +161,7 @@ class WeightAudit(Diagnostic):
             f"{' (mean over components)' if len(self._columns) > 1 else ''}; oracle: {mean_weights('oracle')}.",
             f"Position RMSE {fused:.3f} cm, {unimodal[strongest]:.3f} cm for the "
             f"{measures.layer_label(self.modalities[strongest])}, {best:.3f} cm with the oracle's weights, which no "
-            "filter can reach.",
+            f"filter can reach. {measures.UPDATES_NOTE}",
             self._comparison_with_constant_weights(),
         ]
         source = "beta" if self.beta_is_effective else "effective_weights"

@@ -20,7 +20,7 @@ from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
 from beliefscope.inspect.failures.step_scores import PHASES, RECENT, Survey
 from beliefscope.inspect.failures.survey import check_applies, find_score, survey_of
-from beliefscope.inspect.statistics.measures import Mask, layer_label
+from beliefscope.inspect.statistics.measures import UPDATES_NOTE, Mask, layer_label
 
 HIGH = 0.9
 """Quantile of the scores of all steps above which a step is part of an event."""
@@ -30,6 +30,9 @@ SIGNIFICANCE = 0.05
 
 MAX_ROWS = 20
 """Maximum number of events in the table."""
+
+UPDATE_SCORES = ("disagreement", "regret")
+"""Scores that compare modalities by their updates."""
 
 PROBABILITIES = np.linspace(0.0, 1.0, 51)
 
@@ -146,9 +149,10 @@ class Failures(Diagnostic):
             f"{p.name}, {_percent(p.share)} of steps and {_percent(p.event_share)} of events ({p.lift:.1f} x)"
             for p in self.over_represented
         )
-        return f"{count}; worst: {where}. " + (
-            f"Over-represented: {phases}." if phases else "No phase is over-represented."
-        )
+        sentences = [f"{count}; worst: {where}."]
+        sentences.append(f"Over-represented: {phases}." if phases else "No phase is over-represented.")
+        sentences += [UPDATES_NOTE] if self.by in UPDATE_SCORES else []
+        return " ".join(sentences)
 
     def worst(self, top: int | None = None, phase: str | None = None) -> tuple[Event, ...]:
         """The ``top`` worst events, of one phase or of all. Raises BadInput for an unknown phase."""

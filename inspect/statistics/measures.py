@@ -33,6 +33,10 @@ def layers(trace: Trace) -> tuple[str, ...]:
     return (*trace.modalities, "fused")
 
 
+UPDATES_NOTE = "Updates start from the fused prior; the diagnostic standalone measures each modality by itself."
+"""Part of every verdict that compares modalities by their updates."""
+
+
 def layer_label(layer: str) -> str:
     """Display name of an estimate: that of a modality is an update of the fused filter's prior, not standalone."""
     if layer in ("fused", "truth"):

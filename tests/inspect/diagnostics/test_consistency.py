@@ -13,6 +13,7 @@ import pytest
 
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.consistency import Consistency, consistency
+from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.calibration import (
     gaussian_crps,
     gaussian_level,
@@ -64,6 +65,9 @@ def test_scaled_covariances_are_over_or_underconfident(exact: Consistency, scale
 
     result = consistency(plant.simulated(scale=scale))
     assert re.search(rf"theory\. {prefix}confident by a factor of (1\.9|2|2\.1) ", result.verdict)
+    compares_updates = "Least consistent single-modality update" in result.verdict
+    assert compares_updates == (measures.UPDATES_NOTE in result.verdict)
+    assert compares_updates or scale > 1.0
     for layer in result.layers:
         # Same errors, other covariances; tolerance for the floor of 1e-8 relative to 2e-5.
         assert result.entry(layer).nees == pytest.approx(exact.entry(layer).nees / scale, rel=2e-3)

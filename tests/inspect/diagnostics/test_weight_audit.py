@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.weight_audit import ENTRY, audit
 from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, correlate, correlation_sums
+from beliefscope.inspect.statistics.measures import UPDATES_NOTE
 from beliefscope.inspect.statistics.oracle import oracle_weights
 from beliefscope.inspect.trace import Trace
 
@@ -97,6 +99,8 @@ def test_regret_of_a_worked_example() -> None:
         in result.verdict
     )
     assert "constant weights: too few trajectories (1; at least 5 needed)." in result.verdict
+    assert UPDATES_NOTE in result.verdict
+    assert f"diagnostic {DIAGNOSTICS['standalone'].name} " in UPDATES_NOTE
 
 
 def test_angles_wrap() -> None:

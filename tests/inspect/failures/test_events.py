@@ -73,6 +73,8 @@ def test_planted_error_is_the_worst_event(traces: list[Trace]) -> None:
     assert worst.phase == "contact made"
     assert worst.score == pytest.approx(2.0)  # 1 m x (1 + 1)
     assert f"step 42 of episode {shifted_trace.episode_index}" in failures.verdict
+    assert measures.UPDATES_NOTE not in failures.verdict
+    assert measures.UPDATES_NOTE in replace(failures, by="disagreement").verdict
     release = failures_of(Survey.from_traces([shifted(with_contact(traces[2], ~contact), 37, 47, 1.0)]))
     assert release.events[0].phase == "contact lost"
 
