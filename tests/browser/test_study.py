@@ -14,7 +14,29 @@ def test_bar_opens_the_largest_error(open_page: Any) -> None:
     panel = page.page.locator("#study")
     (study,) = page.page.request.get(f"{page.url}api/studies").json()["studies"]
     (door,) = (task for task in study["tasks"] if task["name"] == "door")
-    rows = {(row["filter"], row["blackout"]): row for row in door["rows"]}
+    assert door["rows"][0]["start"] == "3cm,20deg", "offset starts do not lead"
+    offset, rows = (
+        {(row["filter"], row["blackout"]): row for row in door["rows"] if row["start"] == start}
+        for start in ("3cm,20deg", "")
+    )
+    assert panel.locator("#start input").first.is_checked()
+    about = panel.locator(".about").text_content()
+    assert "start 3 cm, 20° off: 1 seed per filter" in about
+    assert "64 test episodes of the sample set" in about
+    row = offset["crossmodal-ekf", 0.95]
+    cells = panel.locator("tbody tr").first.locator("td").all_text_contents()
+    assert cells[3] == f"{row['mean']['position_cm']:.2f}"
+    row = offset["crossmodal-ekf", 0.0]
+    names = [
+        name for name in panel.locator("thead th").all_text_contents() if name in ("from step 0", "dynamics", "stay")
+    ]
+    assert len(names) == 3
+    numbers = [row["from_step_0"], row["baselines"]["dynamics"], row["baselines"]["stay"]]
+    assert cells[4:7] == [f"{values['position_cm']:.2f}" for values in numbers]
+    assert cells[6] == "3.00", "keeping the start does not have the error of the start"
+    panel.get_by_text("at the truth", exact=True).click()
+    page.until("() => location.search.includes('start=truth')")
+
     labels = panel.locator(".chart a").evaluate_all(LABELS)
     assert len(labels) == len(rows) - 1  # the training mean is a line
     for label, linked in labels:
