@@ -154,7 +154,7 @@ export class Study {
       (key) => this.#store.set({ quantity: key }),
     );
     const starts = [...new Set(results.rows.filter(isOfFilter).map((row) => row.start))];
-    const start = (state.start === 'truth' && starts.find((text) => !text)) || starts[0];
+    const start = state.start === 'truth' && starts.includes('') ? '' : starts[0];
     choice(
       html('#start', this.#host),
       starts.map((text) => [text ? 'offset' : 'truth', startLabel(text)]),
