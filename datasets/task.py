@@ -24,10 +24,11 @@ def display_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class Component:
-    """A state component. Components in rad are angles."""
+    """A state component. Components in rad are angles; static ones are constant in every episode."""
 
     name: str
     unit: Unit
+    static: bool = False
 
     @property
     def label(self) -> str:

@@ -266,6 +266,16 @@ def apply_blackout(batch: Batch, probability: Tensor, generator: torch.Generator
     return replace(batch, observations=observations)
 
 
+def position_channels(task: Task, modality: str) -> list[list[int]]:
+    """x and y of each position (``Task.positions``) in a modality's vector."""
+    result, first = [], 0
+    for key in task.modalities[modality]:
+        if key in task.positions:
+            result.append([first + channel for channel in task.positions[key]])
+        first += task.observations[key][0]
+    return result
+
+
 def shift_positions(batch: Batch, task: Task, scale: Tensor, generator: torch.Generator) -> Batch:
     """The batch with each trajectory shifted on the map, object and end effector together, by a normal offset.
 
@@ -283,13 +293,9 @@ def shift_positions(batch: Batch, task: Task, scale: Tensor, generator: torch.Ge
         return values
 
     observations, controls = dict(batch.observations), batch.controls
-    for modality, keys in task.modalities.items():
-        first = 0
-        for key in keys:
-            if key in task.positions:
-                channels = [first + channel for channel in task.positions[key]]
-                observations[modality] = shifted(observations[modality], channels)
-            first += task.observations[key][0]
+    for modality in task.modalities:
+        for channels in position_channels(task, modality):
+            observations[modality] = shifted(observations[modality], channels)
     if "control" in task.positions:
         controls = shifted(controls, task.positions["control"])
     return replace(
@@ -298,4 +304,5 @@ def shift_positions(batch: Batch, task: Task, scale: Tensor, generator: torch.Ge
         controls=controls,
         states=shifted(batch.states, on_map),
         previous=shifted(batch.previous, on_map),
+        start=None if batch.start is None else shifted(batch.start, on_map),
     )

@@ -12,6 +12,7 @@ from beliefscope.datasets.errors import check_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
+from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.lstm import Lstm
 from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.filters.models.ukf import UnscentedKalmanFilter
@@ -30,6 +31,7 @@ FILTERS: dict[str, tuple[Literal["each", "all", "one"], Architecture]] = {
     "crossmodal-ekf": ("each", Architecture(ANY, "ekf", "crossmodal", feedback=True)),
     "crossmodal-pf": ("each", Architecture(ANY, "pf", "crossmodal")),
     "crossmodal-ukf": ("each", Architecture(ANY, "ukf", "crossmodal", feedback=True)),
+    "information-ekf": ("each", Architecture(ANY, "ekf", "information", feedback=True)),
     "unimodal-ekf": ("each", Architecture(ANY, "ekf", "unimodal")),
     "unimodal-pf": ("each", Architecture(ANY, "pf", "unimodal", likelihoods="raw")),
     "feature-ekf": ("all", Architecture(ANY, "ekf", "none")),
@@ -74,4 +76,4 @@ def build(architecture: Architecture, seed: int = 0) -> Filter:
     """A filter with initial weights that depend only on the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return KINDS[architecture.kind](architecture)
+        return (InformationFilter if architecture.fusion == "information" else KINDS[architecture.kind])(architecture)

@@ -21,7 +21,10 @@ from beliefscope.filters.models.networks import Encoders, Networks, Pooling, Res
 from beliefscope.filters.models.resampling import Resampling
 
 Kind = Literal["ekf", "ukf", "pf", "lstm"]
-Fusion = Literal["crossmodal", "unimodal", "none"]
+Fusion = Literal["crossmodal", "unimodal", "information", "none"]
+
+WEIGHTED: tuple[Fusion, ...] = ("crossmodal", "information")
+"""Fusion rules with a weight model."""
 
 MAX_SIZE = 4096
 """Upper limit of layer widths and other integers of an architecture."""
@@ -35,7 +38,8 @@ class Architecture:
         task: name in ``TASKS``.
         kind: ``ekf``, ``ukf``, ``pf`` or ``lstm``.
         fusion: rule that fuses the measurement models' results: ``crossmodal`` (learned weights beta), ``unimodal``
-            (product of experts for an EKF, sum of likelihoods for a PF), or ``none`` (one model).
+            (product of experts for an EKF, sum of likelihoods for a PF), ``information`` (EKF: one prior, precisions
+            add, weighted by beta), or ``none`` (one model).
         models: for each measurement model its modalities, joined by ``+``.
         units: width of all fully connected layers. image_stride: of the first convolution.
         networks: ``default``, or ``authors``: the layers of the paper's published code, see docs/filters.md.
@@ -74,6 +78,8 @@ class Architecture:
                 raise BadInput(f"{name} of a filter is {value!r}, not a whole number from 1 to {MAX_SIZE}")
         if not self.models or not all(isinstance(model, str) for model in self.models):
             raise BadInput(f"models of a filter are {self.models!r}, not names of modalities")
+        if self.fusion == "information" and (self.kind != "ekf" or any("+" in model for model in self.models)):
+            raise BadInput(f"fusion 'information' needs kind 'ekf' and one modality per model, not {self.kind!r}")
         if not 0.0 < self.soft_share <= 1.0:
             raise BadInput(f"soft_share must be above 0 and at most 1, not {self.soft_share}")
 
@@ -94,10 +100,12 @@ class Filter(nn.Module, ABC):
 
     Attributes:
         has_covariance: whether its estimates have a covariance; else it is NaN.
+        history: number of past steps that the encoding of a step uses.
         dynamics: the dynamics model; the LSTM has none.
     """
 
     has_covariance = True
+    history = 0
     dynamics: Dynamics
 
     def __init__(self, architecture: Architecture) -> None:
@@ -121,7 +129,7 @@ class Filter(nn.Module, ABC):
 
     def log_weights(self, batch: Batch) -> Tensor | None:
         """(T, N, K, W) log beta, or None without a weight model."""
-        if self.architecture.fusion != "crossmodal":
+        if self.architecture.fusion not in WEIGHTED:
             return None
         return self.get_submodule("weight_model")(self.observations(batch))
 
@@ -148,30 +156,35 @@ class Filter(nn.Module, ABC):
             yield trace
 
 
-def encoders(task: Task, modalities: Iterable[str], architecture: Architecture) -> Encoders:
-    """New encoders of these modalities. Raises BadInput for one that the task does not have."""
+def encoders(task: Task, modalities: Iterable[str], architecture: Architecture, steps: int = 1) -> Encoders:
+    """New encoders of these modalities. Raises BadInput for one that the task does not have.
+
+    Args:
+        steps: of which vectors are joined.
+    """
     shapes: dict[str, tuple[int, ...]] = {}
     for modality in modalities:
         if modality not in task.modalities:
             raise BadInput(
                 f"Modality {modality!r} is not in task {task.name!r}. Available: {', '.join(task.modalities)}."
             )
-        shapes[modality] = modality_shape(task, modality)
+        shape = modality_shape(task, modality)
+        shapes[modality] = shape if len(shape) == 2 else (steps * shape[0],)
     a = architecture
     vectors = [m for m, shape in shapes.items() if len(shape) == 1 and a.networks == "authors"]
-    groups = {modality: vector_groups(task, modality) for modality in vectors}
+    groups = {modality: vector_groups(task, modality, steps) for modality in vectors}
     return Encoders(shapes, a.units, a.image_stride, a.pooling, a.networks, groups)
 
 
-def vector_groups(task: Task, modality: str) -> list[list[int]]:
-    """Entries of a modality's vector that are positions, and the others, without empty groups."""
+def vector_groups(task: Task, modality: str, steps: int = 1) -> list[list[int]]:
+    """Entries of a modality's joined vectors that are positions, and the others, without empty groups."""
     groups: dict[bool, list[int]] = {True: [], False: []}
     start = 0
     for key in task.modalities[modality]:
         size = task.observations[key][0]
         groups[key in task.positions] += range(start, start + size)
         start += size
-    return [group for group in groups.values() if group]
+    return [[step * start + i for step in range(steps) for i in group] for group in groups.values() if group]
 
 
 def modality_shape(task: Task, modality: str) -> tuple[int, ...]:

@@ -196,7 +196,11 @@ def simulate_door(seed: int, index: int, steps: int) -> Episode:
 
 DOOR = Task(
     name="door",
-    components=(Component("hinge_x", "m"), Component("hinge_y", "m"), Component("angle", "rad")),
+    components=(
+        Component("hinge_x", "m", static=True),
+        Component("hinge_y", "m", static=True),
+        Component("angle", "rad"),
+    ),
     observations={"image": (32, 32), "effector_position": (3,), "force": (3,), "torque": (3,), "contact": (1,)},
     modalities={"image": ("image",), "haptics": ("effector_position", "force", "torque", "contact")},
     control_size=7,

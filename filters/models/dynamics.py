@@ -14,7 +14,12 @@ class Dynamics(nn.Module):
     f1 is a vector, f2 a scalar gate, so that direction and size of the change are learned separately. State and control
     pass through three layers each, followed by seven shared layers. The first shared layer is split into two summands,
     so that the controls' part is computed once for all steps.
+
+    Attributes:
+        static: indices of components that do not change, apart from noise.
     """
+
+    static: tuple[int, ...] = ()
 
     def __init__(self, n: int, control_size: int, units: int) -> None:
         super().__init__()
@@ -51,7 +56,13 @@ class Dynamics(nn.Module):
         """Next states (..., n), without noise; ``control_part`` must broadcast against the states' leading axes."""
         hidden = self.shared(self.join_state(self.state_encoder(states)) + control_part)
         change, gate = self.output(hidden).split([self.n, 1], dim=-1)
-        return states + change * torch.sigmoid(gate)
+        return states + self._without_static(change) * torch.sigmoid(gate)
+
+    def _without_static(self, change: Tensor) -> Tensor:
+        """A change (..., n), or its derivatives, with zeros at static components."""
+        if not self.static:
+            return change
+        return change.index_fill(-1, torch.tensor(self.static, device=change.device), 0.0)
 
     def with_jacobian(self, states: Tensor, control_part: Tensor) -> tuple[Tensor, Tensor]:
         """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass with dual numbers."""
@@ -62,6 +73,7 @@ class Dynamics(nn.Module):
         value_only = torch.zeros_like(x[..., :1]).index_fill_(-2, torch.tensor(0, device=x.device), 1.0)
         x = x + value_only * control_part.unsqueeze(-2)
         change, gate = dual_linear(self.output, self.shared.dual(x)).split([self.n, 1], dim=-1)
+        change = self._without_static(change)
         scale = torch.sigmoid(gate[..., :1, :])
         next_states = states + change[..., 0, :] * scale[..., 0, :]
         slope = scale * (1.0 - scale)

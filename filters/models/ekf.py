@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
-from beliefscope.filters.filter import Architecture, Filter, WeightModel, encoders
+from beliefscope.filters.filter import WEIGHTED, Architecture, Filter, WeightModel, encoders
 from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.fusion import product_of_experts, symmetric, weighted_average
 from beliefscope.filters.models.networks import Residual, Stack
@@ -50,10 +50,11 @@ class VirtualSensor(nn.Module):
     With ``authors`` networks, each output has its own half of the trunk's features and a first layer of n units.
     """
 
-    def __init__(self, task: Task, model: str, architecture: Architecture) -> None:
+    def __init__(self, task: Task, model: str, architecture: Architecture, steps: int = 1) -> None:
+        """steps: of which vectors are joined."""
         super().__init__()
         n, units = len(task.components), architecture.units
-        self.encoders = encoders(task, model.split("+"), architecture)
+        self.encoders = encoders(task, model.split("+"), architecture, steps)
         self.state: nn.Module
         self.log_noise: nn.Sequential
         self.halves = architecture.networks == "authors"
@@ -87,7 +88,7 @@ class ExtendedKalmanFilter(Filter):
         super().__init__(architecture)
         self.dynamics = Dynamics(self.n, self.task.control_size, architecture.units)
         self.virtual_sensors = nn.ModuleDict({m: VirtualSensor(self.task, m, architecture) for m in self.names})
-        if architecture.fusion == "crossmodal":
+        if architecture.fusion in WEIGHTED:
             self.weight_model = WeightModel(self.task, architecture, self.n)
 
     def encode(self, batch: Batch) -> Evidence:
@@ -101,11 +102,16 @@ class ExtendedKalmanFilter(Filter):
         )
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Gaussian:
-        k = len(self.names)
-        mean = belief.mean.unsqueeze(1).expand(-1, k, -1)
-        return Gaussian(mean, belief.covariance.unsqueeze(1).expand(-1, k, -1, -1))
+        return self.bank_of(belief)
 
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Gaussian, StepTrace]:
+        predicted, bank = self.predict_and_update(belief, evidence)
+        fused = self.fuse(bank, evidence.log_weights, evidence.present)
+        trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)
+        return (self.bank_of(fused) if self.architecture.feedback else bank), trace
+
+    def predict_and_update(self, belief: Belief, evidence: Evidence) -> tuple[Gaussian, Gaussian]:
+        """The predicted bank, and the bank after the update of each filter with its own observation, (N, K, n)."""
         assert isinstance(belief, Gaussian)
         assert evidence.noise is not None
         predicted = self.predict(belief, evidence.control.unsqueeze(1))
@@ -114,14 +120,18 @@ class ExtendedKalmanFilter(Filter):
             present = evidence.present.unsqueeze(-1)
             mean = torch.where(present, bank.mean, predicted.mean)
             bank = Gaussian(mean, torch.where(present.unsqueeze(-1), bank.covariance, predicted.covariance))
-        fused = self.fuse(bank, evidence.log_weights, evidence.present)
-        trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)
-        if self.architecture.feedback:
-            bank = Gaussian(
-                fused.mean.unsqueeze(1).expand_as(bank.mean),
-                fused.covariance.unsqueeze(1).expand_as(bank.covariance),
-            )
-        return bank, trace
+        return predicted, bank
+
+    def bank_of(self, belief: Gaussian) -> Gaussian:
+        """K copies (N, K, n) of a belief (N, n)."""
+        k = len(self.names)
+        mean = belief.mean.unsqueeze(1).expand(-1, k, -1)
+        return Gaussian(mean, belief.covariance.unsqueeze(1).expand(-1, k, -1, -1))
+
+    def shares(self, evidence: Evidence) -> Tensor:
+        """Effective weights of a filter with beta, (T, N, K, n)."""
+        assert evidence.log_weights is not None
+        return torch.softmax(evidence.log_weights, dim=-2)
 
     def predict(self, belief: Gaussian, control_part: Tensor) -> Gaussian:
         """The predicted bank (N, K, n); ``control_part`` (N, 1, u)."""

@@ -52,6 +52,29 @@ def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule =
     return Gaussian(mean, positive_definite(symmetric((share * bank.covariance).sum(-3))))
 
 
+def powers(log_weights: Tensor, present: Tensor | None = None) -> Tensor:
+    """Powers ``K beta_k`` (N, K, n) of K experts, which sum to the number K of those that are used.
+
+    Equal weights give power 1. An expert with beta zero, or not in ``present`` (N, K), is not used.
+    """
+    used = (log_weights > -torch.inf).any(-1, keepdim=True)
+    if present is not None:
+        used = used & present.unsqueeze(-1)
+    return torch.softmax(log_weights, dim=-2) * used.sum(-2, keepdim=True) * used
+
+
+def weighted_product(bank: Gaussian, power: Tensor) -> Gaussian:
+    """Product of K Gaussians (N, K, n) to the powers (N, K, n): precisions add, scaled by the roots of the powers.
+
+    ``S^-1 = sum_k D_k S_k^-1 D_k``, ``m = S sum_k D_k S_k^-1 D_k m_k``, ``D_k = diag(sqrt(power_k))``.
+    """
+    root = power.sqrt()
+    precision = torch.linalg.inv(bank.covariance) * root.unsqueeze(-1) * root.unsqueeze(-2)
+    covariance = symmetric(torch.linalg.inv(precision.sum(-3)))
+    information = (precision @ bank.mean.unsqueeze(-1)).sum(-3)
+    return Gaussian((covariance @ information).squeeze(-1), covariance)
+
+
 def mixture(log_likelihood: Tensor, log_weights: Tensor | None) -> Tensor:
     """``log sum_k b_k p_k`` (eq. 14, 15): log-likelihoods (..., K, M) and log beta (..., K, 1) to (..., M)."""
     if log_weights is None:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.filter import Filter
+from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MeasurementModel
 from beliefscope.filters.rollout import START_VARIANCE, first_belief, rollout
 
@@ -30,6 +31,12 @@ def prediction(filter_: Filter, batch: Batch) -> Tensor:
         x = filter_.dynamics(x, control[t])
         total = total + (x - target[t]).square().mean()
     return total / len(batch)
+
+
+def sensor_likelihood(filter_: InformationFilter, name: str, batch: Batch) -> Tensor:
+    """Mean Gaussian negative log-likelihood of the true state under a virtual sensor, ``N(x; z, R)``."""
+    z, noise = filter_.sense(name, filter_.observations(batch))
+    return (0.5 * ((z - true_states(filter_, batch)) / noise).square() + noise.log()).mean()
 
 
 def likelihood(filter_: Filter, model: MeasurementModel, batch: Batch, noise: torch.Generator) -> Tensor:

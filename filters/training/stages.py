@@ -15,10 +15,12 @@ from torch import Tensor, nn
 from beliefscope.filters.batch import Batch, Steps, apply_blackout, shift_positions
 from beliefscope.filters.filter import Filter, modality_shape
 from beliefscope.filters.models.ekf import VirtualSensor
+from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.networks import ImageEncoder, reset_weights
 from beliefscope.filters.models.pf import MeasurementModel
 from beliefscope.filters.training import losses
 from beliefscope.filters.training.encoder_cache import encode_images, weights_key
+from beliefscope.filters.training.optimiser import optimiser_step, parameter_groups
 from beliefscope.filters.training.plan import BLACKOUTS, Plan, Report
 from beliefscope.filters.training.resume import SharedModules, cache_key
 
@@ -87,21 +89,27 @@ class Trainer:
         self.generator, self.noise = torch.Generator(), torch.Generator(self.device)
 
     def stages(self) -> list[Stage]:
-        """All stages of this filter, in order. Image encoders train only in ``IMAGES`` and ``ALL_PARAMETERS``."""
+        """All stages of this filter, in order. Image encoders train only in ``IMAGES`` and ``ALL_PARAMETERS``.
+
+        Virtual sensors of an ``InformationFilter`` are frozen after their own stage: end to end, they would no longer
+        report their own error.
+        """
         plan, filter_, stages = self.plan, self.filter, []
 
         def add(name: str, run: Callable[..., None], *arguments: Any) -> None:
             stages.append(Stage(name, partial(run, *arguments)))
 
         if hasattr(filter_, "dynamics"):
-            add("dynamics", self.train_shared, "dynamics", [filter_.dynamics], self.train_dynamics)
+            part = "dynamics, static components" if filter_.dynamics.static else "dynamics"
+            add("dynamics", self.train_shared, part, [filter_.dynamics], self.train_dynamics)
         encoders = self.image_encoders()
         if encoders:
             add(IMAGES, self.train_shared, IMAGES, encoders, self.train_image_encoder)
         for name in filter_.names:
             if (module := self.measurement_module(name)) is not None:
                 add(f"{name} model", self.train_model, name, module)
-        everything = list(filter_.parameters())
+        frozen = "virtual_sensors." if isinstance(filter_, InformationFilter) else None
+        everything = [p for n, p in filter_.named_parameters() if frozen is None or not n.startswith(frozen)]
         models: tuple[int | None, ...] = (None,)
         if filter_.architecture.fusion == "crossmodal":
             weights = list(filter_.get_submodule("weight_model").parameters())
@@ -119,7 +127,7 @@ class Trainer:
         for length, count in zip(plan.lengths, plan.together, strict=True):
             name = f"end to end, {length} steps"
             add(name, self.end_to_end, name, everything, count, length, plan.fine_rate, models)
-        if encoders and plan.fine:
+        if encoders and plan.fine and frozen is None:
             length, rate = plan.lengths[-1], plan.fine_rate / 3
             add(ALL_PARAMETERS, self.end_to_end, ALL_PARAMETERS, everything, plan.fine, length, rate, models, False)
         return stages
@@ -262,14 +270,17 @@ class Trainer:
         self.optimise(IMAGES, parameters, self.plan.images, self.plan.rate, loss)
 
     def train_model(self, name: str, module: VirtualSensor | MeasurementModel) -> None:
-        """EKF: the virtual sensor regresses the state. PF: see ``losses.likelihood``."""
-        uses_images = self.uses_images(name)
+        """EKF: the virtual sensor regresses the state, or maximises its likelihood. PF: see ``losses.likelihood``."""
+        uses_images, filter_ = self.uses_images(name), self.filter
+        steps = 1 if uses_images else 1 + filter_.history
         size = (8 if uses_images and isinstance(module, MeasurementModel) else 4) * self.plan.batch
 
         def loss(split: str) -> Tensor:
-            batch = self.sample(split, 1, size)
+            batch = self.sample(split, steps, max(1, 2 * size // (1 + steps)))
             if not uses_images:
                 batch = self.shifted(batch)
+            if isinstance(filter_, InformationFilter):
+                return losses.sensor_likelihood(filter_, name, batch)
             if isinstance(module, VirtualSensor):
                 error = module(self.filter.observations(batch))[0] - losses.true_states(self.filter, batch)
                 return error.square().mean()
@@ -341,13 +352,13 @@ class Trainer:
         self.filter.requires_grad_(False)
         for parameter in trained:
             parameter.requires_grad_(True)
-        optimiser = torch.optim.AdamW(self.parameter_groups(trained, rate), lr=rate, weight_decay=decay)
+        optimiser = torch.optim.AdamW(parameter_groups(self.filter, trained, rate), lr=rate, weight_decay=decay)
         schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.05, total_iters=max(count, 1))
         validate = self.sets["val"] is not None and count > 0
         best_loss = self.validation_loss(stage, loss) if validate else 0.0
         best, failures = [p.detach().clone() for p in trained], 0
         for step in range(1, count + 1):
-            value = _optimiser_step(optimiser, trained, loss)
+            value = optimiser_step(optimiser, trained, loss)
             schedule.step()
             if self.report is not None:
                 self.report(stage, step, count, value)
@@ -367,12 +378,6 @@ class Trainer:
                 for parameter, weights in zip(trained, best, strict=True):
                     parameter.copy_(weights)
 
-    def parameter_groups(self, trained: Sequence[nn.Parameter], rate: float) -> list[dict[str, Any]]:
-        """The process noise, a logarithm that scales all else, trains at ten times the rate and without decay."""
-        noise = [p for n, p in self.filter.named_parameters() if n == "dynamics.log_noise" and p.requires_grad]
-        networks = [p for p in trained if all(p is not q for q in noise)]
-        return [{"params": networks}, {"params": noise, "lr": 10 * rate, "weight_decay": 0.0}]
-
     @torch.no_grad()
     def validation_loss(self, stage: str, loss: Callable[[str], Tensor]) -> float:
         """The loss on ``val``; restores the generators' states."""
@@ -382,15 +387,3 @@ class Trainer:
         self.generator.set_state(states[0])
         self.noise.set_state(states[1])
         return total
-
-
-def _optimiser_step(
-    optimiser: torch.optim.Optimizer, parameters: Sequence[nn.Parameter], loss: Callable[[str], Tensor]
-) -> float:
-    """One step with clipped gradients, skipped if a gradient overflowed; returns the loss."""
-    optimiser.zero_grad(set_to_none=True)
-    value = loss("train")
-    value.backward()
-    if torch.isfinite(nn.utils.clip_grad_norm_(parameters, 5.0)):
-        optimiser.step()
-    return float(value.detach())

@@ -116,13 +116,15 @@ class SingleStep:
 
     def run(self, *inputs: Tensor) -> tuple[StepTrace, Evidence]:
         """Run the step with other inputs, (B, ...) each, and equal random numbers."""
-        batch, count, at = self.replay.batch, len(inputs[0]), slice(self.step, self.step + 1)
+        batch, count = self.replay.batch, len(inputs[0])
+        at = slice(max(0, self.step - self.filter.history), self.step + 1)
 
         def expand(values: Tensor) -> Tensor:
             return values[at].expand(-1, count, *values.shape[2:])
 
         observations = {name: expand(values) for name, values in batch.observations.items()}
-        observations |= {name: values.unsqueeze(0) for name, values in zip(self.modalities, inputs, strict=True)}
+        for name, values in zip(self.modalities, inputs, strict=True):
+            observations[name] = torch.cat([observations[name][:-1].to(values.dtype), values.unsqueeze(0)])
         evidence = self.filter.encode(
             Batch(
                 observations=observations,
@@ -131,7 +133,7 @@ class SingleStep:
                 contact=expand(batch.contact),
                 previous=batch.previous.expand(count, -1),
             )
-        )
+        )[-1:]
         for edit in self._edits:
             evidence = self.replay.apply_weights(evidence, edit)
         belief = repeat_belief(self.replay.beliefs[self.step], count)

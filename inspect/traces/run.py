@@ -18,6 +18,7 @@ from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace,
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter, Kind
+from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
@@ -159,7 +160,8 @@ def _ekf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence)
     z = Gaussian(evidence.observation[:, 0], torch.diag_embed(evidence.noise[:, 0] ** 2))
     arrays["observation_mean"], arrays["observation_covariance"] = _stack(filter_, [z])
     if evidence.log_weights is not None:
-        arrays["effective_weights"] = torch.softmax(evidence.log_weights[:, 0], dim=1)
+        assert isinstance(filter_, ExtendedKalmanFilter)
+        arrays["effective_weights"] = filter_.shares(evidence)[:, 0]
     elif len(filter_.names) > 1:
         information = torch.linalg.inv(torch.cat([belief.covariance for belief in modality]))
         fused = torch.cat([s.estimate.covariance for s in steps])

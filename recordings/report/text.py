@@ -28,6 +28,19 @@ KALMAN_UPDATE = (
 DYNAMICS = r"f(x, u) = x + f_1(x, u) \odot \sigma (f_2(x, u))"
 
 
+INFORMATION_UPDATE = Passage(
+    "Fusion",
+    "All filters continue from the fused belief, so they share the prediction $\\bar{m}$, $\\bar{S}$. The fused belief "
+    "is its update with all virtual observations at once. A weight model maps all modalities to a weight $\\beta_k$ "
+    "per modality and component; the power of an observation is $p_k = K \\beta_k$ for $K$ modalities. Powers multiply "
+    "matrices elementwise.",
+    (
+        r"S^{-1} = \bar{S}^{-1} + \sum_k p_k \odot R_k^{-1}",
+        r"m = \bar{m} + S \sum_k p_k \odot R_k^{-1} (z_k - \bar{m})",
+    ),
+)
+
+
 def methods(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
     """Describe the filter and its evaluation, based on trace and checkpoint."""
     kinds = {"ekf": _kalman, "ukf": _kalman, "pf": _particles, "lstm": _recurrent}
@@ -75,6 +88,8 @@ def _kalman(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
     if trace.weights is None:
         equations: tuple[str, ...] = (r"S = ( \sum_k S_k^{-1} )^{-1} , \quad m = S \sum_k S_k^{-1} m_k",)
         return [*bank, Passage("Fusion", "The beliefs are fused as a product of Gaussians.", equations)]
+    if _setting(checkpoint, "fusion", "crossmodal") == "information":
+        return [*bank, INFORMATION_UPDATE]
     equations = (r"m = \sum_k \beta_k \odot m_k",)
     if _setting(checkpoint, "covariance", "paper") == "moments":
         covariance = "The covariance is that of the mixture, per pair of components."

@@ -54,7 +54,7 @@ def test_trace_has_the_fields_of_its_kind(checkpoint: Checkpoint, traced: Trace)
     assert (traced.observation_mean is not None) == (kind in ("ekf", "ukf"))
     assert (traced.log_likelihood is not None) == (kind == "pf")
     # Effective weights sum to one.
-    assert (traced.weights is not None) == checkpoint.name.startswith("crossmodal")
+    assert (traced.weights is not None) == checkpoint.name.startswith(("crossmodal", "information"))
     assert (traced.effective_weights is not None) == (k > 1)
     if traced.effective_weights is not None:
         np.testing.assert_allclose(traced.effective_weights.sum(1), 1.0, atol=1e-5)

@@ -6,7 +6,9 @@ from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
 from beliefscope.datasets.errors import check_name
 
-ARCHITECTURES = "{crossmodal,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf or lstm (docs/filters.md)."
+ARCHITECTURES = (
+    "{crossmodal,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf, information-ekf or lstm (docs/filters.md)."
+)
 NETWORKS = "default, or authors: layers and image resolution of the paper's published code (docs/filters.md)."
 
 

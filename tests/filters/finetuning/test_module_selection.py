@@ -56,7 +56,7 @@ def test_module_tree_contains_every_parameter_once(name: str) -> None:
     assert set(dict(filter_.named_modules())) <= set(nodes)
     available = presets(filter_)
     assert len(list(select_parameters(filter_, ["all"]))) == len(list(filter_.parameters()))
-    assert ("weights-only" in available) == name.startswith("crossmodal")
+    assert ("weights-only" in available) == name.startswith(("crossmodal", "information"))
     assert all(set(select_parameters(filter_, [preset])) for preset in available)
 
 

@@ -50,7 +50,7 @@ def randomise(filter_: Filter) -> Filter:
 def test_catalog_has_the_filters_of_the_paper_and_a_ukf() -> None:
     fused = {f"{how}-{kind}" for how in ("feature", "unimodal", "crossmodal") for kind in ("ekf", "pf")}
     single = {f"{modality}-{kind}" for modality in ("image", "haptics") for kind in ("ekf", "pf")}
-    assert set(NAMES) == fused | single | {"lstm", "crossmodal-ukf"}
+    assert set(NAMES) == fused | single | {"lstm", "crossmodal-ukf", "information-ekf"}
 
 
 @pytest.fixture

@@ -114,7 +114,7 @@ def test_equal_inputs_and_baselines_have_no_attribution() -> None:
     assert not any(x.any() for x in result)
 
 
-KINDS = ("crossmodal-ukf", "unimodal-ekf", "unimodal-pf", "feature-ekf", "lstm", "haptics-pf")
+KINDS = ("crossmodal-ukf", "information-ekf", "unimodal-ekf", "unimodal-pf", "feature-ekf", "lstm", "haptics-pf")
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf", *KINDS])

@@ -13,7 +13,9 @@ from beliefscope.inspect.trace import ARRAYS, trace
 from beliefscope.inspect.traces.replay import Edit, Replay
 
 
-@pytest.mark.parametrize("name", ["crossmodal-ukf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"])
+@pytest.mark.parametrize(
+    "name", ["crossmodal-ukf", "information-ekf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"]
+)
 def test_empty_edit_is_bit_identical(name: str) -> None:
     checkpoint = Checkpoint(build(architecture("door", name)).eval().requires_grad_(False), name, "0" * 64, {})
     with open_dataset(sample_path("door")) as data:
