@@ -190,10 +190,13 @@ class Jobs:
             job = Job(id, kind, title, submitted=submitted, server=os.getpid(), link=link)
             self._save(job)
             self._jobs[id] = job
-            self._executor.submit(self._run, id, arguments)
+            begun = threading.Event()
+            self._executor.submit(self._run, id, arguments, begun)
             for job in [job for job in self.all() if not job.active][MAX_ENDED:]:
                 self._delete(job.id)
-            return self._jobs[id]
+        if active < self._max_running:
+            begun.wait()
+        return self[id]
 
     def cancel(self, id: str) -> Job:
         """Cancel an active job; delete an ended one with its files. Raises NotFound."""
@@ -233,9 +236,10 @@ class Jobs:
         del self._jobs[id]
         shutil.rmtree(self._folder / id, ignore_errors=True)
 
-    def _run(self, id: str, arguments: Mapping[str, Any]) -> None:
-        """Run a job in a process, unless it has been cancelled."""
+    def _run(self, id: str, arguments: Mapping[str, Any], begun: threading.Event) -> None:
+        """Run a job in a process, unless it has been cancelled. Sets the event once the job has left the queue."""
         with self._lock:
+            begun.set()  # ``submit`` then waits for the lock
             job = self._jobs.get(id)
             if job is None or job.state != "waiting":
                 return
