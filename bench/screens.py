@@ -53,7 +53,7 @@ def state(panel: str) -> str:
 
 
 VIEWS: dict[str, Callable[[Page], None]] = {
-    "failures": tab("failures", state("#failures"), "Look for failures"),
+    "failures": tab("failures", state("#failures"), "Search for failures"),
     "compare": tab("compare", state("#compare .result"), "Compare"),
     "study": tab("study", state("#study")),
     "rerun": tab("rerun", "['ready', 'error'].includes(document.querySelector('#rerun').dataset.state)"),

@@ -49,7 +49,7 @@ SHOTS = (
         },
         "#maps-pairs",
     ),
-    Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Look for failures"),
+    Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Search for failures"),
     Shot("walkthrough-moment", {"tab": "scene"}, "#maps-pairs"),
     Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, READY),
     Shot("walkthrough-standalone", {"tab": "diagnostics", "diagnostic": "standalone"}, READY, "Compute"),
