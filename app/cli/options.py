@@ -134,8 +134,8 @@ OPTIONS: dict[str, Any] = {
     "seed": option("S", "Random seed.", parser=integer(0)),
     "train": option(
         "PRESET|PATTERN",
-        "Train only these modules: haptics-only, image-only, weights-only, noise-only, dynamics-only, heads-only, "
-        "all, or patterns. Repeatable. Default: all modules that are not frozen.",
+        "Train only these modules: haptics-only, image-only, weights-only, noise-only, reliability-only, "
+        "dynamics-only, heads-only, all, or patterns. Repeatable. Default: all modules that are not frozen.",
     ),
     "freeze": option("PATTERN", "Freeze these modules: dotted names, * matches any text. Repeatable."),
     "workspace": option("DIR", "Workspace folder for recordings and traces; created if missing."),

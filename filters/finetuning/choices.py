@@ -8,6 +8,7 @@ from typing import Any
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.finetuning.defaults import default_settings, reason
 from beliefscope.filters.finetuning.module_selection import (
     module_change,
     module_tree,
@@ -16,7 +17,7 @@ from beliefscope.filters.finetuning.module_selection import (
     within,
 )
 from beliefscope.filters.finetuning.settings import FineTune
-from beliefscope.filters.finetuning.slices import CLEAN, standard_slices
+from beliefscope.filters.finetuning.slices import CLEAN, fault_slices, standard_slices
 
 
 @dataclass(frozen=True)
@@ -53,20 +54,23 @@ class SliceInfo:
 
 @dataclass(frozen=True)
 class Choices:
-    """Options for fine-tuning a filter. why_not: why it cannot be fine-tuned, or None. settings: the defaults."""
+    """Options for fine-tuning a filter.
+
+    why_not: why it cannot be fine-tuned, or None. settings: the defaults. reason: why they are the defaults.
+    """
 
     why_not: str | None
     modules: Sequence[ModuleInfo]
     presets: Sequence[PresetInfo]
     slices: Sequence[SliceInfo]
     settings: dict[str, Any]
+    reason: str
 
 
 def choices(checkpoint: Checkpoint) -> Choices:
     """The options for fine-tuning a filter."""
-    defaults = FineTune().to_json()
     if isinstance(checkpoint, ExternalFilter):
-        return Choices("External filters cannot be fine-tuned here.", [], [], [], defaults)
+        return Choices("External filters cannot be fine-tuned here.", [], [], [], FineTune().to_json(), "")
     filter_ = checkpoint.filter
     changes = checkpoint.record.get("parts", {})  # of the fine-tuning that wrote this checkpoint
     modules = []
@@ -77,11 +81,13 @@ def choices(checkpoint: Checkpoint) -> Choices:
             modules.append(ModuleInfo(node.name, node.kind, node.description, node.parameters, node.depth, **sizes))
     parameters = [name for name, _ in filter_.named_parameters()]
     trained = {name: set(select_parameters(filter_, [name])) for name in presets(filter_)}
-    slices = [s for s in standard_slices(checkpoint.task) if s != CLEAN and set(s.only) <= set(filter_.names)]
+    slices = [*fault_slices(checkpoint.task, filter_.names).values()]
+    slices += [s for s in standard_slices(checkpoint.task) if s != CLEAN and set(s.only) <= set(filter_.names)]
     return Choices(
         None,
         modules,
         [PresetInfo(name, [key for key in parameters if key in names]) for name, names in trained.items()],
         [SliceInfo(**slice_.to_json(), text=str(slice_)) for slice_ in slices],
-        defaults,
+        default_settings(filter_).to_json(),
+        reason(filter_),
     )

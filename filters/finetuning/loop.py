@@ -16,12 +16,16 @@ from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.batch_mix import Mix, evenly_spaced
 from beliefscope.filters.finetuning.module_selection import matching
 from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.finetuning.slices import CLEAN
 from beliefscope.filters.models.networks import ImageEncoder
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.training import losses
 
 MAX_LENGTH, MAX_WINDOWS, PARTICLES = 100, 32, 100
 """Of a validation: steps in a window, windows of each slice, and particles."""
+
+CLEAN_LIMIT = 4 / 3
+"""Error on clean data relative to the base checkpoint above which weights are never kept, however good elsewhere."""
 
 NOISE_RATE, ENCODER_RATE = 10.0, 1 / 3
 """Relative learning rates, as in training: of the logarithmic process noise, which scales all else, and of encoders."""
@@ -189,11 +193,18 @@ class FineTuneLoop:
             total = score(validation, self.validations[0], shares, settings.likelihood_weight)
             validation = replace(validation, score=total)
             self.loss, self.failures = 0.0, self.failures + 1
-            if validation.score < min(earlier.score for earlier in self.validations):
+            if self._keeps_clean(validation) and validation.score < min(
+                earlier.score for earlier in self.validations if self._keeps_clean(earlier)
+            ):
                 self.best = {name: p.detach().clone() for name, p in self.trained.items()}
                 self.best_step, self.failures = self.done, 0
         self.validations.append(validation)
         return validation
+
+    def _keeps_clean(self, validation: Validation) -> bool:
+        """Whether the error on clean data, if they are part of the loss, is within ``CLEAN_LIMIT``."""
+        errors = [v.slices[CLEAN.name]["error"] for v in (self.validations[0], validation) if CLEAN.name in v.slices]
+        return not errors or bool(errors[1] <= CLEAN_LIMIT * errors[0])
 
     @torch.no_grad()
     def restore_best(self) -> None:

@@ -32,6 +32,13 @@ MODALITY_PATTERNS = (
 PRESETS: dict[str, tuple[str, ...]] = {
     "weights-only": ("weight_model.trunk", "weight_model.output", "weight_model.encoders.by_modality.{vector}"),
     "noise-only": ("dynamics.log_noise", "virtual_sensors.*.log_noise"),
+    "reliability-only": (
+        "virtual_sensors.*.log_noise",
+        "measurement_models.*.head",
+        "weight_model.trunk",
+        "weight_model.output",
+        "weight_model.encoders.by_modality.{vector}",
+    ),
     "dynamics-only": ("dynamics",),
     "heads-only": (
         "virtual_sensors.*.state",

@@ -156,9 +156,23 @@ def standard_slices(task: Task) -> tuple[Slice, ...]:
     return tuple(slice_ for slice_ in slices if _fits(slice_, task))
 
 
+FAULT_SLICES = {
+    "image": Slice("image occluded", Faults.parse("image_occluded=12")),
+    "haptics": Slice("haptics noisy", Faults.parse("force_noise=5,contact_flipped=0.3")),
+}
+"""Modality -> slice of all steps with a fault that the training data lack."""
+
+
+def fault_slices(task: Task, models: Sequence[str]) -> dict[str, Slice]:
+    """The ``FAULT_SLICES`` of the modalities that a filter's models use and whose sensors the task has."""
+    used = dict.fromkeys(modality for model in models for modality in model.split("+"))
+    return {name: FAULT_SLICES[name] for name in used if name in FAULT_SLICES and _fits(FAULT_SLICES[name], task)}
+
+
 def parse_slices(texts: Iterable[str], fault_sets: Iterable[str], task: Task) -> list[Slice]:
     """Slices from their text, and slices of all steps with faults, given as text or file."""
-    slices = [Slice.parse(text, standard_slices(task)) for text in texts]
+    named = (*standard_slices(task), *fault_slices(task, tuple(task.modalities)).values())
+    slices = [Slice.parse(text, named) for text in texts]
     for text in fault_sets:
         faults = read_faults(text, task)
         slices.append(Slice(str(faults).replace("=", " ").replace(":", " "), faults))

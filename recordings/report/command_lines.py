@@ -42,7 +42,7 @@ def finetune_command(target: str, filter_: str | None, data: Path | None, settin
 
     names = [Path(text).name if text.endswith(".safetensors") else text for text in (target, filter_ or "")]
     words = ["beliefscope", "finetune", names[0], *_options("--filter", names[1:] if filter_ else [])]
-    words += _options("--train", settings.train) + _options("--freeze", settings.freeze)
+    words += _options("--train", settings.train or ("all",)) + _options("--freeze", settings.freeze)
     words += _options("--slice", (slice_ for slice_, _ in settings.mix))
     words += _options("--event", settings.events)
     words += _options("--data", [data.name] if data else [])

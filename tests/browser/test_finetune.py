@@ -24,6 +24,10 @@ def test_filter_is_finetuned_promoted_and_discarded(
     page = open_page("?tab=finetune&filter=crossmodal-ekf&data=few", server.url)
     panel = page.page.locator("#finetune")
     page.until("() => document.querySelectorAll('#finetune .tree li').length > 20")
+    assert panel.locator("select[name=preset]").input_value() == "reliability-only"
+    assert panel.locator("select[name=slice]").input_value() == "image occluded"
+    assert "image occluded" in panel.locator(".reason").text_content()
+    panel.locator("select[name=preset]").select_option("haptics-only")
     assert "26,054 of 449,097" in panel.locator(".count").text_content()
     panel.get_by_label("Train virtual_sensors.haptics", exact=True).uncheck()
     assert panel.locator("select[name=preset]").input_value() == "custom"

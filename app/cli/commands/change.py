@@ -44,7 +44,7 @@ def change(
     """
     from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
     from beliefscope.app.runs.catalog import served_names
-    from beliefscope.filters.finetuning.slices import Slice, standard_slices
+    from beliefscope.filters.finetuning.slices import parse_slices
     from beliefscope.filters.open_filter import is_path, open_filters
     from beliefscope.inspect.compare.checkpoints import compare_checkpoints, write_comparison
     from beliefscope.inspect.diagnostics.views import as_json
@@ -53,7 +53,7 @@ def change(
         raise BadInput(f"output {str(output)!r} exists, or its parent folder does not; give the name of a new folder")
     checkpoints = open_filters(task, before, after)
     target = checkpoints[0].task
-    selection = [Slice.parse(text, standard_slices(target)) for text in slices or []]
+    selection = parse_slices(slices or (), (), target)
     with opt.open_episodes(target, data, skip_bad) as episodes, console.progress("Comparing") as advance:
         report = compare_checkpoints(
             *checkpoints,

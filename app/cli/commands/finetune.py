@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,12 @@ if TYPE_CHECKING:
     output=opt.CHECKPOINT,
     filter=opt.option("NAME|CHECKPOINT", "Name of a built-in filter, or .safetensors file."),
     fault_sets=opt.option("FAULTS", "Learn a slice of all steps with these sensor faults. Repeatable.", "--faults"),
-    clean_weight=opt.option("SHARE", "Weight of clean data in the loss."),
+    clean_weight=opt.option(
+        "SHARE",
+        "Weight of clean data in the loss (default 0.5; without options for modules and data 0.97 with images).",
+    ),
     events=opt.option("EPISODE[:FIRST-LAST]", "Learn slices only from these steps. Repeatable.", "--event"),
-    steps=opt.option("N", "Maximum number of optimiser steps.", parser=opt.integer(1)),
+    steps=opt.option("N", "Maximum number of optimiser steps (default 300).", parser=opt.integer(1)),
     length=opt.option("T", "Window length in steps.", parser=opt.integer(1)),
     rates=opt.option(
         "R|PATTERN=R",
@@ -42,11 +46,11 @@ def finetune(
     freeze: list[str] | None = None,
     slices: list[str] | None = None,
     fault_sets: list[str] | None = None,
-    clean_weight: float = 0.5,
+    clean_weight: float | None = None,
     events: list[str] | None = None,
     data: Path | None = None,
     skip_bad: bool = False,
-    steps: int = 300,
+    steps: int | None = None,
     length: int = 32,
     rates: list[str] | None = None,
     l2_sp: float = 1.0,
@@ -62,14 +66,19 @@ def finetune(
     combines the given slices and clean data. Validates every 25 steps and keeps the best weights. The base checkpoint
     is not changed. The same command resumes an interrupted run from CHECKPOINT.partial. Tutorial: docs/finetune.md.
 
+    Without --train, --freeze, --slice, --faults and --event, the filter learns a sensor fault that its training data
+    lack, for 150 steps: reliability-only learns occluded images; without images, haptics-only learns noisy haptics.
+
     \b
     Examples:
+      beliefscope finetune push --filter crossmodal-ekf -o finetuned.safetensors
       beliefscope finetune push --filter crossmodal-ekf --slice 'blackout 0.8' -o finetuned.safetensors
       beliefscope finetune mine.safetensors --train haptics-only --faults blackout=0.95 -o finetuned.safetensors
       beliefscope finetune door --filter crossmodal-pf --freeze dynamics --slice contact -o finetuned.safetensors
       beliefscope finetune door --filter crossmodal-ekf --train noise-only --rate 0.003 -o finetuned.safetensors
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
+    from beliefscope.filters.finetuning.defaults import default_settings
     from beliefscope.filters.finetuning.report import held_out_rows, training_summary
     from beliefscope.filters.finetuning.settings import FineTune, StepRange, parse_rates
     from beliefscope.filters.finetuning.slices import parse_slices
@@ -83,13 +92,19 @@ def finetune(
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
     rate, own_rates = parse_rates(rates or ())
-    settings = FineTune(
-        train=tuple(train or ()),
-        freeze=tuple(freeze or ()),
-        mix=tuple((slice_, 1.0) for slice_ in parse_slices(slices or (), fault_sets or (), base.task)),
-        clean_weight=clean_weight,
-        events=tuple(StepRange.parse(text) for text in events or ()),
-        steps=steps,
+    if any((train, freeze, slices, fault_sets, events)):
+        settings = FineTune(
+            train=tuple(train or ()),
+            freeze=tuple(freeze or ()),
+            mix=tuple((slice_, 1.0) for slice_ in parse_slices(slices or (), fault_sets or (), base.task)),
+            events=tuple(StepRange.parse(text) for text in events or ()),
+        )
+    else:
+        settings = default_settings(base.filter)
+    settings = replace(
+        settings,
+        clean_weight=settings.clean_weight if clean_weight is None else clean_weight,
+        steps=settings.steps if steps is None else steps,
         length=length,
         rate=rate,
         rates=own_rates,

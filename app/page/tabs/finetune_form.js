@@ -14,7 +14,6 @@ import { ModuleTree } from './module_tree.js';
 /** @typedef {'clean_weight' | 'steps' | 'length' | 'rate' | 'l2_sp' | 'seed'} NumberName */
 
 const CUSTOM = 'custom'; // value of a preset or a slice without a name
-const DEFAULTS = { preset: 'haptics-only', slice: 'blackout 0.8' }; // if the filter has them
 /** @type {[string, string][]} */
 const PHASES = [
   ['', 'all steps'],
@@ -42,6 +41,7 @@ const NUMBERS = [
 ];
 
 const BODY = `
+  <p class="reason"></p>
   <div class="row"><label>Train <select name="preset"></select></label> <span class="count"></span></div>
   <ul class="tree" aria-label="Modules"></ul>
   <div class="row">
@@ -129,13 +129,14 @@ export class FinetuneForm {
    */
   show(offer) {
     this.#offer = offer;
-    const { modules, presets, slices, settings, runs } = offer;
+    const { modules, presets, slices, settings, reason, runs } = offer;
+    html('.reason', this.#form).textContent = reason;
     this.#tree.show(modules, presets.find(({ name }) => name === 'all')?.trains ?? []);
     fill(this.#select('preset'), [
       ...presets.map(({ name }) => pair(name, displayName(name).replace('-only', ' only'))),
       [CUSTOM, 'custom'],
     ]);
-    this.#select('preset').value = defaultName(presets, DEFAULTS.preset) ?? CUSTOM;
+    this.#select('preset').value = settings.train[0] ?? 'all';
     const single = slices.filter(({ only }) => only.length);
     fill(this.#select('only'), [
       ['', 'all'],
@@ -146,7 +147,7 @@ export class FinetuneForm {
       ['', 'clean data only'],
       [CUSTOM, 'custom'],
     ]);
-    this.#select('slice').value = defaultName(slices, DEFAULTS.slice) ?? '';
+    this.#select('slice').value = settings.mix[0]?.slice.name ?? '';
     for (const { name } of NUMBERS) this.#input(name).value = String(settings[name]);
     html('.past', this.#form).hidden = !runs.length;
     fill(this.#select('past'), [
@@ -253,14 +254,6 @@ function customSlice(faults, contact, only) {
   const values = [`faults=${faults}`, contact && `contact=${contact}`, only && `only=${only}`];
   return [parts.filter(Boolean).join(', '), ...values].filter(Boolean).join(':');
 }
-
-/**
- * Returns a name if an item has it, or the name of the first item.
- * @param {{name: string}[]} items
- * @param {string} name
- * @returns {string | undefined}
- */
-const defaultName = (items, name) => (items.find((item) => item.name === name) ?? items[0])?.name;
 
 /** @param {typeof NUMBERS[number]} field */
 function numberField({ name, text, step, title }) {

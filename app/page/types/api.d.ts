@@ -421,6 +421,8 @@ export interface components {
             settings: {
                 [key: string]: unknown;
             };
+            /** Reason */
+            reason: string;
             /** Runs */
             runs: components["schemas"]["FineTuneRunInfo"][];
         };

@@ -44,9 +44,16 @@ def test_options(shared_client: TestClient) -> None:
     names = [m["name"] for m in offer["modules"]]
     assert {"dynamics", "virtual_sensors.haptics.state", "weight_model"} <= set(names)
     presets = {p["name"]: p["trains"] for p in offer["presets"]}
-    assert {"haptics-only", "image-only", "weights-only", "noise-only", "dynamics-only", "heads-only", "all"} <= set(
-        presets
-    )
+    assert {
+        "haptics-only",
+        "image-only",
+        "weights-only",
+        "noise-only",
+        "reliability-only",
+        "dynamics-only",
+        "heads-only",
+        "all",
+    } <= set(presets)
     assert "virtual_sensors.haptics.state.weight" in presets["haptics-only"]
     assert not any(name.startswith("virtual_sensors.image") for name in presets["haptics-only"])
     assert "haptics only" in [m["name"] for m in offer["slices"]]
