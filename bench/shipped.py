@@ -28,7 +28,7 @@ filter is the same filter with the observations of all other modalities masked i
 distance. The hash of simulated data depends on the type of CPU, because contacts amplify rounding.
 """
 OFFSETS = """
-Evaluation from starts 3 cm and 20 deg off the truth, with the covariance of such offsets, on the 64 test episodes of
+Evaluation from starts with an offset of 3 cm and 20 deg and the covariance of such offsets, on the 64 test episodes of
 the sample set, which are not in that file (`python bench/study_offsets.py`):
 """
 AT_TRUTH = """

@@ -79,7 +79,7 @@ class Row:
 def rows_of(documents: Mapping[Any, Document | None]) -> list[Row]:
     """The rows of the requested cells (each a ``Condition``), computed from the finished ones.
 
-    Conditions of which no finished cell of the task has metrics are omitted, such as offset starts of earlier versions.
+    Conditions without metrics of any finished cell of the task are omitted, such as offset starts of earlier versions.
     """
     rows = []
     cells: Sequence[Condition] = list(documents)

@@ -36,7 +36,7 @@ def test_filter_is_finetuned_promoted_and_discarded(
     panel.get_by_label("Expand virtual_sensors.haptics", exact=True).click()
     panel.get_by_label("Train virtual_sensors.haptics.state", exact=True).check()
     panel.locator("select[name=slice]").select_option("haptics only")
-    for name, value in (("steps", "3"), ("length", "8")):
+    for name, value in (("steps", "3"), ("length", "8"), ("clean_weight", "0.5"), ("rate", "0.0003")):
         panel.locator(f"input[name={name}]").fill(value)
     page.screenshot("finetune-form")
     panel.get_by_role("button", name="Fine-tune").click()
