@@ -232,7 +232,7 @@ def test_invalid_permalink_values_are_reported(open_page: Any) -> None:
         "component “elbow”",
         "hinge_x",
         "Step 5000",
-        "fault 'blakout'",
+        "Fault 'blakout'",
     ):
         assert part in message
     assert 0 < page.state["step"] < 5000
