@@ -16,13 +16,14 @@ def evaluate(runs: opt.Runs, only: str | None = None, start_offset: str = "", al
     """Measure the accuracy of a filter on held-out episodes.
 
     Uses the test episodes; if there are none, the validation episodes or all. Each run starts at the true state with
-    covariance 0.1 I in standardised units, or at --start-offset with the covariance of such offsets. Reports the RMSE
-    without the first 30 steps and from step 0; nll, the negative log-likelihood of the truth in nats; nees, the
-    normalised estimation error squared per dimension, 1 for a calibrated covariance; coverage95, the fraction of steps
-    with the truth inside the 95 % ellipsoid. Two baselines run from the same start: stay keeps the start as its
-    estimate; dynamics is the filter with all observations masked. Two errors of each modality: its update, the fused
-    filter's prior of each step updated with this modality only; and standalone, the same filter and random numbers with
-    the observations of all other modalities masked in every step. Warns if the data differ from the training data.
+    covariance 0.1 I in standardised units, or at --start-offset with the covariance of such offsets; runs of field
+    tasks start beside the truth. Reports the RMSE without the first 30 steps (field tasks: of all steps), from step 0,
+    before and after the first contact; nll, the negative log-likelihood of the truth in nats; nees, the normalised
+    estimation error squared per dimension, 1 for a calibrated covariance; coverage95, the fraction of steps with the
+    truth inside the 95 % ellipsoid. Two baselines run from the same start: stay keeps the start as its estimate;
+    dynamics is the filter with all observations masked. Two errors of each modality: its update, the fused filter's
+    prior of each step updated with this modality only; and standalone, the same filter and random numbers with the
+    observations of all other modalities masked in every step. Warns if the data differ from the training data.
 
     \b
     Examples:
