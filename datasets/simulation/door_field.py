@@ -115,7 +115,7 @@ DOOR_FIELD = replace(
             {"hinge": (0.01, 0.02), "angle": (0.02, 0.06)},
         ),
         "nudges": Ingredient(
-            "torques from outside on the door: number per s, mean rotation in rad",
+            "external torques on the door: number per s, mean rotation in rad",
             {"per_second": (0.05, 0.12), "angle": (0.1, 0.25)},
         ),
         "start": start_ingredient(START),

@@ -131,7 +131,7 @@ PUSH_FIELD = replace(
             "error of the position at which the policy aims, standard deviation in m", {"std": (0.01, 0.02)}
         ),
         "nudges": Ingredient(
-            "impulses from outside on the puck: number per s, mean distance in m",
+            "external impulses on the puck: number per s, mean distance in m",
             {"per_second": (0.05, 0.12), "distance": (0.02, 0.04)},
         ),
         "start": start_ingredient(START),
