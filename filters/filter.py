@@ -160,7 +160,7 @@ def encoders(task: Task, modalities: Iterable[str], architecture: Architecture, 
     """New encoders of these modalities. Raises BadInput for one that the task does not have.
 
     Args:
-        steps: of which vectors are joined.
+        steps: number of steps whose vectors are joined.
     """
     shapes: dict[str, tuple[int, ...]] = {}
     for modality in modalities:

@@ -51,7 +51,7 @@ class VirtualSensor(nn.Module):
     """
 
     def __init__(self, task: Task, model: str, architecture: Architecture, steps: int = 1) -> None:
-        """steps: of which vectors are joined."""
+        """steps: number of steps whose vectors are joined."""
         super().__init__()
         n, units = len(task.components), architecture.units
         self.encoders = encoders(task, model.split("+"), architecture, steps)

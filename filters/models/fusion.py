@@ -53,7 +53,7 @@ def weighted_average(bank: Gaussian, log_weights: Tensor, rule: CovarianceRule =
 
 
 def powers(log_weights: Tensor, present: Tensor | None = None) -> Tensor:
-    """Powers ``K beta_k`` (N, K, n) of K experts, which sum to the number K of those that are used.
+    """Powers ``K beta_k`` (N, K, n) of K experts, which sum to the number K of used experts.
 
     Equal weights give power 1. An expert with beta zero, or not in ``present`` (N, K), is not used.
     """

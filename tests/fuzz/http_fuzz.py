@@ -53,8 +53,8 @@ class ErrorLog(logging.Handler):
 @contextmanager
 def running_server(settings_: Settings) -> Iterator[tuple[TestClient, ErrorLog]]:
     """A server in this process whose jobs are queued but never run."""
-    log, start = ErrorLog(), Jobs._start_waiting
-    Jobs._start_waiting = lambda self: None  # type: ignore[method-assign]
+    log, run = ErrorLog(), Jobs._run
+    Jobs._run = lambda self, id, arguments: None  # type: ignore[method-assign]
     logging.getLogger("beliefscope.app").addHandler(log)
     try:
         application = create_app(settings_, warm=False)
@@ -62,7 +62,7 @@ def running_server(settings_: Settings) -> Iterator[tuple[TestClient, ErrorLog]]
         with client:
             yield client, log
     finally:
-        Jobs._start_waiting = start  # type: ignore[method-assign]
+        Jobs._run = run  # type: ignore[method-assign]
         logging.getLogger("beliefscope.app").removeHandler(log)
 
 

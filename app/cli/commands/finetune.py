@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import finetune_command
 
 if TYPE_CHECKING:
+    from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.filters.finetuning.finetune import FineTuned
     from beliefscope.filters.finetuning.loop import Validation
     from beliefscope.filters.finetuning.settings import FineTune
@@ -78,10 +80,7 @@ def finetune(
       beliefscope finetune door --filter crossmodal-ekf --train noise-only --rate 0.003 -o finetuned.safetensors
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
-    from beliefscope.filters.finetuning.defaults import default_settings
-    from beliefscope.filters.finetuning.report import held_out_rows, training_summary
-    from beliefscope.filters.finetuning.settings import FineTune, StepRange, parse_rates
-    from beliefscope.filters.finetuning.slices import parse_slices
+    from beliefscope.filters.finetuning.settings import parse_rates
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.healthy import measure_profile
 
@@ -92,19 +91,8 @@ def finetune(
         raise BadInput(f"--filter is required: give the filter of task {target!r} to fine-tune")
     base = load_checkpoint(Path(target)) if filter is None else open_filter(target, filter)
     rate, own_rates = parse_rates(rates or ())
-    if any((train, freeze, slices, fault_sets, events)):
-        settings = FineTune(
-            train=tuple(train or ()),
-            freeze=tuple(freeze or ()),
-            mix=tuple((slice_, 1.0) for slice_ in parse_slices(slices or (), fault_sets or (), base.task)),
-            events=tuple(StepRange.parse(text) for text in events or ()),
-        )
-    else:
-        settings = default_settings(base.filter)
     settings = replace(
-        settings,
-        clean_weight=settings.clean_weight if clean_weight is None else clean_weight,
-        steps=settings.steps if steps is None else steps,
+        _modules_and_data(base, train or (), freeze or (), slices or (), fault_sets or (), events or ()),
         length=length,
         rate=rate,
         rates=own_rates,
@@ -113,6 +101,10 @@ def finetune(
         patience=patience,
         seed=seed,
     )
+    if clean_weight is not None:
+        settings = replace(settings, clean_weight=clean_weight)
+    if steps is not None:
+        settings = replace(settings, steps=steps)
     partial = output.with_name(f"{output.name}.partial")
     with opt.open_episodes(base.task, data, skip_bad) as episodes:
         command = finetune_command(target, filter, data, settings)
@@ -120,12 +112,47 @@ def finetune(
         tuned = _run(base, members, settings, partial, log, rerun, data_hash=episodes.hash, command=command)
     profile = measure_profile(tuned.filter, base.name, members, command)
     checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
-    frozen = tuned.record["frozen"]
-    lines = [training_summary(tuned.record), ""]
-    lines += [console.grid("On held-out episodes", ["", "before", "after", "change"], held_out_rows(tuned.record)), ""]
+    return opt.checkpoint_result(
+        output, base.task.name, base.name, checkpoint_hash, tuned.record, _summary(tuned.record)
+    )
+
+
+def _modules_and_data(
+    base: Checkpoint,
+    train: Sequence[str],
+    freeze: Sequence[str],
+    slices: Sequence[str],
+    fault_sets: Sequence[str],
+    events: Sequence[str],
+) -> FineTune:
+    """Settings with these modules and data, or the default ones of the filter if none are given."""
+    from beliefscope.filters.finetuning.defaults import default_settings
+    from beliefscope.filters.finetuning.settings import FineTune, StepRange
+    from beliefscope.filters.finetuning.slices import parse_slices
+
+    if not any((train, freeze, slices, fault_sets, events)):
+        return default_settings(base.filter)
+    return FineTune(
+        train=tuple(train),
+        freeze=tuple(freeze),
+        mix=tuple((slice_, 1.0) for slice_ in parse_slices(slices, fault_sets, base.task)),
+        events=tuple(StepRange.parse(text) for text in events),
+    )
+
+
+def _summary(record: dict[str, Any]) -> list[str]:
+    """Lines about training, errors before and after, and frozen tensors."""
+    from beliefscope.filters.finetuning.report import held_out_rows, training_summary
+
+    frozen = record["frozen"]
     unchanged = f"Frozen: {frozen['tensors']} tensors, unchanged (hash {frozen['after'][:12]})."
-    lines.append(unchanged if frozen["tensors"] else "No tensor was frozen.")
-    return opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
+    return [
+        training_summary(record),
+        "",
+        console.grid("On held-out episodes", ["", "before", "after", "change"], held_out_rows(record)),
+        "",
+        unchanged if frozen["tensors"] else "No tensor was frozen.",
+    ]
 
 
 def _run(

@@ -71,9 +71,9 @@ def test_built_in_study(settings: Settings, open_client: Callable[..., TestClien
             assert seeds == [name if built_in else None, None, None]
         for row in task["rows"]:
             for key, mean in row["mean"].items():
-                values = [numbers[key] for numbers in row["by_seed"].values()]
+                values = [numbers[key] for numbers in row["by_seed"].values() if key in numbers]
                 if mean is not None and row["blackout"] is not None:
-                    assert mean == pytest.approx(sum(values) / 3)
+                    assert mean == pytest.approx(sum(values) / len(values))
                     assert min(values) <= mean <= max(values)
 
 
