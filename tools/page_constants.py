@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 from beliefscope.app.protocol import map_format, messages
+from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES
 
 PATH = Path(__file__).parents[1] / "app" / "page" / "core" / "constants.js"
@@ -34,6 +35,7 @@ def constants() -> dict[str, tuple[str, object]]:
         "MAP_QUANTITIES": ("What likelihood maps can show, the default first.", QUANTITIES),
         "LOG_RANGE": ("Nats below its peak that a map distinguishes.", map_format.LOG_RANGE),
         "CELL_STEPS": ("Largest value of a map's cell.", map_format.LEVELS),
+        "CLEAN_WEIGHT": ("Weight of clean data in the loss of a fine-tuning.", FineTune.clean_weight),
         "SCENE_LAYERS": ("Layers of the 3D scene.", messages.LAYERS),
         "VIEWPOINTS": ("Viewpoints of the 3D scene.", get_args(messages.Viewpoint)),
         "SCENE_CHOICES": (

@@ -35,8 +35,10 @@ def test_filter_is_finetuned_promoted_and_discarded(
     assert "nothing to train" in panel.locator(".error").text_content()
     panel.get_by_label("Expand virtual_sensors.haptics", exact=True).click()
     panel.get_by_label("Train virtual_sensors.haptics.state", exact=True).check()
+    assert panel.locator("input[name=clean_weight]").input_value() == "0.97"  # of the default slice
     panel.locator("select[name=slice]").select_option("haptics only")
-    for name, value in (("steps", "3"), ("length", "8"), ("clean_weight", "0.5"), ("rate", "0.0003")):
+    assert panel.locator("input[name=clean_weight]").input_value() == "0.5"
+    for name, value in (("steps", "3"), ("length", "8"), ("rate", "0.0003")):
         panel.locator(f"input[name={name}]").fill(value)
     page.screenshot("finetune-form")
     panel.get_by_role("button", name="Fine-tune").click()

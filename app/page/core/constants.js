@@ -14,6 +14,9 @@ export const LOG_RANGE = /** @type {const} */ (64.0);
 /** Largest value of a map's cell. */
 export const CELL_STEPS = /** @type {const} */ (65535);
 
+/** Weight of clean data in the loss of a fine-tuning. */
+export const CLEAN_WEIGHT = /** @type {const} */ (0.5);
+
 /** Layers of the 3D scene. */
 export const SCENE_LAYERS = /** @type {const} */ (["replay", "objects", "estimates", "contours", "particles", "force", "map", "camera"]);
 

@@ -4,6 +4,7 @@
 /** @import { Catalog, FineTuneOffer, FineTuneRunInfo, FineTuneSettings, SliceInfo } from '../types/server.js' */
 /** @import { FaultDialog } from '../widgets/fault_dialog.js' */
 
+import { CLEAN_WEIGHT } from '../core/constants.js';
 import { create, element, html } from '../core/dom.js';
 import { displayName } from '../core/units.js';
 import { checkSelection } from '../data/api.js';
@@ -25,7 +26,7 @@ const NUMBERS = [
   {
     name: 'clean_weight',
     text: 'Weight of clean data',
-    step: 0.05,
+    step: 0.01,
     title: 'Weight of clean data in the loss, which preserves the accuracy elsewhere',
   },
   { name: 'steps', text: 'Training steps', step: 1, title: 'Maximum number of optimiser steps' },
@@ -85,7 +86,10 @@ export class FinetuneForm {
     });
     html('.numbers', form).append(...NUMBERS.map(numberField));
     fill(this.#select('contact'), PHASES);
-    const useCustomSlice = () => (this.#select('slice').value = CUSTOM);
+    const useCustomSlice = () => {
+      this.#select('slice').value = CUSTOM;
+      this.#weightClean();
+    };
     this.#showFaults = faultPicker(this.#select('faults'), faultDialog, {
       none: 'as recorded',
       selected: () => this.#faults,
@@ -98,7 +102,10 @@ export class FinetuneForm {
     for (const name of ['contact', 'only'])
       this.#select(name).addEventListener('change', useCustomSlice);
     this.#select('preset').addEventListener('change', () => this.#applyPreset());
-    this.#select('slice').addEventListener('change', () => this.#applySlice());
+    this.#select('slice').addEventListener('change', () => {
+      this.#applySlice();
+      this.#weightClean();
+    });
     const past = this.#select('past');
     past.addEventListener('change', () => store.set({ run: past.value }));
     form.addEventListener('submit', (event) => {
@@ -197,6 +204,13 @@ export class FinetuneForm {
     const contact = slice?.contact ?? null;
     this.#select('contact').value = contact === null ? '' : contact ? 'yes' : 'no';
     this.#select('only').value = slice?.only.join('+') ?? '';
+  }
+
+  /** Sets the weight of clean data: the default slice has a weight of its own. */
+  #weightClean() {
+    const { mix, clean_weight } = this.#offer?.settings ?? { mix: [], clean_weight: CLEAN_WEIGHT };
+    const isDefault = mix[0]?.slice.name === this.#select('slice').value;
+    this.#input('clean_weight').value = String(isDefault ? clean_weight : CLEAN_WEIGHT);
   }
 
   /** @returns {FineTuneRequest} */
