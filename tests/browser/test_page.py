@@ -268,6 +268,7 @@ def test_back_and_forward_restore_selections(open_page: Any) -> None:
     assert page.page.locator("#episode").input_value() == "19"
 
 
+@pytest.mark.long
 def test_scene_slider_changes_the_step(open_page: Any) -> None:
     page = open_page("?step=20", scene=True)
     page.until("() => document.querySelector('#scene').dataset.state === 'ready'")

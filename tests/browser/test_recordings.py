@@ -116,6 +116,7 @@ def test_recordings_are_renamed_searched_restored_and_compared(open_page: Callab
     )
 
 
+@pytest.mark.long
 def test_changes_appear_in_other_browsers(open_page: Callable[..., Any], runs: list[Path]) -> None:
     first, second = (RecordingsTab(open_page("?tab=recordings")) for _ in range(2))
     first.add([runs[0]])

@@ -85,6 +85,7 @@ def test_doctor_accepts_the_installation(installed: Path, tmp_path: Path) -> Non
     assert not {name: check for name, check in checks.items() if check["state"] == "failed"}
 
 
+@pytest.mark.long
 def test_page_of_the_installation_shows_maps(address: str, open_page: Any) -> None:
     page = open_page(url=address)
     before = page.maps()

@@ -199,6 +199,7 @@ write_recording(trace, {path!r}, maps())
 """
 
 
+@pytest.mark.long
 def test_killed_writer_leaves_no_file(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     script = KILLED.format(folder=str(Path(__file__).parent), path=str(path))
