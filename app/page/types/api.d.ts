@@ -64,7 +64,7 @@ export interface components {
         };
         /**
          * Component
-         * @description A state component. Components in rad are angles.
+         * @description A state component. Components in rad are angles; static ones are constant in every episode.
          */
         Component: {
             /** Name */
@@ -74,6 +74,11 @@ export interface components {
              * @enum {string}
              */
             unit: "m" | "rad";
+            /**
+             * Static
+             * @default false
+             */
+            static: boolean;
         };
         /**
          * Curve

@@ -189,7 +189,7 @@ def test_sensors_are_trained_by_their_likelihood_and_then_frozen(episodes: list[
         changed = {name.split(".")[0] for name, p in filter_.named_parameters() if not torch.equal(p, before[name])}
         if stage.name in models:
             name = stage.name.removesuffix(" model")
-            assert float(sensor_likelihood(filter_, name, every)) < loss[name]
+            assert float(sensor_likelihood(filter_, name, every).detach()) < loss[name]
         elif names.index(stage.name) > names.index(models[-1]):
             assert changed <= {"dynamics", "weight_model", "log_scale"}
             assert "log_scale" in changed
