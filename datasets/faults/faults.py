@@ -26,6 +26,22 @@ from beliefscope.datasets.faults.fault import (
 from beliefscope.datasets.task import Task
 
 
+class Offset(Fault):
+    """A constant with the parameters x, y and z is added to each axis."""
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        return readings + axis_values(self, readings)
+
+
+class GaussianNoise(Fault):
+    """Independent noise of a standard deviation is added to every value."""
+
+    std: float
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        return readings + rng.normal(0.0, self.std, readings.shape)
+
+
 @dataclass(frozen=True)
 class Blackout(Fault):
     """Images are blacked out, independently at each step."""
@@ -69,14 +85,11 @@ class ImageUnderexposed(Fault):
 
 
 @dataclass(frozen=True)
-class ImageNoise(Fault):
+class ImageNoise(GaussianNoise):
     """Independent Gaussian noise is added to every pixel."""
 
     name, sensor = "image_noise", "image"
     std: float = number_field(40.0, "gray levels", "standard deviation", 0)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + rng.normal(0.0, self.std, readings.shape)
 
 
 @dataclass(frozen=True)
@@ -137,7 +150,7 @@ class ImageOccluded(Fault):
 
 
 @dataclass(frozen=True)
-class ForceBias(Fault):
+class ForceBias(Offset):
     """A constant is added to the force."""
 
     name, sensor = "force_bias", "force"
@@ -145,19 +158,13 @@ class ForceBias(Fault):
     y: float = number_field(0.0, "N", "offset along y")
     z: float = number_field(0.0, "N", "offset along z")
 
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + axis_values(self, readings)
-
 
 @dataclass(frozen=True)
-class ForceNoise(Fault):
+class ForceNoise(GaussianNoise):
     """Independent Gaussian noise is added to each axis of the force."""
 
     name, sensor = "force_noise", "force"
     std: float = number_field(5.0, "N", "standard deviation", 0)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + rng.normal(0.0, self.std, readings.shape)
 
 
 @dataclass(frozen=True)
@@ -200,7 +207,7 @@ class ForceStuck(Fault):
 
 
 @dataclass(frozen=True)
-class TorqueBias(Fault):
+class TorqueBias(Offset):
     """A constant is added to the torque."""
 
     name, sensor = "torque_bias", "torque"
@@ -208,23 +215,17 @@ class TorqueBias(Fault):
     y: float = number_field(0.0, "N m", "offset about y")
     z: float = number_field(0.0, "N m", "offset about z")
 
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + axis_values(self, readings)
-
 
 @dataclass(frozen=True)
-class TorqueNoise(Fault):
+class TorqueNoise(GaussianNoise):
     """Independent Gaussian noise is added to each axis of the torque."""
 
     name, sensor = "torque_noise", "torque"
     std: float = number_field(0.1, "N m", "standard deviation", 0)
 
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + rng.normal(0.0, self.std, readings.shape)
-
 
 @dataclass(frozen=True)
-class EffectorOffset(Fault):
+class EffectorOffset(Offset):
     """A constant is added to the end-effector position."""
 
     name, sensor = "effector_offset", "effector_position"
@@ -232,19 +233,13 @@ class EffectorOffset(Fault):
     y: float = number_field(0.0, "m", "offset along y")
     z: float = number_field(0.0, "m", "offset along z")
 
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + axis_values(self, readings)
-
 
 @dataclass(frozen=True)
-class EffectorNoise(Fault):
+class EffectorNoise(GaussianNoise):
     """Independent Gaussian noise is added to each axis of the end-effector position."""
 
     name, sensor = "effector_noise", "effector_position"
     std: float = number_field(0.005, "m", "standard deviation", 0)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + rng.normal(0.0, self.std, readings.shape)
 
 
 @dataclass(frozen=True)
