@@ -62,11 +62,11 @@ def simulate_door_field(seed: int, index: int, steps: int, without: Collection[s
         aim = AimError((values["hinge"] * unit[0], values["hinge"] * unit[1]), values["angle"] * unit[2])
     nudges = Nudges(draws, door, steps) if "nudges" in draws else None
     model = door_model(door, frame="hidden-frame" not in draws, sleeve=drawn_sleeve(draws))
-    scene = Scene(model, IMPEDANCE, moved_camera(CAMERA, draws), open_loop=True)
+    scene = Scene(model, IMPEDANCE, moved_camera(CAMERA, draws), open_loop=True, disturb=nudges)
     hinge = np.array(door.hinge, np.float32)
     episode = simulate(
         "door-field",
-        scene if nudges is None else replace(scene, disturb=nudges),
+        scene,
         POLICIES[name](door, rng, aim),
         lambda qpos: np.concatenate([np.broadcast_to(hinge, (steps, 2)), qpos[:, -1:]], axis=1),
         seed,

@@ -82,11 +82,15 @@ def simulate_push_field(seed: int, index: int, steps: int, without: Collection[s
     aim = draws["aim"].values["std"] if "aim" in draws else 0.0
     nudges = Nudges(draws, puck.friction, steps) if "nudges" in draws else None
     scene = Scene(
-        push_model(puck=puck, sleeve=drawn_sleeve(draws)), IMPEDANCE, moved_camera(CAMERA, draws), open_loop=True
+        push_model(puck=puck, sleeve=drawn_sleeve(draws)),
+        IMPEDANCE,
+        moved_camera(CAMERA, draws),
+        open_loop=True,
+        disturb=nudges,
     )
     episode = simulate(
         "push-field",
-        scene if nudges is None else replace(scene, disturb=nudges),
+        scene,
         PushPuckWithAimError(episode_rng(seed, index), puck, aim),
         lambda qpos: qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 2],
         seed,

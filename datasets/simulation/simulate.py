@@ -89,7 +89,7 @@ class Scene:
     impedance: Impedance
     camera: Camera
     open_loop: bool = False
-    disturb: Callable[[int, mujoco.MjData], None] = lambda step, data: None
+    disturb: Callable[[int, mujoco.MjData], None] | None = None
 
 
 def episode_rng(seed: int, index: int) -> Generator:
@@ -212,7 +212,8 @@ def _run(scene: Scene, policy: Policy, steps: int) -> _Log:
 
     waypoint, remaining = Waypoint(set_point, 0.0, 0), 0
     for step in range(steps):
-        scene.disturb(step, data)
+        if scene.disturb is not None:
+            scene.disturb(step, data)
         joints = np.array(data.qpos[ROBOT_JOINTS:])
         if remaining == 0:
             waypoint = policy.next(joints)
