@@ -78,7 +78,7 @@ class PushPuck(Policy):
     clearance = (0.01, 0.03)  # range of the distance between fingers and puck before a push, m
 
     def __init__(self, rng: Generator, puck: PuckPhysics = PuckPhysics()) -> None:
-        self._rng, self._reach = rng, puck.radius + TIP
+        self._rng, self._radius = rng, puck.radius
         start = quantise(self._around(HALF_RANGE), POSITION_BITS)
         self.object_start = np.array([*start, HEIGHT / 2, 1.0, 0.0, 0.0, 0.0])
         self._queue: list[str] = []
@@ -104,7 +104,7 @@ class PushPuck(Policy):
             case "descend":
                 return Waypoint(self._at(self._behind), self._speed(0.08), 2)
             case "push":
-                gap = float((puck - self._behind) @ self._direction) - self._reach
+                gap = float((puck - self._behind) @ self._direction) - self._radius - TIP
                 self._height += rng.normal(0.0, 0.006)
                 return Waypoint(self._at(self._behind + (gap + self._length) * self._direction), self._speed(0.05), 0)
             case "retract":
@@ -120,7 +120,7 @@ class PushPuck(Policy):
         while (length := float(np.linalg.norm(direction := self._around(HALF_RANGE) - puck))) < MIN_PUSH:
             pass
         self._direction, self._length = direction / length, length
-        self._behind = puck - (self._reach + rng.uniform(*self.clearance)) * self._direction
+        self._behind = puck - (self._radius + TIP + rng.uniform(*self.clearance)) * self._direction
         self._behind += rng.normal(0.0, 0.012) * _left(self._direction)
         self._height = float(rng.uniform(*PUSH_HEIGHTS))
 
