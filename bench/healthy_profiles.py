@@ -56,7 +56,8 @@ def main() -> None:
         task = checkpoint.task.name
         if task not in episodes:
             episodes[task] = held_out(task, folder)
-        profile = profile_of(trace_all(checkpoint, episodes[task]), COLLECTED[task])
+        traces = trace_all(checkpoint, episodes[task], range(len(episodes[task])))
+        profile = profile_of(traces, COLLECTED[task])
         write(path.with_name(path.stem + SUFFIX), checkpoint.hash, profile)
         print(f"{path.stem}: {profile.episodes} episodes, {len(profile.statistics)} statistics", flush=True)
 

@@ -29,7 +29,8 @@ def survey_of(
 ) -> Survey:
     """Run a filter over episodes of a data set, many at once.
 
-    A particle filter runs over one after the other, so that its random numbers are those of ``trace``.
+    Particle filters and external filters run over one episode after the other: the random numbers are those of
+    ``trace``.
 
     Args:
         by: a score that must apply to the filter.
@@ -50,7 +51,7 @@ def survey_of(
             )
 
     def traces() -> Iterator[Trace]:
-        batched = checkpoint.kind != "pf"
+        batched = checkpoint.kind not in ("pf", "external")
         runs = trace_all(checkpoint, data, indices, **settings) if batched else one_by_one()
         for done, run in enumerate(runs):
             if not done and by is not None:
