@@ -1,7 +1,7 @@
 """Reader of the MIT Push dataset (Yu et al., "More than a Million Ways to Be Pushed", IROS 2016).
 
 A file is one push with ``object_pose``, ``tip_pose`` and ``ft_wrench``, each with its own timestamps. Pushes are
-resampled to one rate, stitched into trajectories of 2.5 s and rendered by a camera.
+resampled to one rate, stitched into trajectories and rendered by a camera.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.readers.hdf5_guard import HDF5_ERRORS, open_hdf5, read_error
 from beliefscope.datasets.readers.hdf5_limits import read_array
 from beliefscope.datasets.readers.push_real_task import (
+    CAMERA,
     CENTRE,
     CONTACT_GAP,
     OUTLINES,
@@ -37,13 +38,15 @@ from beliefscope.datasets.readers.push_real_task import (
     haptic_observations,
     render_images,
 )
-from beliefscope.datasets.simulation.simulate import hand_controls
+from beliefscope.datasets.simulation.ingredients import draw, finish, moved_camera
+from beliefscope.datasets.simulation.simulate import hand_controls, path_controls
 from beliefscope.datasets.task import Task
 
 Array = NDArray[np.float64]
 
 KEYS = ("object_pose", "tip_pose", "ft_wrench")
 SECONDS = 2.5  # length of a trajectory: 45 steps at 18 Hz, as in the paper
+FIELD_SECONDS = 8.0  # the same for tasks with ingredients, whose outages last 1 to 3 s
 MIN_TRAIN, MIN_HELD_OUT = 200, 50  # trajectories of a split, independent of the number of pushes
 AREA = 0.125  # half side length of the square around CENTRE that contains the block's centre, m
 MAX_GAP = 0.5  # s without a sample that is interpolated linearly
@@ -283,10 +286,11 @@ class MitPushDataset(Dataset):
             raise BadInput(f"{path} has no usable push. First error: {skipped[0]}")
         self.skipped = tuple(skipped)
         numbers = {split: count(SPLITS.index(split)) for split in SPLITS}
+        steps = round((FIELD_SECONDS if task.ingredients else SECONDS) * rate)
         self._trajectories = [
             (split, push)
             for (split, *_), pushes in sorted(groups.items())
-            for push in _trajectories(pushes, split, round(SECONDS * rate), _rng(seed, split, next(numbers[split])))
+            for push in _trajectories(pushes, split, steps, _rng(seed, split, next(numbers[split])))
         ]
         self._contact = [gap(p.shape, p.poses, p.tips) < CONTACT_GAP for _, p in self._trajectories]
         self._built: dict[int, Episode] = {}
@@ -309,11 +313,13 @@ class MitPushDataset(Dataset):
     def _build(self, index: int, split: str, push: Push, contact: NDArray[np.bool_]) -> Episode:
         qpos = np.column_stack([push.poses, push.tips]).astype(np.float32)
         haptics = haptic_observations(push.tips, push.force, push.torque, contact)
-        return Episode(
+        path, draws = haptics["effector_position"], draw(self.task, self._seed, index)
+        episode = Episode(
             task=self.task.name,
             states=qpos[:, : len(self.task.components)],
-            controls=hand_controls(haptics["effector_position"], haptics["contact"]),
-            observations={"image": render_images(push.shape, qpos), **haptics},
+            # The robot is stiff, so that the measured path of the tip stands for the commanded one.
+            controls=path_controls(path) if draws else hand_controls(path, haptics["contact"]),
+            observations={"image": render_images(push.shape, qpos, moved_camera(CAMERA, draws)), **haptics},
             contact=contact,
             qpos=qpos,
             dt=self.task.dt,
@@ -331,6 +337,7 @@ class MitPushDataset(Dataset):
                 "mujoco": mujoco.__version__,
             },
         )
+        return finish(self.task, episode, draws, {}) if draws else episode
 
 
 def _policy(push: Push) -> str:

@@ -5,6 +5,8 @@ World frame: the robot's base, x forward, y left, z up from the table; m.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.simulation.camera import Camera, Image, RayCaster
+from beliefscope.datasets.simulation.ingredients import SENSOR_INGREDIENTS, camera_pose, start_ingredient
 from beliefscope.datasets.task import Component, Outline, Task
 
 Array = NDArray[np.float64]
@@ -102,15 +105,15 @@ def _add_prism(
     body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba)
 
 
-def render_images(shape: str, qpos: NDArray[np.floating]) -> Image:
+def render_images(shape: str, qpos: NDArray[np.floating], camera: Camera = CAMERA) -> Image:
     """(T, 32, 32) uint8: top views at joint positions (T, 5), x upwards and y to the left."""
     model = block_model(shape)
-    data, camera = mujoco.MjData(model), RayCaster(model, CAMERA)
-    images = np.empty((len(qpos), CAMERA.size, CAMERA.size), np.uint8)
+    data, caster = mujoco.MjData(model), RayCaster(model, camera)
+    images = np.empty((len(qpos), camera.size, camera.size), np.uint8)
     for step, joints in enumerate(qpos):
         data.qpos[:] = joints
         mujoco.mj_kinematics(model, data)
-        images[step] = camera.render(data)
+        images[step] = caster.render(data)
     return images
 
 
@@ -162,8 +165,25 @@ def _task(name: str, rate: int, yaw: bool) -> Task:
 
 
 PUSH_REAL = _task("push-real", RATE, yaw=False)
+
+START = {"m": (0.03, 0.05)}
+PUSH_REAL_FIELD = replace(
+    PUSH_REAL,
+    name="push-real-field",
+    control_size=6,
+    start_distance=START,
+    warmup=0,
+    ingredients={
+        "camera-pose": camera_pose(0.015, float(np.deg2rad(1.0))),
+        **{name: SENSOR_INGREDIENTS[name] for name in ("image-quality", "outages")},
+        "start": start_ingredient(START),
+    },
+)
+"""The same recordings with a realistic camera, a start with an error, and controls without contact."""
+
 PUSH_REAL_TASKS = (
     PUSH_REAL,
+    PUSH_REAL_FIELD,
     _task("push-real-yaw", RATE, yaw=True),
     _task("push-real-50hz", 50, yaw=False),
     _task("push-real-yaw-50hz", 50, yaw=True),

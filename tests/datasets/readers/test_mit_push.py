@@ -21,16 +21,14 @@ from beliefscope.datasets.readers.push_real_task import (
     CAMERA,
     CENTRE,
     CONTACT_GAP,
-    OUTLINES,
     PUSH_REAL,
+    PUSH_REAL_FIELD,
     PUSH_REAL_TASKS,
-    TIP_RADIUS,
-    VIEW,
-    block_model,
     gap,
     render_images,
 )
 from beliefscope.datasets.simulation.replay import replay
+from beliefscope.datasets.simulation.simulate import path_controls
 from beliefscope.datasets.store import open_dataset, write_dataset
 
 pytestmark = pytest.mark.slow
@@ -116,29 +114,6 @@ def test_hdf5_and_json_are_equivalent(tmp_path: Path) -> None:
         assert data.task is PUSH_REAL
 
 
-def test_gap_of_a_square() -> None:
-    poses = np.zeros((4, 3))
-    poses[1, 2] = np.pi / 4
-    poses[3, :2] = 0.2
-    tips = np.array([(0.06, 0.01), (0.0, 0.07), (0.05, 0.05), (0.2, 0.2)])
-    expected = np.array([0.015, 0.07 - 0.045 * np.sqrt(2), 0.005 * np.sqrt(2), -0.045]) - TIP_RADIUS
-    np.testing.assert_allclose(gap("rect1", poses, tips), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("shape", OUTLINES)
-def test_image_shows_the_outline(shape: str) -> None:
-    """Pixels differ from the table exactly where the block's outline covers them."""
-    pose = np.array([0.36, -0.02, 0.7])
-    image = render_images(shape, np.array([[*pose, 0.9, 0.9]]))[0]
-    pixel = 2 * VIEW / CAMERA.size
-    ticks = VIEW - pixel * (np.arange(CAMERA.size) + 0.5)
-    x, y = np.meshgrid(CENTRE[0] + ticks, CENTRE[1] + ticks, indexing="ij")
-    away = gap(shape, np.tile(pose, (x.size, 1)), np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape) + TIP_RADIUS
-    table = image[0, 0]
-    assert (image[away < -0.75 * pixel] != table).all()
-    assert (image[away > 1.0 * pixel] == table).all()
-
-
 def test_stitching_is_a_rigid_motion(folder: Path) -> None:
     """The block is continuous between pushes; tip, force and torque are unchanged in the block's frame."""
     pushes = [read_push(path, 18) for path in sorted(folder.rglob("*.json"))]
@@ -196,9 +171,10 @@ def test_task_variants(folder: Path, task: Any) -> None:
     assert find_task(task.name) is task
     with open_dataset(folder / "val", task) as data:
         episode = data[0]
-    steps = 45 if "50hz" not in task.name else 125
+    steps = {"push-real-field": 144}.get(task.name, 45 if "50hz" not in task.name else 125)
     assert episode.states.shape == (steps, 3 if "yaw" in task.name else 2)
-    assert episode.dt * steps == pytest.approx(2.5)
+    assert episode.dt * steps == pytest.approx(8.0 if task is PUSH_REAL_FIELD else 2.5)
+    assert episode.controls.shape == (steps, task.control_size)
     np.testing.assert_array_equal(episode.states, episode.qpos[:, : episode.states.shape[1]])
     for key, shape in task.observations.items():
         assert episode.observations[key].shape == (steps, *shape)
@@ -216,6 +192,36 @@ def test_task_variants(folder: Path, task: Any) -> None:
         turned = np.stack([replayed.rotations[:, block, 0, 0], replayed.rotations[:, block, 1, 0]], 1)
         w, z = outline.wxyz[:, 0], outline.wxyz[:, 3]
         np.testing.assert_allclose(np.stack([w * w - z * z, 2 * w * z], 1), turned, atol=1e-6)
+
+
+def test_field_task_has_the_recorded_haptics_and_another_camera(folder: Path) -> None:
+    with open_dataset(folder / "val", PUSH_REAL_FIELD) as data:
+        episodes, again = [data[i] for i in range(12)], data[3]
+    black, better = [], []
+    with open_dataset(folder / "val", PUSH_REAL_FIELD) as data:
+        assert data[3].digest() == again.digest()
+    for episode in episodes:
+        tips, drawn = episode.observations["effector_position"], episode.provenance["ingredients"]
+        assert drawn.keys() == PUSH_REAL_FIELD.ingredients.keys()
+        np.testing.assert_array_equal(episode.controls, path_controls(tips))
+        away = gap("rect1", episode.qpos[:, :3].astype(float), episode.qpos[:, 3:].astype(float))
+        clear = np.abs(away - CONTACT_GAP) > 1e-6  # the joint positions are rounded
+        np.testing.assert_array_equal(episode.contact[clear], away[clear] < CONTACT_GAP)
+        assert 0.03 <= np.linalg.norm(episode.provenance["start_offset"]) <= 0.05
+        lit = episode.observations["image"].max(axis=(1, 2)) > 0
+        black.append(1.0 - lit.mean())
+        if not lit.any():
+            continue
+        pose = drawn["camera-pose"]
+        camera = CAMERA.moved([pose[axis] for axis in "xyz"], [pose[f"turn_{axis}"] for axis in "xyz"])
+        seen = episode.observations["image"][lit].astype(float)
+        fit = {
+            name: np.corrcoef(seen.ravel(), render_images("rect1", episode.qpos[lit], used).ravel())[0, 1]
+            for name, used in (("moved", camera), ("nominal", CAMERA))
+        }
+        better.append(fit["moved"] > fit["nominal"])
+    assert 0.1 < np.mean(black) < 0.7
+    assert all(better)
 
 
 def test_pushes_are_used_equally_often(folder: Path) -> None:
@@ -361,15 +367,3 @@ def test_recorded_block_moves_only_in_contact(real: Dataset) -> None:
     away = np.concatenate(distance)
     assert np.quantile(away[away < CONTACT_GAP], 0.02) > -0.002
     assert ((away > 0.0015) & (away < 0.003)).mean() < 0.01
-
-
-def test_block_model_matches_the_outline() -> None:
-    model = block_model("rect3")
-    data = mujoco.MjData(model)
-    data.qpos[:] = [0.3, 0.1, np.pi / 2, 0.9, 0.9]
-    mujoco.mj_forward(model, data)
-    geom = model.geom("block").id
-    hit = np.zeros(1, np.int32)
-    for point, expected in (((0.3 + 0.044, 0.1), True), ((0.3 + 0.046, 0.1), False), ((0.3, 0.1 + 0.067), True)):
-        mujoco.mj_ray(model, data, np.array([*point, 1.0]), np.array([0, 0, -1.0]), None, 1, -1, hit)
-        assert (hit[0] == geom) == expected
