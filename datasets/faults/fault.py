@@ -148,3 +148,19 @@ def axis_values(fault: Fault, readings: Readings) -> FloatArray:
     if values[d:].any():
         raise BadInput(f"{fault} uses an axis that the sensor does not have. Available: {', '.join(AXES[:d])}.")
     return values[:d]
+
+
+class Offset(Fault):
+    """A constant with the parameters x, y and z is added to each axis."""
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        return readings + axis_values(self, readings)
+
+
+class GaussianNoise(Fault):
+    """Independent noise of a standard deviation is added to every value."""
+
+    std: float
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        return readings + rng.normal(0.0, self.std, readings.shape)

@@ -6,13 +6,17 @@ Units are SI, gray levels 0 to 255 and pixels. ``datasets/faults/injection.py`` 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 
 from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.faults.control_faults import ControlDelayed, ControlScaled
 from beliefscope.datasets.faults.fault import (
     AXES,
     Fault,
+    GaussianNoise,
+    Offset,
     Readings,
     Span,
     axis_values,
@@ -25,21 +29,11 @@ from beliefscope.datasets.faults.fault import (
 )
 from beliefscope.datasets.task import Task
 
+PERMUTATIONS = tuple("".join(order) for order in permutations(AXES))[1:]
+"""Orders of the axes other than x, y, z."""
 
-class Offset(Fault):
-    """A constant with the parameters x, y and z is added to each axis."""
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + axis_values(self, readings)
-
-
-class GaussianNoise(Fault):
-    """Independent noise of a standard deviation is added to every value."""
-
-    std: float
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + rng.normal(0.0, self.std, readings.shape)
+MAX_SHIFT = 4096
+"""Largest shift of an image, pixels."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +144,22 @@ class ImageOccluded(Fault):
 
 
 @dataclass(frozen=True)
+class ImageShift(Fault):
+    """Images are shifted, as by a displaced camera; pixels at the border are repeated."""
+
+    name, sensor = "image_shift", "image"
+    x: int = integer_field(3, "pixels", "shift to the right", minimum=-MAX_SHIFT)
+    y: int = integer_field(0, "pixels", "shift downwards", minimum=-MAX_SHIFT)
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        rows, columns = (
+            np.clip(np.arange(size) - shift, 0, size - 1)
+            for size, shift in zip(readings.shape[1:], (self.y, self.x), strict=True)
+        )
+        return readings[:, rows[:, None], columns]
+
+
+@dataclass(frozen=True)
 class ForceBias(Offset):
     """A constant is added to the force."""
 
@@ -192,13 +202,41 @@ class ForceSaturation(Fault):
 
 
 @dataclass(frozen=True)
-class ForceStuck(Fault):
-    """One axis of the force keeps its value at the fault's first step."""
+class ForceGain(Fault):
+    """The force is scaled."""
 
-    name, sensor = "force_stuck", "force"
-    axis: str = name_field("x", "x, y or z", AXES)
+    name, sensor = "force_gain", "force"
+    factor: float = number_field(-1.0, "factor", "scale of all axes; -1 inverts the sign")
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        return readings * self.factor
+
+
+@dataclass(frozen=True)
+class ForceAxes(Fault):
+    """The axes of the force are exchanged."""
+
+    name, sensor = "force_axes", "force"
+    order: str = name_field("yxz", "axes reported as x, y and z", PERMUTATIONS)
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        available = AXES[: readings.shape[1]]
+        missing = sorted(set(self.order) - set(available))
+        if missing:
+            raise unknown_name("axis of the force", missing[0], available)
+        return readings[:, [AXES.index(axis) for axis in self.order]]
+
+
+@dataclass(frozen=True)
+class ForceStuck(Fault):
+    """One axis of the force, or all, keep their value at the fault's first step."""
+
+    name, sensor = "force_stuck", "force"
+    axis: str = name_field("x", "x, y, z or all", (*AXES, "all"))
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        if self.axis == "all":
+            return np.broadcast_to(readings[span.first], readings.shape)
         axis, stuck = AXES.index(self.axis), readings.copy()
         if axis >= readings.shape[1]:
             raise unknown_name("axis of the force", self.axis, AXES[: readings.shape[1]])
@@ -251,6 +289,17 @@ class ContactFlipped(Fault):
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         return choose_steps(rng.random(len(readings)) < self.probability, 1 - readings, readings)
+
+
+@dataclass(frozen=True)
+class ContactStuck(Fault):
+    """The contact flag is constant."""
+
+    name, sensor = "contact_stuck", "contact"
+    value: int = value_field(0, int, "flag", "0: no contact, 1: contact", minimum=0, maximum=1)
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        return np.full_like(readings, self.value)
 
 
 @dataclass(frozen=True)
@@ -314,19 +363,25 @@ FAULTS: dict[str, type[Fault]] = {
         ImageOutage,
         ImageBlur,
         ImageOccluded,
+        ImageShift,
         ForceBias,
         ForceNoise,
         ForceDrift,
         ForceSaturation,
+        ForceGain,
+        ForceAxes,
         ForceStuck,
         TorqueBias,
         TorqueNoise,
         EffectorOffset,
         EffectorNoise,
         ContactFlipped,
+        ContactStuck,
         ContactDelayed,
         Delay,
         Drop,
+        ControlDelayed,
+        ControlScaled,
     )
 }
 """All faults by name. To add one, write a class and list it here."""

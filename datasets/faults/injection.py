@@ -1,8 +1,8 @@
 """Fault injection: apply a sequence of sensor faults to a copy of an episode.
 
-Faults change the sensor readings and the controls computed from them, never the ground truth (states, contact, joint
-positions). The text ``blackout=0.4,force_bias:x=5:from=20`` stands for two faults: the value after a fault's name sets
-its first parameter, the other parameters are named, and commas separate faults.
+Faults change the sensor readings, the controls computed from them and the controls themselves, never the ground truth
+(states, contact, joint positions). The text ``blackout=0.4,force_bias:x=5:from=20`` stands for two faults: the value
+after a fault's name sets its first parameter, the other parameters are named, and commas separate faults.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.faults.control_faults import ControlFault
 from beliefscope.datasets.faults.fault import Fault, Readings, parameters
 from beliefscope.datasets.faults.faults import FAULTS
 from beliefscope.datasets.io.strict_json import read_json
@@ -92,7 +93,11 @@ class Faults:
                 # The same random numbers for all sensors of a modality: they drop out together.
                 rng = np.random.default_rng([seed, digest, position])
                 observations[key] = fault.apply(observations[key], episode.dt, rng)
-        return replace(episode, observations=observations, controls=_controls(episode, observations))
+        controls = _controls(episode, observations)
+        for position, fault in enumerate(self.sequence):
+            if isinstance(fault, ControlFault):
+                controls = fault.apply(controls, episode.dt, np.random.default_rng([seed, digest, position]))
+        return replace(episode, observations=observations, controls=controls)
 
 
 NO_FAULTS = Faults()
@@ -106,16 +111,22 @@ FAULT_PRESETS: dict[str, str] = {
     "image noisy": "image_noise=40",
     "image occluded": "image_occluded=12",
     "image delayed 5 steps": "delay=image:steps=5",
+    "image shifted 3 px": "image_shift=3",
     "force bias 5 N": "force_bias=5",
     "force noisy": "force_noise=5",
     "force drifting": "force_drift=1",
     "force saturated at 2 N": "force_saturation=2",
     "force axis stuck": "force_stuck=x:from=20",
+    "force sign inverted": "force_gain=-1",
+    "force x and y exchanged": "force_axes=yxz",
     "end-effector offset 2 cm": "effector_offset=0.02",
     "contact flipped": "contact_flipped",
+    "contact stuck at 0": "contact_stuck=0",
     "contact delayed 5 steps": "contact_delayed=5",
     "haptics delayed 5 steps": "delay=haptics:steps=5",
     "haptics dropped": "drop=haptics:from=20",
+    "controls delayed 3 steps": "control_delay=3",
+    "controls scaled by 0.5": "control_scale=0.5",
 }
 """Label -> faults as text: suggested fault injections."""
 

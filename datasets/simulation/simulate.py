@@ -23,6 +23,7 @@ Vector = NDArray[np.float64]
 DT = 0.1  # s per step
 SETTLING_STEPS = 5  # before recording starts, to close the grasp
 MAX_TURN = 0.05  # largest rotation of the hand per step, rad
+CHANGE = slice(3, 6)  # channels of the controls with the change of the position, which is in the channels before
 ROBOT_JOINTS = len(ARM_JOINTS) + len(FINGERS)  # first in qpos, followed by those of the object
 
 # Sensor resolution in bits, powers of two for better compression: 15 um, 1 mN, 61 uN m, 15 urad.

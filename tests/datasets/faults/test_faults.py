@@ -19,7 +19,6 @@ from beliefscope.datasets.faults.faults import FAULTS
 from beliefscope.datasets.faults.injection import FAULT_PRESETS, NO_FAULTS, Faults, fault_catalog, faulty_copies
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.simulate import hand_controls
-from beliefscope.datasets.store import open_dataset, sample_path
 
 Array = np.ndarray[Any, Any]
 SPAN = ":from=20:to=60"
@@ -40,16 +39,14 @@ AFFECTED = {
     "force_noise": {"force"},
     "force_saturation": {"force"},
     "force_stuck": {"force"},
+    "force_stuck=all": {"force"},
+    "force_gain": {"force"},
+    "force_axes": {"force"},
+    "contact_stuck": {"contact"},
+    "control_delay": set(),
+    "control_scale": set(),
 } | {name: {"image"} for name in FAULTS if name.startswith("image_")}
 """Fault -> observations it changes."""
-
-
-@pytest.fixture(scope="module")
-def episode() -> Episode:
-    """A push, with steps in contact and in free motion."""
-    with open_dataset(sample_path("door")) as data:
-        index = next(s.index for s in data.summaries if s.policy == "push" and 0.2 < s.contact_fraction < 0.8)
-        return data[index]
 
 
 def inject(text: str, episode: Episode, seed: int = 0) -> Episode:
@@ -83,6 +80,11 @@ def test_fault_changes_only_its_sensors_within_its_span(text: str, episode: Epis
     for field in fields(Episode):
         if field.name not in ("observations", "controls"):
             assert getattr(after, field.name) is getattr(episode, field.name)
+    if text.startswith("control_"):
+        differs = (after.controls != episode.controls).any(1)
+        assert differs[20:60].any()
+        assert not differs[:20].any()
+        assert not differs[60:].any()
 
 
 @pytest.mark.parametrize("text", [*AFFECTED, "drop=haptics:probability=0.1:steps=4", "blackout=0.4"])
@@ -275,6 +277,7 @@ def test_only_training_episodes_are_copied(episode: Episode) -> None:
 def test_fault_round_trips_as_text_and_json(fault: type[Fault]) -> None:
     unusual = {float: 0.37, int: 3}
     values = {p.name: unusual.get(p.metadata["kind"], p.default) for p in parameters(fault).values()}
+    values |= {"value": 1} if "value" in values else {}
     values |= {"from_": 2, "to": 9}
     for faults in (Faults((fault(),)), Faults((fault(**values), fault()))):
         assert Faults.parse(str(faults)) == faults
@@ -329,7 +332,7 @@ def test_every_fault_is_documented() -> None:
 
 
 BAD = {
-    "blakout": r"fault 'blakout' does not exist\. Available: blackout, image_frozen, .*drop\.",
+    "blakout": r"fault 'blakout' does not exist\. Available: blackout, image_frozen, .*control_scale\.",
     "blackout,,": r"fault '' does not exist\. Available",
     "blackout:chance=1": r"parameter of blackout 'chance' does not exist\. Available: probability, gray, from, to\.",
     "blackout=1.5": r"blackout's 'probability' is 1\.5, not a number from 0 to 1",
@@ -341,7 +344,10 @@ BAD = {
     "blackout:from": r"'from' in 'blackout:from' is not a new parameter=value",
     "blackout:from=1:from=2": r"'from=2' in 'blackout:from=1:from=2' is not a new parameter=value",
     "force_bias=1e9": r"force_bias's 'x' is 1000000000\.0, not a number from -1e\+06 to 1e\+06",
-    "force_stuck=w": r"axis of force_stuck 'w' does not exist\. Available: x, y, z\.",
+    "force_stuck=w": r"axis of force_stuck 'w' does not exist\. Available: x, y, z, all\.",
+    "force_axes=xyz": r"order of force_axes 'xyz' does not exist\. Available: xzy, yxz, yzx, zxy, zyx\.",
+    "contact_stuck=2": r"contact_stuck's 'value' is 2, not a whole number from 0 to 1",
+    "control_scale=0.5:axis=x": r"parameter of control_scale 'axis' does not exist\. Available: factor, from, to\.",
     "delay=3": r"delay's 'modality' is 3, not a name",
     "delay:steps=-1": r"delay's 'steps' is -1, not a whole number",
     "[1]": r"faults is \[1\], not a list of objects",
@@ -376,3 +382,5 @@ def test_faults_of_missing_sensors_are_rejected(episode: Episode) -> None:
         inject("force_bias:z=1", flat)
     with pytest.raises(BadInput, match=r"axis of the force 'z' does not exist\. Available: x, y\."):
         inject("force_stuck=z", flat)
+    with pytest.raises(BadInput, match=r"axis of the force 'z' does not exist\. Available: x, y\."):
+        inject("force_axes=zyx", flat)

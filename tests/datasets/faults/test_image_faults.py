@@ -31,3 +31,13 @@ def test_blur_keeps_the_mean_and_spreads_a_point() -> None:
     assert (FAULTS["image_blur"](std=0.0).apply(point, 0.1, np.random.default_rng(0)) == point).all()
     flat = np.full((2, 32, 32), 77, np.uint8)
     assert (FAULTS["image_blur"](std=3.0).apply(flat, 0.1, np.random.default_rng(0)) == 77).all()
+
+
+def test_shifts_move_the_content_and_repeat_the_border() -> None:
+    images = np.random.default_rng(0).integers(0, 256, (2, 32, 32), np.uint8)
+    shifted = FAULTS["image_shift"](x=3, y=-2).apply(images, 0.1, np.random.default_rng(0))
+    assert (shifted[:, :-2, 3:] == images[:, 2:, :-3]).all()
+    assert (shifted[:, :-2, :3] == images[:, 2:, :1]).all()
+    assert (shifted[:, -2:] == shifted[:, -3:-2]).all()
+    wide = FAULTS["image_shift"](x=100).apply(images, 0.1, np.random.default_rng(0))
+    assert (wide == images[:, :, :1]).all()

@@ -1,0 +1,44 @@
+"""Faults of the controls: applied after all faults of sensors, to the controls computed from their readings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beliefscope.datasets.faults.fault import Fault, Readings, Span, delay_steps, integer_field, number_field
+from beliefscope.datasets.simulation.simulate import CHANGE
+from beliefscope.datasets.task import Task
+
+
+class ControlFault(Fault):
+    """A fault of the controls; it changes no observation."""
+
+    sensor = "control"
+
+    def keys(self, task: Task) -> tuple[str, ...]:
+        return ()
+
+
+@dataclass(frozen=True)
+class ControlDelayed(ControlFault):
+    """The controls are delayed; the first steps repeat the control of step 0."""
+
+    name = "control_delay"
+    steps: int = integer_field(3, "steps", "length of the delay")
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        return delay_steps(readings, self.steps)
+
+
+@dataclass(frozen=True)
+class ControlScaled(ControlFault):
+    """The change of the hand position in the controls is scaled; all channels of controls without a position are."""
+
+    name = "control_scale"
+    factor: float = number_field(0.5, "factor", "scale")
+
+    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
+        scaled = readings.copy()
+        scaled[:, CHANGE if readings.shape[1] >= CHANGE.stop else slice(None)] *= self.factor
+        return scaled
