@@ -57,7 +57,7 @@ def main() -> None:
         if task not in episodes:
             episodes[task] = held_out(task, folder)
         traces = trace_all(checkpoint, episodes[task], range(len(episodes[task])))
-        profile = profile_of(traces, COLLECTED[task])
+        profile = profile_of(checkpoint, traces, COLLECTED[task])
         write(path.with_name(path.stem + SUFFIX), checkpoint.hash, profile)
         print(f"{path.stem}: {profile.episodes} episodes, {len(profile.statistics)} statistics", flush=True)
 

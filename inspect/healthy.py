@@ -10,7 +10,7 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter
-from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -19,21 +19,12 @@ MAX_EPISODES = 120
 """Maximum number of episodes of a profile; more hardly change it."""
 
 
-def statistics_of(trace: Trace) -> dict[str, float]:
-    """Statistics of a trace by all diagnostics that apply."""
-    values: dict[str, float] = {}
-    for entry in DIAGNOSTICS.values():
-        if entry.statistics is not None and entry.refusal(trace, None) is None:
-            values |= entry.statistics(trace)
-    return values
-
-
-def profile_of(traces: Iterable[Trace], data: str) -> HealthyProfile:
-    """The healthy profile of clean traces of one filter. ``data``: where their episodes come from."""
+def profile_of(checkpoint: Checkpoint, traces: Iterable[Trace], data: str) -> HealthyProfile:
+    """The healthy profile of clean traces of a filter. ``data``: where their episodes come from."""
     rows: list[dict[str, float]] = []
     particles = None
     for trace in traces:
-        rows.append(statistics_of(trace))
+        rows.append(episode_statistics(trace, checkpoint))
         particles = None if trace.particles is None else trace.particles.shape[1]
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
@@ -45,4 +36,5 @@ def measure_profile(filter_: Filter, name: str, episodes: Sequence[Episode], dat
     held_out = [episode for episode in episodes if episode.split != "train"][-MAX_EPISODES:]
     if not held_out:
         return None
-    return profile_of(trace_all(Checkpoint(filter_, name, "", {}), held_out, range(len(held_out))), data).to_json()
+    checkpoint = Checkpoint(filter_, name, "", {})
+    return profile_of(checkpoint, trace_all(checkpoint, held_out, range(len(held_out))), data).to_json()

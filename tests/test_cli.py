@@ -40,6 +40,7 @@ OPTIONS = {
     "import": "-o --json",
     "export": "-o --json",
     "inspect": "--filter --only --option --all --figures --format --json",
+    "diagnose": "--filter --data --skip-bad --episode --base --alarm-rate --faults --particles --seed --json",
     "report": "-o --title --event --filter --data --all --url --pdf --json",
     "counterfactual": "--filter --data --episode --faults --weights --from --to --particles --seed --trace -o --json",
     "figure": "--filter --data --skip-bad --episode --step --faults --particles --seed -o --json",

@@ -1,0 +1,179 @@
+"""Causes of faults: a catalog entry states which statistics a fault changes, how to undo it and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from typing import Any, Literal
+
+from beliefscope.inspect.diagnostics.views import Table
+
+
+@dataclass(frozen=True)
+class Symptom:
+    """Statistics that a fault changes directly.
+
+    Attributes:
+        statistics: patterns of names ``KIND/SUBJECT/PHASE``, joined by ``|``; ``*`` matches any text.
+        direction: 1 if they increase, -1 if they decrease, 0 for either.
+        weight: relative to the other symptoms of the cause.
+    """
+
+    statistics: str
+    direction: Literal[-1, 0, 1] = 1
+    weight: float = 1.0
+
+    def matches(self, statistic: str) -> bool:
+        """Whether a statistic belongs to the symptom, whatever its value."""
+        return matches(self.statistics, statistic)
+
+
+def matches(patterns: str, statistic: str) -> bool:
+    """Whether the name of a statistic matches one of the patterns, which are joined by ``|``."""
+    return any(fnmatchcase(statistic, pattern) for pattern in patterns.split("|"))
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause of faults and its signature.
+
+    Attributes:
+        name: ``component.mechanism``, such as ``image.frozen`` or ``model.image.bias``.
+        title: what has happened, such as ``Image frozen``; start of the headline.
+        symptoms: deviations that the cause always produces.
+        consequences: patterns of statistics that it may change as well.
+        undo: name of the intervention that undoes it (``inspect/diagnosis/interventions.py``); empty if there is none.
+        next: recommended action; may have the placeholders ``{task}`` and ``{filter}``.
+    """
+
+    name: str
+    title: str
+    symptoms: tuple[Symptom, ...]
+    consequences: str
+    next: str
+    undo: str = ""
+
+    @property
+    def component(self) -> str:
+        """The faulty component: the name without the mechanism."""
+        return self.name.rpartition(".")[0]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A deviation that supports a cause.
+
+    Attributes:
+        text: statistic, value and healthy range in words.
+        value, low, high: value of the statistic and its 95 % healthy range.
+        episode, step: moment that shows it best; None if it concerns whole episodes.
+    """
+
+    text: str
+    value: float
+    low: float
+    high: float
+    episode: int | None = None
+    step: int | None = None
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Effect of undoing a cause on the filter, by replay with the same random numbers.
+
+    Attributes:
+        error: share of the excess position error that the undo removes, with the 95 % interval over episodes; without
+            ground truth, None.
+        low, high: of the interval.
+        nll: decrease of the negative log-likelihood by step, in nats: of the true state; without ground truth, of the
+            observations.
+    """
+
+    error: float | None
+    low: float | None
+    high: float | None
+    nll: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A ranked cause.
+
+    Attributes:
+        cause: catalog entry.
+        probability: that it is the cause; those of all causes, and of an unknown one, sum to one.
+        episodes: indices of the affected episodes.
+        steps: first affected step and first step after it; None for complete episodes.
+        evidence: deviations that support it, largest first.
+        recovered: effect of undoing it; None if it was not undone.
+        next: recommended action.
+    """
+
+    cause: Cause
+    probability: float
+    episodes: tuple[int, ...]
+    steps: tuple[int, int] | None
+    evidence: tuple[Evidence, ...]
+    recovered: Recovery | None
+    next: str
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values, except that numbers may be NaN."""
+        return {
+            "cause": self.cause.name,
+            "component": self.cause.component,
+            "probability": self.probability,
+            "episodes": list(self.episodes),
+            "steps": None if self.steps is None else list(self.steps),
+            "evidence": [vars(evidence) for evidence in self.evidence],
+            "recovered": None if self.recovered is None else vars(self.recovered),
+            "next": self.next,
+        }
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of ``diagnose``.
+
+    Attributes:
+        state: ``healthy``; ``fault``: the first cause is probable; ``unsure``: a fault, whose cause is not certain.
+        masked: whether a sensor is faulty and the filter is unaffected.
+        headline: one sentence.
+        causes: most probable first; empty if healthy.
+        provenance: task, filter, hash, episodes and healthy record.
+    """
+
+    state: Literal["healthy", "fault", "unsure"]
+    masked: bool
+    headline: str
+    causes: tuple[Candidate, ...]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values, except that numbers may be NaN."""
+        head = {"state": self.state, "masked": self.masked, "headline": self.headline}
+        return head | {"causes": [candidate.to_json() for candidate in self.causes], **self.provenance}
+
+    def tables(self) -> list[Table]:
+        """The ranked causes, and the evidence and next action of each."""
+        if not self.causes:
+            return []
+        rows = tuple(
+            (c.cause.name, c.probability, _share(c.recovered), ", ".join(map(str, c.episodes))) for c in self.causes
+        )
+        tables = [Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), rows)]
+        evidence = tuple((c.cause.name, e.text) for c in self.causes for e in c.evidence)
+        actions = tuple((c.cause.name, c.next) for c in self.causes)
+        return [
+            *tables,
+            Table("Evidence", ("cause", "deviation"), evidence),
+            Table("Next", ("cause", "action"), actions),
+        ]
+
+
+def _share(recovery: Recovery | None) -> str:
+    """Recovered share of the error with its interval, empty without one."""
+    if recovery is None or recovery.error is None:
+        return ""
+    return f"{100 * recovery.error:.0f} % ({100 * recovery.low:.0f} to {100 * recovery.high:.0f})"
