@@ -8,6 +8,7 @@ from typing import Any
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import (
     consistency,
+    fusion_efficiency,
     likelihood_maps,
     particle_health,
     saliency,
@@ -22,6 +23,7 @@ ENTRIES: tuple[Entry, ...] = (
     likelihood_maps.ENTRY,
     weight_audit.ENTRY,
     standalone_modalities.ENTRY,
+    fusion_efficiency.ENTRY,
     consistency.ENTRY,
     particle_health.ENTRY,
     shapley.ENTRY,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 
 from beliefscope.datasets.errors import BadInput
@@ -17,6 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.subsets import check_modality, input_modalities, standalone_evidence
+from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.run import assemble_trace
 
@@ -37,6 +39,26 @@ def standalone_runs(traces: Sequence[Trace], checkpoint: Checkpoint | None) -> d
     if other or len(modalities) < 2:
         return {}
     return {modality: [standalone(checkpoint, trace, modality) for trace in traces] for modality in modalities}
+
+
+def standalone_errors(
+    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
+) -> list[measures.Array]:
+    """Errors (T, K, n) of the standalone filter of each of the K input modalities, by trace; m and rad."""
+    modalities = input_modalities(checkpoint.filter)
+    runs = len(traces) * len(modalities)
+    errors = []
+    for i, trace in enumerate(traces):
+        alone = []
+        for k, modality in enumerate(modalities):
+
+            def share(done: float, index: int = i * len(modalities) + k) -> None:
+                if progress is not None:
+                    progress((index + done) / runs)
+
+            alone.append(measures.errors(standalone(checkpoint, trace, modality, share))[:, -1])
+        errors.append(np.stack(alone, axis=1))
+    return errors
 
 
 @torch.no_grad()

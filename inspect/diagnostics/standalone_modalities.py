@@ -18,7 +18,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
-from beliefscope.inspect.standalone import standalone
+from beliefscope.inspect.standalone import standalone_errors
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import jackknife, too_few
 from beliefscope.inspect.statistics.measures import Mask
@@ -158,18 +158,8 @@ def standalone_modalities(
 ) -> StandaloneModalities:
     """Run the standalone filter of every modality over the episodes of one or more traces, and compare all errors."""
     first, modalities = traces[0], input_modalities(checkpoint.filter)
-    runs = len(traces) * len(modalities)
-    errors = []
-    for i, trace in enumerate(traces):
-        alone = []
-        for k, modality in enumerate(modalities):
-
-            def share(done: float, index: int = i * len(modalities) + k) -> None:
-                if progress is not None:
-                    progress((index + done) / runs)
-
-            alone.append(measures.errors(standalone(checkpoint, trace, modality, share))[:, -1])
-        errors.append(_with_position(trace, modalities, np.stack(alone, axis=1)))
+    alone = standalone_errors(traces, checkpoint, progress)
+    errors = [_with_position(trace, modalities, values) for trace, values in zip(traces, alone, strict=True)]
     keep = len(first) if len(traces) == 1 else 0
     position = errors[0][:keep, :, 0]
     return StandaloneModalities(

@@ -121,6 +121,20 @@ def phases(trace: Trace) -> dict[str, Mask]:
     return {"all": keep, "contact": keep & contact, "free motion": keep & ~contact, "blackout": keep & blackout(trace)}
 
 
+GROUPS = {"all": (0, 1, 2, 3), "contact": (2, 3), "free motion": (0, 1), "blackout": (1, 3)}
+"""Phase -> its disjoint groups of steps: free motion and contact, each without and with image blackout."""
+
+
+def group_index(trace: Trace) -> NDArray[np.int64]:
+    """(T,): group of each step, see ``GROUPS``."""
+    return 2 * trace.episode.contact.astype(np.int64) + blackout(trace)
+
+
+def group_masks(trace: Trace) -> Mask:
+    """(4, T): counted steps of each group."""
+    return (group_index(trace) == np.arange(4)[:, None]) & counted(trace)
+
+
 def long_phases(trace: Trace) -> dict[str, Mask]:
     """``phases`` of at least ``MIN_STEPS`` steps."""
     return {phase: mask for phase, mask in phases(trace).items() if mask.sum() >= MIN_STEPS}

@@ -52,6 +52,25 @@ def simplex_minimum(gram: Array, near: Array) -> Array:
     return best / best.sum(-1, keepdims=True)
 
 
+def unbiased_weights(gram: Array) -> Array:
+    """Minimum of ``w^T G w`` over ``sum_k w_k = 1`` for G (..., K, K): ``G^-1 1 / (1^T G^-1 1)``, also negative.
+
+    With the second moments of K errors as G, the best linear combination of K unbiased estimates. Two errors with RMSE
+    i and h and correlation r leave ``(1 - r^2) i^2 h^2 / (i^2 + h^2 - 2 r i h)``, independent ones
+    ``i^2 / (1 + (i/h)^2)``. Equal weights if G is zero.
+    """
+    count = gram.shape[-1]
+    size = np.trace(gram, axis1=-2, axis2=-1)[..., None, None]
+    scaled = np.divide(gram, size, out=np.zeros_like(gram), where=size > 0)
+    weights = np.linalg.inv(scaled + TIE * np.eye(count)).sum(-1)
+    return weights / weights.sum(-1, keepdims=True)
+
+
+def squared_error(weights: Array, gram: Array) -> Array:
+    """``w^T G w`` of weights (..., K) and second moments (..., K, K)."""
+    return np.einsum("...k,...kl,...l->...", weights, gram, weights)
+
+
 def constant_weights(
     errors: Sequence[Array], phases: Sequence[NDArray[np.int64]], near: Sequence[Array]
 ) -> list[Array]:

@@ -1,0 +1,232 @@
+"""Fusion efficiency: achieved error against the best that the modalities' own errors and their correlation allow.
+
+The standalone filters (``inspect/standalone.py``) measure what each modality knows by itself. The best linear
+combination of their estimates, with constant weights in contact and free motion, each with and without image blackout,
+is the reference. ``fusion_gaps.py`` measures the reasons for a gap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.catalog import find_task
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.subsets import input_modalities
+from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.fusion_gaps import Reason, reasons_of
+from beliefscope.inspect.diagnostics.standalone_modalities import why_not
+from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
+from beliefscope.inspect.standalone import standalone_errors
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.intervals import jackknife, too_few
+from beliefscope.inspect.statistics.measures import GROUPS, Mask
+from beliefscope.inspect.statistics.oracle import squared_error, unbiased_weights
+from beliefscope.inspect.trace import Trace
+
+
+@dataclass(frozen=True)
+class PhaseEfficiency:
+    """Root mean square errors in one phase, of the position and of each component, m and rad.
+
+    Attributes:
+        phase: phase name.
+        trajectories, steps: number of trajectories and steps in the phase.
+        fused: (1 + n,) of the filter.
+        standalone: (K, 1 + n) of the standalone filters.
+        best: (1 + n,) of the best linear combination of the standalone estimates.
+        independent: (1 + n,) of the best combination if the standalone errors were not correlated.
+        correlation: (1 + n,) of the standalone errors about zero, mean over pairs of modalities.
+        efficiency: (1 + n,) ``best / fused``.
+        low, high: (1 + n,) 95 % intervals of ``efficiency`` over trajectories; NaN for too few of them.
+    """
+
+    phase: str
+    trajectories: int
+    steps: int
+    fused: Array
+    standalone: Array
+    best: Array
+    independent: Array
+    correlation: Array
+    efficiency: Array
+    low: Array
+    high: Array
+
+
+@dataclass(frozen=True)
+class FusionEfficiency(Diagnostic):
+    """Result of ``fusion_efficiency``; K modalities, T steps of a single trace (0 for several).
+
+    Attributes:
+        task, filter: of the traces.
+        modalities: K names.
+        trajectories: number of traces.
+        phases: efficiencies by phase.
+        reasons: all measured reasons for a gap, also those that do not contribute.
+        fused, best: (T,) m, position errors of the filter and of the best combination.
+        standalone: (T, K) m, position errors of the standalone filters.
+        contact, blackout: (T,) masks.
+    """
+
+    task: str
+    filter: str
+    modalities: tuple[str, ...]
+    trajectories: int
+    phases: tuple[PhaseEfficiency, ...]
+    reasons: tuple[Reason, ...]
+    fused: Array
+    best: Array
+    standalone: Array
+    contact: Mask
+    blackout: Mask
+
+    @property
+    def verdict(self) -> str:
+        total = self.phases[0]
+        alone = [f"{name} {100.0 * x:.2f} cm" for name, x in zip(self.modalities, total.standalone[:, 0], strict=True)]
+        sentence = (
+            f"Position RMSE {100.0 * total.fused[0]:.2f} cm; the standalone errors ({', '.join(alone)}; correlation "
+            f"{total.correlation[0]:.2f}) allow {100.0 * total.best[0]:.2f} cm: efficiency {total.efficiency[0]:.2f}"
+        )
+        if math.isnan(total.low[0]):
+            return f"{sentence}. No interval and no reasons: {too_few(self.trajectories)}."
+        sentence = f"{sentence} (95 % interval {total.low[0]:.2f} to {total.high[0]:.2f})."
+        if total.high[0] >= 1.0:
+            return f"{sentence} No significant gap."
+        texts = [reason.headline for reason in self.reasons if reason.contributes]
+        if not texts:
+            return f"{sentence} None of the {len(self.reasons)} measured reasons is significant."
+        return f"{sentence} Reasons: {'; '.join(texts)}."
+
+    def tables(self) -> list[Table]:
+        task = find_task(self.task)
+        units, scale = measures.display_units(task)
+        names = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
+        rows: list[tuple[Value, ...]] = []
+        for entry in self.phases:
+            for q, (name, unit, factor) in enumerate(names):
+                lengths = (entry.fused[q], *entry.standalone[:, q], entry.best[q], entry.independent[q])
+                ratios = (entry.correlation[q], entry.efficiency[q], entry.low[q], entry.high[q])
+                values = [*(float(factor * length) for length in lengths), *map(float, ratios)]
+                numbers = [value if math.isfinite(value) else None for value in values]
+                rows.append((entry.phase, entry.steps, f"{name} ({unit})", *numbers))
+        heads = ["fused", *(f"{name} standalone" for name in self.modalities), "best combination", "if uncorrelated"]
+        columns = ("phase", "steps", "quantity", *heads, "correlation", "efficiency", "95 % from", "to")
+        tables = [Table("Errors of fusion and of the best combination", columns, tuple(rows))]
+        if self.reasons:
+            tables.append(
+                Table(
+                    "Reasons for a gap",
+                    ("reason", "modality", "quantity", "ideal", "value", "95 % from", "to", "contributes"),
+                    tuple(reason.row() for reason in self.reasons),
+                )
+            )
+        return tables
+
+    def curves(self) -> list[Curve]:
+        if not len(self.fused):
+            return []
+        chart = "Position error"
+        alone = [
+            Curve(f"{name} standalone", 100.0 * self.standalone[:, k], chart, "cm", name)
+            for k, name in enumerate(self.modalities)
+        ]
+        best = Curve("best combination", 100.0 * self.best, chart, "cm", "truth")
+        return [Curve("fused", 100.0 * self.fused, chart, "cm", "fused"), *alone, best]
+
+    def bands(self) -> dict[str, Mask]:
+        return {"contact": self.contact, "blackout": self.blackout} if len(self.fused) else {}
+
+
+def fusion_efficiency(
+    traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
+) -> FusionEfficiency:
+    """Run the standalone filter of every modality over the episodes of one or more traces, and compare all errors."""
+    return efficiency_of(traces, checkpoint, standalone_errors(traces, checkpoint, progress))
+
+
+def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequence[Array]) -> FusionEfficiency:
+    """The result, given the errors (T, K, n) of the standalone filters by trace."""
+    first, where = traces[0], list(measures.task_of(traces[0]).map_indices)
+    errors = [
+        np.concatenate([measures.errors(trace)[:, -1:], e], axis=1) for trace, e in zip(traces, alone, strict=True)
+    ]
+    groups = [measures.group_masks(trace) for trace in traces]
+    moments = np.stack([_moments(e, mask, where) for e, mask in zip(errors, groups, strict=True)])
+    steps = np.stack([mask.sum(-1) for mask in groups])
+    keep = len(first) if len(traces) == 1 else 0
+    weights = unbiased_weights(moments[0, 0, :, 1:, 1:])[measures.group_index(first)]  # (T, K), of the position
+    best = np.einsum("tk,tkn->tn", weights, errors[0][:, 1:])
+    position = np.linalg.norm(errors[0][..., where], axis=-1)[:keep]
+    return FusionEfficiency(
+        task=first.episode.task,
+        filter=first.filter,
+        modalities=input_modalities(checkpoint.filter),
+        trajectories=len(traces),
+        phases=tuple(
+            _phase(name, moments, steps, list(members))
+            for name, members in GROUPS.items()
+            if steps[:, list(members)].any()
+        ),
+        reasons=reasons_of(traces, checkpoint),
+        fused=position[:, 0],
+        best=np.linalg.norm(best[..., where], axis=-1)[:keep],
+        standalone=position[:, 1:],
+        contact=first.episode.contact.astype(bool)[:keep],
+        blackout=measures.blackout(first)[:keep],
+    )
+
+
+def _moments(errors: Array, groups: Mask, where: list[int]) -> Array:
+    """(1 + n, G, 1 + K, 1 + K): products of errors (T, 1 + K, n) summed over groups (G, T), of position and components."""
+    products = np.einsum("gt,tan,tbn->ngab", groups, errors, errors, optimize=True)
+    return np.concatenate([products[where].sum(0, keepdims=True), products])
+
+
+def _phase(name: str, moments: Array, steps: NDArray[np.int64], members: list[int]) -> PhaseEfficiency:
+    """Efficiency in a phase. Args: moments (R, 1 + n, G, 1 + K, 1 + K), steps (R, G), members: groups of the phase."""
+    has = steps[:, members].any(-1)
+    sums, count = moments[has][:, :, members], int(steps[:, members].sum())
+    logarithm, low, high = jackknife(sums, lambda s: 0.5 * np.log(_best(s) / s[..., 0, 0].sum(-1)))
+    total = sums.sum(0)
+    pooled = total.sum(1)  # (1 + n, 1 + K, 1 + K)
+    rmse = np.sqrt(np.einsum("qkk->qk", pooled) / count)
+    own = np.einsum("qgkk->qgk", total)[..., 1:]
+    scale = np.einsum("qkk->qk", pooled[:, 1:, 1:])
+    correlation = pooled[:, 1:, 1:] / np.sqrt(scale[:, :, None] * scale[:, None])
+    pairs = np.triu_indices(correlation.shape[-1], 1)
+    return PhaseEfficiency(
+        phase=name,
+        trajectories=int(has.sum()),
+        steps=count,
+        fused=rmse[:, 0],
+        standalone=rmse[:, 1:].T,
+        best=np.sqrt(_best(total) / count),
+        independent=np.sqrt(_best(own[..., None] * np.eye(own.shape[-1]), 0) / count),
+        correlation=correlation[:, pairs[0], pairs[1]].mean(-1),
+        efficiency=np.exp(logarithm),
+        low=np.exp(low),
+        high=np.exp(high),
+    )
+
+
+def _best(moments: Array, first: int = 1) -> Array:
+    """(...) sum over groups of the squared error of the best combination; moments (..., G, L, L), K from ``first``."""
+    gram = moments[..., first:, first:]
+    return squared_error(unbiased_weights(gram), gram).sum(-1)
+
+
+ENTRY = Entry(
+    name="efficiency",
+    title="Fusion efficiency",
+    question="How close is the fused error to the best that the modalities allow, and which property causes the gap?",
+    run=fusion_efficiency,
+    why_not=why_not,
+    needs="checkpoint",
+    slow=True,
+)

@@ -1,0 +1,238 @@
+"""Reasons why fusion is less accurate than the modalities allow, each with a measured quantity.
+
+Sensor biases and calibration use the sensors' own output, virtual observation z and covariance R, against the true
+state. Filters without virtual sensors (particle filters, LSTM) have neither.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnostics.views import Array, Value
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.intervals import jackknife, mean_interval
+from beliefscope.inspect.statistics.oracle import simplex_minimum, squared_error
+from beliefscope.inspect.trace import Trace
+
+CALIBRATION, DRIFT, PRIOR, WEIGHTS = "uncalibrated R", "drifted sensor", "shared prior counted twice", "wrong weights"
+
+MIN_FACTOR = 1.5
+"""Factor by which NEES/n of a sensor must differ from 1."""
+
+MIN_BIAS = 0.3
+"""Smallest bias of a drifted sensor, relative to the root mean square of its error."""
+
+MIN_COUNT = 1.25
+"""Smallest number of times that a prior is counted twice."""
+
+MIN_EXCESS = 1.05
+"""Smallest ratio of errors for wrong weights."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """A possible reason for a gap. ``modality``: the measurement model, empty for properties of the fusion.
+
+    Attributes:
+        quantity: what ``value`` is. ideal: its value without a gap.
+        low, high: 95 % interval over trajectories; NaN for too few of them.
+        contributes: whether the interval excludes ``ideal`` and the difference is relevant.
+        headline: the finding as a clause.
+    """
+
+    name: str
+    modality: str
+    quantity: str
+    ideal: float
+    value: float
+    low: float
+    high: float
+    contributes: bool
+    headline: str
+
+    def row(self) -> tuple[Value, ...]:
+        """As a row of a table."""
+        interval = (None, None) if math.isnan(self.low) else (self.low, self.high)
+        verdict = "unknown" if math.isnan(self.low) else "yes" if self.contributes else "no"
+        return (self.name, self.modality, self.quantity, self.ideal, self.value, *interval, verdict)
+
+
+def reasons_of(traces: Sequence[Trace], checkpoint: Checkpoint) -> tuple[Reason, ...]:
+    """All reasons that can be measured for this filter."""
+    architecture = checkpoint.filter.architecture
+    one_prior = architecture.fusion in ("crossmodal", "unimodal") and architecture.feedback
+    reasons = []
+    if traces[0].observation_covariance is not None:
+        reasons += _sensor_reasons(traces)
+    if traces[0].predicted_covariance is not None and len(traces[0].modalities) > 1 and one_prior:
+        reasons.append(_prior(traces))
+    if traces[0].effective_weights is not None and traces[0].modalities_with_posterior:
+        reasons.append(_weights(traces, of_sensors=architecture.fusion == "information"))
+    return tuple(reasons)
+
+
+def _sensor_errors(trace: Trace) -> tuple[Array, Array]:
+    """Errors (T, K, n) of the virtual sensors, and the inverses of R (T, K, n, n), at counted steps."""
+    assert trace.observation_mean is not None
+    assert trace.observation_covariance is not None
+    error = measures.wrapped(measures.task_of(trace), trace.observation_mean - trace.episode.states[:, None])
+    keep = measures.counted(trace)
+    return error[keep], np.linalg.inv(trace.observation_covariance[keep].astype(np.float64))
+
+
+def _sensor_reasons(traces: Sequence[Trace]) -> list[Reason]:
+    """Bias and calibration of each virtual sensor; the calibration is that of the errors about the bias."""
+    task = measures.task_of(traces[0])
+    units, scale = measures.display_units(task)
+    sensors = [_sensor_errors(trace) for trace in traces]
+    weighted = []
+    for error, precision in sensors:
+        weight = np.einsum("tknn->tkn", precision)
+        weighted.append(np.stack([weight, weight * error, weight * error**2], axis=-1).sum(0))
+    sums = np.stack(weighted)  # (R, K, n, 3)
+    total = sums.sum(0)
+    bias = total[..., 1] / total[..., 0]  # (K, n)
+    value, low, high = jackknife(sums, lambda s: s[..., 1] / np.sqrt(s[..., 0] * s[..., 2]))
+    nees = np.stack(
+        [np.einsum("tki,tkij,tkj->k", e - bias, p, e - bias, optimize=True) / e.shape[-1] for e, p in sensors]
+    )
+    factor, factor_low, factor_high = mean_interval(nees, np.array([[len(e)] for e, _ in sensors]))
+    reasons = []
+    for k, name in enumerate(traces[0].modalities):
+        i = int(np.abs(value[k]).argmax())
+        size = f"{scale[i] * bias[k, i]:+.2f} {units[i]}"
+        relevant = abs(value[k, i]) > MIN_BIAS and (low[k, i] > 0.0 or high[k, i] < 0.0)
+        reasons.append(
+            Reason(
+                name=CALIBRATION,
+                modality=name,
+                quantity="NEES/n of the sensor about its bias",
+                ideal=1.0,
+                value=float(factor[k]),
+                low=float(factor_low[k]),
+                high=float(factor_high[k]),
+                contributes=bool(factor_low[k] > 1.0 and factor[k] > MIN_FACTOR)
+                or bool(factor_high[k] < 1.0 and factor[k] < 1.0 / MIN_FACTOR),
+                headline=f"uncalibrated R: standard deviations of the {name} sensor are "
+                f"{'too small' if factor[k] > 1.0 else 'too large'} (NEES/n {factor[k]:.2f})",
+            )
+        )
+        reasons.append(
+            Reason(
+                name=DRIFT,
+                modality=name,
+                quantity=f"bias of {task.components[i].label} over its RMSE",
+                ideal=0.0,
+                value=float(value[k, i]),
+                low=float(low[k, i]),
+                high=float(high[k, i]),
+                contributes=bool(relevant),
+                headline=f"drifted sensor: {task.components[i].label} of the {name} sensor has a bias of {size}",
+            )
+        )
+    return sorted(reasons, key=lambda reason: reason.name != CALIBRATION)
+
+
+def _prior(traces: Sequence[Trace]) -> Reason:
+    """How many times the fused mean counts the prior: ``odds(W) / odds(W_1)``, ``odds(W) = tr(W) / (n - tr(W))``.
+
+    Posteriors ``m_k, S_k`` of one prior ``m', P'`` are fused with weights A_k, so ``m = sum_k A_k m_k`` has the part
+    ``W m'``, ``W = sum_k A_k S_k P'^-1``. Used once, it is ``W_1 = (sum_k S_k^-1 - (K - 1) P'^-1)^-1 P'^-1``. Equal
+    scalar sensors give K, both by the mean and by the product of the posteriors.
+    """
+    sums = np.array([_prior_weights(trace) for trace in traces])  # (R, 2, 2)
+    logarithms = jackknife(sums, lambda s: np.log(s[..., 0, 0] * s[..., 1, 1] / (s[..., 0, 1] * s[..., 1, 0])))
+    value, low, high = (float(np.exp(v)) for v in logarithms)
+    nees = np.concatenate([measures.nees(trace)[measures.counted(trace), -1] for trace in traces]).mean()
+    return Reason(
+        name=PRIOR,
+        modality="",
+        quantity="number of times that the fused mean counts the prior",
+        ideal=1.0,
+        value=value,
+        low=low,
+        high=high,
+        contributes=low > 1.0 and value > MIN_COUNT,
+        headline=f"shared prior counted twice: every fused posterior contains it, and their mean counts it {value:.1f} "
+        f"times (NEES/n of the fused belief {nees:.2f})",
+    )
+
+
+def _prior_weights(trace: Trace) -> Array:
+    """(2, 2): sums over steps of W and W_1 of ``_prior``, and of their complements: tr and ``n - tr``."""
+    assert trace.predicted_covariance is not None
+    keep = measures.counted(trace)
+    posterior = trace.modality_covariance[keep].astype(np.float64)  # (T, K, n, n)
+    prior = np.linalg.inv(trace.predicted_covariance[keep].astype(np.float64))
+    if trace.weights is None:  # product of experts: A_k = S S_k^-1
+        weighted = np.broadcast_to(trace.estimate_covariance[keep, None].astype(np.float64), posterior.shape)
+    else:
+        weighted = trace.weights[keep, :, :, None].astype(np.float64) * posterior
+    once = np.linalg.inv(np.linalg.inv(posterior).sum(1) - prior[:, 1:].sum(1))
+    parts = np.stack([(weighted @ prior).sum(1), once @ prior[:, 0]])
+    total, n = np.einsum("atnn->a", parts), posterior.shape[-1]
+    return np.stack([total, n * keep.sum() - total], axis=-1)
+
+
+def _weights(traces: Sequence[Trace], of_sensors: bool) -> Reason:
+    """Position error of the modalities' mean with the effective weights, over that with the best convex weights.
+
+    The best weights are constant in contact and free motion, with and without image blackout. Weighted are the
+    single-modality updates, or the virtual sensors of a filter that fuses these.
+    """
+    parts = [_weighted_sums(trace, of_sensors) for trace in traces]
+    sums = np.stack([part for part, _ in parts])  # (R, G, d, K K + K + 1)
+    means = np.mean([mean for _, mean in parts], axis=0)
+    count = means.shape[-1]
+    logarithms = jackknife(sums, lambda s: 0.5 * np.log(s[..., -1].sum((-2, -1)) / _least(s, count)[0]))
+    value, low, high = (float(np.exp(v)) for v in logarithms)
+    share = _least(sums.sum(0), count)[1]
+    k = int(np.abs(means - share).round(6).argmax())  # of two, the first
+    name = traces[0].modalities[k]
+    return Reason(
+        name=WEIGHTS,
+        modality="",
+        quantity="error with the effective weights over that with the best constant weights",
+        ideal=1.0,
+        value=value,
+        low=low,
+        high=high,
+        contributes=low > 1.0 and value > MIN_EXCESS,
+        headline=f"wrong weights: mean weight of {name} {means[k]:.2f}, best {share[k]:.2f}; the best constant weights "
+        f"would reduce the error of the weighted mean by {100.0 * (1.0 - 1.0 / value):.0f} %",
+    )
+
+
+def _weighted_sums(trace: Trace, of_sensors: bool) -> tuple[Array, Array]:
+    """Sums by group and coordinate (G, d, K K + 2): second moments, steps, squared error; and mean weights (K,).
+
+    A scalar weight serves both coordinates of the position, d = 1; else d = 2.
+    """
+    assert trace.effective_weights is not None
+    task = measures.task_of(trace)
+    where = list(task.map_indices)
+    estimates = trace.observation_mean if of_sensors else trace.modality_mean
+    assert estimates is not None
+    error = measures.wrapped(task, estimates - trace.episode.states[:, None])[..., where]  # (T, K, 2)
+    weights = trace.effective_weights.astype(np.float64)
+    scalar = weights.shape[-1] == 1
+    weights = np.broadcast_to(weights, error.shape) if scalar else weights[..., where]
+    groups = measures.group_masks(trace)
+    moments = np.einsum("gt,tkd,tld->gdkl", groups, error, error, optimize=True)
+    cost = groups @ np.square((weights * error).sum(1))
+    steps = np.broadcast_to(groups.sum(1)[:, None], cost.shape)
+    parts = np.concatenate([moments.reshape(*cost.shape, -1), steps[..., None], cost[..., None]], axis=-1)
+    return parts.sum(1, keepdims=True) if scalar else parts, weights[measures.counted(trace)].mean((0, 2))
+
+
+def _least(sums: Array, count: int) -> tuple[Array, Array]:
+    """Squared error (...) with the best weights of K = ``count`` estimates, and mean best weights (..., K)."""
+    gram = sums[..., : count * count].reshape(*sums.shape[:-1], count, count)
+    best = simplex_minimum(gram, np.full(gram.shape[:-1], 1.0 / count))
+    steps = sums[..., -2, None]
+    return squared_error(best, gram).sum((-2, -1)), (best * steps).sum((-3, -2)) / steps.sum((-3, -2))
