@@ -67,7 +67,7 @@ class FusionEfficiency(Diagnostic):
         modalities: K names.
         trajectories: number of traces.
         phases: efficiencies by phase.
-        reasons: all measured reasons for a gap, also those that do not contribute.
+        reasons: all measured reasons for a gap, contributing or not.
         fused, best: (T,) m, position errors of the filter and of the best combination.
         standalone: (T, K) m, position errors of the standalone filters.
         contact, blackout: (T,) masks.
@@ -183,7 +183,7 @@ def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequen
 
 
 def _moments(errors: Array, groups: Mask, where: list[int]) -> Array:
-    """(1 + n, G, 1 + K, 1 + K): products of errors (T, 1 + K, n) summed over groups (G, T), of position and components."""
+    """(1 + n, G, 1 + K, 1 + K): products of errors (T, 1 + K, n) summed over groups (G, T)."""
     products = np.einsum("gt,tan,tbn->ngab", groups, errors, errors, optimize=True)
     return np.concatenate([products[where].sum(0, keepdims=True), products])
 

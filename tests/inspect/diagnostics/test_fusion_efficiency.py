@@ -41,9 +41,8 @@ def optimum(correlation: float) -> float:
 def with_errors(correlation: float, weight: float, trajectories: int) -> tuple[list[Trace], list[Any]]:
     """Traces in one phase whose standalone errors have exactly these moments; fused is their weighted mean."""
     rng = np.random.default_rng(1)
-    factor = np.linalg.cholesky(
-        [[IMAGE**2, correlation * IMAGE * HAPTICS], [correlation * IMAGE * HAPTICS, HAPTICS**2]] / np.array(2.0)
-    )
+    moments = np.array([[IMAGE**2, correlation * IMAGE * HAPTICS], [correlation * IMAGE * HAPTICS, HAPTICS**2]])
+    factor = np.linalg.cholesky(moments / 2.0)
     traces, alone = [], []
     base = plant.real("crossmodal-ekf")
     states = base.episode.states.astype(np.float64)
