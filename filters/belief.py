@@ -34,7 +34,7 @@ class Particles:
 
 @dataclass(frozen=True)
 class Recurrent:
-    """hidden (N, L, 2, H): output and cell of each of L layers. mean (N, n): the estimate, without a covariance."""
+    """hidden (N, L, S, H): S vectors of each of L layers. mean (N, n): the estimate, without a covariance."""
 
     hidden: Tensor
     mean: Tensor
@@ -66,9 +66,9 @@ class Evidence:
     ``evidence[a:b]`` a range of steps.
 
     Attributes:
-        control: (T, N, u) the controls' part of the dynamics model. LSTM: the encoded controls.
+        control: (T, N, u) the controls' part of the dynamics model. Sequence models: the encoded controls.
         observation: EKF, UKF: (T, N, K, n) virtual observations z. PF: (T, N, K, u) observations' part of the
-            likelihood. LSTM: (T, N, 1, u) observations and controls, encoded and joined.
+            likelihood. Sequence models: (T, N, 1, u) observations and controls, encoded and joined.
         noise: EKF, UKF: (T, N, K, n) standard deviations of z, the square root of R's diagonal. Others: None.
         log_weights: (T, N, K, W) log beta, W = n for weights per component, 1 for scalars; None without a weight model.
         present: (T, N, K) bool, which models' evidence is used; None for all. See ``select_models``.
@@ -132,7 +132,7 @@ class StepTrace:
 
     Attributes:
         predicted: belief after the prediction, before the update. EKF, UKF: bank (N, K, n); PF: particles with
-            their prior weights; LSTM, which has no prediction: the belief before the step.
+            their prior weights; sequence models, which have no prediction: the belief before the step.
         posterior: fused belief after the observation and, for a PF, before resampling. EKF, UKF: Gaussian (N, n).
         estimate: Gaussian (N, n), (N, n, n): mean and covariance of the posterior, the filter's output. LSTM: the
             covariance is NaN.

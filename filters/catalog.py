@@ -15,6 +15,7 @@ from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.lstm import Lstm
 from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.transformer import Transformer
 from beliefscope.filters.models.ukf import UnscentedKalmanFilter
 
 KINDS: dict[Kind, type[Filter]] = {
@@ -22,6 +23,7 @@ KINDS: dict[Kind, type[Filter]] = {
     "ukf": UnscentedKalmanFilter,
     "pf": ParticleFilter,
     "lstm": Lstm,
+    "transformer": Transformer,
 }
 
 ANY = ""
@@ -39,6 +41,7 @@ FILTERS: dict[str, tuple[Literal["each", "all", "one"], Architecture]] = {
     "{modality}-ekf": ("one", Architecture(ANY, "ekf", "none")),
     "{modality}-pf": ("one", Architecture(ANY, "pf", "none")),
     "lstm": ("all", Architecture(ANY, "lstm", "none")),
+    "transformer": ("all", Architecture(ANY, "transformer", "none")),
 }
 """Name -> measurement models and architecture. ``each``: one model per modality. ``all``: one model of all modalities.
 ``one``: a filter per modality, with that modality only (``image-pf``, ``haptics-pf``)."""

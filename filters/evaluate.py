@@ -21,6 +21,7 @@ from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
+from beliefscope.filters.models.sequence import SequenceModel
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start, shifted, without_start_offset
 from beliefscope.filters.start_offset import UNITS as UNITS
@@ -176,7 +177,7 @@ def _filter_runs(
     by_name = {FILTER: evidence if only is None else standalone_evidence(filter_, batch, evidence, only)}
     for name in input_modalities(filter_) if modalities else ():
         by_name[STANDALONE.format(name)] = standalone_evidence(filter_, batch, evidence, name)
-    if baselines and filter_.architecture.kind != "lstm":
+    if baselines and not isinstance(filter_, SequenceModel):
         by_name[DYNAMICS] = evidence.select_models(torch.zeros_like(evidence.observation[..., 0], dtype=torch.bool))
     runs = {}
     for name, selected in by_name.items():

@@ -20,7 +20,7 @@ from beliefscope.filters.models.fusion import CovarianceRule
 from beliefscope.filters.models.networks import Encoders, Networks, Pooling, Residual, Stack
 from beliefscope.filters.models.resampling import Resampling
 
-Kind = Literal["ekf", "ukf", "pf", "lstm"]
+Kind = Literal["ekf", "ukf", "pf", "lstm", "transformer"]
 Fusion = Literal["crossmodal", "unimodal", "information", "none"]
 
 WEIGHTED: tuple[Fusion, ...] = ("crossmodal", "information")
@@ -36,7 +36,7 @@ class Architecture:
 
     Attributes:
         task: name in ``TASKS``.
-        kind: ``ekf``, ``ukf``, ``pf`` or ``lstm``.
+        kind: ``ekf``, ``ukf``, ``pf``, ``lstm`` or ``transformer``.
         fusion: rule that fuses the measurement models' results: ``crossmodal`` (learned weights beta), ``unimodal``
             (product of experts for an EKF, sum of likelihoods for a PF), ``information`` (EKF: one prior, precisions
             add, weighted by beta), or ``none`` (one model).
@@ -101,7 +101,7 @@ class Filter(nn.Module, ABC):
     Attributes:
         has_covariance: whether its estimates have a covariance; else it is NaN.
         history: number of past steps that the encoding of a step uses.
-        dynamics: the dynamics model; the LSTM has none.
+        dynamics: the dynamics model; sequence models have none.
     """
 
     has_covariance = True

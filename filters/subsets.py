@@ -48,8 +48,8 @@ def subset_evidence(filter_: Filter, batch: Batch, evidence: Evidence, has: Tens
     """Evidence (T, S, ...) in which trajectory s has only the modalities of row s of ``has``.
 
     Models without any of their modalities are deselected (``Evidence.select_models``); beta keeps the proportions of
-    ``evidence``. In a shared model that lacks some of its modalities, and in an LSTM, missing images are black and
-    missing vectors are at the training mean.
+    ``evidence``. In a shared model that lacks some of its modalities, and in a sequence model, missing images are black
+    and missing vectors are at the training mean.
 
     Args:
         batch: N = S trajectories, or one for all S. evidence: of the batch.

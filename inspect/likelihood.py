@@ -57,8 +57,8 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quanti
         if None not in reasons:
             return f"filter {checkpoint.name!r} {subject}: {reasons[-1]}"
     elif not checkpoint.filter.has_covariance:
-        kind = checkpoint.kind.upper()
-        return f"filter {checkpoint.name!r} {subject}: an {kind} has no likelihood and no covariance"
+        kind = {"lstm": "an LSTM"}.get(checkpoint.kind, f"a {checkpoint.kind}")
+        return f"filter {checkpoint.name!r} {subject}: {kind} has no likelihood and no covariance"
     off_map = [c.name for i, c in enumerate(task.components) if i not in task.map_indices]
     if len(off_map) > 1:
         return f"task {task.name!r} {subject}: {', '.join(off_map)} are not on the map; at most one can be held fixed"

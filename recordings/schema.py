@@ -208,7 +208,7 @@ PROPERTIES: dict[str, str] = {
     "versions": "JSON: versions of beliefscope, rerun-sdk and numpy that wrote the file",
     "task": "name of the task",
     "filter": "name of the filter",
-    "kind": "`ekf`, `ukf`, `pf`, `lstm`, or `external` for an external filter",
+    "kind": "`ekf`, `ukf`, `pf`, `lstm`, `transformer`, or `external` for an external filter",
     "modalities": "JSON list: the K modalities in order",
     "episode_index": "index in the dataset",
     "steps": "T, rows of every path under `trace/` and `observations/` that is not static; -1 during a live run",

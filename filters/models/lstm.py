@@ -1,16 +1,15 @@
-"""The unstructured baseline: an LSTM from observations and controls to the state."""
+"""An LSTM from observations and controls to the state."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor, nn
 
-from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Belief, Evidence, Gaussian, Recurrent, StepTrace
-from beliefscope.filters.filter import Architecture, Filter, encoders
-from beliefscope.filters.models.networks import Residual, Stack, vector_stack
+from beliefscope.filters.filter import Architecture
+from beliefscope.filters.models.sequence import SequenceModel
 
 HIDDEN = 512
 LAYERS = 2
@@ -39,29 +38,14 @@ class Cell(nn.Module):
         return torch.stack([torch.sigmoid(leave) * torch.tanh(cell), cell], dim=1)
 
 
-class Lstm(Filter):
-    """Encoders of all modalities and of the controls, shared layers, two LSTM layers of 512 units, a state readout.
-
-    It has no prediction step and no covariance. Its first hidden state is a learned function of the first belief's
-    mean, so that it starts from the same belief as the other filters.
-    """
-
-    has_covariance = False
+class Lstm(SequenceModel):
+    """Two LSTM layers of 512 units. Its memory is the output and cell of each layer."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
-        units = architecture.units
-        self.encoders = encoders(self.task, self.task.modalities, architecture)
-        self.control_encoder = vector_stack(self.task.control_size, units)
-        self.shared = Stack(nn.Linear(self.encoders.size + units, units), nn.ReLU(inplace=True), Residual(units))
-        self.layers = nn.ModuleList(Cell(units if i == 0 else HIDDEN) for i in range(LAYERS))
-        self.output = Stack(nn.Linear(HIDDEN, units), nn.ReLU(inplace=True), nn.Linear(units, self.n))
+        self.layers = nn.ModuleList(Cell(architecture.units if i == 0 else HIDDEN) for i in range(LAYERS))
+        self.output = self.readout(HIDDEN)
         self.initial = nn.Linear(self.n, LAYERS * 2 * HIDDEN)
-
-    def encode(self, batch: Batch) -> Evidence:
-        control = self.control_encoder(self.statistics.standardise("control", batch.controls))
-        joined = torch.cat([self.encoders(self.observations(batch)), control], dim=-1)
-        return Evidence(control=control, observation=self.shared(joined).unsqueeze(2), noise=None, log_weights=None)
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Recurrent:
         return Recurrent(self.initial(belief.mean).unflatten(-1, (LAYERS, 2, HIDDEN)).tanh(), belief.mean)
@@ -72,7 +56,7 @@ class Lstm(Filter):
         for layer, before in zip(self.layers, belief.hidden.unbind(1), strict=True):
             hidden.append(layer(x, before))
             x = hidden[-1][:, 0]
-        return self.read(belief, hidden)
+        return self.read(belief, torch.stack(hidden, dim=1), x)
 
     def steps(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> Iterator[StepTrace]:
         """All steps, layer by layer: identical results, but each layer's weights stay in the CPU cache."""
@@ -85,12 +69,6 @@ class Lstm(Filter):
                 states.append(state)
             inputs = tuple(state[:, 0] for state in states)
             hidden.append(states)
-        for layers in zip(*hidden, strict=True):
-            belief, trace = self.read(belief, layers)
+        for output, *layers in zip(inputs, *hidden, strict=True):
+            belief, trace = self.read(belief, torch.stack(layers, dim=1), output)
             yield trace
-
-    def read(self, before: Recurrent, hidden: Sequence[Tensor]) -> tuple[Recurrent, StepTrace]:
-        """The belief, and the step's trace, from each layer's new hidden state (N, 2, H)."""
-        after = Recurrent(torch.stack(list(hidden), dim=1), self.output(hidden[-1][:, 0]))
-        unknown = torch.full((*after.mean.shape, self.n), torch.nan, device=after.mean.device)
-        return after, StepTrace(predicted=before, posterior=after, estimate=Gaussian(after.mean, unknown))

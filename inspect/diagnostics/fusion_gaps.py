@@ -1,7 +1,7 @@
 """Reasons why fusion is less accurate than the modalities allow, each with a measured quantity.
 
 Sensor biases and calibration use the sensors' own output, virtual observation z and covariance R, against the true
-state. Filters without virtual sensors (particle filters, LSTM) have neither.
+state. Filters without virtual sensors (particle filters, sequence models) have neither.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ class Shapley(Diagnostic):
     @property
     def baseline(self) -> str:
         """Name of the empty subset."""
-        return "controls only" if self.kind == "lstm" else "dynamics only"
+        return "controls only" if self.kind in ("lstm", "transformer") else "dynamics only"
 
     def _title(self, subset: tuple[str, ...]) -> str:
         return " + ".join(subset) or self.baseline

@@ -17,6 +17,7 @@ from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace
 from beliefscope.filters.evaluate import UNITS
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.sequence import SequenceModel
 from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.views import Array
 from beliefscope.inspect.traces.replay import Edit, Replay, repeat_belief
@@ -143,7 +144,7 @@ class SingleStep:
     def _targets(self) -> Iterable[Target]:
         for i, component in enumerate(self.filter.task.components):
             yield Target(component.name, *UNITS[component.unit], self._component(i), self)
-        if self.filter.architecture.kind == "lstm":
+        if isinstance(self.filter, SequenceModel):
             return
         for k, name in enumerate(self.filter.names):
             yield Target(f"log-likelihood:{name}", "nats", 1.0, self._log_likelihood(k), self)

@@ -30,11 +30,11 @@ class Trace:
     Attributes:
         episode: filter input: true states, contact, observations after fault injection, data for the replay.
         modalities: names of the K measurement models, in the order of every K axis: a modality, or several joined by
-            ``+`` that share one model. Empty for an LSTM, which has no measurement models (K = 0).
-        kind: ``ekf``, ``ukf``, ``pf``, ``lstm`` or ``external``. An external filter has the fields that could be
-            captured. Statements about EKFs below hold for UKFs as well.
+            ``+`` that share one model. Empty for an LSTM or transformer, which have no measurement models (K = 0).
+        kind: ``ekf``, ``ukf``, ``pf``, ``lstm``, ``transformer`` or ``external``. An external filter has the fields
+            that could be captured. Statements about EKFs below hold for UKFs as well.
         filter: filter name.
-        estimate_mean, estimate_covariance: (T, n), (T, n, n) fused posterior. LSTM: the covariance is NaN.
+        estimate_mean, estimate_covariance: (T, n), (T, n, n) fused posterior. LSTM, transformer: the covariance is NaN.
         modality_mean, modality_covariance: (T, K, n), (T, K, n, n) single-modality updates: the prior of
             this step, updated with one modality only. PF: the predicted particles weighted by one likelihood. EKF:
             the posterior of each filter of the bank. The prior comes from the fused belief, and so from all
@@ -91,7 +91,7 @@ class Trace:
 
     @property
     def has_covariance(self) -> bool:
-        """Whether the estimates have a covariance; those of an LSTM do not."""
+        """Whether the estimates have a covariance; those of an LSTM or transformer do not."""
         return not np.isnan(self.estimate_covariance).all() or not len(self)
 
     @property

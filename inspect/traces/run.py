@@ -198,7 +198,7 @@ def _pf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) 
     return arrays
 
 
-def _lstm_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
+def _sequence_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
     none = torch.zeros(len(steps), 0, filter_.n)
     return {"modality_mean": none, "modality_covariance": none.unsqueeze(-1).expand(-1, -1, -1, filter_.n)}
 
@@ -207,6 +207,7 @@ ARRAYS_OF: dict[Kind, Callable[[Filter, Sequence[StepTrace], Evidence], dict[str
     "ekf": _ekf_arrays,
     "ukf": _ekf_arrays,
     "pf": _pf_arrays,
-    "lstm": _lstm_arrays,
+    "lstm": _sequence_arrays,
+    "transformer": _sequence_arrays,
 }
 """Kind of filter -> function that converts its steps to trace arrays."""

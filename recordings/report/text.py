@@ -43,7 +43,7 @@ INFORMATION_UPDATE = Passage(
 
 def methods(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
     """Describe the filter and its evaluation, based on trace and checkpoint."""
-    kinds = {"ekf": _kalman, "ukf": _kalman, "pf": _particles, "lstm": _recurrent}
+    kinds = {"ekf": _kalman, "ukf": _kalman, "pf": _particles, "lstm": _recurrent, "transformer": _attention}
     passages = kinds[trace.kind](trace, checkpoint) if trace.kind in kinds else [_external(trace)]
     return [*passages, _run(trace)]
 
@@ -147,6 +147,14 @@ def _recurrent(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
         "observations $z$ and of the control $u$. It has no covariance and no measurement models."
     )
     return [Passage("Estimator", text, (r"h_t = \text{LSTM}(e(z_t, u_t), h_{t-1}) , \quad m_t = W h_t + b",))]
+
+
+def _attention(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
+    text = (
+        "The estimate is the output of a transformer, whose layers attend to the inputs of the last steps. These are "
+        "features $e$ of all observations $z$ and of the control $u$. It has no covariance and no measurement models."
+    )
+    return [Passage("Estimator", text, (r"m_t = f(e(z_t, u_t), e(z_{t-1}, u_{t-1}), \dots)",))]
 
 
 def _external(trace: Trace) -> Passage:

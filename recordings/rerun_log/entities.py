@@ -32,6 +32,7 @@ KINDS = {
     "ukf": "An unscented Kalman filter for each measurement model",
     "pf": "A particle filter",
     "lstm": "An LSTM without covariance and likelihood",
+    "transformer": "A transformer without covariance and likelihood",
     "external": "An external filter",
 }
 MEANINGS = {"truth": "true state", "fused": "estimate from all modalities", "contact": "the robot touches the object"}

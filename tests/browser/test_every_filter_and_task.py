@@ -48,7 +48,7 @@ def test_missing_outputs_are_explained_per_filter(open_page: Any, start_server: 
 
     select(page, "filter", "my-lstm")
     page.until("() => document.querySelector('#heatmaps').dataset.state === 'empty'")
-    assert "an LSTM estimates the state" in text("#heatmaps .note").text_content()
+    assert "an LSTM has no likelihood" in text("#heatmaps .note").text_content()
     assert text("#step-summary").text_content().endswith("no predicted standard deviation.")
     assert "\N{GREEK SMALL LETTER SIGMA}" not in text("#step-table thead").text_content()
     assert not text("#angle-label").is_visible()

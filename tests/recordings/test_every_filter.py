@@ -45,12 +45,13 @@ def traced(checkpoint: Checkpoint, episode: Episode) -> Trace:
 
 def test_trace_has_the_fields_of_its_kind(checkpoint: Checkpoint, traced: Trace) -> None:
     kind, names = checkpoint.kind, checkpoint.filter.names
-    n, k = 3, 0 if kind == "lstm" else len(names)
-    assert traced.modalities == (() if kind == "lstm" else names)
+    sequence = kind in ("lstm", "transformer")
+    n, k = 3, 0 if sequence else len(names)
+    assert traced.modalities == (() if sequence else names)
     assert traced.modality_mean.shape == (24, k, n)
     assert traced.modality_covariance.shape == (24, k, n, n)
     assert np.isfinite(traced.estimate_mean).all()
-    assert (np.isnan if kind == "lstm" else np.isfinite)(traced.estimate_covariance).all()
+    assert (np.isnan if sequence else np.isfinite)(traced.estimate_covariance).all()
     assert (traced.observation_mean is not None) == (kind in ("ekf", "ukf"))
     assert (traced.log_likelihood is not None) == (kind == "pf")
     # Effective weights sum to one.
@@ -66,8 +67,8 @@ def test_maps_and_recording_round_trip(
     checkpoint: Checkpoint, traced: Trace, assert_same: Callable[[Trace, Trace], None], tmp_path: Path
 ) -> None:
     maps = None
-    if checkpoint.kind == "lstm":
-        with pytest.raises(BadInput, match="'lstm' has no likelihood maps"):
+    if checkpoint.kind in ("lstm", "transformer"):
+        with pytest.raises(BadInput, match=f"'{checkpoint.kind}' has no likelihood maps: an? "):
             MapEngine(checkpoint, traced)
     else:
         maps = list(MapEngine(checkpoint, traced).maps([0, 12], size=21))

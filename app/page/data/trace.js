@@ -126,7 +126,7 @@ export class Trace {
   get inputs() {
     const { kind } = this.header;
     if (kind === 'external' || this.standalone) return [];
-    const names = kind === 'lstm' ? this.task.modalities : this.modalities;
+    const names = this.modalities.length ? this.modalities : this.task.modalities;
     const inputs = [...new Set(names.flatMap((name) => name.split('+')))];
     return inputs.length > 1 ? inputs : [];
   }

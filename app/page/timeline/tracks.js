@@ -225,10 +225,13 @@ function innovationTrack(trace, component) {
 }
 
 /** @param {string} kind of the filter */
+const isSequenceModel = (kind) => kind === 'lstm' || kind === 'transformer';
+
+/** @param {string} kind of the filter */
 function missingInnovation(kind) {
   if (kind === 'pf')
     return 'None: a particle filter weights its particles and does not measure the state.';
-  if (kind === 'lstm') return 'None: the network has no separate prediction and measurement.';
+  if (isSequenceModel(kind)) return 'None: the network has no separate prediction and measurement.';
   return 'None: this filter does not report its predictions and measurements.';
 }
 
@@ -252,7 +255,7 @@ function particleTrack(trace) {
 
 /** @param {string} kind of the filter */
 function missingParticles(kind) {
-  if (kind === 'lstm') return 'None: an LSTM has no particles.';
+  if (isSequenceModel(kind)) return 'None: this network has no particles.';
   if (kind === 'external') return 'None: this filter reports no particles.';
   return 'None: a Kalman filter has a Gaussian belief and no particles.';
 }

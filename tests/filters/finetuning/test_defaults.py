@@ -31,7 +31,9 @@ def test_defaults_train_a_model_of_the_filter_on_a_fault_of_its_sensors(task: st
     ((slice_, _),) = settings.mix
     (preset,) = settings.train
     modality = input_modalities(filter_)[0]
-    expected = {"lstm": "image-only", "haptics-ekf": "haptics-only"}.get(name, "reliability-only")
+    expected = {"lstm": "image-only", "transformer": "image-only", "haptics-ekf": "haptics-only"}.get(
+        name, "reliability-only"
+    )
     assert preset == expected
     assert preset in presets(filter_)
     assert 0 < len(select_parameters(filter_, settings.train)) <= len(list(filter_.parameters()))
