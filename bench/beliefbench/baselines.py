@@ -13,9 +13,9 @@ from sklearn.tree import DecisionTreeClassifier
 from beliefbench.cases import Case, load_case, read_truth
 from beliefbench.scorecard import Answer, component
 from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.healthy import statistics_of
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
@@ -80,7 +80,7 @@ def features(case: Case) -> dict[str, float]:
     State components are averaged, so that features of different tasks agree.
     """
     profile = HealthyProfile.from_json(case.checkpoint.healthy_profile)
-    rows = [statistics_of(trace) for trace in traces_of(case)]
+    rows = [episode_statistics(trace, case.checkpoint) for trace in traces_of(case)]
     groups: dict[str, list[float]] = {}
     for name, healthy in profile.statistics.items():
         values = np.array([row.get(name, np.nan) for row in rows])
