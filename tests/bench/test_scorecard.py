@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from beliefbench.scorecard import Score, calibration_error, confusion, proportion, score_card, table
-from beliefbench.tools import NO_ANSWER, command_tool
 
 
 def truth(*causes: str, visible: bool = True) -> dict[str, Any]:
@@ -117,24 +114,3 @@ def test_confusion_and_table() -> None:
     assert confusion(TRUTHS, answers)["force.bias"] == {"force.bias": 1}
     text = table({"mine": score_card(TRUTHS, answers)})
     assert "| exact cause first | >= 0.80 | 0.75 [0.30, 0.95] (4) |" in text
-
-
-class FakeCase:
-    class checkpoint:
-        class task:
-            name = "door"
-
-        name = "crossmodal-ekf"
-
-    folder, particles, seed, runnable = Path("case"), 300, 7, True
-
-
-def test_commands_get_the_files_and_print_json() -> None:
-    script = "import json, sys; print(json.dumps({'state': 'healthy', 'causes': [], 'arguments': sys.argv[1:]}))"
-    case: Any = FakeCase()
-    tool = command_tool(f'{sys.executable} -c "{script}" {{checkpoint}} --seed {{seed}}')
-    assert tool(case)["arguments"] == [str(Path("case/checkpoint.safetensors")), "--seed", "7"]
-    with pytest.raises(RuntimeError, match=r"printed no JSON document for case: .*broken"):
-        command_tool(f"{sys.executable} -c \"raise SystemExit('broken')\"")(case)
-    case.runnable = False
-    assert tool(case) is NO_ANSWER
