@@ -40,7 +40,16 @@ from beliefscope.inspect.statistics.intervals import jackknife
 Array = NDArray[np.float64]
 
 PLAN = Plan(
-    dynamics=100, images=400, models=600, single=80, weights=80, together=(60, 80, 60), fine=0, batch=16, patience=4
+    dynamics=150,
+    horizons=(1, 4, 16, 64),
+    images=1500,
+    models=3000,
+    single=80,
+    weights=80,
+    together=(60, 80, 60),
+    fine=0,
+    batch=16,
+    patience=8,
 )
 DEFAULT = ("information-ekf", "information-ekf:image", "information-ekf:haptics")
 TESTS = ("outages", "no_outages")

@@ -11,6 +11,7 @@ from torch import nn
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter, VirtualSensor
+from beliefscope.filters.models.information import InformationFilter
 
 ROUNDS = 3
 """Scalings: a single one is not exact, because the covariance of the first belief is fixed."""
@@ -19,10 +20,14 @@ ROUNDS = 3
 def noise_parameters(filter_: Filter) -> list[nn.Parameter]:
     """The log standard deviations of the process noise, and the biases of those of all virtual sensors.
 
+    An information filter has its scales of R and sensor biases instead of the latter: its sensors are frozen.
+
     Raises BadInput for a filter without virtual sensors.
     """
     if not isinstance(filter_, ExtendedKalmanFilter):
         raise BadInput(f"--calibrate applies to ekf and ukf filters, not to {filter_.architecture.kind}")
+    if isinstance(filter_, InformationFilter):
+        return [filter_.dynamics.log_noise, filter_.log_scale, filter_.log_bias]
     sensors = [module for module in filter_.virtual_sensors.values() if isinstance(module, VirtualSensor)]
     return [filter_.dynamics.log_noise, *(sensor.log_noise[-1].get_parameter("bias") for sensor in sensors)]
 

@@ -128,6 +128,11 @@ class ExtendedKalmanFilter(Filter):
         mean = belief.mean.unsqueeze(1).expand(-1, k, -1)
         return Gaussian(mean, belief.covariance.unsqueeze(1).expand(-1, k, -1, -1))
 
+    def virtual_observations(self, evidence: Evidence) -> Gaussian:
+        """z and R of all virtual sensors, (T, N, K, n)."""
+        assert evidence.noise is not None
+        return Gaussian(evidence.observation, torch.diag_embed(evidence.noise**2))
+
     def shares(self, evidence: Evidence) -> Tensor:
         """Effective weights of a filter with beta, (T, N, K, n)."""
         assert evidence.log_weights is not None

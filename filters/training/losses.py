@@ -34,9 +34,15 @@ def prediction(filter_: Filter, batch: Batch) -> Tensor:
 
 
 def sensor_likelihood(filter_: InformationFilter, name: str, batch: Batch) -> Tensor:
-    """Mean Gaussian negative log-likelihood of the true state under a virtual sensor, ``N(x; z, R)``."""
+    """Mean negative log-likelihood of the true state under the product of the prior N(0, I) and N(x; z, R).
+
+    The product with the training distribution's prior makes N(x; z, R) a likelihood, which a filter may multiply at
+    every step. Trained as a posterior, a sensor would repeat the prior: even a black image would carry information.
+    """
     z, noise = filter_.sense(name, filter_.observations(batch))
-    return (0.5 * ((z - true_states(filter_, batch)) / noise).square() + noise.log()).mean()
+    variance = noise.square() / (1.0 + noise.square())
+    error = z / (1.0 + noise.square()) - true_states(filter_, batch)
+    return 0.5 * (error.square() / variance + variance.log()).mean()
 
 
 def likelihood(filter_: Filter, model: MeasurementModel, batch: Batch, noise: torch.Generator) -> Tensor:

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from beliefscope.filters.filter import Filter
 
-NOISE_SCALES = ("dynamics.log_noise", "log_scale")
-"""Parameters that are logarithms of noise."""
+NOISE_SCALES = ("dynamics.log_noise", "log_scale", "log_bias", "memory")
+"""Parameters that are logarithms of noise, or of its correlation."""
 
 
 def parameter_groups(filter_: Filter, trained: Sequence[nn.Parameter], rate: float) -> list[dict[str, Any]]:

@@ -22,9 +22,11 @@ class Plan:
     """Schedule of a training. Counts are optimiser steps and upper limits: see ``patience``.
 
     Attributes:
-        dynamics: for each of the lengths 1, 4, 8, 16. images: for the image encoders. models: for each virtual sensor
-            or likelihood. single: for the filter reduced to one modality, each in turn. weights: for the weight model.
-        together: end to end, for each of ``lengths``. fine: end to end, image encoders included.
+        dynamics: for each of ``horizons``, numbers of predicted steps. images: for the image encoders. models: for each
+            virtual sensor or likelihood. single: for the filter reduced to one modality, each in turn.
+            weights: for the weight model.
+        calibration: for the error parameters of an information filter. together: end to end, for each of ``lengths``.
+            fine: end to end, image encoders included.
         lengths: of the subsequences in end-to-end stages. window: length in the stages ``single`` and ``weights``.
         batch: subsequences of 16 steps in a batch; shorter ones are proportionally more. particles: in training.
         rate: Adam's learning rate. fine_rate: the same where whole filters train end to end.
@@ -39,9 +41,11 @@ class Plan:
     models: int = 1500
     single: int = 300
     weights: int = 300
+    calibration: int = 60
     together: tuple[int, ...] = (100, 150, 250)
     fine: int = 60
     lengths: tuple[int, ...] = (4, 16, 32)
+    horizons: tuple[int, ...] = (1, 4, 8, 16)
     window: int = 32
     batch: int = 32
     particles: int = 30
@@ -60,13 +64,24 @@ PLANS = {
         models=20_000,
         single=1500,
         weights=1500,
+        calibration=120,
         together=(1500, 1500, 4000),
         fine=2000,
         batch=64,
         check=250,
     ),
     "smoke": Plan(
-        dynamics=2, images=2, models=2, single=1, weights=1, together=(1,), fine=1, lengths=(4,), window=4, batch=4
+        dynamics=2,
+        images=2,
+        models=2,
+        single=1,
+        weights=1,
+        calibration=1,
+        together=(1,),
+        fine=1,
+        lengths=(4,),
+        window=4,
+        batch=4,
     ),
 }
 

@@ -19,6 +19,7 @@ from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.networks import ImageEncoder, reset_weights
 from beliefscope.filters.models.pf import MeasurementModel
 from beliefscope.filters.training import losses
+from beliefscope.filters.training.calibration import fit_errors
 from beliefscope.filters.training.encoder_cache import encode_images, weights_key
 from beliefscope.filters.training.optimiser import optimiser_step, parameter_groups
 from beliefscope.filters.training.plan import BLACKOUTS, Plan, Report
@@ -91,8 +92,8 @@ class Trainer:
     def stages(self) -> list[Stage]:
         """All stages of this filter, in order. Image encoders train only in ``IMAGES`` and ``ALL_PARAMETERS``.
 
-        Virtual sensors of an ``InformationFilter`` are frozen after their own stage: end to end, they would no longer
-        report their own error.
+        Virtual sensors and dynamics of an ``InformationFilter`` are frozen after their own stages: end to end, they
+        would no longer report their own error.
         """
         plan, filter_, stages = self.plan, self.filter, []
 
@@ -108,8 +109,15 @@ class Trainer:
         for name in filter_.names:
             if (module := self.measurement_module(name)) is not None:
                 add(f"{name} model", self.train_model, name, module)
-        frozen = "virtual_sensors." if isinstance(filter_, InformationFilter) else None
-        everything = [p for n, p in filter_.named_parameters() if frozen is None or not n.startswith(frozen)]
+        if isinstance(filter_, InformationFilter):
+            if len(filter_.names) > 1:
+                weights = [*filter_.get_submodule("weight_model").parameters(), *filter_.error_parameters()]
+                name = "weights and errors"
+                add(name, self.end_to_end, name, weights, plan.weights, plan.window, plan.rate)
+            held_out = self.sets["val"] or self.sets["train"]
+            add("calibration", fit_errors, filter_, held_out, plan.calibration, self.seed, self.report)
+            return stages
+        everything = list(filter_.parameters())
         models: tuple[int | None, ...] = (None,)
         if filter_.architecture.fusion == "crossmodal":
             weights = list(filter_.get_submodule("weight_model").parameters())
@@ -127,7 +135,7 @@ class Trainer:
         for length, count in zip(plan.lengths, plan.together, strict=True):
             name = f"end to end, {length} steps"
             add(name, self.end_to_end, name, everything, count, length, plan.fine_rate, models)
-        if encoders and plan.fine and frozen is None:
+        if encoders and plan.fine:
             length, rate = plan.lengths[-1], plan.fine_rate / 3
             add(ALL_PARAMETERS, self.end_to_end, ALL_PARAMETERS, everything, plan.fine, length, rate, models, False)
         return stages
@@ -220,8 +228,8 @@ class Trainer:
             module.load_state_dict(tensors)
 
     def train_dynamics(self) -> None:
-        """Minimises the squared error 1, 4, 8, 16 steps ahead from the true state."""
-        for length in (1, 4, 8, 16):
+        """Minimises the squared error over each of the plan's horizons, from the true state."""
+        for length in self.plan.horizons:
             self.optimise(
                 f"dynamics, {length} steps",
                 self.filter.dynamics.parameters(),
@@ -270,17 +278,18 @@ class Trainer:
         self.optimise(IMAGES, parameters, self.plan.images, self.plan.rate, loss)
 
     def train_model(self, name: str, module: VirtualSensor | MeasurementModel) -> None:
-        """EKF: the virtual sensor regresses the state, or maximises its likelihood. PF: see ``losses.likelihood``."""
+        """EKF: the virtual sensor regresses the state, or is a likelihood. PF: see ``losses.likelihood``."""
         uses_images, filter_ = self.uses_images(name), self.filter
-        steps = 1 if uses_images else 1 + filter_.history
+        longest = min(int(steps.length.max()) for steps in self.sets.values() if steps is not None)
+        steps = 1 if uses_images else min(1 + 2 * filter_.history, longest)
         size = (8 if uses_images and isinstance(module, MeasurementModel) else 4) * self.plan.batch
 
         def loss(split: str) -> Tensor:
-            batch = self.sample(split, steps, max(1, 2 * size // (1 + steps)))
-            if not uses_images:
-                batch = self.shifted(batch)
+            batch = self.sample(split, steps, max(8, 2 * size // (1 + steps)))
             if isinstance(filter_, InformationFilter):
                 return losses.sensor_likelihood(filter_, name, batch)
+            if not uses_images:
+                batch = self.shifted(batch)
             if isinstance(module, VirtualSensor):
                 error = module(self.filter.observations(batch))[0] - losses.true_states(self.filter, batch)
                 return error.square().mean()

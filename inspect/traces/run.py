@@ -151,16 +151,17 @@ def _stack(filter_: Filter, beliefs: list[Gaussian]) -> tuple[Tensor, Tensor]:
 
 
 def _ekf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
-    assert evidence.noise is not None
+    assert isinstance(filter_, ExtendedKalmanFilter)
     predicted = [s.predicted for s in steps if isinstance(s.predicted, Gaussian)]
     modality = [s.modality for s in steps if s.modality is not None]
     arrays: dict[str, Tensor] = {}
     arrays["predicted_mean"], arrays["predicted_covariance"] = _stack(filter_, predicted)
     arrays["modality_mean"], arrays["modality_covariance"] = _stack(filter_, modality)
-    z = Gaussian(evidence.observation[:, 0], torch.diag_embed(evidence.noise[:, 0] ** 2))
-    arrays["observation_mean"], arrays["observation_covariance"] = _stack(filter_, [z])
+    z = filter_.virtual_observations(evidence)
+    arrays["observation_mean"], arrays["observation_covariance"] = _stack(
+        filter_, [Gaussian(z.mean[:, 0], z.covariance[:, 0])]
+    )
     if evidence.log_weights is not None:
-        assert isinstance(filter_, ExtendedKalmanFilter)
         arrays["effective_weights"] = filter_.shares(evidence)[:, 0]
     elif len(filter_.names) > 1:
         information = torch.linalg.inv(torch.cat([belief.covariance for belief in modality]))

@@ -1,7 +1,8 @@
-"""The information filter: equal to the Kalman filter, invariant to translation, and calibrated stage by stage."""
+"""The information filter: a Kalman filter of state and biases, invariant to translation, calibrated stage by stage."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -14,9 +15,8 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Batch, Steps, shift_positions
 from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.catalog import architecture, build
-from beliefscope.filters.models.ekf import predict
 from beliefscope.filters.models.fusion import powers, product_of_experts, weighted_product
-from beliefscope.filters.models.information import HISTORY, InformationFilter, recent_steps
+from beliefscope.filters.models.information import MAX_NOISE, InformationFilter, recent_steps
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.subsets import standalone_evidence
 from beliefscope.filters.training.losses import sensor_likelihood
@@ -50,33 +50,106 @@ def batch(filter_: InformationFilter, episodes: list[Episode]) -> Batch:
     return steps.windows(steps.first, STEPS)
 
 
-def kalman_update(prior: Gaussian, z: Tensor, r: Tensor) -> Gaussian:
-    """Textbook update with K stacked observations of the whole state. z: (K, n), r: (K, n, n)."""
-    k, n = z.shape
-    h = torch.eye(n, dtype=torch.float64).repeat(k, 1)
-    gain = prior.covariance @ h.T @ torch.linalg.inv(h @ prior.covariance @ h.T + torch.block_diag(*r))
-    mean = prior.mean + gain @ (z.flatten() - h @ prior.mean)
-    return Gaussian(mean, (torch.eye(n, dtype=torch.float64) - gain @ h) @ prior.covariance)
+def kalman_update(prior: Gaussian, z: Tensor, h: Tensor, r: Tensor) -> Gaussian:
+    """Textbook update with z (m,) of ``h`` (m, s) and noise covariance r (m, m)."""
+    gain = prior.covariance @ h.T @ torch.linalg.inv(h @ prior.covariance @ h.T + r)
+    mean = prior.mean + gain @ (z - h @ prior.mean)
+    return Gaussian(mean, (torch.eye(len(mean), dtype=torch.float64) - gain @ h) @ prior.covariance)
 
 
-def test_equal_weights_give_the_kalman_filter_with_stacked_measurements(
-    filter_: InformationFilter, batch: Batch
-) -> None:
-    filter_ = build(filter_.architecture, seed=3).double().eval()  # type: ignore[assignment]
+def equal_weights(filter_: InformationFilter, batch: Batch) -> Evidence:
+    """Evidence with beta 1/2 in which one reading is too uncertain to be used."""
     evidence = filter_.encode(batch)
     assert evidence.log_weights is not None
     assert evidence.noise is not None
-    evidence = replace(evidence, log_weights=torch.zeros_like(evidence.log_weights) - torch.log(torch.tensor(2.0)))
-    start = first_belief(filter_, batch)
+    noise = 0.1 + 0.8 * torch.rand(evidence.noise.shape, generator=torch.Generator().manual_seed(0))
+    noise[4, :, 0, 2] = 1.5 * MAX_NOISE
+    log_weights = torch.full_like(evidence.log_weights, -math.log(2.0))
+    return replace(evidence, noise=noise.double(), log_weights=log_weights)
+
+
+def double_filter(bias: float) -> InformationFilter:
+    filter_ = build(architecture("door-field", "information-ekf"), seed=3).double().eval().requires_grad_(False)
+    assert isinstance(filter_, InformationFilter)
+    filter_.log_bias.copy_(torch.tensor(bias).log() + 0.1 * torch.arange(6.0).reshape(2, 3))
+    filter_.memory.copy_(torch.arange(6.0).reshape(2, 3))
+    filter_.log_scale.copy_(-0.1 * torch.arange(6.0).reshape(2, 3))
+    return filter_
+
+
+def test_equal_weights_give_the_kalman_filter_of_state_and_biases(batch: Batch) -> None:
+    filter_ = double_filter(bias=0.5)
+    evidence, start = equal_weights(filter_, batch), first_belief(filter_, batch)
     estimate = rollout(filter_, evidence, start, torch.Generator()).estimate
+    eye = torch.eye(3, dtype=torch.float64)
+    phi, variance = filter_.phi.flatten(), filter_.bias.flatten() ** 2
     for i in range(N):
-        belief = Gaussian(start.mean[i], start.covariance[i])
+        belief = Gaussian(
+            torch.cat([start.mean[i], torch.zeros(6, dtype=torch.float64)]),
+            torch.block_diag(start.covariance[i], torch.diag(variance)),
+        )
         for t in range(STEPS):
-            mean, jacobian = filter_.dynamics.with_jacobian(belief.mean, evidence.control[t, i])
-            prior = predict(belief, mean, jacobian, filter_.dynamics.noise)
-            belief = kalman_update(prior, evidence.observation[t, i], torch.diag_embed(evidence.noise[t, i] ** 2))
-            torch.testing.assert_close(estimate.mean[t, i], belief.mean)
-            torch.testing.assert_close(estimate.covariance[t, i], belief.covariance)
+            mean, jacobian = filter_.dynamics.with_jacobian(belief.mean[:3], evidence.control[t, i])
+            transition = torch.block_diag(jacobian, torch.diag(phi))
+            noise = torch.cat([filter_.dynamics.noise**2, variance * (1 - phi**2)])
+            covariance = transition @ belief.covariance @ transition.T + torch.diag(noise)
+            belief = Gaussian(torch.cat([mean, phi * belief.mean[3:]]), covariance)
+            assert evidence.noise is not None
+            image, haptics = torch.diag_embed(evidence.noise[t, i])
+            h = torch.cat([torch.cat([eye, image, 0 * eye], dim=1), torch.cat([eye, 0 * eye, haptics], dim=1)])
+            used = (evidence.noise[t, i] < MAX_NOISE).flatten()
+            assert used.sum() == (5 if t == 4 else 6)
+            r = torch.diag(((evidence.noise[t, i] * filter_.log_scale.exp()) ** 2).flatten()[used])
+            belief = kalman_update(belief, evidence.observation[t, i].flatten()[used], h[used], r)
+            torch.testing.assert_close(estimate.mean[t, i], belief.mean[:3])
+            torch.testing.assert_close(estimate.covariance[t, i], belief.covariance[:3, :3])
+
+
+def test_without_biases_precisions_add(batch: Batch) -> None:
+    """``P^-1 = P'^-1 + sum p_k R_k^-1``, ``m = m' + P sum p_k R_k^-1 (z_k - m')``."""
+    filter_ = double_filter(bias=0.0)
+    evidence = equal_weights(filter_, batch)
+    beta = torch.rand(STEPS, N, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    evidence = replace(evidence, log_weights=torch.log_softmax(beta, dim=2))
+    belief = filter_.start(first_belief(filter_, batch), 0, torch.Generator())
+    for t in range(STEPS):
+        belief, trace = filter_.step(belief, evidence[t], torch.Generator())
+        assert isinstance(trace.predicted, Gaussian)
+        assert evidence.noise is not None
+        assert evidence.log_weights is not None
+        power = 2.0 * evidence.log_weights[t].exp() * (evidence.noise[t] < MAX_NOISE)
+        precision = power / (evidence.noise[t] * filter_.log_scale.exp()) ** 2
+        prior = Gaussian(trace.predicted.mean[:, 0], trace.predicted.covariance[:, 0])
+        covariance = torch.linalg.inv(torch.linalg.inv(prior.covariance) + torch.diag_embed(precision.sum(1)))
+        information = (precision * (evidence.observation[t] - prior.mean.unsqueeze(1))).sum(1)
+        torch.testing.assert_close(trace.estimate.covariance, covariance)
+        torch.testing.assert_close(trace.estimate.mean, prior.mean + (covariance @ information.unsqueeze(-1))[..., 0])
+
+
+def test_a_lasting_bias_is_learned_from_the_other_sensor(batch: Batch) -> None:
+    """With a constant image error, the image alone is more accurate after some steps with haptics."""
+    filter_ = double_filter(bias=0.5)
+    filter_.memory.fill_(9.0)
+    filter_.dynamics.log_noise.fill_(0.0)
+    evidence, start = equal_weights(filter_, batch), first_belief(filter_, batch)
+    truth = start.mean.expand(STEPS, -1, -1)
+    bias = torch.tensor([[0.4, -0.3, 0.2], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    evidence = replace(
+        evidence, observation=truth.unsqueeze(2) + bias, noise=torch.full_like(bias, 0.3).expand(STEPS, N, 2, 3)
+    )
+    evidence = replace(evidence, control=torch.zeros_like(evidence.control))
+    filter_.log_bias[1] = -20.0
+    both = torch.ones(STEPS, N, 2, dtype=torch.bool)
+    both[STEPS // 2 :, :, 1] = False
+    image = both.clone()
+    image[..., 1] = False
+    errors = [
+        (
+            rollout(filter_, evidence.select_models(present), start, torch.Generator()).estimate.mean[-1] - truth[-1]
+        ).norm()
+        for present in (both, image)
+    ]
+    assert errors[0] < 0.6 * errors[1]
 
 
 def test_powers() -> None:
@@ -105,8 +178,9 @@ def test_without_any_model_the_belief_is_only_predicted(filter_: InformationFilt
     belief = filter_.start(first_belief(filter_, batch), 0, torch.Generator())
     posterior, trace = filter_.step(belief, evidence[0], torch.Generator())
     assert isinstance(trace.predicted, Gaussian)
-    torch.testing.assert_close(posterior.mean, trace.predicted.mean)
-    torch.testing.assert_close(posterior.covariance, trace.predicted.covariance, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(trace.estimate.mean, trace.predicted.mean[:, 0])
+    torch.testing.assert_close(trace.estimate.covariance, trace.predicted.covariance[:, 0])
+    torch.testing.assert_close(posterior.covariance[:, 3:, 3:], belief.covariance[:, 3:, 3:])  # stationary biases
 
 
 def test_standalone_filter_is_the_update_with_one_sensor(filter_: InformationFilter, batch: Batch) -> None:
@@ -145,18 +219,16 @@ def test_haptics_are_relative_to_the_hand(filter_: InformationFilter, batch: Bat
     torch.testing.assert_close(after.observation[:, :, 0], before.observation[:, :, 0])
 
 
-def test_history_has_the_past_steps_and_nothing_else(filter_: InformationFilter, batch: Batch) -> None:
+def test_history_has_the_past_steps_and_nothing_else(filter_: InformationFilter) -> None:
     values = torch.arange(8.0).reshape(8, 1, 1)
-    window = recent_steps(values, 2, [])
+    window = recent_steps(values, (1, 2), [])
     assert window[5, 0].tolist() == [5, 4, 3]
     assert window[0, 0].tolist() == [0, 0, 0]
-    assert recent_steps(values, 2, [0])[5, 0].tolist() == [0, -1, -2]
-    whole = filter_.encode(batch).observation
-    later = Batch(
-        {name: values[-1 - HISTORY :] for name, values in batch.observations.items()},
-        *(values[-1 - HISTORY :] for values in (batch.controls, batch.states, batch.contact)),
-        batch.previous,
-    )
+    assert recent_steps(values, (1, 2), [0])[5, 0].tolist() == [0, -1, -2]
+    assert filter_.task.simulate is not None
+    steps = Steps.from_episodes(filter_.task, [filter_.task.simulate(2, 0, filter_.history + 4)])
+    whole = filter_.encode(steps.episode(0)).observation
+    later = steps.windows(steps.first + 3, filter_.history + 1)
     torch.testing.assert_close(filter_.encode(later).observation[-1], whole[-1])
     changed = {**later.observations, "haptics": later.observations["haptics"].clone()}
     changed["haptics"][0] += 1.0
@@ -170,6 +242,26 @@ def test_static_components_do_not_move(filter_: InformationFilter, batch: Batch)
     assert torch.equal(moved[:, :2], states[:, :2])
     assert (moved[:, 2] != states[:, 2]).all()
     torch.testing.assert_close(jacobian[:, :2], torch.eye(3)[:2].expand(5, -1, -1))
+
+
+def test_a_sensor_without_information_has_an_optimum_at_infinite_noise(
+    batch: Batch, filter_: InformationFilter
+) -> None:
+    """The prior of the training states is not part of a sensor, so that a filter may use it at every step."""
+    truth = torch.randn(4096, 1, 3, generator=torch.Generator().manual_seed(0))
+    states = filter_.statistics.state_to_si(truth)
+    many = replace(batch, states=states)
+    losses = []
+    for noise in (1.0, 10.0, 100.0):
+
+        class Sensor:
+            statistics, observations = filter_.statistics, filter_.observations
+
+            def sense(self, name: str, observations: object, noise: float = noise) -> tuple[Tensor, Tensor]:
+                return torch.zeros_like(truth), torch.full_like(truth, noise)
+
+        losses.append(float(sensor_likelihood(Sensor(), "image", many)))  # type: ignore[arg-type]
+    assert losses[0] > losses[1] > losses[2]
 
 
 def test_sensors_are_trained_by_their_likelihood_and_then_frozen(episodes: list[Episode]) -> None:
@@ -191,9 +283,11 @@ def test_sensors_are_trained_by_their_likelihood_and_then_frozen(episodes: list[
             name = stage.name.removesuffix(" model")
             assert float(sensor_likelihood(filter_, name, every).detach()) < loss[name]
         elif names.index(stage.name) > names.index(models[-1]):
-            assert changed <= {"dynamics", "weight_model", "log_scale"}
-            assert "log_scale" in changed
-    assert names[-1].startswith("end to end")
+            errors = {"dynamics", "log_scale", "log_bias", "memory"}
+            assert changed == errors | ({"weight_model"} if stage.name == names[-2] else set())
+            trained = [n for n, p in filter_.dynamics.named_parameters() if not torch.equal(p, before[f"dynamics.{n}"])]
+            assert trained == ["log_noise"]
+    assert names[-2:] == ["weights and errors", "calibration"]
 
 
 def test_other_kinds_have_no_information_form() -> None:
