@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.models.fusion import mixture
-from beliefscope.filters.models.pf import MeasurementModel, ParticleFilter
+from beliefscope.filters.models.pf import MeasurementModel, MixtureParticleFilter
 from beliefscope.inspect.likelihood import COARSE, FINE, MapEngine
 from beliefscope.inspect.maps.grid import one_thread
 
@@ -32,7 +32,7 @@ class DirectEvaluation:
     """
 
     def __init__(self, engine: MapEngine, split: bool = False) -> None:
-        assert isinstance(engine.checkpoint.filter, ParticleFilter)
+        assert isinstance(engine.checkpoint.filter, MixtureParticleFilter)
         self.filter, self.engine, self.split = engine.checkpoint.filter, engine, split
         self.batch = Steps.from_episodes(engine.task, [engine.trace.episode]).episode(0)
 
@@ -78,7 +78,7 @@ def measure() -> list[Row]:
         engine = MapEngine(subject.checkpoint(name), subject.traced(name))
         for size, bar in BARS.items():
             label = f"{name}, {size} x {size}"
-            if isinstance(engine.checkpoint.filter, ParticleFilter):
+            if isinstance(engine.checkpoint.filter, MixtureParticleFilter):
                 rows += compare_with_direct(engine, label, size)
             sample = [next(places) for places in [distinct_places()] for _ in range(100 if size == FINE else 400)]
             engine.map(0, size=size)

@@ -22,7 +22,7 @@ from torch import nn
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.filter import Filter
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 
 REPOSITORIES = {
     "torchfilter": "https://github.com/stanford-iprl-lab/torchfilter",
@@ -157,7 +157,7 @@ def networks_flops(filter_: Any, batch: Batch) -> Flops:
 def _ours_once(filter_: Filter, one: Batch) -> None:
     evidence = filter_.encode(one)[0]
     filter_.dynamics(one.previous, evidence.control)
-    if isinstance(filter_, ParticleFilter):
+    if isinstance(filter_, MixtureParticleFilter):
         filter_.log_likelihood(evidence, one.previous.unsqueeze(1))
 
 

@@ -13,18 +13,22 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.information import InformationFilter
+from beliefscope.filters.models.information_pf import InformationParticleFilter
 from beliefscope.filters.models.lstm import Lstm
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.transformer import Transformer
 from beliefscope.filters.models.ukf import UnscentedKalmanFilter
 
 KINDS: dict[Kind, type[Filter]] = {
     "ekf": ExtendedKalmanFilter,
     "ukf": UnscentedKalmanFilter,
-    "pf": ParticleFilter,
+    "pf": MixtureParticleFilter,
     "lstm": Lstm,
     "transformer": Transformer,
 }
+
+INFORMATION: dict[Kind, type[Filter]] = {"ekf": InformationFilter, "pf": InformationParticleFilter}
+"""Filters with fusion ``information``."""
 
 ANY = ""
 """Placeholder for the task in ``FILTERS``; the models follow from the task's modalities."""
@@ -34,6 +38,7 @@ FILTERS: dict[str, tuple[Literal["each", "all", "one"], Architecture]] = {
     "crossmodal-pf": ("each", Architecture(ANY, "pf", "crossmodal")),
     "crossmodal-ukf": ("each", Architecture(ANY, "ukf", "crossmodal", feedback=True)),
     "information-ekf": ("each", Architecture(ANY, "ekf", "information", feedback=True)),
+    "information-pf": ("each", Architecture(ANY, "pf", "information")),
     "unimodal-ekf": ("each", Architecture(ANY, "ekf", "unimodal")),
     "unimodal-pf": ("each", Architecture(ANY, "pf", "unimodal", likelihoods="raw")),
     "feature-ekf": ("all", Architecture(ANY, "ekf", "none")),
@@ -79,4 +84,5 @@ def build(architecture: Architecture, seed: int = 0) -> Filter:
     """A filter with initial weights that depend only on the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return (InformationFilter if architecture.fusion == "information" else KINDS[architecture.kind])(architecture)
+        classes = INFORMATION if architecture.fusion == "information" else KINDS
+        return classes[architecture.kind](architecture)

@@ -38,8 +38,8 @@ class Architecture:
         task: name in ``TASKS``.
         kind: ``ekf``, ``ukf``, ``pf``, ``lstm`` or ``transformer``.
         fusion: rule that fuses the measurement models' results: ``crossmodal`` (learned weights beta), ``unimodal``
-            (product of experts for an EKF, sum of likelihoods for a PF), ``information`` (EKF: one prior, precisions
-            add, weighted by beta), or ``none`` (one model).
+            (product of experts for an EKF, sum of likelihoods for a PF), ``information`` (one prior; precisions add, or
+            particles are weighted by a product of likelihoods, each to a power given by beta), or ``none`` (one model).
         models: for each measurement model its modalities, joined by ``+``.
         units: width of all fully connected layers. image_stride: of the first convolution.
         networks: ``default``, or ``authors``: the layers of the paper's published code, see docs/filters.md.
@@ -78,8 +78,10 @@ class Architecture:
                 raise BadInput(f"{name} of a filter is {value!r}, not a whole number from 1 to {MAX_SIZE}")
         if not self.models or not all(isinstance(model, str) for model in self.models):
             raise BadInput(f"models of a filter are {self.models!r}, not names of modalities")
-        if self.fusion == "information" and (self.kind != "ekf" or any("+" in model for model in self.models)):
-            raise BadInput(f"fusion 'information' needs kind 'ekf' and one modality per model, not {self.kind!r}")
+        if self.fusion == "information" and (
+            self.kind not in ("ekf", "pf") or any("+" in model for model in self.models)
+        ):
+            raise BadInput(f"fusion 'information' needs kind ekf or pf and one modality per model, not {self.kind!r}")
         if not 0.0 < self.soft_share <= 1.0:
             raise BadInput(f"soft_share must be above 0 and at most 1, not {self.soft_share}")
 

@@ -15,12 +15,12 @@ from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.fusion import mixture
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.maps.fusion_rules import fuse_sensors, fusion_rule
 from beliefscope.inspect.maps.grid import GridEvaluator, one_thread
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, Quantity
 from beliefscope.inspect.maps.particle_density import ParticleDensity
-from beliefscope.inspect.statistics.measures import wrapped
+from beliefscope.inspect.statistics.measures import FLOOR, wrapped
 from beliefscope.inspect.trace import Trace
 
 __all__ = [
@@ -116,16 +116,16 @@ class MapEngine:
 
     @torch.no_grad()
     def _encode(self) -> Evidence | None:
-        if self.trace.log_likelihood is None:
-            return None
         filter_ = self.checkpoint.filter
+        if not isinstance(filter_, MixtureParticleFilter):
+            return None
         return filter_.encode(Steps.from_episodes(self.task, [self.trace.episode]).episode(0))
 
     def _grid_evaluator(self) -> GridEvaluator | None:
         if self.evidence is None:
             return None
         filter_ = self.checkpoint.filter
-        assert isinstance(filter_, ParticleFilter)
+        assert isinstance(filter_, MixtureParticleFilter)
         models = [filter_.measurement_model(name) for name in filter_.names]
         return GridEvaluator(models, self.task.map_indices, filter_.statistics.mean_std("state")[1])
 
@@ -199,7 +199,7 @@ class MapEngine:
         evidence p(z) the mean likelihood of the particles under their prior weights.
         """
         filter_, trace = self.checkpoint.filter, self.trace
-        assert isinstance(filter_, ParticleFilter)
+        assert isinstance(filter_, MixtureParticleFilter)
         assert self.evidence is not None
         evidence = self.evidence[step]
         assert self._grid is not None
@@ -232,7 +232,8 @@ class MapEngine:
         if quantity == "posterior":
             mean = np.concatenate([trace.modality_mean[step], trace.estimate_mean[step][None]])
             covariance = np.concatenate([trace.modality_covariance[step], trace.estimate_covariance[step][None]])
-            return mean.astype(np.float64), covariance.astype(np.float64)
+            floor = 0.0 if trace.particles is None else FLOOR  # the weights may be concentrated on one particle
+            return mean.astype(np.float64), covariance.astype(np.float64) + floor * np.eye(mean.shape[-1])
         assert trace.observation_mean is not None
         assert trace.observation_covariance is not None
         sensors, noise = trace.observation_mean[step], trace.observation_covariance[step]

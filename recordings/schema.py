@@ -29,6 +29,7 @@ Needs = Literal[
     "weights",
     "effective_weights",
     "ekf",
+    "sensors",
     "pf",
     "maps",
     "diagnostics",
@@ -50,7 +51,8 @@ class Entity:
         shape: per step; T steps, K modalities, n components, M particles, c controls, S cells per side of a map,
             W weights per modality, B bounds.
         unit: of the stored numbers.
-        needs: property of the trace that the path requires; ``ekf`` includes UKFs.
+        needs: property of the trace that the path requires; ``ekf`` includes UKFs; ``sensors`` are
+            virtual ones.
         meaning: one-line description for the documentation.
     """
 
@@ -93,8 +95,8 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("trace/effective_weights", "Trace", "(K, W)", "1", "effective_weights", "modality's share in the posterior"),
     Entity("trace/predicted_mean", "Trace", "(K, n)", "m, rad", "ekf", "mean before the observation"),
     Entity("trace/predicted_covariance", "Trace", "(K, n, n)", "m, rad", "ekf", "covariance before the observation"),
-    Entity("trace/observation_mean", "Trace", "(K, n)", "m, rad", "ekf", "measurement z of the virtual sensors"),
-    Entity("trace/observation_covariance", "Trace", "(K, n, n)", "m, rad", "ekf", "noise R of the virtual sensors"),
+    Entity("trace/observation_mean", "Trace", "(K, n)", "m, rad", "sensors", "measurement z of the virtual sensors"),
+    Entity("trace/observation_covariance", "Trace", "(K, n, n)", "m, rad", "sensors", "noise R of the virtual sensors"),
     Entity("trace/particles", "Trace", "(M, n)", "m, rad", "pf", "predicted particles"),
     Entity("trace/prior_log_weights", "Trace", "(M,)", "log", "pf", "normalised weights before the observation"),
     Entity("trace/log_weights", "Trace", "(M,)", "log", "pf", "normalised weights after it, before resampling"),

@@ -101,10 +101,10 @@ class ExtendedKalmanFilter(Filter):
             log_weights=self.log_weights(batch),
         )
 
-    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Gaussian:
+    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
         return self.bank_of(belief)
 
-    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Gaussian, StepTrace]:
+    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         predicted, bank = self.predict_and_update(belief, evidence)
         fused = self.fuse(bank, evidence.log_weights, evidence.present)
         trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)

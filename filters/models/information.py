@@ -110,13 +110,13 @@ class InformationFilter(ExtendedKalmanFilter):
             log_weights=self.log_weights(batch),
         )
 
-    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Gaussian:
+    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
         """The joint Gaussian (N, n (1 + K)) of the state and the biases, which are independent of it."""
         variance = self.bias.flatten().square().expand(len(belief.mean), -1)
         mean = torch.cat([belief.mean, torch.zeros_like(variance)], dim=-1)
         return Gaussian(mean, block_diagonal(belief.covariance, torch.diag_embed(variance)))
 
-    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Gaussian, StepTrace]:
+    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         assert isinstance(belief, Gaussian)
         assert evidence.log_weights is not None
         predicted = self.predict_joint(belief, evidence.control)

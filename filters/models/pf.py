@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
 
@@ -54,7 +55,35 @@ class MeasurementModel(nn.Module):
 
 
 class ParticleFilter(Filter):
-    """Sampling importance resampling with ``w_i = sum_k beta_k p_k(z | x_i) / s_k``, resampled at every step.
+    """Sampling importance resampling, resampled at every step. Subclasses have the likelihoods and their fusion."""
+
+    @abstractmethod
+    def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
+        """Of each modality, for particles (N, M, n) at one step: (N, K, M), unnormalised."""
+
+    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Particles:
+        factor = torch.linalg.cholesky(belief.covariance)
+        shape = (len(belief.mean), particles, self.n)
+        unit = common_random_numbers.normal(shape, generator)
+        states = belief.mean.unsqueeze(1) + unit @ factor.transpose(-1, -2)
+        return Particles(states, torch.full(shape[:2], -math.log(particles), device=states.device))
+
+    def propagate(self, states: Tensor, evidence: Evidence, generator: torch.Generator) -> Tensor:
+        """States (N, M, n) of the next step, with process noise."""
+        control = evidence.control.unsqueeze(1)
+        moved = in_chunks(lambda states: self.dynamics(states, control), states)
+        return moved + common_random_numbers.normal(moved.shape, generator) * self.dynamics.noise
+
+    def resample(self, particles: Particles, generator: torch.Generator) -> tuple[Particles, Tensor]:
+        """Resampled particles and their ancestors (N, M)."""
+        rule, share = self.architecture.resampling, self.architecture.soft_share
+        ancestors, log_weights = resample(particles.log_weights, rule, share, generator)
+        states = particles.states.gather(1, ancestors.unsqueeze(-1).expand_as(particles.states))
+        return Particles(states, log_weights), ancestors
+
+
+class MixtureParticleFilter(ParticleFilter):
+    """Learned likelihoods, ``w_i = sum_k beta_k p_k(z | x_i) / s_k``.
 
     The scale s_k is each model's evidence, or 1 (``architecture.likelihoods``).
     """
@@ -83,8 +112,6 @@ class ParticleFilter(Filter):
         )
 
     def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
-        """Of each modality, for particles (N, M, n) at one step: (N, K, M), unnormalised."""
-
         def model_likelihood(k: int, states: Tensor) -> Tensor:
             model = self.measurement_model(self.names[k])
             return model.log_likelihood(evidence.observation[:, k, None], model.state_part(states))
@@ -100,29 +127,17 @@ class ParticleFilter(Filter):
             return torch.zeros_like(log_likelihood[..., :1])
         return torch.logsumexp(log_weights.unsqueeze(1) + log_likelihood, dim=-1, keepdim=True)
 
-    def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Particles:
-        factor = torch.linalg.cholesky(belief.covariance)
-        shape = (len(belief.mean), particles, self.n)
-        unit = common_random_numbers.normal(shape, generator)
-        states = belief.mean.unsqueeze(1) + unit @ factor.transpose(-1, -2)
-        return Particles(states, torch.full(shape[:2], -math.log(particles), device=states.device))
-
-    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Particles, StepTrace]:
+    def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         assert isinstance(belief, Particles)
-        control = evidence.control.unsqueeze(1)
-        moved = in_chunks(lambda states: self.dynamics(states, control), belief.states)
-        unit = common_random_numbers.normal(moved.shape, generator)
-        predicted = Particles(moved + unit * self.dynamics.noise, belief.log_weights)
+        predicted = Particles(self.propagate(belief.states, evidence, generator), belief.log_weights)
         log_likelihood = self.log_likelihood(evidence, predicted.states)
         scaled = log_likelihood - self.scale(predicted.log_weights, log_likelihood)
         if evidence.present is not None:
             scaled = only_present(scaled, evidence.present)
         log_weights = predicted.log_weights + mixture(scaled, evidence.log_weights)
         posterior = Particles(predicted.states, torch.log_softmax(log_weights, dim=-1))
-        rule, share = self.architecture.resampling, self.architecture.soft_share
-        ancestors, log_weights = resample(posterior.log_weights, rule, share, generator)
-        states = posterior.states.gather(1, ancestors.unsqueeze(-1).expand_as(posterior.states))
-        return Particles(states, log_weights), StepTrace(
+        resampled, ancestors = self.resample(posterior, generator)
+        return resampled, StepTrace(
             predicted=predicted,
             posterior=posterior,
             estimate=posterior.moments(),

@@ -20,6 +20,8 @@ from beliefscope.filters.catalog import build
 from beliefscope.filters.data_check import summarise
 from beliefscope.filters.evaluate import Metrics, evaluate
 from beliefscope.filters.filter import Architecture, Filter
+from beliefscope.filters.models.information import InformationFilter
+from beliefscope.filters.models.information_pf import with_particles
 from beliefscope.filters.start_offset import NO_OFFSET, StartOffset
 from beliefscope.filters.training.plan import BLACKOUTS, EVALUATED_BLACKOUTS, PLANS, Plan, Report
 from beliefscope.filters.training.resume import Partial, SharedModules, cache_key
@@ -70,7 +72,9 @@ def train(
     if not splits["train"]:
         raise BadInput("the data set has no episode of split 'train'")
     began = time.monotonic()
-    filter_ = build(architecture, seed).to(device)
+    by_particles = architecture.fusion == "information" and architecture.kind == "pf"
+    # The same model as a Kalman filter has a likelihood without sampling noise.
+    filter_ = build(replace(architecture, kind="ekf") if by_particles else architecture, seed).to(device)
     steps = Steps.from_episodes(filter_.task, [*splits["train"], *splits["val"]], device)
     count = len(splits["train"])
     train_steps, val_steps = steps.part(0, count), steps.part(count, len(steps.length)) if splits["val"] else None
@@ -96,6 +100,9 @@ def train(
         inputs |= {"architecture": architecture.to_json(), "blackouts": list(blackouts), "command": command}
         state = Partial(partial, cache_key(**inputs))
     seconds = _run_stages(trainer, state, began, on_resume)
+    if by_particles:
+        assert isinstance(filter_, InformationFilter)
+        filter_ = with_particles(filter_).to(device)
     filter_.eval().requires_grad_(False)
     held_out = splits["test"] or splits["val"]
     record |= {

@@ -25,12 +25,12 @@ def fusion_rule(checkpoint: Checkpoint, modalities: tuple[str, ...], quantity: Q
         return likelihood if quantity == "likelihood" else "posterior reported by the filter"
     architecture = checkpoint.filter.architecture
     crossmodal = architecture.fusion == "crossmodal"
+    if architecture.fusion == "information":
+        rule = "beta-weighted product of virtual sensors (one prior)"
+        return rule if quantity == "likelihood" else f"prior times {rule}"
     if architecture.kind == "pf":
         kind = "likelihoods" if architecture.likelihoods == "raw" else "normalised likelihoods"
         rule = f"beta-weighted sum of {kind} (crossmodal)" if crossmodal else f"sum of {kind} (unimodal)"
-        return rule if quantity == "likelihood" else f"prior times {rule}"
-    if architecture.fusion == "information":
-        rule = "beta-weighted product of virtual sensors (information form)"
         return rule if quantity == "likelihood" else f"prior times {rule}"
     subject = "virtual sensors" if quantity == "likelihood" else "posteriors"
     return f"beta-weighted mean of {subject} (crossmodal)" if crossmodal else f"product of {subject} (unimodal)"

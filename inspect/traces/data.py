@@ -46,7 +46,8 @@ class Trace:
             Crossmodal EKF: beta normalised over modalities. Unimodal EKF, W = n: the diagonal of S S_k^-1, its share
             of each mean. PF: prior weight x beta x likelihood of one modality over the total, summed over particles.
         predicted_mean, predicted_covariance: EKF: (T, K, n), (T, K, n, n) prior before the observation.
-        observation_mean, observation_covariance: EKF: (T, K, n), (T, K, n, n) virtual sensor output z and R.
+        observation_mean, observation_covariance: filters with virtual sensors: (T, K, n), (T, K, n, n) their output z
+            and R.
         particles: PF: (T, M, n) predicted particles.
         prior_log_weights, log_weights: PF: (T, M) normalised, before and after the observation.
         log_likelihood: PF: (T, K, M), not normalised.

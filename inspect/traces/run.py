@@ -19,7 +19,8 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.information import InformationFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.external import trace_external
@@ -157,10 +158,7 @@ def _ekf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence)
     arrays: dict[str, Tensor] = {}
     arrays["predicted_mean"], arrays["predicted_covariance"] = _stack(filter_, predicted)
     arrays["modality_mean"], arrays["modality_covariance"] = _stack(filter_, modality)
-    z = filter_.virtual_observations(evidence)
-    arrays["observation_mean"], arrays["observation_covariance"] = _stack(
-        filter_, [Gaussian(z.mean[:, 0], z.covariance[:, 0])]
-    )
+    arrays |= _sensor_arrays(filter_, evidence)
     if evidence.log_weights is not None:
         arrays["effective_weights"] = filter_.shares(evidence)[:, 0]
     elif len(filter_.names) > 1:
@@ -168,6 +166,12 @@ def _ekf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence)
         fused = torch.cat([s.estimate.covariance for s in steps])
         arrays["effective_weights"] = (fused.unsqueeze(1) @ information).diagonal(dim1=-2, dim2=-1)
     return arrays
+
+
+def _sensor_arrays(filter_: ExtendedKalmanFilter, evidence: Evidence) -> dict[str, Tensor]:
+    z = filter_.virtual_observations(evidence)
+    mean, covariance = _stack(filter_, [Gaussian(z.mean[:, 0], z.covariance[:, 0])])
+    return {"observation_mean": mean, "observation_covariance": covariance}
 
 
 def _pf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) -> dict[str, Tensor]:
@@ -188,7 +192,9 @@ def _pf_arrays(filter_: Filter, steps: Sequence[StepTrace], evidence: Evidence) 
         "modality_mean": si.state_to_si(modality.mean),
         "modality_covariance": si.covariance_to_si(modality.covariance),
     }
-    assert isinstance(filter_, ParticleFilter)
+    if isinstance(filter_, InformationFilter):
+        return arrays | _sensor_arrays(filter_, evidence) | {"effective_weights": filter_.shares(evidence)[:, 0]}
+    assert isinstance(filter_, MixtureParticleFilter)
     if len(filter_.names) == 1:
         return arrays
     scaled = log_likelihood - filter_.scale(prior, log_likelihood)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.task import Task
@@ -38,6 +38,17 @@ INFORMATION_UPDATE = Passage(
         r"S^{-1} = \bar{S}^{-1} + \sum_k p_k \odot R_k^{-1}",
         r"m = \bar{m} + S \sum_k p_k \odot R_k^{-1} (z_k - \bar{m})",
     ),
+)
+
+
+PRODUCT_UPDATE = Passage(
+    "Update and fusion",
+    "A virtual sensor, one network per modality, maps an observation to a measurement $z_k$ of the full state and its "
+    "diagonal covariance $R_k$. A slowly varying bias of each sensor is estimated by every particle, with mean "
+    "$\\mu_{ik}$ and variance $s_k$ given its path. Particles are weighted by the product of the likelihoods. A weight "
+    "model maps all modalities to a weight $\\beta_k$ per modality and component; the power of an observation is "
+    "$p_k = K \\beta_k$ for $K$ modalities, which divides $R_k$ elementwise.",
+    (r"w_i' \propto w_i \prod_k N(z_k ; \bar{x}_i + \mu_{ik} , s_k + R_k / p_k)",),
 )
 
 
@@ -122,6 +133,13 @@ def _particles(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
             (DYNAMICS, r"\bar{x}_i = f(x_i, u) + q_i , \quad q_i \sim N(0, Q)"),
         )
     ]
+    moments = r"m = \sum_i w_i' \bar{x}_i , \quad S = \sum_i w_i' (\bar{x}_i - m) (\bar{x}_i - m)^\top"
+    closing = f" Estimate and covariance are the mean and covariance of the particles before resampling.{resampled}"
+    if _setting(checkpoint, "fusion", "crossmodal") == "information":
+        return [
+            *passages,
+            replace(PRODUCT_UPDATE, text=PRODUCT_UPDATE.text + closing, equations=(*PRODUCT_UPDATE.equations, moments)),
+        ]
     models = f"A network per measurement model ({_listed(trace.modalities)}) computes the likelihood $p_k(z | x)$ of "
     models += "its observation $z$ at a particle, up to a constant factor."
     raw = _setting(checkpoint, "likelihoods", "raw" if trace.weights is None else "normalised") == "raw"
@@ -136,9 +154,7 @@ def _particles(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
     if not single and not raw:
         text += " Each likelihood is divided by its mean $s_k$ over the predicted particles."
         equations.append(r"s_k = \sum_i w_i p_k(z | \bar{x}_i)")
-    equations.append(r"m = \sum_i w_i' \bar{x}_i , \quad S = \sum_i w_i' (\bar{x}_i - m) (\bar{x}_i - m)^\top")
-    text += f" Estimate and covariance are the mean and covariance of the particles before resampling.{resampled}"
-    return [*passages, Passage("Update" if single else "Update and fusion", text, tuple(equations))]
+    return [*passages, Passage("Update" if single else "Update and fusion", text + closing, (*equations, moments))]
 
 
 def _recurrent(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:

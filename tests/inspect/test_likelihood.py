@@ -14,7 +14,7 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter, update
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.likelihood import QUANTITIES, LikelihoodMap, MapEngine
 from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.trace import trace
@@ -49,7 +49,7 @@ def test_particle_filter_maps_equal_a_direct_evaluation(pf: MapEngine) -> None:
     step, size = 40, 21
     map_ = pf.map(step, size=size)
     filter_ = pf.checkpoint.filter
-    assert isinstance(filter_, ParticleFilter)
+    assert isinstance(filter_, MixtureParticleFilter)
     batch = Steps.from_episodes(filter_.task, [pf.trace.episode]).episode(0)
     observed = {
         m: v[step : step + 1].expand(1, size * size, *v.shape[2:]) for m, v in filter_.observations(batch).items()

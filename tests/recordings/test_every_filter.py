@@ -52,7 +52,7 @@ def test_trace_has_the_fields_of_its_kind(checkpoint: Checkpoint, traced: Trace)
     assert traced.modality_covariance.shape == (24, k, n, n)
     assert np.isfinite(traced.estimate_mean).all()
     assert (np.isnan if sequence else np.isfinite)(traced.estimate_covariance).all()
-    assert (traced.observation_mean is not None) == (kind in ("ekf", "ukf"))
+    assert (traced.observation_mean is not None) == (kind in ("ekf", "ukf") or "information" in checkpoint.name)
     assert (traced.log_likelihood is not None) == (kind == "pf")
     # Effective weights sum to one.
     assert (traced.weights is not None) == checkpoint.name.startswith(("crossmodal", "information"))

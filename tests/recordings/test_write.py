@@ -38,6 +38,7 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
         "weights": trace.weights is not None,
         "effective_weights": trace.effective_weights is not None,
         "ekf": trace.kind in ("ekf", "ukf"),
+        "sensors": trace.observation_mean is not None,
         "pf": trace.kind == "pf",
         "maps": maps,
         "diagnostics": False,  # tests/recordings/rerun_log/test_diagnostics.py

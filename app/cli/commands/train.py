@@ -7,7 +7,7 @@ from beliefscope.app.cli import options as opt
 from beliefscope.datasets.errors import check_name
 
 ARCHITECTURES = (
-    "{crossmodal,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf, information-ekf, lstm or transformer "
+    "{crossmodal,information,unimodal,feature,image,haptics}-{ekf,pf}, crossmodal-ukf, lstm or transformer "
     "(docs/filters.md)."
 )
 NETWORKS = "default, or authors: layers and image resolution of the paper's published code (docs/filters.md)."

@@ -94,6 +94,7 @@ def map_layers(client: TestClient, task: Task) -> list[str] | None:
             "effective_sample_size",
         ),
         ("information-ekf", ["image", "haptics", "fused"], "effective_weights weights", "effective_sample_size"),
+        ("information-pf", ["image", "haptics", "fused"], "effective_weights weights effective_sample_size", ""),
         ("lstm", None, "estimate_mean", "estimate_sigma modality_mean modality_sigma weights effective_weights"),
     ],
 )

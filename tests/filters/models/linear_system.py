@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from beliefscope.filters.belief import Evidence
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 
 A = np.array([[0.9, 0.1, 0.0], [0.0, 0.8, 0.2], [0.1, 0.0, 0.7]])
 Q_STD = np.array([0.3, 0.2, 0.25])
@@ -30,7 +30,7 @@ class LinearDynamics(nn.Module):
         return self(states, control_part), self.matrix.expand(*states.shape, 3)
 
 
-class GaussianLikelihood(ParticleFilter):
+class GaussianLikelihood(MixtureParticleFilter):
     """A particle filter whose only measurement model is the system's Gaussian likelihood."""
 
     def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:

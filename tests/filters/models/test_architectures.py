@@ -20,7 +20,7 @@ from beliefscope.filters.filter import Architecture, Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.lstm import Lstm
 from beliefscope.filters.models.networks import ImageEncoder, SpatialSoftmax
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.ukf import sigma_points, unscented
 from beliefscope.filters.rollout import Rollout, first_belief, rollout
 
@@ -50,7 +50,7 @@ def randomise(filter_: Filter) -> Filter:
 def test_catalog_has_the_filters_of_the_paper_and_a_ukf() -> None:
     fused = {f"{how}-{kind}" for how in ("feature", "unimodal", "crossmodal") for kind in ("ekf", "pf")}
     single = {f"{modality}-{kind}" for modality in ("image", "haptics") for kind in ("ekf", "pf")}
-    assert set(NAMES) == fused | single | {"lstm", "crossmodal-ukf", "information-ekf"}
+    assert set(NAMES) == fused | single | {"lstm", "crossmodal-ukf", "information-ekf", "information-pf"}
 
 
 @pytest.fixture
@@ -214,7 +214,7 @@ def test_feedback_replaces_every_belief_by_the_fused_one(window: MakeWindow) -> 
 def posterior(likelihoods: str, offset: float, window: MakeWindow) -> Tensor:
     """Log-weights after a step with a constant added to the haptics log-likelihood."""
 
-    class Shifted(ParticleFilter):
+    class Shifted(MixtureParticleFilter):
         def log_likelihood(self, evidence: Evidence, states: Tensor) -> Tensor:
             return super().log_likelihood(evidence, 20.0 * states) + torch.tensor([0.0, offset]).unsqueeze(-1)
 

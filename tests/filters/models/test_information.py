@@ -291,8 +291,8 @@ def test_sensors_are_trained_by_their_likelihood_and_then_frozen(episodes: list[
 
 
 def test_other_kinds_have_no_information_form() -> None:
-    with pytest.raises(BadInput, match="fusion 'information' needs kind 'ekf'"):
-        replace(architecture("door", "information-ekf"), kind="pf")
+    with pytest.raises(BadInput, match="fusion 'information' needs kind ekf or pf"):
+        replace(architecture("door", "information-ekf"), kind="ukf")
 
 
 def test_evidence_without_a_model_has_no_share(filter_: InformationFilter, batch: Batch) -> None:

@@ -26,7 +26,16 @@ pytestmark = pytest.mark.slow
 
 SMOKE = PLANS["smoke"]
 NAMES = tuple(filters_of(find_task("door")))
-KINDS = ("crossmodal-ekf", "crossmodal-pf", "crossmodal-ukf", "information-ekf", "feature-pf", "lstm", "transformer")
+KINDS = (
+    "crossmodal-ekf",
+    "crossmodal-pf",
+    "crossmodal-ukf",
+    "information-ekf",
+    "information-pf",
+    "feature-pf",
+    "lstm",
+    "transformer",
+)
 VAL = 8  # index of the first validation episode
 STEPS = 50
 

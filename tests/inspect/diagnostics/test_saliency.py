@@ -18,7 +18,7 @@ from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
 from beliefscope.inspect.diagnostics.saliency import ENTRY, MIN_CHANGE, Saliency, saliency
 from beliefscope.inspect.diagnostics.single_step import SingleStep, channel_names
@@ -114,7 +114,8 @@ def test_equal_inputs_and_baselines_have_no_attribution() -> None:
     assert not any(x.any() for x in result)
 
 
-KINDS = ("crossmodal-ukf", "information-ekf", "unimodal-ekf", "unimodal-pf", "feature-ekf", "lstm", "haptics-pf")
+INFORMATION = ("information-ekf", "information-pf")
+KINDS = ("crossmodal-ukf", *INFORMATION, "unimodal-ekf", "unimodal-pf", "feature-ekf", "lstm", "haptics-pf")
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf", *KINDS])
@@ -164,7 +165,7 @@ def test_log_likelihood_of_particles_averages_to_one() -> None:
     for name in replay.original.modalities:
         values = single_step.target(f"log-likelihood:{name}")(*copies)
         assert float(values.exp().mean()) == pytest.approx(1.0, abs=1e-4)
-    assert isinstance(replay.checkpoint.filter, ParticleFilter)
+    assert isinstance(replay.checkpoint.filter, MixtureParticleFilter)
 
 
 def test_position_of_the_log_likelihood() -> None:

@@ -14,7 +14,7 @@ from beliefscope.inspect.traces.replay import Edit, Replay
 
 
 @pytest.mark.parametrize(
-    "name", ["crossmodal-ukf", "information-ekf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"]
+    "name", ["crossmodal-ukf", "information-ekf", "information-pf", "unimodal-ekf", "unimodal-pf", "feature-pf", "lstm"]
 )
 def test_empty_edit_is_bit_identical(name: str) -> None:
     checkpoint = Checkpoint(build(architecture("door", name)).eval().requires_grad_(False), name, "0" * 64, {})

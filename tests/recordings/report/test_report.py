@@ -19,6 +19,7 @@ import pytest
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.likelihood import LikelihoodMap
@@ -223,6 +224,16 @@ def test_every_equation_is_converted(new_trace: Callable[..., Trace], kind: str,
     assert all(p.text.count("$") % 2 == 0 for p in passages)
     fusion = " ".join(e for p in passages for e in p.equations)
     assert (r"\beta_k" in fusion) == (weighted and kind in ("ekf", "ukf", "pf"))
+
+
+@pytest.mark.parametrize("kind", ["ekf", "pf"])
+def test_information_filters_are_described(new_trace: Callable[..., Trace], kind: str) -> None:
+    checkpoint = Checkpoint(build(architecture("door", f"information-{kind}")), "f", "0" * 64, {})
+    passage = next(p for p in methods(new_trace(kind), checkpoint) if "usion" in p.heading)
+    assert "$p_k = K \\beta_k$" in passage.text
+    for tex in (*passage.equations, *passage.text.split("$")[1::2]):
+        assert "\\" not in "".join(ElementTree.fromstring(mathml(tex, "block")).itertext())
+    assert (r"\prod_k" in passage.equations[0]) == (kind == "pf")
 
 
 def test_without_checkpoint_there_are_no_maps(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
