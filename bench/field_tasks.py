@@ -33,6 +33,8 @@ from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
 from beliefscope.filters.evaluate import Metrics, evaluate
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
+from beliefscope.filters.models.information import InformationFilter
+from beliefscope.filters.models.information_pf import with_particles
 from beliefscope.filters.training.plan import Plan
 from beliefscope.filters.training.train import train
 from beliefscope.inspect.statistics.intervals import jackknife
@@ -59,7 +61,14 @@ DROPPED = 20
 
 
 def trained(folder: Path, name: str) -> Filter:
-    """The filter's checkpoint in the folder, which is trained if it does not exist."""
+    """The filter's checkpoint in the folder, which is trained if it does not exist.
+
+    ``information-pf`` has the weights of ``information-ekf``.
+    """
+    if name.startswith("information-pf"):
+        kalman = trained(folder, name.replace("-pf", "-ekf", 1))
+        assert isinstance(kalman, InformationFilter)
+        return with_particles(kalman)
     path = folder / f"{name.replace(':', '-')}.safetensors"
     if not path.exists():
         with open_dataset(folder / "train.h5") as data:
