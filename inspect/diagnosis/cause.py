@@ -44,7 +44,7 @@ class Cause:
         symptoms: deviations that the cause always produces.
         consequences: patterns of statistics that it may change as well.
         undo: name of the intervention that undoes it (``inspect/diagnosis/interventions.py``); empty if there is none.
-        next: recommended action; may have the placeholders ``{task}`` and ``{filter}``.
+        next: next action; may have the placeholders ``{task}`` and ``{filter}``.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Candidate:
         steps: first affected step and first step after it; None for complete episodes.
         evidence: deviations that support it, largest first.
         recovered: effect of undoing it; None if it was not undone.
-        next: recommended action.
+        next: next action.
     """
 
     cause: Cause

@@ -1,0 +1,65 @@
+"""Causes in the dynamics model, its process noise, and the reported covariance."""
+
+from __future__ import annotations
+
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER
+
+RETRAIN = "Fine-tune it: beliefscope finetune {task} --filter {filter} --train dynamics-only."
+CALIBRATE = "Calibrate it: beliefscope finetune {task} --filter {filter} --train noise-only."
+
+CAUSES = (
+    Cause(
+        "dynamics.bias",
+        "Dynamics biased",
+        (Symptom("dynamics bias/*", 0),),
+        f"dynamics error/*|dynamics nis/*|dynamics slope/*|{FILTER}",
+        RETRAIN,
+        "shift dynamics",
+    ),
+    Cause(
+        "dynamics.frozen",
+        "Dynamics frozen: predicted changes are too small",
+        (Symptom("dynamics slope/*", -1),),
+        f"dynamics error/*|dynamics nis/*|dynamics bias/*|{FILTER}",
+        RETRAIN,
+        "scale dynamics",
+    ),
+    Cause(
+        "dynamics.broken",
+        "Dynamics broken",
+        (Symptom("dynamics spread/*", 1), Symptom("dynamics error/*", 1)),
+        DYNAMICS,
+        RETRAIN,
+    ),
+    Cause(
+        "process_noise.small",
+        "Process noise too small",
+        (Symptom("process noise/*", -1), Symptom("dynamics nis/*", 1)),
+        FILTER,
+        CALIBRATE,
+        "rescale process noise",
+    ),
+    Cause(
+        "process_noise.large",
+        "Process noise too large",
+        (Symptom("process noise/*", 1), Symptom("dynamics nis/*", -1)),
+        FILTER,
+        CALIBRATE,
+        "rescale process noise",
+    ),
+    Cause(
+        "covariance.small",
+        "Reported covariance too small",
+        (Symptom("reported variance/*", -1),),
+        FILTER,
+        "Report the covariance of the belief without scaling it.",
+    ),
+    Cause(
+        "covariance.large",
+        "Reported covariance too large",
+        (Symptom("reported variance/*", 1),),
+        FILTER,
+        "Report the covariance of the belief without scaling it.",
+    ),
+)

@@ -1,0 +1,68 @@
+"""Causes in the force sensor."""
+
+from __future__ import annotations
+
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes.consequences import HAPTICS
+
+CONTACT = "agreement/contact/*|unflagged force/contact/*|lag/contact/*"
+"""Relations of the force and the contact flag."""
+
+CAUSES = (
+    Cause(
+        "force.bias",
+        "Force biased",
+        (Symptom("level/force*", 0),),
+        f"drift/force*|direction/force/*|{CONTACT}|{HAPTICS}",
+        "Tare the force sensor in free motion.",
+        "tare force",
+    ),
+    Cause(
+        "force.drift",
+        "Force drifting",
+        (Symptom("drift/force*", 0),),
+        f"level/force*|direction/force/*|size/force/*|axes/force/*|lever/force*|{CONTACT}|{HAPTICS}",
+        "Tare the force sensor before each run and check its temperature.",
+        "detrend force",
+    ),
+    Cause(
+        "force.gain",
+        "Force gain wrong",
+        (Symptom("lever/force*|size/force/*", 0), Symptom("size/force/*|noise/force*", 0)),
+        f"level/force*|drift/force*|saturation/force*|{CONTACT}|{HAPTICS}",
+        "Check the units and the calibration of the force sensor.",
+        "scale force",
+    ),
+    Cause(
+        "force.sign",
+        "Force sign inverted",
+        (Symptom("direction/force/*", 1), Symptom("lever/force*", 0)),
+        f"level/force*|drift/force*|axes/force/*|{CONTACT}|{HAPTICS}",
+        "Invert the force, or correct the frame of the sensor.",
+        "negate force",
+    ),
+    Cause(
+        "force.axes",
+        "Force axes exchanged",
+        (Symptom("axes/force/*", -1),),
+        f"lever/force*|direction/force/*|level/force*|drift/force*|noise/force*|stuck/force*|{CONTACT}|{HAPTICS}",
+        "Correct the frame of the force sensor.",
+        "drop haptics",
+    ),
+    Cause(
+        "force.noise",
+        "Force noisy",
+        (Symptom("noise/force*"),),
+        f"level/force*|drift/force*|direction/force/*|lever/force*|size/force/*|axes/force/*|{CONTACT}|{HAPTICS}",
+        "Check the cable and the filter of the force sensor.",
+        "drop haptics",
+    ),
+    Cause(
+        "force.stuck",
+        "Force stuck",
+        (Symptom("stuck/force*"),),
+        f"*/force*|{CONTACT}|{HAPTICS}",
+        "Restart the force sensor.",
+        "drop haptics",
+    ),
+)

@@ -1,0 +1,50 @@
+"""Causes in the fusion weights and the fusion rule."""
+
+from __future__ import annotations
+
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes.consequences import FILTER, WEIGHTS
+
+RETRAIN = "Fine-tune them: beliefscope finetune {task} --filter {filter} --train weights-only."
+
+CAUSES = (
+    Cause("weights.constant", "Fusion weights constant", (Symptom("beta spread/*", -1),), WEIGHTS, RETRAIN, "healthy beta"),
+    Cause(
+        "weights.inverted",
+        "Fusion weights inverted",
+        (Symptom("beta logit/*", target="mirrored"), Symptom("beta logit/*", 0)),
+        WEIGHTS,
+        RETRAIN,
+        "invert beta",
+    ),
+    Cause(
+        "weights.ignores_image",
+        "Fusion weights ignore the image",
+        (Symptom("beta logit/image*", -1),),
+        f"beta spread/*|{FILTER}",
+        RETRAIN,
+        "healthy beta",
+    ),
+    Cause(
+        "weights.ignores_haptics",
+        "Fusion weights ignore haptics",
+        (Symptom("beta logit/image*", 1),),
+        f"beta spread/*|{FILTER}",
+        RETRAIN,
+        "healthy beta",
+    ),
+    Cause(
+        "fusion.shared_prior",
+        "Prior counted more than once in the fusion",
+        (Symptom("fusion mean/*", 1),),
+        f"fusion variance/*|reported variance/*|{FILTER}",
+        "Divide the product of the posteriors by their common prior, or use the information filter.",
+    ),
+    Cause(
+        "fusion.miscalibrated",
+        "Fusion miscalibrated: its covariance does not follow the fusion rule",
+        (Symptom("fusion variance/*", 0),),
+        f"offspring/*|{FILTER}",
+        "Check the implementation of the fusion rule.",
+    ),
+)

@@ -1,0 +1,60 @@
+"""Causes in the camera and its images."""
+
+from __future__ import annotations
+
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes.consequences import IMAGE
+
+CHECK = "Check the camera and its driver; until then, run the filter without the image."
+
+CAUSES = (
+    Cause(
+        "image.blackout",
+        "Images blacked out",
+        (Symptom("black/image/*"),),
+        f"lag/image/*|frozen/image/*|{IMAGE}",
+        CHECK,
+        "drop image",
+    ),
+    Cause("image.frozen", "Image frozen", (Symptom("frozen/image/*"),), f"lag/image/*|noise/image/*|{IMAGE}", CHECK, "drop image"),
+    Cause(
+        "image.delay",
+        "Image delayed",
+        (Symptom("lag/image/*"),),
+        f"frozen/image/*|offset/effector_position*|{IMAGE}",
+        "Synchronise the clocks of camera and robot, or delay the other sensors by the same number of steps.",
+        "advance image",
+    ),
+    Cause(
+        "image.shift",
+        "Camera moved",
+        (Symptom("shift/image*", 0),),
+        f"occlusion/image/*|brightness/image/*|sharpness/image/*|offset/effector_position*|{IMAGE}",
+        "Calibrate the camera pose again.",
+        "realign image",
+    ),
+    Cause(
+        "image.noise",
+        "Image noisy",
+        (Symptom("noise/image/*"),),
+        f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|offset/effector_position*|{IMAGE}",
+        "Reduce the camera's gain, or fine-tune with noisy images: beliefscope finetune {task} --filter {filter} --faults image_noise=40.",
+        "drop image",
+    ),
+    Cause(
+        "image.exposure",
+        "Exposure changed",
+        (Symptom("brightness/image/*", 0),),
+        f"noise/image/*|sharpness/image/*|occlusion/image/*|offset/effector_position*|shift/image*|{IMAGE}",
+        "Restore the camera's exposure or the lighting.",
+        "expose image",
+    ),
+    Cause(
+        "image.occlusion",
+        "Camera occluded",
+        (Symptom("occlusion/image/*"),),
+        f"sharpness/image/*|shift/image*|brightness/image/*|noise/image/*|offset/effector_position*|{IMAGE}",
+        "Clear the camera's view.",
+        "drop image",
+    ),
+)

@@ -1,0 +1,51 @@
+"""Causes in the measurement models, the same for each modality."""
+
+from __future__ import annotations
+
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes.consequences import FILTER
+
+
+def causes_of(modality: str) -> tuple[Cause, ...]:
+    """Causes of one modality's measurement model."""
+    name, title = f"model.{modality}", f"{modality.capitalize()} model"
+    module = f"*{modality}*"
+    retrain = f"Fine-tune it: beliefscope finetune {{task}} --filter {{filter}} --train {modality}-only."
+    calibrate = "Calibrate it: beliefscope finetune {task} --filter {filter} --train noise-only."
+    return (
+        Cause(
+            f"{name}.bias",
+            f"{title} biased",
+            (Symptom(f"module bias/{module}", 0),),
+            f"module error/{module}|module nis/{module}|{FILTER}",
+            retrain,
+            f"shift {modality}",
+        ),
+        Cause(
+            f"{name}.overconfident",
+            f"{title} overconfident",
+            (Symptom(f"module std/{module}", -1), Symptom(f"module nis/{module}", 1)),
+            FILTER,
+            calibrate,
+            f"rescale {modality}",
+        ),
+        Cause(
+            f"{name}.underconfident",
+            f"{title} underconfident",
+            (Symptom(f"module std/{module}", 1), Symptom(f"module nis/{module}", -1)),
+            FILTER,
+            calibrate,
+            f"rescale {modality}",
+        ),
+        Cause(
+            f"{name}.broken",
+            f"{title} broken",
+            (Symptom(f"module spread/{module}|module scatter/{module}", 1), Symptom(f"module error/{module}", 1)),
+            f"module */{module}|{FILTER}",
+            retrain,
+            f"drop {modality}",
+        ),
+    )
+
+
+CAUSES = causes_of("image") + causes_of("haptics")

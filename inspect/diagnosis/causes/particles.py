@@ -1,0 +1,41 @@
+"""Causes in the particle set and its resampling."""
+
+from __future__ import annotations
+
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.causes.consequences import FILTER
+
+CAUSES = (
+    Cause(
+        "particles.few",
+        "Too few particles",
+        (Symptom("particles/*", -1),),
+        FILTER,
+        "Use more particles: beliefscope evaluate {task} --filter {filter} --particles 1000.",
+        "10 x particles",
+    ),
+    Cause(
+        "particles.deprived",
+        "Particle deprivation: few ancestors survive",
+        (Symptom("ancestors/*", -1), Symptom("offspring/*", 1)),
+        FILTER,
+        "Check the resampling, and increase the process noise.",
+        "restore resampling",
+    ),
+    Cause(
+        "resampling.off",
+        "Resampling off",
+        (Symptom("prior ess/*", -1),),
+        FILTER,
+        "Resample at every step.",
+        "restore resampling",
+    ),
+    Cause(
+        "resampling.biased",
+        "Resampling biased: offspring is not proportional to the weights",
+        (Symptom("offspring/*", 1), Symptom("ancestors/*", 1, 0.5)),
+        FILTER,
+        "Check the implementation of the resampling.",
+        "restore resampling",
+    ),
+)

@@ -1,0 +1,134 @@
+"""Statistics of a filter's equations: its outputs compared with those recomputed from its own intermediate results.
+
+In a filter that follows its equations, each of them has a fixed value, whatever the sensors and networks do.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from beliefscope.filters.belief import Gaussian, moments
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.models.ekf import ExtendedKalmanFilter
+from beliefscope.filters.models.fusion import powers, product_of_experts, weighted_average, weighted_product
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.trace import Trace
+
+
+@torch.no_grad()
+def equation_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
+    """``KIND//all`` -> value.
+
+    ``reported variance``: log-ratio of the variances of the estimate and of the belief that the recursion uses.
+    ``fusion variance``: log-ratio of the variances of that belief and of the fusion rule's result.
+    ``fusion mean``: root mean square distance of the estimate from the fusion rule's result, in standard deviations.
+    Particle filters also have ``particles``: number M; ``ancestors``: share of particles with offspring;
+    ``offspring``: mean square of the difference between the number of offspring and its expectation M w; and
+    ``prior ess``: relative effective sample size of the weights after resampling.
+    """
+    filter_ = checkpoint.filter
+    if isinstance(filter_, ParticleFilter) and trace.particles is not None:
+        return _particle_statistics(trace, filter_)
+    if isinstance(filter_, ExtendedKalmanFilter) and trace.predicted_covariance is not None and len(trace) > 1:
+        return _kalman_statistics(trace, filter_)
+    return {}
+
+
+def _kalman_statistics(trace: Trace, filter_: ExtendedKalmanFilter) -> dict[str, float]:
+    mean, covariance = _tensor(trace.estimate_mean), _tensor(trace.estimate_covariance)
+    rule = _fused(trace, filter_)
+    variance, by_rule = (matrix.diagonal(dim1=-2, dim2=-1).log() for matrix in (covariance, rule.covariance))
+    distance = measures.wrapped(filter_.task, (mean - rule.mean).numpy()) / by_rule.exp().sqrt().numpy()
+    values = {"fusion mean//all": float(np.sqrt(np.square(distance).mean()))}
+    if filter_.architecture.feedback or filter_.architecture.fusion == "information":
+        used = _belief_before(trace, filter_).diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).log()
+        values["fusion variance//all"] = float((used - by_rule[:-1]).median())
+        values["reported variance//all"] = float((variance[:-1] - used).median())
+    else:
+        values["reported variance//all"] = float((variance - by_rule).median())
+    return values
+
+
+def _fused(trace: Trace, filter_: ExtendedKalmanFilter) -> Gaussian:
+    """Result of the fusion rule for the bank's posteriors, (T, n) and (T, n, n)."""
+    bank = Gaussian(_tensor(trace.modality_mean), _tensor(trace.modality_covariance))
+    log_weights = None if trace.weights is None else _tensor(trace.weights).log()
+    architecture = filter_.architecture
+    if bank.mean.shape[1] == 1:
+        return Gaussian(bank.mean[:, 0], bank.covariance[:, 0])
+    if log_weights is None:
+        return product_of_experts(bank)
+    if architecture.fusion != "information":
+        return weighted_average(bank, log_weights, architecture.covariance)
+    prior, sensors = (
+        (_tensor(getattr(trace, f"{name}_mean")), _tensor(getattr(trace, f"{name}_covariance")))
+        for name in ("predicted", "observation")
+    )
+    experts = Gaussian(torch.cat([prior[0][:, :1], sensors[0]], 1), torch.cat([prior[1][:, :1], sensors[1]], 1))
+    power = powers(log_weights)
+    return weighted_product(experts, torch.cat([torch.ones_like(power[:, :1]), power], 1))
+
+
+def _belief_before(trace: Trace, filter_: ExtendedKalmanFilter) -> Tensor:
+    """(T - 1, n, n) covariances from which the next step's prediction started: ``A^-1 (P' - Q) A^-T``."""
+    si = filter_.statistics
+    std = si.mean_std("state")[1].double()
+    controls = si.standardise("control", torch.from_numpy(trace.episode.controls[1:]))
+    states = si.standardise("state", torch.from_numpy(trace.estimate_mean[:-1]))
+    jacobian = filter_.dynamics.with_jacobian(states, filter_.dynamics.control_part(controls))[1].double()
+    predicted = _tensor(trace.predicted_covariance)[1:, 0] / (std * std[:, None])
+    back = torch.linalg.inv(jacobian)
+    before = back @ (predicted - torch.diag_embed(filter_.dynamics.noise.double() ** 2)) @ back.transpose(-1, -2)
+    return before * std * std[:, None]
+
+
+def _particle_statistics(trace: Trace, filter_: ParticleFilter) -> dict[str, float]:
+    assert trace.log_weights is not None
+    assert trace.prior_log_weights is not None
+    steps, count = trace.log_weights.shape
+    log_weights, prior = _tensor(trace.log_weights), _tensor(trace.prior_log_weights)
+    rule = moments(_tensor(trace.particles), log_weights)
+    variance, by_rule = (
+        matrix.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12)
+        for matrix in (_tensor(trace.estimate_covariance), rule.covariance)
+    )
+    distance = measures.wrapped(filter_.task, trace.estimate_mean - rule.mean.numpy()) / by_rule.sqrt().numpy()
+    offspring = _offspring(trace.ancestors, steps, count)
+    return {
+        "reported variance//all": float((variance.log() - by_rule.log()).median()),
+        "fusion mean//all": float(np.sqrt(np.square(distance).mean())),
+        "fusion variance//all": -float(np.log(max(_likelihood_power(trace, filter_, prior, log_weights), 1e-3))),
+        "particles//all": float(count),
+        "ancestors//all": float((offspring > 0).mean()),
+        "offspring//all": float(np.square(offspring - count * log_weights.exp().numpy()).mean()),
+        "prior ess//all": float((1.0 / (2.0 * prior).exp().sum(-1)).mean() / count),
+    }
+
+
+def _likelihood_power(trace: Trace, filter_: ParticleFilter, prior: Tensor, log_weights: Tensor) -> float:
+    """Power to which the fused likelihood has been raised: slope of ``log w - log w'`` on its logarithm."""
+    log_likelihood = _tensor(trace.log_likelihood)
+    scaled = log_likelihood - filter_.scale(prior, log_likelihood)
+    if trace.weights is not None:
+        scaled = scaled + _tensor(trace.weights).log()
+    fused = torch.logsumexp(scaled, dim=1)
+    weight = log_weights.exp() / len(log_weights)
+    x, y = ((v - (weight * v).sum(-1, keepdim=True) * len(log_weights)) for v in (fused, log_weights - prior))
+    return float((weight * x * y).sum() / (weight * x * x).sum().clamp_min(1e-12))
+
+
+def _offspring(ancestors: NDArray[Any] | None, steps: int, count: int) -> NDArray[np.int64]:
+    """(T, M): number of offspring of each particle."""
+    index = (np.arange(count) if ancestors is None else ancestors) + count * np.arange(steps)[:, None]
+    return np.bincount(index.ravel(), minlength=steps * count).reshape(steps, count)
+
+
+def _tensor(values: NDArray[Any] | None) -> Tensor:
+    assert values is not None
+    return torch.from_numpy(values).double()

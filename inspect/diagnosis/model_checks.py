@@ -1,0 +1,197 @@
+"""Statistics of a filter's modules, each by itself and against the true state, not through the filter's belief.
+
+Measurement models are compared with the true state of their step; the dynamics model starts at the true previous state.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.filters.batch import Steps
+from beliefscope.filters.belief import Evidence
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.filter import MAX_LOGIT
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.trace import Trace
+
+EVERY = 4
+"""The likelihoods of a particle filter are evaluated at every fourth step."""
+
+SCALES = (0.03, 0.1, 0.3, 1.0)
+"""Standard deviations of the states at which likelihoods are evaluated, in standard deviations of the training data."""
+
+PER_SCALE = 64
+"""Number of such states by scale."""
+
+LARGEST = 0.9999
+"""Largest absolute log-odds of fusion weights, as a share of the network's bound."""
+
+MIN_PATH = 0.3
+"""Minimum path of a component for a slope of the dynamics, in standard deviations of the training data."""
+
+MIN_STEPS = 10
+"""Minimum number of steps of a statistic."""
+
+
+def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
+    """``KIND/SUBJECT/PHASE`` -> value, SI units, of all modules; statistics that do not exist are absent."""
+    if isinstance(checkpoint, ExternalFilter):
+        return {}
+    values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
+    if np.isfinite(trace.episode.states).all():
+        values |= measurement_statistics(trace, checkpoint)
+        values |= dynamics_statistics(trace.episode, checkpoint)
+    return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
+    """Of each measurement model and component, from its residuals r with standard deviation s.
+
+    ``module bias``: mean of r. ``module spread``: standard deviation of r. ``module error``: root mean square of r.
+    ``module std``: root mean square of s. ``module nis``: mean of (r / s)^2. Steps with image blackout do not count for
+    images.
+    """
+    if trace.observation_mean is not None and trace.observation_covariance is not None:
+        steps = np.arange(len(trace))
+        observed = trace.observation_mean.astype(np.float64)
+        variance = np.diagonal(trace.observation_covariance, axis1=-2, axis2=-1).astype(np.float64)
+    elif trace.log_likelihood is not None and isinstance(checkpoint.filter, ParticleFilter):
+        steps = np.arange(0, len(trace), EVERY)
+        observed, variance = likelihood_moments(checkpoint.filter, trace.episode, steps)
+    else:
+        return {}
+    task = measures.task_of(trace)
+    truth = trace.episode.states[steps].astype(np.float64)
+    residual = measures.wrapped(task, observed - truth[:, None])
+    black = measures.blackout(trace)[steps]
+    values: dict[str, float] = {}
+    for k, model in enumerate(trace.modalities):
+        keep = ~black if "image" in model.split("+") else np.ones(len(steps), dtype=bool)
+        if keep.sum() < min(MIN_STEPS, len(steps)):
+            continue
+        r, v = residual[keep, k], variance[keep, k]
+        columns = {
+            "module bias": r.mean(0),
+            "module spread": r.std(0),
+            "module error": np.sqrt(np.square(r).mean(0)),
+            "module std": np.sqrt(v.mean(0)),
+            "module nis": (np.square(r) / v).mean(0),
+        }
+        for kind, column in columns.items():
+            for component, value in zip(task.components, column, strict=True):
+                values[f"{kind}/{model} {component.name}/all"] = float(value)
+    return values
+
+
+@torch.no_grad()
+def likelihood_moments(filter_: ParticleFilter, episode: Episode, steps: np.ndarray) -> tuple[Array, Array]:
+    """Means (S, K, n) and variances (S, K, n) of the likelihoods at some steps, as densities of the state; SI units.
+
+    Self-normalised importance sampling from a mixture of Gaussians around the true state with the standard deviations
+    ``SCALES``: wide enough for a biased likelihood and dense enough for a narrow one. All steps share the offsets.
+    """
+    batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
+    batch = type(batch)(
+        {name: values[steps] for name, values in batch.observations.items()},
+        batch.controls[steps],
+        batch.states[steps],
+        batch.contact[steps],
+        batch.previous,
+    )
+    evidence = filter_.encode(batch)
+    by_step = Evidence(evidence.control[:, 0], evidence.observation[:, 0], None, None)  # (S, K, u): steps as the batch
+    offsets, log_density = proposal(filter_.n)
+    truth = filter_.statistics.standardise("state", batch.states[:, 0])
+    states = truth.unsqueeze(1) + offsets
+    log_weights = filter_.log_likelihood(by_step, states) - log_density
+    weights = torch.softmax(log_weights, dim=-1)  # (S, K, G)
+    mean = torch.einsum("skg,gn->skn", weights, offsets)
+    variance = torch.einsum("skg,skgn->skn", weights, (offsets - mean.unsqueeze(2)).square())
+    si, std = filter_.statistics, filter_.statistics.mean_std("state")[1]
+    # One sample may have all the weight: the likelihood is then narrower than the spacing of the samples.
+    variance = variance.clamp_min((0.1 * SCALES[0]) ** 2) * std.square()
+    return si.state_to_si(truth.unsqueeze(1) + mean).double().numpy(), variance.double().numpy()
+
+
+def proposal(n: int) -> tuple[Tensor, Tensor]:
+    """Offsets (G, n) from the mixture of zero-mean Gaussians with standard deviations ``SCALES``; log-density (G,)."""
+    unit = torch.randn(len(SCALES), PER_SCALE, n, generator=torch.Generator().manual_seed(0))
+    scales = torch.tensor(SCALES)
+    offsets = (unit * scales[:, None, None]).flatten(0, 1)
+    log_each = -0.5 * (offsets.unsqueeze(1) / scales[:, None]).square().sum(-1) - n * scales.log()
+    return offsets, torch.logsumexp(log_each, dim=-1) - math.log(len(SCALES)) - 0.5 * n * math.log(2.0 * math.pi)
+
+
+@torch.no_grad()
+def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, float]:
+    """Of the dynamics model from the true previous state, by component, with residual r and process noise q.
+
+    ``dynamics bias``: mean of r. ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2.
+    ``dynamics slope``: slope of the predicted on the true change, for components that move enough. ``dynamics spread``:
+    standard deviation of r that neither bias nor slope explains. ``process noise``: q.
+    """
+    filter_ = checkpoint.filter
+    if checkpoint.kind == "lstm" or len(episode) < MIN_STEPS:
+        return {}
+    si = filter_.statistics
+    states = si.standardise("state", torch.from_numpy(episode.states))
+    controls = si.standardise("control", torch.from_numpy(episode.controls))
+    before, after = states[:-1], states[1:]
+    predicted = filter_.dynamics(before, filter_.dynamics.control_part(controls[1:]))
+    std = si.mean_std("state")[1].double().numpy()
+    noise = filter_.dynamics.noise.double().numpy() * std
+    residual = measures.wrapped(filter_.task, (predicted - after).double().numpy() * std)
+    change = measures.wrapped(filter_.task, (after - before).double().numpy() * std)
+    values: dict[str, float] = {}
+    moved = np.abs(change).sum(0) > MIN_PATH * std
+    centred, around = residual - residual.mean(0), change - change.mean(0)
+    excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
+    columns = {
+        "dynamics bias": residual.mean(0),
+        "dynamics error": np.sqrt(np.square(residual).mean(0)),
+        "dynamics nis": (np.square(residual) / noise**2).mean(0),
+        "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
+        "dynamics spread": (centred - excess * around).std(0),
+        "process noise": noise,
+    }
+    for kind, column in columns.items():
+        for component, value in zip(filter_.task.components, column, strict=True):
+            values[f"{kind}/{component.name}/all"] = float(value)
+    return values
+
+
+def weight_statistics(trace: Trace) -> dict[str, float]:
+    """Of the log-odds of each fusion weight before the network's bound.
+
+    ``beta logit``: mean. ``beta spread``: standard deviation. ``beta contact``: slope on the contact flag, per standard
+    deviation of the flag; absent in episodes without both phases.
+    """
+    if trace.weights is None or len(trace) < MIN_STEPS or trace.weights.shape[1] < 2:
+        return {}
+    names = [c.name for c in measures.task_of(trace).components] if trace.weights.shape[-1] > 1 else [""]
+    weights = trace.weights.astype(np.float64)
+    odds = np.log(weights / (1.0 - weights))
+    logits = 2.0 * MAX_LOGIT * np.arctanh(np.clip(odds / (2.0 * MAX_LOGIT), -LARGEST, LARGEST))
+    contact = trace.episode.contact.astype(np.float64)
+    contact = (contact - contact.mean()) / contact.std() if contact.std() > 0.0 else np.full(len(trace), np.nan)
+    columns = {
+        "beta logit": logits.mean(0),
+        "beta spread": logits.std(0),
+        "beta contact": np.einsum("t,tkw->kw", contact, logits) / len(trace),
+    }
+    count = 1 if len(trace.modalities) == 2 else len(trace.modalities)
+    return {
+        f"{kind}/{trace.modalities[k]} {name}".rstrip() + "/all": float(column[k, w])
+        for kind, column in columns.items()
+        for k in range(count)
+        for w, name in enumerate(names)
+    }
