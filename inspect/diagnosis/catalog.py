@@ -3,6 +3,25 @@
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause
+from beliefscope.inspect.diagnosis.causes import (
+    data,
+    dynamics,
+    force,
+    fusion,
+    image,
+    model,
+    other_sensors,
+    particles,
+)
 
-CAUSES: tuple[Cause, ...] = ()
+CAUSES: tuple[Cause, ...] = (
+    *image.CAUSES,
+    *force.CAUSES,
+    *other_sensors.CAUSES,
+    *data.CAUSES,
+    *model.CAUSES,
+    *dynamics.CAUSES,
+    *fusion.CAUSES,
+    *particles.CAUSES,
+)
 """All causes, by component."""

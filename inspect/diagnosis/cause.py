@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -18,11 +19,14 @@ class Symptom:
         statistics: patterns of names ``KIND/SUBJECT/PHASE``, joined by ``|``; ``*`` matches any text.
         direction: 1 if they increase, -1 if they decrease, 0 for either.
         weight: relative to the other symptoms of the cause.
+        target: how the statistics together must deviate: ``mirrored``, to the healthy values with the opposite sign; or
+            ``shifted``, all by the same amount.
     """
 
     statistics: str
     direction: Literal[-1, 0, 1] = 1
     weight: float = 1.0
+    target: Literal["", "mirrored", "shifted"] = ""
 
     def matches(self, statistic: str) -> bool:
         """Whether a statistic belongs to the symptom, whatever its value."""
@@ -83,16 +87,15 @@ class Recovery:
     """Effect of undoing a cause on the filter, by replay with the same random numbers.
 
     Attributes:
-        error: share of the excess position error that the undo removes, with the 95 % interval over episodes; without
-            ground truth, None.
-        low, high: of the interval.
+        error: share of the position error that the undo removes; NaN without ground truth.
+        low, high: 95 % interval over episodes; NaN for too few of them.
         nll: decrease of the negative log-likelihood by step, in nats: of the true state; without ground truth, of the
-            observations.
+            virtual observations.
     """
 
-    error: float | None
-    low: float | None
-    high: float | None
+    error: float
+    low: float
+    high: float
     nll: float
 
 
@@ -174,6 +177,6 @@ class Diagnosis:
 
 def _share(recovery: Recovery | None) -> str:
     """Recovered share of the error with its interval, empty without one."""
-    if recovery is None or recovery.error is None:
+    if recovery is None or math.isnan(recovery.error):
         return ""
     return f"{100 * recovery.error:.0f} % ({100 * recovery.low:.0f} to {100 * recovery.high:.0f})"

@@ -7,6 +7,7 @@ catalog is scored by how well its signature explains all deviations.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -16,8 +17,8 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence
 from beliefscope.inspect.diagnosis.scoring import applicable, probabilities, score
-from beliefscope.inspect.diagnosis.statistics import episode_statistics
-from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, Deviation, compare
+from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
+from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, Deviation, compare, critical_value
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -67,7 +68,8 @@ def diagnose(
         if progress is not None:
             progress(0.5 * len(traces) / len(episodes))
     rows = [episode_statistics(trace, checkpoint) for trace in traces]
-    comparison = compare(profile, rows, significance=alarm_rate)
+    extended, extended_rows = with_scatter(profile, rows)
+    comparison = compare(extended, extended_rows, significance=alarm_rate)
     provenance = {
         "task": checkpoint.task.name,
         "filter": checkpoint.name,
@@ -79,21 +81,17 @@ def diagnose(
     if not comparison.alarms:
         text = f"Healthy: all statistics are within the record of {profile.episodes} healthy episodes"
         return Diagnosis("healthy", False, f"{text}.", (), provenance)
-    critical = critical_value(comparison)
-    causes = applicable(CAUSES, [deviation.statistic for deviation in comparison.deviations])
+    names = [deviation.statistic for deviation in comparison.deviations]
+    critical = critical_value(extended, names, len(rows), alarm_rate)
+    causes = applicable(CAUSES, names)
     scores = {cause.name: score(cause, comparison.deviations, critical) for cause in causes}
     ranked = sorted(probabilities(scores).items(), key=lambda item: -item[1])[:LISTED]
     by_name = {cause.name: cause for cause in causes}
     candidates = tuple(
         _candidate(by_name[name], probability, comparison, traces, rows, checkpoint) for name, probability in ranked
     )
-    state = "fault" if candidates and candidates[0].probability >= SURE else "unsure"
+    state: Literal["fault", "unsure"] = "fault" if candidates and candidates[0].probability >= SURE else "unsure"
     return Diagnosis(state, False, _headline(candidates, comparison), candidates, provenance)
-
-
-def critical_value(comparison: Comparison) -> float:
-    """Smallest absolute t-value of an alarm."""
-    return min(abs(deviation.t) for deviation in comparison.alarms)
 
 
 def _candidate(

@@ -17,6 +17,7 @@ from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import MAX_LOGIT
+from beliefscope.filters.models.dynamics import Dynamics
 from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
 from beliefscope.inspect.statistics import measures
@@ -43,11 +44,17 @@ MIN_STEPS = 10
 
 
 def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
-    """``KIND/SUBJECT/PHASE`` -> value, SI units, of all modules; statistics that do not exist are absent."""
+    """``KIND/SUBJECT/PHASE`` -> value, SI units, of all modules.
+
+    ``error``: root mean square position error of the estimate. Statistics that do not apply are absent.
+    """
     if isinstance(checkpoint, ExternalFilter):
         return {}
     values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if np.isfinite(trace.episode.states).all():
+        values["error//all"] = float(
+            np.sqrt(np.square(measures.position_error(trace)[measures.counted(trace), -1]).mean())
+        )
         values |= measurement_statistics(trace, checkpoint)
         values |= dynamics_statistics(trace.episode, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}
@@ -140,7 +147,7 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     standard deviation of r that neither bias nor slope explains. ``process noise``: q.
     """
     filter_ = checkpoint.filter
-    if checkpoint.kind == "lstm" or len(episode) < MIN_STEPS:
+    if not isinstance(getattr(filter_, "dynamics", None), Dynamics) or len(episode) < MIN_STEPS:
         return {}
     si = filter_.statistics
     states = si.standardise("state", torch.from_numpy(episode.states))

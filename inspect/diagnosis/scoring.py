@@ -1,4 +1,9 @@
-"""Probabilities of causes from the deviations of all statistics."""
+"""Probabilities of causes from the deviations of all statistics.
+
+A cause must explain every deviation: its own symptoms must deviate in the right direction, and whatever it cannot
+change must not. An unexplained deviation upstream, of a sensor or an equation, weighs most, since a fault downstream
+cannot produce it; the filter's belief, at the end of the chain, is changed by everything.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,15 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from beliefscope.inspect.diagnosis.cause import Cause, matches
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom, matches
+from beliefscope.inspect.diagnosis.causes.consequences import FILTER
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
-CERTAIN = 10.0
-"""Ratio of a t-value to its critical value from which a deviation counts fully."""
+NOISE, GROWTH = 0.7, 1.0
+"""Ratio of a t-value to its critical value up to which a deviation does not count, and scale of its growth."""
+
+OF_FILTER = 0.2
+"""Weight of an unexplained deviation of the filter's belief; that of others is 1."""
 
 TEMPERATURE = 0.15
 """Difference of scores that changes the odds of two causes by a factor of e; calibrated by ``bench/beliefbench``."""
@@ -22,36 +31,53 @@ UNKNOWN = -0.3
 
 def strength(ratio: float) -> float:
     """Strength of a deviation, 0 to 1, from the ratio of its t-value to the critical value."""
-    return min(1.0, math.log1p(max(0.0, ratio - 0.5)) / math.log1p(CERTAIN - 0.5))
+    return max(0.0, 1.0 - math.exp((NOISE - ratio) / GROWTH))
+
+
+def support(symptom: Symptom, deviations: Sequence[Deviation], critical: float) -> float:
+    """How well the symptom's statistics agree with it, -1 to 1; -1 if none deviates."""
+    if not deviations:
+        return -1.0
+    sizes = [strength(abs(deviation.t) / critical) for deviation in deviations]
+    if not symptom.target:
+        agrees = (symptom.direction * deviation.t >= 0.0 for deviation in deviations)
+        return 2.0 * max(size if yes else 0.0 for size, yes in zip(sizes, agrees, strict=True)) - 1.0
+    value, healthy = (np.array([getattr(d, name) for d in deviations]) for name in ("value", "healthy"))
+    shift = value - healthy
+    if symptom.target == "shifted":
+        quality = 1.0 - 2.0 * np.ptp(shift) / max(float(np.abs(shift).mean()), 1e-9)
+    else:
+        distance = np.abs(value + healthy) / np.maximum(np.abs(shift), 1e-9)
+        width = np.array([d.high - d.low for d in deviations])
+        informative = np.minimum(1.0, np.abs(healthy) / np.maximum(width, 1e-9))
+        quality = float((informative * (1.0 - 2.0 * distance)).sum() / max(informative.sum(), 1e-9))
+    return max(sizes) * (1.0 + max(-1.0, float(quality))) - 1.0
 
 
 def score(cause: Cause, deviations: Iterable[Deviation], critical: float) -> float:
-    """How well a cause explains all deviations, -1 to 1: strength of its symptoms minus the unexplained share.
+    """How well a cause explains all deviations, -2 to 1: support of its symptoms minus unexplained deviations.
 
-    Statistics of one kind and subject in several phases count once, by their largest deviation. A symptom counts by its
-    largest deviation in the right direction; one in the wrong direction, or none, counts against the cause.
+    Statistics of one kind and subject in several phases count once, by their largest deviation.
 
     Args:
         critical: t-value from which a deviation is significant.
     """
-    symptoms = [0.0] * len(cause.symptoms)
-    total: dict[str, float] = {}
+    members: list[list[Deviation]] = [[] for _ in cause.symptoms]
     unexplained: dict[str, float] = {}
     for deviation in deviations:
-        name, size = deviation.statistic, strength(abs(deviation.t) / critical)
-        group = name.rpartition("/")[0]
-        total[group] = max(total.get(group, 0.0), size)
-        explained = matches(cause.consequences, name)
-        for i, symptom in enumerate(cause.symptoms):
-            if symptom.matches(name):
-                explained = True
-                sign = symptom.direction * deviation.t >= 0.0
-                symptoms[i] = max(symptoms[i], size) if sign else symptoms[i]
-        if not explained:
+        name = deviation.statistic
+        hits = [i for i, symptom in enumerate(cause.symptoms) if symptom.matches(name)]
+        for i in hits:
+            members[i].append(deviation)
+        if not hits and not matches(cause.consequences, name):
+            group = name.rpartition("/")[0]
+            size = (OF_FILTER if matches(FILTER, name) else 1.0) * strength(abs(deviation.t) / critical)
             unexplained[group] = max(unexplained.get(group, 0.0), size)
     weights = [symptom.weight for symptom in cause.symptoms]
-    support = sum(w * (2.0 * s - 1.0) for w, s in zip(weights, symptoms, strict=True)) / sum(weights)
-    return support - sum(unexplained.values()) / max(1.0, sum(total.values()))
+    supports = [support(s, found, critical) for s, found in zip(cause.symptoms, members, strict=True)]
+    total = sum(w * s for w, s in zip(weights, supports, strict=True)) / sum(weights)
+    # Probability that at least one unexplained deviation is real, if they are independent.
+    return total - (1.0 - math.prod(1.0 - size for size in unexplained.values()))
 
 
 def probabilities(scores: Mapping[str, float], temperature: float = TEMPERATURE) -> dict[str, float]:

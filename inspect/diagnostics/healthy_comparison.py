@@ -37,6 +37,7 @@ KINDS = {
     "weight": ("effective weight", False, 0.01),
     "regret": ("error relative to the oracle's weights", True, 0.02),
     "ess": ("effective sample size", True, 0.05),
+    "error": ("RMS position error", True, 0.02),
     "module bias": ("bias of the measurement model", False, 5e-4),
     "module error": ("error of the measurement model", True, 0.02),
     "module std": ("predicted standard deviation of the measurement model", True, 0.02),
@@ -54,7 +55,7 @@ KINDS = {
     "beta contact": ("change of the log-odds of beta with contact", False, 0.02),
     "reported variance": ("log-ratio of the reported to the used variance", False, 0.02),
     "fusion variance": ("log-ratio of the used variance to that of the fusion rule", False, 0.02),
-    "fusion mean": ("distance of the estimate from the fusion rule", False, 0.02),
+    "fusion mean": ("distance of the estimate from the fusion rule", True, 1.0),
     "prior ess": ("effective sample size after resampling", False, 0.01),
     "particles": ("number of particles", True, 0.02),
     "ancestors": ("share of particles with offspring", False, 0.01),
@@ -174,9 +175,7 @@ def compare(
     names, values = [name for name, kept in zip(names, keep, strict=True) if kept], values[:, keep]
     if not names:
         return Comparison(count, profile.episodes, profile.data, ())
-    settings = [KINDS.get(name.split("/")[0], ("", False, 1e-9)) for name in names]
-    logarithmic, floor = np.array([s[1] for s in settings]), np.array([s[2] for s in settings])
-    scaled = np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values)
+    scaled, floor = _scaled(names, values)
     divisions = np.concatenate([np.arange(len(values))[None] < count, _divisions(len(values), count, seed)])
     t, effect = _t_values(scaled, divisions, floor)
     # Rounding must not distinguish a division from itself.
@@ -194,6 +193,20 @@ def compare(
     deviations = [Deviation(*row) for row in rows]
     order = np.argsort(-np.abs(t[0]), kind="stable")
     return Comparison(count, profile.episodes, profile.data, tuple(deviations[i] for i in order))
+
+
+def critical_value(profile: HealthyProfile, names: Sequence[str], count: int, significance: float) -> float:
+    """Quantile of the largest absolute t-value of ``count`` healthy trajectories against the other healthy ones."""
+    values, floor = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
+    divisions = _divisions(profile.episodes, min(count, profile.episodes // 2), 0)
+    return float(np.quantile(np.abs(_t_values(values, divisions, floor)[0]).max(1), 1.0 - significance))
+
+
+def _scaled(names: Sequence[str], values: Array) -> tuple[Array, Array]:
+    """Values (N, S) on the scale of their kind, and the smallest standard deviations (S,)."""
+    settings = [KINDS.get(name.split("/")[0], ("", False, 1e-9)) for name in names]
+    logarithmic, floor = np.array([s[1] for s in settings]), np.array([s[2] for s in settings])
+    return np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values), floor
 
 
 @lru_cache(maxsize=16)

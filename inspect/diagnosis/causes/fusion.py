@@ -8,11 +8,13 @@ from beliefscope.inspect.diagnosis.causes.consequences import FILTER, WEIGHTS
 RETRAIN = "Fine-tune them: beliefscope finetune {task} --filter {filter} --train weights-only."
 
 CAUSES = (
-    Cause("weights.constant", "Fusion weights constant", (Symptom("beta spread/*", -1),), WEIGHTS, RETRAIN, "healthy beta"),
+    Cause(
+        "weights.constant", "Fusion weights constant", (Symptom("beta spread/*", -1),), WEIGHTS, RETRAIN, "healthy beta"
+    ),
     Cause(
         "weights.inverted",
         "Fusion weights inverted",
-        (Symptom("beta logit/*", target="mirrored"), Symptom("beta logit/*", 0)),
+        (Symptom("beta logit/*|beta contact/*", target="mirrored"), Symptom("beta logit/*", 0)),
         WEIGHTS,
         RETRAIN,
         "invert beta",
@@ -20,7 +22,7 @@ CAUSES = (
     Cause(
         "weights.ignores_image",
         "Fusion weights ignore the image",
-        (Symptom("beta logit/image*", -1),),
+        (Symptom("beta logit/image*", -1), Symptom("beta logit/*", target="shifted")),
         f"beta spread/*|{FILTER}",
         RETRAIN,
         "healthy beta",
@@ -28,7 +30,7 @@ CAUSES = (
     Cause(
         "weights.ignores_haptics",
         "Fusion weights ignore haptics",
-        (Symptom("beta logit/image*", 1),),
+        (Symptom("beta logit/image*", 1), Symptom("beta logit/*", target="shifted")),
         f"beta spread/*|{FILTER}",
         RETRAIN,
         "healthy beta",

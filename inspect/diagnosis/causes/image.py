@@ -5,6 +5,9 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import IMAGE
 
+HAND = "offset/effector_position*"
+"""Position of the hand in the image against the measured one."""
+
 CHECK = "Check the camera and its driver; until then, run the filter without the image."
 
 CAUSES = (
@@ -16,12 +19,19 @@ CAUSES = (
         CHECK,
         "drop image",
     ),
-    Cause("image.frozen", "Image frozen", (Symptom("frozen/image/*"),), f"lag/image/*|noise/image/*|{IMAGE}", CHECK, "drop image"),
+    Cause(
+        "image.frozen",
+        "Image frozen",
+        (Symptom("frozen/image/*"),),
+        f"lag/image/*|noise/image/*|{IMAGE}",
+        CHECK,
+        "drop image",
+    ),
     Cause(
         "image.delay",
         "Image delayed",
         (Symptom("lag/image/*"),),
-        f"frozen/image/*|offset/effector_position*|{IMAGE}",
+        f"frozen/image/*|{HAND}|{IMAGE}",
         "Synchronise the clocks of camera and robot, or delay the other sensors by the same number of steps.",
         "advance image",
     ),
@@ -29,7 +39,7 @@ CAUSES = (
         "image.shift",
         "Camera moved",
         (Symptom("shift/image*", 0),),
-        f"occlusion/image/*|brightness/image/*|sharpness/image/*|offset/effector_position*|{IMAGE}",
+        f"occlusion/image/*|brightness/image/*|sharpness/image/*|{HAND}|{IMAGE}",
         "Calibrate the camera pose again.",
         "realign image",
     ),
@@ -37,8 +47,9 @@ CAUSES = (
         "image.noise",
         "Image noisy",
         (Symptom("noise/image/*"),),
-        f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|offset/effector_position*|{IMAGE}",
-        "Reduce the camera's gain, or fine-tune with noisy images: beliefscope finetune {task} --filter {filter} --faults image_noise=40.",
+        f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|{HAND}|{IMAGE}",
+        "Reduce the camera's gain, or train with noisy images: beliefscope finetune {task} --filter {filter} "
+        "--faults image_noise=40.",
         "drop image",
     ),
     Cause(
@@ -53,7 +64,7 @@ CAUSES = (
         "image.occlusion",
         "Camera occluded",
         (Symptom("occlusion/image/*"),),
-        f"sharpness/image/*|shift/image*|brightness/image/*|noise/image/*|offset/effector_position*|{IMAGE}",
+        f"sharpness/image/*|shift/image*|brightness/image/*|noise/image/*|{HAND}|{IMAGE}",
         "Clear the camera's view.",
         "drop image",
     ),

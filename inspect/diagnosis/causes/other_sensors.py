@@ -17,7 +17,10 @@ CAUSES = (
     Cause(
         "contact.stuck",
         "Contact flag stuck",
-        (Symptom("agreement/contact/*|unflagged force/contact/*|share/contact/*", 0), Symptom("share/contact/*", 0, 0.5)),
+        (
+            Symptom("agreement/contact/*|unflagged force/contact/*|share/contact/*", 0),
+            Symptom("share/contact/*", 0, 0.5),
+        ),
         f"*/force*|*/torque*|lag/contact/*|{HAPTICS}|{DYNAMICS}",
         "Check the contact sensor or its threshold.",
         "drop haptics",
