@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from beliefscope.app.runs.first_moment import first_moment
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
@@ -113,10 +114,7 @@ class TaskCatalog:
             "map": {"x": x, "y": y, "half_width": task.map_half_width},
             "fault_presets": [{"name": name, "faults": text} for name, text in available_presets(task).items()],
             "filters": [_filter_json(name, checkpoint) for name, checkpoint in self.filters.items()],
-            "data": [
-                {"name": name, "first": data.held_out()[0], "episodes": [asdict(summary) for summary in data.summaries]}
-                for name, data in self.data.items()
-            ],
+            "data": [_data_json(name, data) for name, data in self.data.items()],
         }
 
     def close(self) -> None:
@@ -205,6 +203,12 @@ def _filter_json(name: str, checkpoint: Checkpoint) -> dict[str, Any]:
         "training": record,
         "metrics": metrics,
     }
+
+
+def _data_json(name: str, data: Dataset) -> dict[str, Any]:
+    episode, step = first_moment(data)
+    episodes = [asdict(summary) for summary in data.summaries]
+    return {"name": name, "first": episode, "first_step": step, "episodes": episodes}
 
 
 @contextmanager

@@ -19,8 +19,14 @@ test('an empty link selects the first of everything', () => {
   assert.equal(state.angle, null);
   assert.equal(
     permalink(state),
-    '?task=door&filter=crossmodal-pf&data=door&episode=9&step=0&component=hinge_x&weights=raw&track=error&tab=scene',
+    '?task=door&filter=crossmodal-pf&data=door&episode=9&step=2&component=hinge_x&weights=raw&track=error&tab=scene',
   );
+});
+
+test('an episode opens at its start, unless it is the first of its data set', () => {
+  assert.equal(stateOf('').step, 2);
+  assert.equal(stateOf('?episode=8').step, 0);
+  assert.equal(stateOf('?step=3').step, 3);
 });
 
 test('a permalink restores every key', () => {

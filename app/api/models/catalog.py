@@ -114,10 +114,11 @@ class FaultPreset(Reply):
 
 
 class DataInfo(Reply):
-    """A data set in the catalog. first: the episode to open first."""
+    """A data set in the catalog. first, first_step: the episode and step to open first."""
 
     name: str
     first: int
+    first_step: int
     episodes: list[EpisodeSummary]
 
 

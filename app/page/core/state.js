@@ -245,7 +245,7 @@ export function parsePermalink(search, catalog) {
       data.first,
       data.episodes.map(({ index }) => index),
     ),
-    step: link.integer('step', 0),
+    step: link.integer('step', link.query.has('episode') ? 0 : data.first_step),
     angle: Number.isFinite(angle) ? angle : null,
     component: link.choice(
       'component',

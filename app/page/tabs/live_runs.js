@@ -43,6 +43,7 @@ export function addLiveRuns(catalog, { runs, tasks }) {
     task.data.push({
       name: run.data,
       first: run.episode,
+      first_step: 0,
       live: run,
       episodes: [{ index: run.episode, steps: run.steps, label }],
     });

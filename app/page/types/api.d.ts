@@ -103,13 +103,15 @@ export interface components {
         };
         /**
          * DataInfo
-         * @description A data set in the catalog. first: the episode to open first.
+         * @description A data set in the catalog. first, first_step: the episode and step to open first.
          */
         DataInfo: {
             /** Name */
             name: string;
             /** First */
             first: number;
+            /** First Step */
+            first_step: number;
             /** Episodes */
             episodes: components["schemas"]["EpisodeSummary"][];
         };

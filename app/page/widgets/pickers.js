@@ -64,7 +64,13 @@ export function connectPickers(catalog, store, dialog) {
   const switchData = (set) => {
     const filters = filtersOf(currentTask(), set.name);
     const { name } = byName(filters, filter.value) ?? currentTask().filters[0];
-    return { data: set.name, filter: name, episode: set.first, step: 0, playing: false };
+    return {
+      data: set.name,
+      filter: name,
+      episode: set.first,
+      step: set.first_step,
+      playing: false,
+    };
   };
   filter.addEventListener('change', () =>
     store.set({ filter: filter.value, ...swapped(store.state, 'filter', filter.value) }),
@@ -122,7 +128,7 @@ const swapped = (state, key, value) =>
  * @param {State} state
  */
 function firstRun(task, state) {
-  const [{ name: data, first }] = task.data;
+  const [{ name: data, first, first_step: step }] = task.data;
   const hasFaults = task.fault_presets.some(({ faults }) => faults === state.faults);
   return {
     task: task.name,
@@ -131,7 +137,7 @@ function firstRun(task, state) {
     episode: first,
     faults: hasFaults ? state.faults : '',
     against: '',
-    step: 0,
+    step,
     angle: null,
     component: task.map.x,
     playing: false,
