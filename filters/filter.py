@@ -139,6 +139,10 @@ class Filter(nn.Module, ABC):
         """Observations by modality, standardised, float32."""
         return self.statistics.standardise_observations(batch.observations)
 
+    def process_noise(self, change: Tensor) -> Tensor:
+        """Root of Q's diagonal (n,) or (..., n), which may depend on the predicted change (..., n)."""
+        return self.dynamics.noise
+
     @abstractmethod
     def encode(self, batch: Batch) -> Evidence:
         """Everything that does not depend on the belief, for all T x N at once."""
@@ -158,11 +162,13 @@ class Filter(nn.Module, ABC):
             yield trace
 
 
-def encoders(task: Task, modalities: Iterable[str], architecture: Architecture, steps: int = 1) -> Encoders:
+def encoders(
+    task: Task, modalities: Iterable[str], architecture: Architecture, steps: int = 1, extra: int = 0
+) -> Encoders:
     """New encoders of these modalities. Raises BadInput for one that the task does not have.
 
     Args:
-        steps: number of steps whose vectors are joined.
+        steps: number of steps whose vectors are joined. extra: number of further entries of each vector.
     """
     shapes: dict[str, tuple[int, ...]] = {}
     for modality in modalities:
@@ -171,7 +177,7 @@ def encoders(task: Task, modalities: Iterable[str], architecture: Architecture, 
                 f"Modality {modality!r} is not in task {task.name!r}. Available: {', '.join(task.modalities)}."
             )
         shape = modality_shape(task, modality)
-        shapes[modality] = shape if len(shape) == 2 else (steps * shape[0],)
+        shapes[modality] = shape if len(shape) == 2 else (steps * shape[0] + extra,)
     a = architecture
     vectors = [m for m, shape in shapes.items() if len(shape) == 1 and a.networks == "authors"]
     groups = {modality: vector_groups(task, modality, steps) for modality in vectors}

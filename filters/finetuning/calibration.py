@@ -27,7 +27,7 @@ def noise_parameters(filter_: Filter) -> list[nn.Parameter]:
     if not isinstance(filter_, ExtendedKalmanFilter):
         raise BadInput(f"--calibrate applies to ekf and ukf filters, not to {filter_.architecture.kind}")
     if isinstance(filter_, InformationFilter):
-        return [filter_.dynamics.log_noise, filter_.log_scale, filter_.log_bias]
+        return [filter_.dynamics.log_noise, filter_.log_motion, filter_.log_scale, filter_.log_bias]
     sensors = [module for module in filter_.virtual_sensors.values() if isinstance(module, VirtualSensor)]
     return [filter_.dynamics.log_noise, *(sensor.log_noise[-1].get_parameter("bias") for sensor in sensors)]
 

@@ -50,11 +50,11 @@ class VirtualSensor(nn.Module):
     With ``authors`` networks, each output has its own half of the trunk's features and a first layer of n units.
     """
 
-    def __init__(self, task: Task, model: str, architecture: Architecture, steps: int = 1) -> None:
-        """steps: number of steps whose vectors are joined."""
+    def __init__(self, task: Task, model: str, architecture: Architecture, steps: int = 1, extra: int = 0) -> None:
+        """steps: number of steps whose vectors are joined. extra: number of further inputs."""
         super().__init__()
         n, units = len(task.components), architecture.units
-        self.encoders = encoders(task, model.split("+"), architecture, steps)
+        self.encoders = encoders(task, model.split("+"), architecture, steps, extra)
         self.state: nn.Module
         self.log_noise: nn.Sequential
         self.halves = architecture.networks == "authors"

@@ -12,6 +12,10 @@ from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.filter import Architecture
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter, VirtualSensor
 from beliefscope.filters.models.fusion import powers, symmetric, weighted_product
+from beliefscope.filters.models.path_circle import FEATURES, MEMORY, circle_features
+
+CONTACT = "contact"
+"""Observation that is 1 in contact, else 0."""
 
 LAGS = (1, 2, 3, 4, 5, 8, 16, 32, 64)
 """Past steps that virtual sensors of vectors see besides the current one: a stretch of the hand's path.
@@ -45,26 +49,29 @@ class InformationFilter(ExtendedKalmanFilter):
 
     ``r_k`` is the root of R_k, which the virtual sensor reports. Errors of a camera pose or a puck's radius last for
     many steps. White noise cannot represent them; a bias does: ``b_k' = phi_k b_k + w``, stationary with standard
-    deviation ``bias``. The belief between steps is the joint
-    Gaussian of (x, b_1 ... b_K), n (1 + K) components; traces contain its x. The powers are ``p_k = K beta_k``;
-    equal weights and biases of zero give the Kalman filter with stacked measurements.
+    deviation ``bias``. The belief between steps is the joint Gaussian of (x, b_1 ... b_K), n (1 + K) components; traces
+    contain its x. The powers are ``p_k = K beta_k``; equal weights and biases of zero give the Kalman filter with
+    stacked measurements. Process noise increases with the predicted motion.
 
     Virtual sensors and dynamics are trained by their likelihood and then frozen. A component of z_k whose standard
     deviation exceeds ``MAX_NOISE`` is not used. Sensors of vectors see the steps ``LAGS`` before, and observe the
-    object's position relative to the end effector. Static components do not move.
+    object's position relative to the end effector. Of an object with a static position, they also see the circle on
+    which the hand moved. Static components have identity dynamics.
     """
 
-    history = max(LAGS)
+    history = MEMORY
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__(architecture)
         vectors = [name for name in self.names if len(self.task.observations[self.task.modalities[name][0]]) == 1]
         for name in vectors:
-            self.virtual_sensors[name] = VirtualSensor(self.task, name, architecture, 1 + len(LAGS))
+            extra = FEATURES if self.follows_circle(name) else 0
+            self.virtual_sensors[name] = VirtualSensor(self.task, name, architecture, 1 + len(LAGS), extra)
         shape = (len(self.names), self.n)
         self.log_scale = nn.Parameter(torch.full(shape, -1.0))
         self.log_bias = nn.Parameter(torch.full(shape, -0.3))
         self.memory = nn.Parameter(torch.full(shape, 3.0))
+        self.log_motion = nn.Parameter(torch.zeros(self.n))
         self.dynamics.static = tuple(i for i, component in enumerate(self.task.components) if component.static)
 
     @property
@@ -79,7 +86,7 @@ class InformationFilter(ExtendedKalmanFilter):
 
     def error_parameters(self) -> list[nn.Parameter]:
         """Sizes and correlations of all errors: scales of each R, biases, and process noise."""
-        return [self.log_scale, self.log_bias, self.memory, self.dynamics.log_noise]
+        return [self.log_scale, self.log_bias, self.memory, self.log_motion, self.dynamics.log_noise]
 
     def sense(self, name: str, observations: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """z and the square root of R's diagonal of one virtual sensor, (T, N, n), standardised.
@@ -92,13 +99,30 @@ class InformationFilter(ExtendedKalmanFilter):
             return sensor(observations)
         channels = position_channels(self.task, name)
         flat = [channel for pair in channels for channel in pair]
-        z, noise = sensor({name: recent_steps(values, LAGS, flat)})
+        features = recent_steps(values, LAGS, flat)
         if not channels:
-            return z, noise
+            return sensor({name: features})
         (mean, std), (state_mean, state_std) = (self.statistics.mean_std(key) for key in (name, "state"))
         x_y, on_map = channels[0], list(self.task.map_indices)
-        hand = (values[..., x_y] * std[x_y] + mean[x_y] - state_mean[on_map]) / state_std[on_map]
+        path = values[..., x_y] * std[x_y] + mean[x_y]
+        if self.follows_circle(name):
+            contact = self.channel(name, CONTACT)
+            touched = values[..., contact] * std[contact] + mean[contact] > 0.5
+            circle = circle_features(path, touched, state_mean[on_map])
+            features = torch.cat([features, circle[..., :2] / state_std[on_map], circle[..., 2:]], dim=-1)
+        z, noise = sensor({name: features})
+        hand = (path - state_mean[on_map]) / state_std[on_map]
         return z.index_add(-1, torch.tensor(on_map, device=z.device), hand), noise
+
+    def follows_circle(self, name: str) -> bool:
+        """Whether a hand in contact moves about a static point, the centre of its path."""
+        static = all(self.task.components[i].static for i in self.task.map_indices)
+        return static and CONTACT in self.task.modalities[name] and bool(position_channels(self.task, name))
+
+    def channel(self, name: str, key: str) -> int:
+        """Position of a scalar observation in a modality's vector."""
+        keys = self.task.modalities[name]
+        return sum(self.task.observations[k][0] for k in keys[: keys.index(key)])
 
     def encode(self, batch: Batch) -> Evidence:
         observations = self.observations(batch)
@@ -157,12 +181,19 @@ class InformationFilter(ExtendedKalmanFilter):
 
     def predict_joint(self, belief: Gaussian, control: Tensor) -> Gaussian:
         """Prediction of state and biases. control: (N, u), the controls' part of the dynamics model."""
-        phi = self.phi.flatten()
-        mean, jacobian = self.dynamics.with_jacobian(belief.mean[:, : self.n], control)
+        phi, state = self.phi.flatten(), belief.mean[:, : self.n]
+        mean, jacobian = self.dynamics.with_jacobian(state, control)
         transition = block_diagonal(jacobian, torch.diag(phi).expand(len(mean), -1, -1))
-        noise = torch.cat([self.dynamics.noise.square(), self.bias.flatten().square() * (1.0 - phi.square())])
-        covariance = transition @ belief.covariance @ transition.mT + torch.diag(noise)
+        bias = self.bias.flatten().square() * (1.0 - phi.square())
+        noise = torch.cat([self.process_noise(mean - state).square(), bias.expand(len(mean), -1)], dim=-1)
+        covariance = transition @ belief.covariance @ transition.mT + torch.diag_embed(noise)
         return Gaussian(torch.cat([mean, phi * belief.mean[:, self.n :]], dim=-1), symmetric(covariance))
+
+    def process_noise(self, change: Tensor) -> Tensor:
+        """Root of Q's diagonal (..., n) for a predicted change (..., n): ``q^2 + m^2 |change|^2``; m = 0 if static."""
+        moving = torch.tensor([not component.static for component in self.task.components], device=change.device)
+        motion = moving * self.log_motion.exp().square() * change.square().sum(-1, keepdim=True)
+        return (self.dynamics.noise.square() + motion).sqrt()
 
     def virtual_observations(self, evidence: Evidence) -> Gaussian:
         """z and the covariance of its whole error, bias and noise, (T, N, K, n)."""

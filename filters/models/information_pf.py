@@ -23,8 +23,8 @@ class InformationParticleFilter(ParticleFilter, InformationFilter):
     It has the same modules, so it runs with the weights of a trained ``InformationFilter``. Given the path of a
     particle, the biases of the sensors are linear and Gaussian: each particle has their means mu and variances s
     (Rao-Blackwellised), and ``V_k = r_k^2 s_k + R_k / p_k``, r_k the noise that a sensor reports. A belief has states
-    (N, M, n (1 + 2 K)): x, mu, s; traces contain x. With linear dynamics and many particles, the posterior is that of
-    the Kalman filter.
+    (N, M, n (1 + 2 K)): x, mu, s; traces contain x. With linear dynamics, process noise that does not depend on the
+    motion, and many particles, the posterior is that of the Kalman filter.
     """
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Particles:

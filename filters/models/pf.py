@@ -72,7 +72,7 @@ class ParticleFilter(Filter):
         """States (N, M, n) of the next step, with process noise."""
         control = evidence.control.unsqueeze(1)
         moved = in_chunks(lambda states: self.dynamics(states, control), states)
-        return moved + common_random_numbers.normal(moved.shape, generator) * self.dynamics.noise
+        return moved + common_random_numbers.normal(moved.shape, generator) * self.process_noise(moved - states)
 
     def resample(self, particles: Particles, generator: torch.Generator) -> tuple[Particles, Tensor]:
         """Resampled particles and their ancestors (N, M)."""

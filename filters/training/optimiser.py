@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from beliefscope.filters.filter import Filter
 
-NOISE_SCALES = ("dynamics.log_noise", "log_scale", "log_bias", "memory")
+NOISE_SCALES = ("dynamics.log_noise", "log_scale", "log_bias", "memory", "log_motion")
 """Parameters that are logarithms of noise, or of its correlation."""
 
 

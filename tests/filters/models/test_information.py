@@ -17,6 +17,7 @@ from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.models.fusion import powers, product_of_experts, weighted_product
 from beliefscope.filters.models.information import MAX_NOISE, InformationFilter, recent_steps
+from beliefscope.filters.models.path_circle import circle_features
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.subsets import standalone_evidence
 from beliefscope.filters.training.losses import sensor_likelihood
@@ -73,6 +74,8 @@ def double_filter(bias: float) -> InformationFilter:
     assert isinstance(filter_, InformationFilter)
     filter_.log_bias.copy_(torch.tensor(bias).log() + 0.1 * torch.arange(6.0).reshape(2, 3))
     filter_.memory.copy_(torch.arange(6.0).reshape(2, 3))
+    nn.init.normal_(filter_.dynamics.output.weight, std=0.5, generator=torch.Generator().manual_seed(4))
+    filter_.log_motion.copy_(torch.arange(3.0))
     filter_.log_scale.copy_(-0.1 * torch.arange(6.0).reshape(2, 3))
     return filter_
 
@@ -91,7 +94,9 @@ def test_equal_weights_give_the_kalman_filter_of_state_and_biases(batch: Batch) 
         for t in range(STEPS):
             mean, jacobian = filter_.dynamics.with_jacobian(belief.mean[:3], evidence.control[t, i])
             transition = torch.block_diag(jacobian, torch.diag(phi))
-            noise = torch.cat([filter_.dynamics.noise**2, variance * (1 - phi**2)])
+            motion = filter_.log_motion.exp() ** 2 * (mean - belief.mean[:3]).square().sum()
+            moved = filter_.dynamics.noise**2 + motion * torch.tensor([0.0, 0.0, 1.0])
+            noise = torch.cat([moved, variance * (1 - phi**2)])
             covariance = transition @ belief.covariance @ transition.T + torch.diag(noise)
             belief = Gaussian(torch.cat([mean, phi * belief.mean[3:]]), covariance)
             assert evidence.noise is not None
@@ -206,9 +211,15 @@ def test_information_adds(filter_: InformationFilter, batch: Batch) -> None:
     torch.testing.assert_close(filter_.shares(evidence).sum(2), torch.ones(STEPS, N, 3))
 
 
-def test_haptics_are_relative_to_the_hand(filter_: InformationFilter, batch: Batch) -> None:
+def test_haptics_are_relative_to_the_hand() -> None:
     """A common shift of hand and object shifts the virtual observation, and leaves its noise unchanged."""
-    moved = shift_positions(batch, filter_.task, torch.tensor([0.1, 0.1, 0.0]), torch.Generator().manual_seed(0))
+    task = find_task("push-field")
+    assert task.simulate is not None
+    filter_ = build(architecture("push-field", "information-ekf"), seed=0).eval().requires_grad_(False)
+    steps = Steps.from_episodes(task, [task.simulate(2, index, STEPS) for index in range(N)])
+    filter_.statistics.fit(steps)
+    batch = steps.windows(steps.first, STEPS)
+    moved = shift_positions(batch, filter_.task, torch.tensor([0.1, 0.1]), torch.Generator().manual_seed(0))
     shift = (moved.states - batch.states) / filter_.statistics.mean_std("state")[1]
     assert shift.abs().max() > 0.5
     before, after = filter_.encode(batch), filter_.encode(moved)
@@ -233,6 +244,23 @@ def test_history_has_the_past_steps_and_nothing_else(filter_: InformationFilter)
     changed = {**later.observations, "haptics": later.observations["haptics"].clone()}
     changed["haptics"][0] += 1.0
     assert (filter_.encode(replace(later, observations=changed)).observation[-1] != whole[-1]).any()
+
+
+def test_circle_through_a_path() -> None:
+    """The fit finds the centre of an arc, starts from the prior, and ignores steps without contact."""
+    angle = torch.linspace(0.0, 1.5, 60)
+    centre, prior = torch.tensor([0.5, -0.2]), torch.tensor([0.4, -0.1])
+    arc = (centre + 0.45 * torch.stack([angle.cos(), angle.sin()], dim=-1)).unsqueeze(1)
+    contact = torch.ones(60, 1, dtype=torch.bool)
+    features = circle_features(arc, contact, prior)
+    assert (features[-1, 0, :2] + arc[-1, 0] - centre).norm() < 0.01
+    assert (features[0, 0, :2] + arc[0, 0] - prior).norm() < 1e-6
+    outlier, free = arc.clone(), contact.clone()
+    outlier[20] += 1.0
+    free[20] = False
+    away = circle_features(outlier, free, prior)
+    assert (away[-1, 0, :2] + arc[-1, 0] - centre).norm() < 0.01
+    assert torch.equal(away[:20], features[:20])
 
 
 def test_static_components_do_not_move(filter_: InformationFilter, batch: Batch) -> None:
@@ -283,7 +311,7 @@ def test_sensors_are_trained_by_their_likelihood_and_then_frozen(episodes: list[
             name = stage.name.removesuffix(" model")
             assert float(sensor_likelihood(filter_, name, every).detach()) < loss[name]
         elif names.index(stage.name) > names.index(models[-1]):
-            errors = {"dynamics", "log_scale", "log_bias", "memory"}
+            errors = {"dynamics", "log_scale", "log_bias", "memory", "log_motion"}
             assert changed == errors | ({"weight_model"} if stage.name == names[-2] else set())
             trained = [n for n, p in filter_.dynamics.named_parameters() if not torch.equal(p, before[f"dynamics.{n}"])]
             assert trained == ["log_noise"]

@@ -39,6 +39,7 @@ def pair(bias: float) -> tuple[InformationFilter, InformationParticleFilter]:
     for filter_ in (kalman, particles):
         filter_.double().eval().requires_grad_(False)
         filter_.dynamics = linear.LinearDynamics()  # type: ignore[assignment]
+        filter_.log_motion.fill_(-20.0)
         filter_.log_bias.fill_(float(torch.tensor(bias).log()))
         filter_.log_scale.zero_()
     return kalman, particles
