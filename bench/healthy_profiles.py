@@ -2,8 +2,9 @@
 
 python bench/healthy_profiles.py DIR [TASK-FILTER ...]
 
-DIR: has the data of filters/pretrained/README.md, ``door.h5``, ``push.h5`` and ``push-real.h5``; of missing simulated
-data the test episodes are simulated. Real pushes have none, so their validation episodes are used.
+DIR: has the data of filters/pretrained/README.md, ``door.h5``, ``push.h5`` and ``push-real.h5``, and the test sets of
+docs/field_tasks.md with outages, ``door-field.h5`` and ``push-field.h5``; of missing data of door and push the test
+episodes are simulated. Real pushes have none, so their validation episodes are used.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfi
 from beliefscope.inspect.healthy import profile_of
 from beliefscope.inspect.traces.batch import trace_all
 
+FIELD = "beliefscope collect {0} --episodes 60 --steps 200 --seed 1 --split test -o {0}.h5"
 COUNTS = {"door": 600, "push": 500}
 STEPS, SEED = 100, 1
 
@@ -57,7 +59,8 @@ def main() -> None:
         if task not in episodes:
             episodes[task] = held_out(task, folder)
         traces = trace_all(checkpoint, episodes[task], range(len(episodes[task])))
-        profile = profile_of(checkpoint, traces, COLLECTED[task])
+        collected = FIELD.format(task) if checkpoint.task.start_distance else COLLECTED[task]
+        profile = profile_of(checkpoint, traces, collected)
         write(path.with_name(path.stem + SUFFIX), checkpoint.hash, profile)
         print(f"{path.stem}: {profile.episodes} episodes, {len(profile.statistics)} statistics", flush=True)
 

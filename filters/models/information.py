@@ -12,7 +12,7 @@ from beliefscope.filters.belief import Belief, Evidence, Gaussian, StepTrace
 from beliefscope.filters.filter import Architecture
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter, VirtualSensor
 from beliefscope.filters.models.fusion import powers, symmetric, weighted_product
-from beliefscope.filters.models.path_circle import FEATURES, MEMORY, circle_features
+from beliefscope.filters.models.path_circle import FEATURES, MEMORY, circle
 
 CONTACT = "contact"
 """Observation that is 1 in contact, else 0."""
@@ -55,8 +55,8 @@ class InformationFilter(ExtendedKalmanFilter):
 
     Virtual sensors and dynamics are trained by their likelihood and then frozen. A component of z_k whose standard
     deviation exceeds ``MAX_NOISE`` is not used. Sensors of vectors see the steps ``LAGS`` before, and observe the
-    object's position relative to the end effector. Of an object with a static position, they also see the circle on
-    which the hand moved. Static components have identity dynamics.
+    object's position relative to the end effector. Of an object with a static position, they observe the offset
+    from the centre of the circle on which the hand moved. Static components have identity dynamics.
     """
 
     history = MEMORY
@@ -105,14 +105,16 @@ class InformationFilter(ExtendedKalmanFilter):
         (mean, std), (state_mean, state_std) = (self.statistics.mean_std(key) for key in (name, "state"))
         x_y, on_map = channels[0], list(self.task.map_indices)
         path = values[..., x_y] * std[x_y] + mean[x_y]
+        origin = path
         if self.follows_circle(name):
             contact = self.channel(name, CONTACT)
             touched = values[..., contact] * std[contact] + mean[contact] > 0.5
-            circle = circle_features(path, touched, state_mean[on_map])
-            features = torch.cat([features, circle[..., :2] / state_std[on_map], circle[..., 2:]], dim=-1)
+            centre, shape = circle(path, touched, state_mean[on_map])
+            features = torch.cat([features, (centre - path) / state_std[on_map], shape], dim=-1)
+            origin = torch.clamp(centre, *(state_mean[on_map] + side * state_std[on_map] for side in (-3.0, 3.0)))
         z, noise = sensor({name: features})
-        hand = (path - state_mean[on_map]) / state_std[on_map]
-        return z.index_add(-1, torch.tensor(on_map, device=z.device), hand), noise
+        origin = (origin - state_mean[on_map]) / state_std[on_map]
+        return z.index_add(-1, torch.tensor(on_map, device=z.device), origin), noise
 
     def follows_circle(self, name: str) -> bool:
         """Whether a hand in contact moves about a static point, the centre of its path."""

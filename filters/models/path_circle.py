@@ -9,19 +9,19 @@ MEMORY = 199
 """Past steps whose positions are used."""
 
 FEATURES = 6
-"""Number of features per step."""
+"""Number of features per step: centre and shape."""
 
 PRIOR = 1e-3
 """Weight of the prior centre in the fit, m^2: that of a path with this sum of squared deviations."""
 
 
-def circle_features(path: Tensor, contact: Tensor, prior: Tensor) -> Tensor:
-    """Features (T, N, 6) of the circle through each step's path so far.
+def circle(path: Tensor, contact: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre (T, N, 2) of the circle through each step's path so far, m, and shape (T, N, 4) of that path.
 
     The algebraic fit (Kasa, 1976) of ``|q|^2 = 2 c q + k`` minimises its squared residuals over positions q in contact
-    and ``PRIOR |c - prior|^2``. Features: centre c minus the current position (m); sums of squares and products of
-    the path's deviations from its mean, relative to their trace plus ``PRIOR``, and the logarithm of the latter over
-    ``PRIOR``; together they show along which direction c is known.
+    and ``PRIOR |c - prior|^2``. The shape shows along which direction the centre is known: sums of squares and products
+    of the path's deviations from its mean, relative to their trace plus ``PRIOR``, and the logarithm of the latter over
+    ``PRIOR``.
 
     Args:
         path: (T, N, 2) positions, m. contact: (T, N) bool. prior: (2,) centre for a path without curvature, m.
@@ -38,7 +38,8 @@ def circle_features(path: Tensor, contact: Tensor, prior: Tensor) -> Tensor:
     centre = torch.linalg.solve(2.0 * spread + PRIOR * identity, moment)
     size = spread.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).clamp_min(0.0) + PRIOR
     direction = torch.stack([spread[..., 0, 0], spread[..., 1, 1], spread[..., 0, 1]], dim=-1) / size
-    return torch.cat([centre - q, direction, (size / PRIOR).log()], dim=-1).to(path.dtype)
+    shape = torch.cat([direction, (size / PRIOR).log()], dim=-1)
+    return (centre + prior).to(path.dtype), shape.to(path.dtype)
 
 
 def recent_sums(values: Tensor) -> Tensor:

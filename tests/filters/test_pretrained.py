@@ -51,6 +51,9 @@ def test_record_has_the_training_command(name: str) -> None:
         assert record["command"].startswith(f"beliefscope finetune {checkpoint.task.name}-base.safetensors")
         assert record["base"]["hash"] in readme
         assert {"best_step", "frozen", "noise_factor"} <= record.keys()
+    elif checkpoint.task.start_distance:
+        assert record["command"] == f"python bench/field_tasks.py DIR {checkpoint.name}"
+        assert "plan" in record
     else:
         assert record["command"].startswith(f"beliefscope train {checkpoint.task.name} --filter {checkpoint.name}")
         assert "plan" in record

@@ -17,7 +17,7 @@ from beliefscope.filters.belief import Evidence, Gaussian
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.models.fusion import powers, product_of_experts, weighted_product
 from beliefscope.filters.models.information import MAX_NOISE, InformationFilter, recent_steps
-from beliefscope.filters.models.path_circle import circle_features
+from beliefscope.filters.models.path_circle import circle
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.subsets import standalone_evidence
 from beliefscope.filters.training.losses import sensor_likelihood
@@ -252,15 +252,16 @@ def test_circle_through_a_path() -> None:
     centre, prior = torch.tensor([0.5, -0.2]), torch.tensor([0.4, -0.1])
     arc = (centre + 0.45 * torch.stack([angle.cos(), angle.sin()], dim=-1)).unsqueeze(1)
     contact = torch.ones(60, 1, dtype=torch.bool)
-    features = circle_features(arc, contact, prior)
-    assert (features[-1, 0, :2] + arc[-1, 0] - centre).norm() < 0.01
-    assert (features[0, 0, :2] + arc[0, 0] - prior).norm() < 1e-6
+    fitted, shape = circle(arc, contact, prior)
+    assert (fitted[-1, 0] - centre).norm() < 0.01
+    assert (fitted[0, 0] - prior).norm() < 1e-6
+    assert (shape[1:, 0, 3] > shape[:-1, 0, 3]).all()  # a longer path is more informative
     outlier, free = arc.clone(), contact.clone()
     outlier[20] += 1.0
     free[20] = False
-    away = circle_features(outlier, free, prior)
-    assert (away[-1, 0, :2] + arc[-1, 0] - centre).norm() < 0.01
-    assert torch.equal(away[:20], features[:20])
+    away, _ = circle(outlier, free, prior)
+    assert (away[-1, 0] - centre).norm() < 0.01
+    assert torch.equal(away[:20], fitted[:20])
 
 
 def test_static_components_do_not_move(filter_: InformationFilter, batch: Batch) -> None:
