@@ -1,13 +1,15 @@
 """Diagnosis of a filter over episodes: the probable cause of a fault, its evidence, and the next action.
 
 Every statistic of the episodes is compared with the filter's own healthy profile. If any deviates, each cause of the
-catalog is scored by how well its signature explains all deviations.
+catalog is scored by how well its signature explains all deviations; the best ones are undone and the episodes replayed
+with the same random numbers. The right undo restores the healthy statistics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,9 +17,11 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.catalog import CAUSES
-from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence
-from beliefscope.inspect.diagnosis.scoring import applicable, probabilities, score
+from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence, Recovery, matches
+from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
+from beliefscope.inspect.diagnosis.scoring import applicable, burden, probabilities, score
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
+from beliefscope.inspect.diagnosis.undo import Setting
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, Deviation, compare, critical_value
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace
@@ -31,6 +35,45 @@ LISTED = 5
 
 EVIDENCE = 5
 """Maximum number of listed deviations by cause."""
+
+UNDONE = 3
+"""Maximum number of causes that are undone."""
+
+WORTH_UNDOING = 0.02
+"""Smallest probability of a cause that is undone."""
+
+RESTORED = 0.3
+"""Weight of the restored share of all deviations in the score of a cause that was undone."""
+
+VISIBLE = "error/*|nees/fused/*"
+"""Statistics of a fault that affects the filter."""
+
+VISIBLE_SHARE = 0.17
+"""Share of the position error from which a fault affects the filter if undoing it removes more: 1 - 1 / 1.2."""
+
+Rows = Sequence[Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Episodes of a filter and their deviations from the healthy profile.
+
+    Attributes:
+        rows: statistics by episode. critical: t-value of a significant deviation.
+    """
+
+    setting: Setting
+    traces: Sequence[Trace]
+    rows: Rows
+    profile: HealthyProfile
+    comparison: Comparison
+    critical: float
+    alarm_rate: float
+
+    @property
+    def deviations(self) -> dict[str, Deviation]:
+        """By statistic."""
+        return {deviation.statistic: deviation for deviation in self.comparison.deviations}
 
 
 def diagnose(
@@ -49,94 +92,146 @@ def diagnose(
     Args:
         episodes: by index in their data set.
         alarm_rate: probability that a healthy filter is not called healthy.
-        base: checkpoint whose modules replace the filter's, one at a time; it must have the same architecture.
+        base: checkpoint of the same architecture whose modules replace suspected ones.
         profile: healthy profile; default: that of the checkpoint.
         progress: called with the completed fraction.
 
     Raises BadInput without episodes, without a healthy profile, and for episodes of another task.
     """
+    report = progress or (lambda fraction: None)
     if not episodes:
         raise BadInput("no episodes to diagnose")
     profile = profile or find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
     if profile is None:
         raise BadInput(
-            f"filter {checkpoint.name!r} has no healthy profile; give clean episodes with --profile-from DATA"
+            f"filter {checkpoint.name!r} has no healthy profile, which new checkpoints and shipped ones have"
         )
     traces = []
     for trace in trace_all(checkpoint, episodes, episodes, seed, particles):
         traces.append(trace)
-        if progress is not None:
-            progress(0.5 * len(traces) / len(episodes))
-    rows = [episode_statistics(trace, checkpoint) for trace in traces]
-    extended, extended_rows = with_scatter(profile, rows)
-    comparison = compare(extended, extended_rows, significance=alarm_rate)
-    provenance = {
-        "task": checkpoint.task.name,
-        "filter": checkpoint.name,
-        "checkpoint_hash": checkpoint.hash,
-        "episodes": len(episodes),
-        "healthy_episodes": profile.episodes,
-        "alarm_rate": alarm_rate,
-    }
-    if not comparison.alarms:
-        text = f"Healthy: all statistics are within the record of {profile.episodes} healthy episodes"
-        return Diagnosis("healthy", False, f"{text}.", (), provenance)
+        report(0.4 * len(traces) / len(episodes))
+    setting = Setting(checkpoint, episodes, particles, frozenset(episodes))
+    case = examine(setting, traces, profile, alarm_rate)
+    report(0.5)
+    provenance = _provenance(case)
+    if not case.comparison.alarms:
+        text = f"Healthy: all statistics are within the record of {profile.episodes} healthy episodes."
+        report(1.0)
+        return Diagnosis("healthy", False, text, (), provenance)
+    scores = signature_scores(case)
+    recovered = confirm(case, scores, seed, base, lambda share: report(0.5 + 0.5 * share))
+    report(1.0)
+    return _conclude(case, scores, recovered, provenance)
+
+
+def examine(setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, alarm_rate: float) -> Case:
+    """Compare all statistics of traces with the healthy profile."""
+    rows = [episode_statistics(trace, setting.checkpoint) for trace in traces]
+    profile, rows = with_scatter(profile, rows)
+    comparison = compare(profile, rows, significance=alarm_rate)
     names = [deviation.statistic for deviation in comparison.deviations]
-    critical = critical_value(extended, names, len(rows), alarm_rate)
-    causes = applicable(CAUSES, names)
-    scores = {cause.name: score(cause, comparison.deviations, critical) for cause in causes}
+    critical = critical_value(profile, names, len(rows), alarm_rate)
+    return Case(setting, traces, rows, profile, comparison, critical, alarm_rate)
+
+
+def signature_scores(case: Case) -> dict[str, float]:
+    """Score by name of the causes that can be observed."""
+    causes = applicable(CAUSES, case.deviations)
+    return {cause.name: score(cause, case.comparison.deviations, case.critical) for cause in causes}
+
+
+def confirm(
+    case: Case, scores: dict[str, float], seed: int, base: Checkpoint | None, progress: Callable[[float], None]
+) -> dict[str, Recovery]:
+    """Undo the most probable causes; updates their scores by the share of all deviations that disappears."""
+    by_name = {cause.name: cause for cause in CAUSES}
+    likely = sorted(((p, name) for name, p in probabilities(scores).items() if p >= WORTH_UNDOING), reverse=True)
+    before = burden(case.comparison.deviations, case.critical)
+    recovered: dict[str, Recovery] = {}
+    for number, (_, name) in enumerate(likely[:UNDONE], 1):
+        affected = _affected(case, _evidence_alarms(case, by_name[name]))
+        indices = [trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit]
+        setting = Setting(case.setting.checkpoint, case.setting.episodes, case.setting.particles, frozenset(indices))
+        if (replay := replay_without(by_name[name], setting, case.deviations, seed, base)) is not None:
+            recovered[name] = recovery(case.traces, replay)
+            after = examine(setting, replay, case.profile, case.alarm_rate)
+            left = burden(after.comparison.deviations, case.critical)
+            scores[name] += RESTORED * max(-1.0, 1.0 - left / before)
+        progress(number / min(UNDONE, len(likely)))
+    return recovered
+
+
+def _conclude(
+    case: Case, scores: Mapping[str, float], recovered: Mapping[str, Recovery], provenance: Mapping[str, Any]
+) -> Diagnosis:
+    by_name = {cause.name: cause for cause in CAUSES}
     ranked = sorted(probabilities(scores).items(), key=lambda item: -item[1])[:LISTED]
-    by_name = {cause.name: cause for cause in causes}
-    candidates = tuple(
-        _candidate(by_name[name], probability, comparison, traces, rows, checkpoint) for name, probability in ranked
-    )
-    state: Literal["fault", "unsure"] = "fault" if candidates and candidates[0].probability >= SURE else "unsure"
-    return Diagnosis(state, False, _headline(candidates, comparison), candidates, provenance)
+    candidates = tuple(_candidate(case, by_name[name], p, recovered.get(name)) for name, p in ranked)
+    sure = bool(candidates) and candidates[0].probability >= SURE
+    state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
+    masked = not any(matches(VISIBLE, alarm.statistic) for alarm in case.comparison.alarms)
+    if candidates and (first := candidates[0].recovered) is not None and first.error > VISIBLE_SHARE:
+        masked = False
+    return Diagnosis(state, masked, _headline(case, candidates, masked), candidates, provenance)
 
 
-def _candidate(
-    cause: Cause,
-    probability: float,
-    comparison: Comparison,
-    traces: Sequence[Trace],
-    rows: Sequence[Mapping[str, float]],
-    checkpoint: Checkpoint,
-) -> Candidate:
-    """A cause with its evidence: the alarms among its symptoms, largest first."""
-    alarms = [d for d in comparison.alarms if any(s.matches(d.statistic) for s in cause.symptoms)]
-    evidence = tuple(_evidence(deviation, traces, rows) for deviation in alarms[:EVIDENCE])
-    affected = _affected(alarms[0], rows) if alarms else np.ones(len(rows), dtype=bool)
+def _candidate(case: Case, cause: Cause, probability: float, recovered: Recovery | None) -> Candidate:
+    alarms = _evidence_alarms(case, cause)
+    affected = _affected(case, alarms)
+    task, name = case.setting.checkpoint.task.name, case.setting.checkpoint.name
     return Candidate(
         cause=cause,
         probability=probability,
-        episodes=tuple(trace.episode_index for trace, hit in zip(traces, affected, strict=True) if hit),
+        episodes=tuple(trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit),
         steps=None,
-        evidence=evidence,
-        recovered=None,
-        next=cause.next.format(task=checkpoint.task.name, filter=checkpoint.name),
+        evidence=tuple(_evidence(case, alarm) for alarm in alarms[:EVIDENCE]),
+        recovered=recovered,
+        next=cause.next.format(task=task, filter=name),
     )
 
 
-def _evidence(deviation: Deviation, traces: Sequence[Trace], rows: Sequence[Mapping[str, float]]) -> Evidence:
+def _evidence_alarms(case: Case, cause: Cause) -> list[Deviation]:
+    """The alarms among the symptoms of a cause, largest first."""
+    return [d for d in case.comparison.alarms if any(s.matches(d.statistic) for s in cause.symptoms)]
+
+
+def _evidence(case: Case, deviation: Deviation) -> Evidence:
     """A deviation and the episode that shows it most."""
-    distance = [abs(row.get(deviation.statistic, np.nan) - deviation.healthy) for row in rows]
-    episode = traces[int(np.nanargmax(distance))].episode_index
+    distance = [abs(row.get(deviation.statistic, np.nan) - deviation.healthy) for row in case.rows]
+    episode = case.traces[int(np.nanargmax(distance))].episode_index
     return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, episode)
 
 
-def _affected(deviation: Deviation, rows: Sequence[Mapping[str, float]]) -> np.ndarray:
-    """(E,) mask of episodes whose value deviates by at least half of the largest deviation."""
-    distance = np.array([row.get(deviation.statistic, np.nan) - deviation.healthy for row in rows])
-    distance *= np.sign(deviation.value - deviation.healthy)
-    return distance >= 0.5 * np.nanmax(distance)
+def _affected(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
+    """(E,) mask of episodes whose value of the first alarm deviates by at least half as much as the most deviating."""
+    if not alarms:
+        return np.ones(len(case.rows), dtype=bool)
+    name, healthy = alarms[0].statistic, alarms[0].healthy
+    distance = np.array([row.get(name, np.nan) - healthy for row in case.rows])
+    distance *= np.sign(alarms[0].value - healthy)
+    return np.asarray(distance >= 0.5 * np.nanmax(distance))
 
 
-def _headline(candidates: Sequence[Candidate], comparison: Comparison) -> str:
+def _headline(case: Case, candidates: Sequence[Candidate], masked: bool) -> str:
     """The first cause with its probability; two causes that cannot be separated; or the largest deviation."""
-    if not candidates or candidates[0].probability < 0.1:
-        return f"Fault of unknown cause: {comparison.alarms[0].text}."
-    first = candidates[0]
+    if not candidates or not candidates[0].evidence:
+        return f"Fault of unknown cause: {case.comparison.alarms[0].text}."
+    first, count = candidates[0], len(case.rows)
     if first.probability < SURE and len(candidates) > 1:
         return f"Cannot separate {first.cause.name} from {candidates[1].cause.name}; try: {first.next}"
-    place = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 else ""
-    return f"{first.cause.title}{place}, probability {first.probability:.2f}"
+    where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
+    where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
+    text = f"{first.cause.title}{where}, probability {first.probability:.2f}"
+    return f"{text}; the filter is unaffected" if masked else text
+
+
+def _provenance(case: Case) -> dict[str, Any]:
+    checkpoint = case.setting.checkpoint
+    return {
+        "task": checkpoint.task.name,
+        "filter": checkpoint.name,
+        "checkpoint_hash": checkpoint.hash,
+        "episodes": len(case.rows),
+        "healthy_episodes": case.profile.episodes,
+        "alarm_rate": case.alarm_rate,
+    }

@@ -33,6 +33,12 @@ SCALES = (0.03, 0.1, 0.3, 1.0)
 PER_SCALE = 64
 """Number of such states by scale."""
 
+REFERENCE = slice(2 * PER_SCALE, 3 * PER_SCALE)
+"""The states whose log-likelihoods measure the power of a likelihood: those of the third scale."""
+
+POWER = 10.0
+"""Standard deviation of log-likelihoods over these states to which they are scaled before their mean is computed."""
+
 LARGEST = 0.9999
 """Largest absolute log-odds of fusion weights, as a share of the network's bound."""
 
@@ -64,16 +70,18 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
     """Of each measurement model and component, from its residuals r with standard deviation s.
 
     ``module bias``: mean of r. ``module spread``: standard deviation of r. ``module error``: root mean square of r.
-    ``module std``: root mean square of s. ``module nis``: mean of (r / s)^2. Steps with image blackout do not count for
-    images.
+    ``module std``: root mean square of s. ``module nis``: mean of (r / s)^2. ``module power``: in a Kalman filter the
+    geometric mean of 1 / s^2, in a particle filter the variance of the log-likelihood over fixed states, of which r is
+    independent. Steps with image blackout do not count for images.
     """
     if trace.observation_mean is not None and trace.observation_covariance is not None:
         steps = np.arange(len(trace))
         observed = trace.observation_mean.astype(np.float64)
         variance = np.diagonal(trace.observation_covariance, axis1=-2, axis2=-1).astype(np.float64)
+        power = 1.0 / variance
     elif trace.log_likelihood is not None and isinstance(checkpoint.filter, ParticleFilter):
         steps = np.arange(0, len(trace), EVERY)
-        observed, variance = likelihood_moments(checkpoint.filter, trace.episode, steps)
+        observed, variance, power = likelihood_moments(checkpoint.filter, trace.episode, steps)
     else:
         return {}
     task = measures.task_of(trace)
@@ -86,6 +94,7 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
         if keep.sum() < min(MIN_STEPS, len(steps)):
             continue
         r, v = residual[keep, k], variance[keep, k]
+        values[f"module power/{model}/all"] = float(np.exp(np.log(power[keep, k]).mean()))
         columns = {
             "module bias": r.mean(0),
             "module spread": r.std(0),
@@ -100,8 +109,11 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
 
 
 @torch.no_grad()
-def likelihood_moments(filter_: ParticleFilter, episode: Episode, steps: np.ndarray) -> tuple[Array, Array]:
+def likelihood_moments(filter_: ParticleFilter, episode: Episode, steps: np.ndarray) -> tuple[Array, Array, Array]:
     """Means (S, K, n) and variances (S, K, n) of the likelihoods at some steps, as densities of the state; SI units.
+
+    The means are those of likelihoods raised to a power, so that they have the same variance ``POWER^2`` of their
+    logarithm over fixed states; also returns this variance (S, K, 1) of the likelihoods themselves.
 
     Self-normalised importance sampling from a mixture of Gaussians around the true state with the standard deviations
     ``SCALES``: wide enough for a biased likelihood and dense enough for a narrow one. All steps share the offsets.
@@ -119,14 +131,22 @@ def likelihood_moments(filter_: ParticleFilter, episode: Episode, steps: np.ndar
     offsets, log_density = proposal(filter_.n)
     truth = filter_.statistics.standardise("state", batch.states[:, 0])
     states = truth.unsqueeze(1) + offsets
-    log_weights = filter_.log_likelihood(by_step, states) - log_density
-    weights = torch.softmax(log_weights, dim=-1)  # (S, K, G)
-    mean = torch.einsum("skg,gn->skn", weights, offsets)
-    variance = torch.einsum("skg,skgn->skn", weights, (offsets - mean.unsqueeze(2)).square())
+    log_likelihood = filter_.log_likelihood(by_step, states)  # (S, K, G)
+    spread = log_likelihood[..., REFERENCE].std(-1, keepdim=True).clamp_min(1e-6)
+    mean, _ = _moments(POWER / spread * log_likelihood - log_density, offsets)
+    _, variance = _moments(log_likelihood - log_density, offsets)
     si, std = filter_.statistics, filter_.statistics.mean_std("state")[1]
     # One sample may have all the weight: the likelihood is then narrower than the spacing of the samples.
     variance = variance.clamp_min((0.1 * SCALES[0]) ** 2) * std.square()
-    return si.state_to_si(truth.unsqueeze(1) + mean).double().numpy(), variance.double().numpy()
+    mean = si.state_to_si(truth.unsqueeze(1) + mean)
+    return mean.double().numpy(), variance.double().numpy(), spread.square().double().numpy()
+
+
+def _moments(log_weights: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """Means and variances (S, K, n) of offsets (G, n) with unnormalised log-weights (S, K, G)."""
+    weights = torch.softmax(log_weights, dim=-1)
+    mean = torch.einsum("skg,gn->skn", weights, offsets)
+    return mean, torch.einsum("skg,skgn->skn", weights, (offsets - mean.unsqueeze(2)).square())
 
 
 def proposal(n: int) -> tuple[Tensor, Tensor]:

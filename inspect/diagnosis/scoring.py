@@ -80,6 +80,16 @@ def score(cause: Cause, deviations: Iterable[Deviation], critical: float) -> flo
     return total - (1.0 - math.prod(1.0 - size for size in unexplained.values()))
 
 
+def burden(deviations: Iterable[Deviation], critical: float) -> float:
+    """Sum of the strengths of all deviations, one by kind and subject; those of the filter count less."""
+    largest: dict[str, float] = {}
+    for deviation in deviations:
+        group = deviation.statistic.rpartition("/")[0]
+        weight = OF_FILTER if matches(FILTER, deviation.statistic) else 1.0
+        largest[group] = max(largest.get(group, 0.0), weight * strength(abs(deviation.t) / critical))
+    return sum(largest.values())
+
+
 def probabilities(scores: Mapping[str, float], temperature: float = TEMPERATURE) -> dict[str, float]:
     """Softmax of scores, with an unknown cause in the denominator."""
     values = np.array([*scores.values(), UNKNOWN]) / temperature

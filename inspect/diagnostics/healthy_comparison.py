@@ -41,6 +41,7 @@ KINDS = {
     "module bias": ("bias of the measurement model", False, 5e-4),
     "module error": ("error of the measurement model", True, 0.02),
     "module std": ("predicted standard deviation of the measurement model", True, 0.02),
+    "module power": ("sharpness of the measurement model", True, 0.02),
     "module nis": ("squared error over predicted variance of the measurement model", True, 0.05),
     "module spread": ("standard deviation of the error of the measurement model", True, 0.02),
     "module scatter": ("variation of the bias between episodes of the measurement model", True, 0.05),

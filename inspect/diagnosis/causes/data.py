@@ -5,21 +5,24 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, WEIGHTS
 
+LABELS = "label_lag/*|label_offset/*|shared_label_*"
+"""Labels against the modalities."""
+
 MODULES = f"module */*|{WEIGHTS}|{DYNAMICS}"
 
 CAUSES = (
     Cause(
         "labels.delay",
         "Labels delayed",
-        (Symptom("lag/labels/*", 0),),
-        f"offset/labels*|{MODULES}",
+        (Symptom("shared_label_lag/*", 0),),
+        f"{LABELS}|{MODULES}",
         "Synchronise the clock of the motion capture with the sensors.",
     ),
     Cause(
         "labels.offset",
         "Labels offset",
-        (Symptom("offset/labels*", 0),),
-        MODULES,
+        (Symptom("shared_label_offset/*", 0),),
+        f"{LABELS}|{MODULES}",
         "Register the frame of the motion capture with the robot's.",
     ),
 )

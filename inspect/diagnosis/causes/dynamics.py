@@ -31,6 +31,7 @@ CAUSES = (
         (Symptom("dynamics spread/*", 1), Symptom("dynamics error/*", 1)),
         DYNAMICS,
         RETRAIN,
+        "restore dynamics",
     ),
     Cause(
         "process_noise.small",
@@ -54,6 +55,7 @@ CAUSES = (
         (Symptom("reported variance/*", -1),),
         FILTER,
         "Report the covariance of the belief without scaling it.",
+        "restore equations",
     ),
     Cause(
         "covariance.large",
@@ -61,5 +63,6 @@ CAUSES = (
         (Symptom("reported variance/*", 1),),
         FILTER,
         "Report the covariance of the belief without scaling it.",
+        "restore equations",
     ),
 )

@@ -41,6 +41,7 @@ CAUSES = (
         (Symptom("fusion mean/*", 1),),
         f"fusion variance/*|reported variance/*|{FILTER}",
         "Divide the product of the posteriors by their common prior, or use the information filter.",
+        "restore equations",
     ),
     Cause(
         "fusion.miscalibrated",
@@ -48,5 +49,6 @@ CAUSES = (
         (Symptom("fusion variance/*", 0),),
         f"offspring/*|{FILTER}",
         "Check the implementation of the fusion rule.",
+        "restore equations",
     ),
 )

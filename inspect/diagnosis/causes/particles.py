@@ -20,7 +20,7 @@ CAUSES = (
         (Symptom("ancestors/*", -1), Symptom("offspring/*", 1)),
         FILTER,
         "Check the resampling, and increase the process noise.",
-        "restore resampling",
+        "restore equations",
     ),
     Cause(
         "resampling.off",
@@ -28,7 +28,7 @@ CAUSES = (
         (Symptom("prior ess/*", -1),),
         FILTER,
         "Resample at every step.",
-        "restore resampling",
+        "restore equations",
     ),
     Cause(
         "resampling.biased",
@@ -36,6 +36,6 @@ CAUSES = (
         (Symptom("offspring/*", 1), Symptom("ancestors/*", 1, 0.5)),
         FILTER,
         "Check the implementation of the resampling.",
-        "restore resampling",
+        "restore equations",
     ),
 )

@@ -98,11 +98,22 @@ def test_moments_of_a_gaussian_likelihood(monkeypatch: pytest.MonkeyPatch) -> No
         centre = (truth + bias)[:, None, None]
         gaussian = lambda _, x, c=centre, s=std: -0.5 * ((x[:, None] - c) / s).square().sum(-1)  # noqa: E731
         monkeypatch.setattr(filter_, "log_likelihood", gaussian)
-        mean, variance = likelihood_moments(filter_, episode(), np.arange(8))
+        mean, variance, _ = likelihood_moments(filter_, episode(), np.arange(8))
         scale = filter_.statistics.mean_std("state")[1].numpy()
         error = (mean - episode().states[:8, None])[:, 0] / scale
         assert np.abs(error - bias).max() < 0.5 * std
         assert np.abs(np.log(variance[:, 0] / (scale * std) ** 2)).max() < 1.0
+
+
+def test_the_power_of_a_likelihood_does_not_change_its_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    filter_ = run("crossmodal-pf")[0].filter
+    assert isinstance(filter_, ParticleFilter)
+    before = likelihood_moments(filter_, episode(), np.arange(8))
+    likelihood = filter_.log_likelihood
+    monkeypatch.setattr(filter_, "log_likelihood", lambda evidence, states: 4.0 * likelihood(evidence, states))
+    after = likelihood_moments(filter_, episode(), np.arange(8))
+    np.testing.assert_allclose(after[0], before[0], atol=1e-4)
+    np.testing.assert_allclose(after[2], 16.0 * before[2], rtol=1e-3)
 
 
 def test_the_proposal_is_a_density() -> None:

@@ -1,0 +1,70 @@
+"""Confirmation of causes: undo each and replay the episodes with the same random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnosis.cause import Cause, Recovery
+from beliefscope.inspect.diagnosis.undo import Deviations, Setting, undo
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.innovations import innovations
+from beliefscope.inspect.statistics.intervals import jackknife
+from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.batch import trace_all
+
+
+def replay_without(
+    cause: Cause, setting: Setting, deviations: Deviations, seed: int, base: Checkpoint | None = None
+) -> list[Trace] | None:
+    """Traces of the episodes without a cause, in their order; None if it cannot be undone."""
+    if not cause.undo:
+        return None
+    changed = undo(cause.undo, setting, deviations, base)
+    if changed is None:
+        return None
+    return list(trace_all(changed.checkpoint, changed.episodes, changed.episodes, seed, changed.particles))
+
+
+def recovery(before: Sequence[Trace], after: Sequence[Trace]) -> Recovery:
+    """Effect of an undone cause: share of the RMS position error that it removes, and the decrease of the NLL."""
+    nll = float(np.mean([negative_log_likelihood(trace) for trace in before]))
+    nll -= float(np.mean([negative_log_likelihood(trace) for trace in after]))
+    sums = np.array([[_squared_error(a), _squared_error(b)] for a, b in zip(before, after, strict=True)])
+    if not np.isfinite(sums).all():
+        return Recovery(np.nan, np.nan, np.nan, nll)
+    share, low, high = jackknife(sums, _removed)
+    return Recovery(float(share), float(low), float(high), nll)
+
+
+def negative_log_likelihood(trace: Trace) -> float:
+    """Mean over the counted steps, nats; NaN if unknown.
+
+    Of the true state under the posterior; without ground truth, of the virtual observations under their prediction.
+    """
+    keep = measures.counted(trace)
+    if np.isfinite(trace.episode.states).all():
+        pair = (measures.errors(trace)[:, -1], measures.covariances(trace)[:, -1]) if trace.has_covariance else None
+    else:
+        pair = innovations(trace)
+    return float("nan") if pair is None else float(_gaussian_nll(pair[0][keep], pair[1][keep]).mean())
+
+
+def _gaussian_nll(error: Array, covariance: Array) -> Array:
+    """``(e^T S^-1 e + ln det S + n ln 2 pi) / 2`` of errors (..., n)."""
+    squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
+    n = error.shape[-1]
+    return np.asarray(0.5 * (squared + np.linalg.slogdet(covariance).logabsdet + n * np.log(2.0 * np.pi)))
+
+
+def _squared_error(trace: Trace) -> float:
+    """m^2: sum over the counted steps."""
+    return float(np.square(measures.position_error(trace)[measures.counted(trace), -1]).sum())
+
+
+def _removed(sums: Array) -> Array:
+    """Share of the root of the first of two sums (..., 2) that is missing in that of the second."""
+    return np.asarray(1.0 - np.sqrt(sums[..., 1] / np.maximum(sums[..., 0], 1e-12)))

@@ -1,0 +1,399 @@
+"""Undoing a cause: changes of the episodes, the filter or the number of particles that remove a fault.
+
+Sizes come from the deviations: a bias is subtracted, a factor divided out, a delay advanced.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.filters.batch import Batch
+from beliefscope.filters.belief import Evidence
+from beliefscope.filters.catalog import build
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.filter import MAX_LOGIT, Filter
+from beliefscope.filters.models.ekf import ExtendedKalmanFilter
+from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+
+POSITION, CHANGE = slice(0, 3), slice(3, 6)
+"""Channels of controls that command a hand position: the previous position and its change."""
+
+MIN_SLOPE = 0.2
+"""Smallest slope of a dynamics model that can be rescaled."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Inputs of a run.
+
+    Attributes:
+        affected: episodes to which changes of sensors apply.
+    """
+
+    checkpoint: Checkpoint
+    episodes: Mapping[int, Episode]
+    particles: int
+    affected: frozenset[int]
+
+
+Deviations = Mapping[str, Deviation]
+"""Statistic -> deviation."""
+
+Undo = Callable[[Setting, Deviations], Setting | None]
+"""Returns the setting without the fault; None if it cannot be undone."""
+
+
+def undo(name: str, setting: Setting, deviations: Deviations, base: Checkpoint | None = None) -> Setting | None:
+    """The setting without a fault.
+
+    Args:
+        name: key of ``UNDO``, or one of its keys that end in a sensor or modality.
+        base: checkpoint of the same architecture, whose modules replace faulty ones where it is given.
+    """
+    action, _, subject = name.rpartition(" ")
+    if base is not None and name in MODULES:
+        return _with_modules(setting, base, MODULES[name])
+    function = UNDO.get(name) or partial(BY_SUBJECT[action], subject)
+    return function(setting, deviations)
+
+
+def _with_modules(setting: Setting, base: Checkpoint, prefixes: Sequence[str]) -> Setting | None:
+    """The modules whose names start with one of the prefixes, from another checkpoint."""
+    if base.filter.architecture != setting.checkpoint.filter.architecture:
+        return None
+    filter_ = _copy(setting.checkpoint)
+    taken = {k: v for k, v in base.filter.state_dict().items() if k.startswith(tuple(prefixes))}
+    filter_.load_state_dict(filter_.state_dict() | taken)
+    return _with_filter(setting, filter_)
+
+
+def _copy(checkpoint: Checkpoint) -> Filter:
+    return copy.deepcopy(checkpoint.filter)
+
+
+def _with_filter(setting: Setting, filter_: Filter) -> Setting:
+    return replace(setting, checkpoint=replace(setting.checkpoint, filter=filter_))
+
+
+def _with_evidence(setting: Setting, change: Callable[[Evidence], Evidence]) -> Setting:
+    """A filter whose evidence is changed."""
+    filter_ = _copy(setting.checkpoint)
+    encode = filter_.encode
+
+    def encode_and_change(batch: Batch) -> Evidence:
+        return change(encode(batch))
+
+    object.__setattr__(filter_, "encode", encode_and_change)
+    return _with_filter(setting, filter_)
+
+
+def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], float], NDArray[Any]]) -> Setting | None:
+    """Changed readings (T, ...) of a sensor, or controls, in the affected episodes; ``change`` also takes dt."""
+    episodes = dict(setting.episodes)
+    for index in setting.affected:
+        episode = episodes[index]
+        if key == "control":
+            controls = change(episode.controls, episode.dt).astype(np.float32)
+            episodes[index] = replace(episode, controls=controls)
+            continue
+        if key not in episode.observations:
+            return None
+        readings = episode.observations[key]
+        changed = change(readings.astype(np.float64), episode.dt)
+        if readings.dtype == np.uint8:
+            changed = np.rint(changed).clip(0, 255)
+        observations = {**episode.observations, key: changed.astype(readings.dtype)}
+        episodes[index] = replace(episode, observations=observations)
+    return replace(setting, episodes=episodes)
+
+
+def drop(modality: str, setting: Setting, deviations: Deviations) -> Setting | None:
+    """Without all models that use a modality; None if no other model remains."""
+    keep = torch.tensor([modality not in model.split("+") for model in setting.checkpoint.filter.names])
+    if keep.all() or not keep.any():
+        return None
+    return _with_evidence(setting, lambda e: e.select_models(keep.expand(*e.observation.shape[:3])))
+
+
+def rescale(modality: str, setting: Setting, deviations: Deviations) -> Setting | None:
+    """Healthy standard deviations of a measurement model."""
+    filter_ = setting.checkpoint.filter
+    ratio = _by_component(deviations, "module std", modality, filter_, lambda d: d.value / d.healthy)
+    if ratio is None or modality not in filter_.names:
+        return None
+    k = filter_.names.index(modality)
+    if isinstance(filter_, ExtendedKalmanFilter):
+        return _with_evidence(setting, lambda e: replace(e, noise=_at(_noise(e), k, _noise(e)[:, :, k] / ratio)))
+    power = float(ratio.log().mean().exp().square())
+    return _with_likelihood(setting, k, lambda likelihood, evidence, states: power * likelihood(evidence, states))
+
+
+def shift(modality: str, setting: Setting, deviations: Deviations) -> Setting | None:
+    """A measurement model without its excess bias."""
+    filter_ = setting.checkpoint.filter
+    bias = _by_component(deviations, "module bias", modality, filter_, lambda d: d.value - d.healthy)
+    if bias is None or modality not in filter_.names:
+        return None
+    k, bias = filter_.names.index(modality), bias / filter_.statistics.mean_std("state")[1]
+    if isinstance(filter_, ExtendedKalmanFilter):
+        return _with_evidence(
+            setting, lambda e: replace(e, observation=_at(e.observation, k, e.observation[:, :, k] - bias))
+        )
+    return _with_likelihood(setting, k, lambda likelihood, evidence, states: likelihood(evidence, states + bias))
+
+
+def _with_likelihood(setting: Setting, k: int, change: Callable[..., Tensor]) -> Setting | None:
+    """A particle filter with another likelihood of model k."""
+    if not isinstance(setting.checkpoint.filter, ParticleFilter):
+        return None
+    filter_ = _copy(setting.checkpoint)
+    assert isinstance(filter_, ParticleFilter)
+    likelihood = filter_.log_likelihood
+
+    def changed(evidence: Evidence, states: Tensor) -> Tensor:
+        return _at(likelihood(evidence, states), k, change(likelihood, evidence, states)[:, k], axis=1)
+
+    object.__setattr__(filter_, "log_likelihood", changed)
+    return _with_filter(setting, filter_)
+
+
+def _with_dynamics(setting: Setting, change: Callable[[Tensor, Tensor], Tensor]) -> Setting:
+    """Another prediction, a function of the states and the predicted states; its Jacobian is unchanged."""
+    filter_ = _copy(setting.checkpoint)
+    forward, with_jacobian = filter_.dynamics.forward, filter_.dynamics.with_jacobian
+
+    def predict(states: Tensor, control: Tensor) -> Tensor:
+        return change(states, forward(states, control))
+
+    def predict_with_jacobian(states: Tensor, control: Tensor) -> tuple[Tensor, Tensor]:
+        predicted, jacobian = with_jacobian(states, control)
+        return change(states, predicted), jacobian
+
+    object.__setattr__(filter_.dynamics, "forward", predict)
+    object.__setattr__(filter_.dynamics, "with_jacobian", predict_with_jacobian)
+    return _with_filter(setting, filter_)
+
+
+def shift_dynamics(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Predictions without their excess bias."""
+    filter_ = setting.checkpoint.filter
+    bias = _by_component(deviations, "dynamics bias", "", filter_, lambda d: d.value - d.healthy)
+    if bias is None:
+        return None
+    bias = bias / filter_.statistics.mean_std("state")[1]
+    return _with_dynamics(setting, lambda states, predicted: predicted - bias)
+
+
+def scale_dynamics(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Predicted changes with the healthy slope; None for a slope below ``MIN_SLOPE``."""
+    slopes = [d.value / d.healthy for name, d in deviations.items() if name.startswith("dynamics slope/")]
+    if not slopes or np.mean(slopes) < MIN_SLOPE:
+        return None
+    factor = 1.0 / float(np.mean(slopes))
+    return _with_dynamics(setting, lambda states, predicted: states + factor * (predicted - states))
+
+
+def rescale_process_noise(setting: Setting, deviations: Deviations) -> Setting | None:
+    """The healthy process noise."""
+    filter_ = _copy(setting.checkpoint)
+    ratio = _by_component(deviations, "process noise", "", filter_, lambda d: d.value / d.healthy)
+    if ratio is None:
+        return None
+    filter_.dynamics.log_noise.sub_(ratio.log())
+    return _with_filter(setting, filter_)
+
+
+def change_beta(setting: Setting, change: Callable[[Tensor], Tensor]) -> Setting | None:
+    """Other log-odds (..., W) of the first of two models, before their bound."""
+    if len(setting.checkpoint.filter.names) != 2:
+        return None
+
+    def changed(evidence: Evidence) -> Evidence:
+        assert evidence.log_weights is not None
+        odds = evidence.log_weights[..., 0, :] - evidence.log_weights[..., 1, :]
+        logit = 2.0 * MAX_LOGIT * torch.atanh((odds / (2.0 * MAX_LOGIT)).clamp(-0.9999, 0.9999))
+        odds = 2.0 * MAX_LOGIT * torch.tanh(change(logit) / (2.0 * MAX_LOGIT))
+        log_weights = torch.stack([torch.nn.functional.logsigmoid(odds), torch.nn.functional.logsigmoid(-odds)], -2)
+        return replace(evidence, log_weights=log_weights)
+
+    return _with_evidence(setting, changed)
+
+
+def healthy_beta(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Fusion weights whose mean log-odds are healthy."""
+    shifts = [d.healthy - d.value for name, d in deviations.items() if name.startswith("beta logit/")]
+    return change_beta(setting, lambda logit: logit + torch.tensor(shifts, dtype=logit.dtype)) if shifts else None
+
+
+def invert_beta(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Fusion weights with exchanged modalities."""
+    return change_beta(setting, lambda logit: -logit)
+
+
+def more_particles(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Ten times as many particles."""
+    return replace(setting, particles=10 * setting.particles)
+
+
+def restore_equations(setting: Setting, deviations: Deviations) -> Setting | None:
+    """The filter with its weights and the equations of this version."""
+    filter_ = build(setting.checkpoint.filter.architecture)
+    filter_.load_state_dict(setting.checkpoint.filter.state_dict())
+    return _with_filter(setting, filter_.eval().requires_grad_(False))
+
+
+def advance(key: str, setting: Setting, deviations: Deviations) -> Setting | None:
+    """A delayed image, the delayed haptics, or controls, advanced by their delay."""
+    lag = deviations.get("lag/control/all" if key == "control" else "lag/image/all")
+    steps = 0 if lag is None else round(abs(lag.value - lag.healthy))
+    keys = setting.checkpoint.task.modalities.get(key, (key,))
+    result: Setting | None = setting
+    for name in keys:
+        if result is not None:
+            result = _with_readings(
+                result, name, lambda values, dt: values[np.minimum(np.arange(len(values)) + steps, len(values) - 1)]
+            )
+    return result if steps else None
+
+
+def realign_image(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Images shifted back; their borders are repeated."""
+    x, y = (_excess(deviations, f"shift/image {axis}/all") for axis in "xy")
+    if x is None or y is None:
+        return None
+
+    def back(images: NDArray[Any], dt: float) -> NDArray[Any]:
+        rows, columns = (np.arange(size) + round(n) for size, n in zip(images.shape[1:], (y, x), strict=True))
+        height, width = images.shape[1:]
+        return images[:, rows.clip(0, height - 1)][:, :, columns.clip(0, width - 1)]
+
+    return _with_readings(setting, "image", back)
+
+
+def expose_image(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Images of healthy brightness."""
+    ratio = _ratio(deviations, "brightness/image/all")
+    return None if not ratio else _with_readings(setting, "image", lambda images, dt: images / ratio)
+
+
+def tare_force(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Force without its excess level in free motion."""
+    bias = [_excess(deviations, f"level/force {axis}/free motion") for axis in "xyz"]
+    if None in bias:
+        return None
+    return _with_readings(setting, "force", lambda force, dt: force - np.array(bias)[: force.shape[1]])
+
+
+def detrend_force(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Force without its excess slope in free motion."""
+    slope = [_excess(deviations, f"drift/force {axis}/free motion") for axis in "xyz"]
+    if None in slope:
+        return None
+    return _with_readings(
+        setting, "force", lambda f, dt: f - np.array(slope)[: f.shape[1]] * dt * np.arange(len(f))[:, None]
+    )
+
+
+def scale_force(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Force of healthy size."""
+    gain = _ratio(deviations, "size/force/contact")
+    return None if not gain else _with_readings(setting, "force", lambda force, dt: force / gain)
+
+
+def negate_force(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Force with the opposite sign."""
+    return _with_readings(setting, "force", lambda force, dt: -force)
+
+
+def scale_control(setting: Setting, deviations: Deviations) -> Setting | None:
+    """Controls whose change of the hand position has the healthy scale."""
+    scale = _ratio(deviations, "scale/control/all")
+    channels = CHANGE if setting.checkpoint.task.control_size >= CHANGE.stop else slice(None)
+
+    def rescaled(controls: NDArray[Any], dt: float) -> NDArray[Any]:
+        controls = controls.copy()
+        controls[:, channels] /= scale
+        return controls
+
+    return None if not scale else _with_readings(setting, "control", rescaled)
+
+
+def _by_component(
+    deviations: Deviations, kind: str, model: str, filter_: Filter, value: Callable[[Deviation], float]
+) -> Tensor | None:
+    """(n,) values of a kind of statistic of a model; None if one is missing."""
+    names = [f"{kind}/{f'{model} {c.name}'.strip()}/all" for c in filter_.task.components]
+    if not all(name in deviations for name in names):
+        return None
+    return torch.tensor([value(deviations[name]) for name in names], dtype=torch.float32)
+
+
+def _excess(deviations: Deviations, name: str) -> float | None:
+    return deviations[name].value - deviations[name].healthy if name in deviations else None
+
+
+def _ratio(deviations: Deviations, name: str) -> float | None:
+    deviation = deviations.get(name)
+    return deviation.value / deviation.healthy if deviation is not None and deviation.healthy else None
+
+
+def _noise(evidence: Evidence) -> Tensor:
+    assert evidence.noise is not None
+    return evidence.noise
+
+
+def _at(values: Tensor, k: int, row: Tensor, axis: int = 2) -> Tensor:
+    """A copy of the values with index k of an axis replaced."""
+    return values.index_copy(axis, torch.tensor([k]), row.unsqueeze(axis))
+
+
+BY_SUBJECT: dict[str, Callable[[str, Setting, Deviations], Setting | None]] = {
+    "drop": drop,
+    "restore": drop,  # unless there is a base checkpoint
+    "rescale": rescale,
+    "shift": shift,
+    "advance": advance,
+}
+"""Interventions that are followed by a modality or sensor."""
+
+UNDO: dict[str, Undo] = {
+    "shift dynamics": shift_dynamics,
+    "scale dynamics": scale_dynamics,
+    "rescale process noise": rescale_process_noise,
+    "healthy beta": healthy_beta,
+    "invert beta": invert_beta,
+    "10 x particles": more_particles,
+    "restore equations": restore_equations,
+    "realign image": realign_image,
+    "expose image": expose_image,
+    "tare force": tare_force,
+    "detrend force": detrend_force,
+    "scale force": scale_force,
+    "negate force": negate_force,
+    "scale control": scale_control,
+}
+"""The other interventions."""
+
+MODULES: dict[str, tuple[str, ...]] = {
+    "shift dynamics": ("dynamics.",),
+    "scale dynamics": ("dynamics.",),
+    "restore dynamics": ("dynamics.",),
+    "rescale process noise": ("dynamics.log_noise",),
+    "healthy beta": ("weight_model.",),
+    "invert beta": ("weight_model.",),
+}
+for modality in ("image", "haptics"):
+    for action in ("shift", "rescale", "restore"):
+        MODULES[f"{action} {modality}"] = (f"virtual_sensors.{modality}.", f"measurement_models.{modality}.")
+"""Intervention -> prefixes of the modules that a base checkpoint replaces instead."""

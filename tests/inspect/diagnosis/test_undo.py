@@ -1,0 +1,190 @@
+"""Undone faults: the replay without a planted fault is the run of the original filter."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.filter import Filter
+from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.interventions import negative_log_likelihood, recovery
+from beliefscope.inspect.diagnosis.statistics import episode_statistics
+from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, Setting, undo
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.batch import trace_all
+
+
+@cache
+def checkpoint(name: str) -> Checkpoint:
+    return load_checkpoint(shipped("door", name))
+
+
+@cache
+def episodes() -> dict[int, Episode]:
+    with open_dataset(sample_path("door")) as data:
+        return {index: data[index] for index in data.held_out()[:3]}
+
+
+def setting(filter_: Checkpoint, data: dict[int, Episode] | None = None) -> Setting:
+    data = data or episodes()
+    return Setting(filter_, data, 30, frozenset(data))
+
+
+def traces(run: Setting) -> list[Trace]:
+    return list(trace_all(run.checkpoint, run.episodes, run.episodes, 0, run.particles))
+
+
+def deviations(healthy: Setting, faulty: Setting) -> dict[str, Deviation]:
+    """Mean statistics of two runs."""
+    rows = [[episode_statistics(trace, run.checkpoint) for trace in traces(run)] for run in (healthy, faulty)]
+    result = {}
+    for name in rows[0][0]:
+        mean = [float(np.nanmean([row.get(name, np.nan) for row in group])) for group in rows]
+        result[name] = Deviation(name, mean[1], mean[0], mean[0], mean[0], 0.0, True, 10.0)
+    return result
+
+
+def planted(name: str, change: Callable[[Any], None]) -> Checkpoint:
+    filter_: Filter = copy.deepcopy(checkpoint(name).filter)
+    change(filter_)
+    return replace(checkpoint(name), filter=filter_)
+
+
+def biased(filter_: Any) -> None:
+    filter_.virtual_sensors.image.state.bias += 0.3
+
+
+def overconfident(filter_: Any) -> None:
+    filter_.virtual_sensors.image.log_noise[-1].bias -= math.log(1.5)
+
+
+def noisy(filter_: Any) -> None:
+    filter_.dynamics.log_noise += math.log(2.0)
+
+
+def inverted(filter_: Any) -> None:
+    output = filter_.weight_model.output
+    output.weight *= -1.0
+    output.bias *= -1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "action"),
+    [
+        ("crossmodal-ekf", biased, "shift image"),
+        ("crossmodal-ekf", overconfident, "rescale image"),
+        ("crossmodal-ekf", noisy, "rescale process noise"),
+        ("crossmodal-pf", noisy, "rescale process noise"),
+        ("crossmodal-ekf", inverted, "invert beta"),
+        ("crossmodal-pf", inverted, "invert beta"),
+    ],
+)
+def test_the_replay_without_a_fault_of_the_model_is_the_original_run(
+    name: str, change: Callable[[Any], None], action: str
+) -> None:
+    healthy, faulty = setting(checkpoint(name)), setting(planted(name, change))
+    changed = undo(action, faulty, deviations(healthy, faulty))
+    assert changed is not None
+    distance = [
+        [np.abs(a.estimate_mean - b.estimate_mean).mean() for a, b in zip(traces(healthy), traces(run), strict=True)]
+        for run in (faulty, changed)
+    ]
+    assert np.sum(distance[1]) < 0.1 * np.sum(distance[0])
+
+
+@pytest.mark.parametrize("action", ["shift image", "rescale image", "restore image", "shift dynamics", "healthy beta"])
+def test_a_base_checkpoint_replaces_modules(action: str) -> None:
+    if action == "healthy beta":
+        change: Callable[[Any], None] = inverted
+    else:
+        change = (lambda f: f.dynamics.output.bias.add_(1.0)) if "dynamics" in action else biased
+    faulty = setting(planted("crossmodal-ekf", change))
+    changed = undo(action, faulty, {}, base=checkpoint("crossmodal-ekf"))
+    assert changed is not None
+    for a, b in zip(traces(setting(checkpoint("crossmodal-ekf"))), traces(changed), strict=True):
+        np.testing.assert_array_equal(a.estimate_mean, b.estimate_mean)
+
+
+def values(**by_statistic: float) -> dict[str, Deviation]:
+    """Deviations from zero of statistics; ``__`` stands for ``/`` and ``_`` for a space."""
+    names = {name.replace("__", "/").replace("_", " "): value for name, value in by_statistic.items()}
+    return {name: Deviation(name, value, 0.0, 0.0, 0.0, 0.0, True, 10.0) for name, value in names.items()}
+
+
+GAIN = {"size/force/contact": Deviation("size/force/contact", 6.0, 3.0, 3.0, 3.0, 0.0, True, 10.0)}
+BIAS = values(level__force_x__free_motion=1.0, level__force_y__free_motion=2.0, level__force_z__free_motion=0.0)
+DRIFT = values(drift__force_x__free_motion=1.0, drift__force_y__free_motion=0.0, drift__force_z__free_motion=0.0)
+
+
+@pytest.mark.parametrize(
+    ("faults", "action", "found", "key"),
+    [
+        ("delay=image:steps=3", "advance image", values(lag__image__all=3.0), "image"),
+        ("image_shift=2:y=-3", "realign image", values(shift__image_x__all=2.0, shift__image_y__all=-3.0), "image"),
+        ("force_gain=2", "scale force", GAIN, "force"),
+        ("force_gain=-1", "negate force", {}, "force"),
+        ("force_bias=1:y=2", "tare force", BIAS, "force"),
+        ("force_drift=1", "detrend force", DRIFT, "force"),
+    ],
+)
+def test_readings_without_a_fault_are_the_original_ones(
+    faults: str, action: str, found: dict[str, Deviation], key: str
+) -> None:
+    faulty = {index: Faults.parse(faults).apply(episode) for index, episode in episodes().items()}
+    changed = undo(action, setting(checkpoint("crossmodal-ekf"), faulty), found)
+    assert changed is not None
+    for index, episode in episodes().items():
+        inner = (slice(0, -3), slice(3, -3), slice(3, -3))[: episode.observations[key].ndim]
+        np.testing.assert_allclose(
+            changed.episodes[index].observations[key][inner], episode.observations[key][inner], atol=1e-4
+        )
+
+
+def test_only_affected_episodes_change() -> None:
+    run = replace(setting(checkpoint("crossmodal-ekf")), affected=frozenset(list(episodes())[:1]))
+    changed = undo("negate force", run, {})
+    assert changed is not None
+    same = [changed.episodes[index] is episode for index, episode in episodes().items()]
+    assert same == [False, True, True]
+
+
+def test_the_last_modality_is_not_dropped() -> None:
+    assert undo("drop image", setting(checkpoint("image-ekf")), {}) is None
+    assert undo("drop image", setting(checkpoint("feature-ekf")), {}) is None
+    assert undo("drop image", setting(checkpoint("unimodal-ekf")), {}) is not None
+
+
+def test_recovery_compares_runs() -> None:
+    healthy, faulty = (traces(setting(c)) for c in (checkpoint("crossmodal-ekf"), planted("crossmodal-ekf", biased)))
+    same, better = recovery(faulty, faulty), recovery(faulty, healthy)
+    assert (same.error, same.nll) == (0.0, 0.0)
+    assert better.error > 0.3
+    assert better.nll > 0.0
+
+
+def test_without_ground_truth_the_innovations_are_compared() -> None:
+    (trace, *_) = traces(setting(checkpoint("crossmodal-ekf")))
+    unknown = replace(trace, episode=replace(trace.episode, states=np.full_like(trace.episode.states, np.nan)))
+    assert math.isfinite(negative_log_likelihood(unknown))
+    assert negative_log_likelihood(unknown) != negative_log_likelihood(trace)
+    result = recovery([unknown], [unknown])
+    assert math.isnan(result.error)
+    assert result.nll == 0.0
+
+
+@pytest.mark.parametrize("cause", CAUSES, ids=lambda cause: cause.name)
+def test_the_undo_of_every_cause_exists(cause: Any) -> None:
+    action, _, subject = cause.undo.rpartition(" ")
+    assert not cause.undo or cause.undo in UNDO or (action in BY_SUBJECT and subject)
