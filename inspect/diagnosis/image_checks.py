@@ -1,0 +1,128 @@
+"""Statistics of images without ground truth: lost, frozen, exposure, noise, sharpness, shift, occlusion and delay."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.inspect.diagnosis.reference import HAND, Gray, Reference, lost_images, median_image, normalised
+from beliefscope.inspect.diagnosis.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats
+
+BLACK = 8
+"""Gray level up to which a pixel says nothing about the exposure."""
+
+DARK, BRIGHT = 30.0, 225.0
+"""Gray levels between which noise is not clipped."""
+
+TOLERANCE = 12.0
+"""Gray levels by which a pixel must differ from all healthy images to count as occluded."""
+
+MOTION_FLOOR = 1e-4
+"""m per step added to the hand's speed, and gray levels to the image's, before the logarithm."""
+
+
+def frozen_images(images: Gray) -> Mask:
+    """(T,): whether an image repeats the previous one; lost images do not count."""
+    return repeats(images) & ~lost_images(images)
+
+
+def image_statistics(episode: Episode, key: str, reference: Reference | None) -> dict[str, float]:
+    """Statistics of one image sensor; those that need a reference of the same sensor and size only with one."""
+    images = episode.observations[key]
+    lost = lost_images(images)
+    middle = median_image(images)
+    values = {
+        f"black/{key}/all": float(lost.mean()),
+        f"frozen/{key}/all": float(frozen_images(images).mean()),
+        f"noise/{key}/all": _noise(images[~lost & ~frozen_images(images)]),
+        f"sharpness/{key}/all": _sharpness(middle),
+    }
+    if HAND in episode.observations:
+        values[f"lag/{key}/all"] = image_lag(images, episode.observations[HAND])
+    usable = ~lost
+    if reference is None or (reference.key, reference.image.shape) != (key, middle.shape) or not usable.any():
+        return values
+    brightness = float(brightness_of(middle, reference))
+    values |= {
+        f"brightness/{key}/all": brightness,
+        f"occlusion/{key}/all": float(occluded_pixels(middle, brightness, reference).mean()),
+    }
+    if reference.has_hand and HAND in episode.observations:
+        hand = episode.observations[HAND].astype(np.float64)[usable]
+        offset = np.median(reference.hand(images[usable]) - hand, axis=0)
+        values |= {f"offset/{HAND} {axis}/all": float(m) for axis, m in zip("xyz", offset, strict=False)}
+        x, y = registration(reference.images(hand), normalised(images[usable]).reshape(-1, *middle.shape))
+        values |= {f"shift/{key} x/all": x, f"shift/{key} y/all": y}
+    return values
+
+
+def image_lag(images: Gray, hand: Array) -> float:
+    """Steps by which images (T, H, W) follow the measured hand (T, d); NaN if unknown.
+
+    Cross-correlation of the logarithms of two speeds: the mean change of the pixels and that of the hand. The pixels'
+    depends neither on the camera's position nor on what else is visible.
+    """
+    lost, frozen = lost_images(images), frozen_images(images)
+    change = np.abs(np.diff(images.astype(np.float64), axis=0))
+    level = noise_level(images[~lost].astype(np.float64)) if (~lost).sum() >= MIN_STEPS else np.zeros(images.shape[1:])
+    pixels = np.maximum(change - 3.0 * level, 0.0).mean((1, 2))
+    speed = np.linalg.norm(np.diff(hand.astype(np.float64), axis=0), axis=1)
+    known = ~(lost[1:] | lost[:-1] | frozen[1:])
+    late, early = np.log(pixels + 10.0 * MOTION_FLOOR), np.log(speed + MOTION_FLOOR)
+    return lag(late[:, None], early[:, None], known)[0]
+
+
+def registration(reference: Array, images: Array) -> tuple[float, float]:
+    """(x, y) pixels by which images (T, H, W) are shifted to the right and downwards against others (T, H, W).
+
+    Maximum of the cross-correlation of horizontal and vertical gradients, pooled over the images, over all shifts up to
+    a quarter of an image, refined by a parabola.
+    """
+    height, width = images.shape[1:]
+    shape, rows, columns = (2 * height, 2 * width), height // 4, width // 4
+    spectrum = np.zeros((shape[0], width + 1), dtype=np.complex128)
+    for axis in (1, 2):
+        a, b = (np.fft.rfft2(np.gradient(stack, axis=axis), shape) for stack in (images, reference))
+        spectrum += (a * np.conj(b)).sum(0)
+    product = np.roll(np.fft.irfft2(spectrum, shape), (rows, columns), axis=(0, 1))
+    power = product[: 2 * rows + 1, : 2 * columns + 1]
+    i, j = (int(k) for k in np.unravel_index(int(power.argmax()), power.shape))
+    return j - columns + _vertex(power[i], j), i - rows + _vertex(power[:, j], i)
+
+
+def _vertex(values: Array, i: int) -> float:
+    """Offset of the vertex of the parabola through values i - 1, i, i + 1 from i; zero at the border."""
+    if not 0 < i < len(values) - 1:
+        return 0.0
+    a, b, c = values[i - 1 : i + 2]
+    return float(0.5 * (a - c) / (a - 2.0 * b + c)) if a - 2.0 * b + c < 0 else 0.0
+
+
+def occluded_pixels(middle: Array, brightness: float, reference: Reference) -> Mask:
+    """(..., H, W): pixels of a median image outside of the healthy range, corrected for its exposure."""
+    difference = np.abs(middle / max(brightness, 1e-3) - reference.image)
+    return np.asarray(difference > reference.spread + TOLERANCE)
+
+
+def brightness_of(images: Array, reference: Reference) -> Array:
+    """(...,) exposure of images (..., H, W): the median ratio of pixels, which an occlusion does not change."""
+    bright = reference.image > BLACK
+    ratio = images[..., bright] / reference.image[bright]
+    return np.asarray(np.median(ratio, axis=-1) if bright.any() else np.full(images.shape[:-2], np.nan))
+
+
+def _noise(images: Gray) -> float:
+    """Gray levels: noise of the median pixel of those that are neither dark nor bright."""
+    if len(images) < MIN_STEPS:
+        return np.nan
+    middle = np.median(images, axis=0)
+    usable = (middle > DARK) & (middle < BRIGHT)
+    level = noise_level(images.astype(np.float64))
+    return float(np.median(level[usable] if usable.any() else level))
+
+
+def _sharpness(middle: Array) -> float:
+    """Standard deviation of the Laplacian of an image (H, W) relative to that of the image."""
+    inner = middle[1:-1, 1:-1]
+    laplacian = middle[:-2, 1:-1] + middle[2:, 1:-1] + middle[1:-1, :-2] + middle[1:-1, 2:] - 4.0 * inner
+    return float(laplacian.std() / inner.std()) if np.isfinite(middle).all() and inner.std() > 0 else np.nan

@@ -1,0 +1,56 @@
+"""Lag and offset of the labels (true states) against what the modalities of a filter measure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beliefscope.inspect.diagnosis.signals import MIN_STEPS, Array, Mask, lag
+from beliefscope.inspect.statistics.measures import counted, task_of, wrapped
+from beliefscope.inspect.trace import Trace
+
+SMALLEST_MOTION = 1e-2
+"""m or rad: range of a component that moves."""
+
+BASELINE = 4
+"""Steps over which changes are compared: longer ones have less noise, shorter ones a sharper correlation."""
+
+
+def label_statistics(trace: Trace) -> dict[str, float]:
+    """Lag and offset of the labels against each modality, and shared by all of them, over the counted steps.
+
+    A delay of one sensor changes the lag of its own modality, one of the labels that of all modalities; likewise for
+    offsets. Modalities are virtual sensors (Kalman filters) or single-modality updates.
+
+    ``lag/labels MODALITY/all``: steps by which the labels follow the modality. ``lag/labels/all`` and
+    ``offset/labels COMPONENT/all`` (median of label minus modality, m or rad): the smallest in size over the
+    modalities, zero if the signs differ. NaN if no component moves.
+    """
+    measured = trace.observation_mean if trace.observation_mean is not None else trace.modality_mean
+    labels, task = trace.episode.states.astype(np.float64), task_of(trace)
+    keep = counted(trace)
+    if not trace.modalities or keep.sum() < MIN_STEPS or not np.isfinite(labels).all():
+        return {}
+    difference = wrapped(task, labels[:, None] - measured)  # (T, K, n)
+    offset = np.median(difference[keep], axis=0)  # (K, n)
+    lags = np.array([_lag(labels, labels - difference[:, k], keep) for k in range(len(trace.modalities))])
+    values = {f"lag/labels {name}/all": float(steps) for name, steps in zip(trace.modalities, lags, strict=True)}
+    values["lag/labels/all"] = float(_shared(lags[np.isfinite(lags), None])[0]) if np.isfinite(lags).any() else np.nan
+    for component, common in zip(task.components, _shared(offset), strict=True):
+        values[f"offset/labels {component.name}/all"] = float(common)
+    return values
+
+
+def _lag(labels: Array, measured: Array, keep: Mask) -> float:
+    """Steps by which changes of the labels follow those of measured values (T, n), from the components that move."""
+    moving = np.ptp(labels[keep], axis=0) > SMALLEST_MOTION
+    if not moving.any():
+        return np.nan
+    scale = labels[keep][:, moving].std(0)
+    late, early = ((x[BASELINE:, moving] - x[:-BASELINE, moving]) / scale for x in (labels, measured))
+    return lag(late, early, keep[BASELINE:])[0]
+
+
+def _shared(values: Array) -> Array:
+    """(n,): the smallest of values (K, n) in size, zero where their signs differ."""
+    smallest = np.abs(values).min(0)
+    return np.where((values > 0).all(0), smallest, np.where((values < 0).all(0), -smallest, 0.0))

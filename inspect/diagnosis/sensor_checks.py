@@ -1,0 +1,71 @@
+"""Statistics of an episode's readings and controls without ground truth, compared with a healthy profile.
+
+Named ``KIND/SUBJECT/PHASE`` like all statistics of a profile; NaN where one is not defined.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
+from beliefscope.inspect.diagnosis.reference import Reference, image_keys, lost_images
+from beliefscope.inspect.diagnosis.signals import Array, Mask, deviating_interval, long_runs, repeats
+from beliefscope.inspect.diagnosis.vector_checks import AXES, free_motion, saturated, stuck, vector_statistics
+
+
+def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:
+    """All statistics of sensors and controls; those that need a healthy reference only with one."""
+    values: dict[str, float] = {}
+    for key in image_keys(episode):
+        values |= image_statistics(episode, key, reference)
+    return values | vector_statistics(episode)
+
+
+def localise(statistic: str, episode: Episode, reference: Reference | None) -> tuple[int, int] | None:
+    """First and last step that a statistic of sensors is about; None if it has no steps, such as a lag.
+
+    Lost, repeated and saturated readings are marked step by step; of noise, level and exposure it is the interval that
+    differs most from the rest of the episode.
+    """
+    kind, subject, _ = statistic.split("/")
+    key, _, axis = subject.partition(" ")
+    if key not in episode.observations:
+        return None
+    marked = _marked_steps(kind, key, axis, episode)
+    if marked is not None:
+        steps = np.flatnonzero(marked)
+        return (int(steps[0]), int(steps[-1])) if len(steps) else None
+    series = _series(kind, key, axis, episode, reference)
+    return None if series is None else deviating_interval(series)
+
+
+def _marked_steps(kind: str, key: str, axis: str, episode: Episode) -> Mask | None:
+    """(T,) affected steps of a statistic that counts steps; None for others."""
+    readings = episode.observations[key]
+    match kind:
+        case "black":
+            return lost_images(readings)
+        case "frozen":
+            return long_runs(frozen_images(readings))
+        case "stuck":
+            return long_runs(stuck(episode, key, AXES.index(axis)) if axis else repeats(readings))
+        case "saturation":
+            return saturated(readings[:, AXES.index(axis)].astype(np.float64))
+    return None
+
+
+def _series(kind: str, key: str, axis: str, episode: Episode, reference: Reference | None) -> Array | None:
+    """(T,) sizes of the deviation that a statistic measures; None if it has none."""
+    readings = episode.observations[key].astype(np.float64)
+    match kind:
+        case "noise" | "position noise":
+            chosen = readings[:, [AXES.index(axis)]] if axis else readings.reshape(len(readings), -1)
+            size = np.median(np.abs(np.diff(chosen, n=2, axis=0)), axis=1)
+            return np.log(np.pad(size, 1, mode="edge") + max(1e-3 * size.max(), 1e-12))
+        case "brightness" if reference is not None and reference.image.shape == readings.shape[1:]:
+            ratio, lost = brightness_of(readings, reference), lost_images(episode.observations[key])
+            return np.where(lost, 0.0, np.abs(ratio - 1.0))
+        case "level":
+            return np.where(free_motion(episode), np.abs(readings[:, AXES.index(axis)]), 0.0)
+    return None

@@ -1,0 +1,113 @@
+"""Robust estimates of signals: level and drift, noise, lag, and the interval in which a series deviates."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MAX_LAG = 12
+"""Largest lag that is searched, steps."""
+
+MIN_SCORE = 3.5
+"""Smallest correlation of two signals with a lag, in standard errors of white noise, 1 / sqrt(number of steps)."""
+
+MIN_STEPS = 10
+"""Minimum number of steps of an estimate."""
+
+NORMAL_MAD = 0.6745
+"""Median absolute deviation of the standard normal distribution."""
+
+
+def robust_line(values: Array, at: Mask) -> tuple[Array, Array]:
+    """Level at step 0 and slope per step of values (T, d) over the steps ``at`` (T,), each (d,).
+
+    Theil-Sen estimate: the slope is the median of those of all pairs. Adding a + b t to the values adds exactly a to
+    the level and b to the slope. NaN for less than ``MIN_STEPS`` steps.
+    """
+    if at.sum() < MIN_STEPS:
+        unknown = np.full(values.shape[1], np.nan)
+        return unknown, unknown
+    steps, chosen = np.flatnonzero(at), values[at]
+    i, j = np.triu_indices(len(steps), 1)
+    slope = np.median((chosen[j] - chosen[i]) / (steps[j] - steps[i])[:, None], axis=0)
+    return np.median(chosen - slope * steps[:, None], axis=0), slope
+
+
+def noise_level(values: Array) -> Array:
+    """(...,) standard deviation of independent noise in values (T, ...), whatever smooth signal it is added to.
+
+    Median absolute second difference, which has the standard deviation sqrt(6) sigma. NaN for less than 3 values.
+    """
+    if len(values) < 3:
+        return np.full(values.shape[1:], np.nan)
+    second = np.diff(values, n=2, axis=0)
+    result: Array = np.median(np.abs(second), axis=0) / (NORMAL_MAD * np.sqrt(6.0))
+    return result
+
+
+def repeats(values: NDArray[np.generic]) -> Mask:
+    """(T,): whether a reading (T, ...) equals the previous one.
+
+    At the start of an episode, up to ``MAX_LAG`` repetitions do not count: a delayed sensor repeats its first reading.
+    """
+    same = np.zeros(len(values), dtype=bool)
+    same[1:] = (values[1:] == values[:-1]).reshape(len(values) - 1, -1).all(1)
+    leading = int(np.argmin(same[1:])) if not same[1:].all() else len(values)
+    if leading <= MAX_LAG:
+        same[: leading + 1] = False
+    return same
+
+
+def lag(late: Array, early: Array, valid: Mask | None = None) -> tuple[float, float]:
+    """Steps by which ``late`` (T, d) follows ``early`` (T, d), and the correlation at that lag.
+
+    The lag, at most ``MAX_LAG`` in size, has the largest correlation of late[t] with early[t - lag], pooled over the
+    d columns. NaN if none is significant (``MIN_SCORE``).
+
+    Args:
+        valid: (T,) steps at which ``late`` is known; default: all.
+    """
+    steps, lags = len(late), np.arange(-MAX_LAG, MAX_LAG + 1)
+    source = np.arange(steps)[:, None] - lags  # (T, L): step of ``early`` that belongs to a step of ``late``
+    known = (source >= 0) & (source < steps)
+    known &= np.isfinite(early).all(1)[source.clip(0, steps - 1)] & np.isfinite(late).all(1)[:, None]
+    if valid is not None:
+        known &= valid[:, None]
+    count = known.sum(0)
+    a = np.where(known[..., None], np.nan_to_num(late)[:, None], 0.0)  # (T, L, d)
+    b = np.where(known[..., None], np.nan_to_num(early)[source.clip(0, steps - 1)], 0.0)
+    size = np.maximum(count, 1)[:, None]
+    a, b = (np.where(known[..., None], x - x.sum(0) / size, 0.0) for x in (a, b))
+    power = (a * a).sum((0, 2)) * (b * b).sum((0, 2))
+    enough = (count >= max(MIN_STEPS, steps // 3)) & (power > 1e-24)
+    correlation = np.where(enough, (a * b).sum((0, 2)) / np.sqrt(np.maximum(power, 1e-24)), -1.0)
+    best = int(correlation.argmax())
+    if correlation[best] < MIN_SCORE / np.sqrt(max(count[best], 1)):
+        return np.nan, np.nan
+    return float(lags[best]), float(correlation[best])
+
+
+def deviating_interval(series: Array) -> tuple[int, int]:
+    """First and last step of the interval whose mean exceeds that of the rest of a series (T,) the most.
+
+    It maximises n m / T (mean - rest)^2, with n steps in the interval and m others: the likelihood ratio of a step
+    change and its end in Gaussian noise. All steps if none exceeds the rest.
+    """
+    steps = len(series)
+    total = np.concatenate([[0.0], np.cumsum(series - series.mean())])
+    first, end = np.triu_indices(steps + 1, 1)
+    length = end - first
+    excess = np.maximum(total[end] - total[first], 0.0)
+    gain = np.where(length < steps, excess**2 / (length * np.maximum(steps - length, 1)), 1e-12)
+    best = int(gain.argmax())
+    return int(first[best]), int(end[best]) - 1
+
+
+def long_runs(mask: Mask, shortest: int = 3) -> Mask:
+    """(T,): the steps of a mask that are in runs of at least ``shortest`` steps."""
+    edges = np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))
+    begin, end = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    return np.repeat(end - begin >= shortest, end - begin)[np.cumsum(mask) - 1] & mask if mask.any() else mask

@@ -1,0 +1,182 @@
+"""Statistics of vector sensors and controls without ground truth: each axis, and relations between sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import permutations
+
+import numpy as np
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.inspect.diagnosis.reference import HAND
+from beliefscope.inspect.diagnosis.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats, robust_line
+
+AXES = "xyz"
+FORCE, TORQUE, CONTACT = "force", "torque", "contact"
+"""Observation keys of the haptic sensors, which ``datasets/faults`` uses as well."""
+
+POSITION, CHANGE = slice(0, 3), slice(3, 6)
+"""Channels of controls that command a hand position: the previous position and its change."""
+
+MIN_MOTION = 1e-3
+"""m per step: the hand moves."""
+
+
+def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
+    """Level, drift, noise, repeated and saturated readings of each axis of a vector sensor (T, d)."""
+    readings = episode.observations[key].astype(np.float64)
+    level, slope = robust_line(readings, free_motion(episode))
+    noise = noise_level(readings)
+    values = {}
+    for i in range(readings.shape[1]):
+        axis = _axis(key, i, readings.shape[1])
+        values |= {
+            f"level/{axis}/free motion": float(level[i]),
+            f"drift/{axis}/free motion": float(slope[i] / episode.dt),
+            f"noise/{axis}/all": float(noise[i]),
+            f"stuck/{axis}/all": float(stuck(episode, key, i).mean()),
+            f"saturation/{axis}/all": float(saturated(readings[:, i]).mean()),
+        }
+    return values
+
+
+def stuck(episode: Episode, key: str, axis: int) -> Mask:
+    """(T,): whether an axis repeats its reading while the hand moves."""
+    same = repeats(episode.observations[key][:, axis])
+    return same & _moving(episode) if key != HAND else same
+
+
+def contact_statistics(episode: Episode) -> dict[str, float]:
+    """The contact flag compared with the force: how often, how strongly related, and how late.
+
+    The flag and the force's distance from its median in free motion are correlated in healthy episodes with and without
+    contact. A bias or the sign of the force does not matter.
+    """
+    if CONTACT not in episode.observations:
+        return {}
+    flag = episode.observations[CONTACT][:, 0] > 0.5
+    values = {f"share/{CONTACT}/all": float(flag.mean())}
+    if FORCE not in episode.observations:
+        return values
+    force = episode.observations[FORCE].astype(np.float64)
+    calm = force[~flag] if (~flag).any() else force
+    size = np.linalg.norm(force - np.median(calm, axis=0), axis=1)
+    both = min(flag.sum(), (~flag).sum()) >= 3 and size.std() > 0
+    spread = np.log(size + 1e-2 * max(size.max(), 1e-9))
+    related = float(np.corrcoef(flag, spread)[0, 1]) if both else np.nan
+    return values | {
+        f"agreement/{CONTACT}/all": related,
+        f"lag/{CONTACT}/all": lag(flag[:, None].astype(np.float64), spread[:, None])[0] if both else np.nan,
+        f"unflagged force/{CONTACT}/all": float(np.quantile(size[~flag], 0.9)) if (~flag).any() else np.nan,
+    }
+
+
+def wrench_statistics(episode: Episode) -> dict[str, float]:
+    """Laws of a rigid contact: torque = lever x force + constant, and a force that opposes the hand's motion.
+
+    A gain g of the force divides the lever by g; a sign inverts lever and motion; an exchange of axes breaks both laws.
+    A bias of force or torque changes only the constant.
+    """
+    observations = episode.observations
+    values: dict[str, float] = {}
+    if FORCE not in observations:
+        return values
+    at = in_contact(episode)
+    force = observations[FORCE].astype(np.float64)[at]
+    if len(force) < MIN_STEPS or force.shape[1] != 3:
+        return values
+    values[f"size/{FORCE}/contact"] = float(np.sqrt(np.square(force - force.mean(0)).sum(1).mean()))
+    if TORQUE in observations and observations[TORQUE].shape[1] == 3:
+        torque = observations[TORQUE].astype(np.float64)[at]
+        values[f"size/{TORQUE}/contact"] = float(np.sqrt(np.square(torque - torque.mean(0)).sum(1).mean()))
+        residuals = {order: lever(force[:, order], torque) for order in permutations(range(3))}
+        arm, rest = residuals.pop((0, 1, 2))
+        values |= {f"lever/{FORCE} {axis}/contact": float(r) for axis, r in zip(AXES, arm, strict=True)}
+        others = min(share for _, share in residuals.values())
+        values[f"axes/{FORCE}/contact"] = float(np.log(max(others, 1e-6) / max(rest, 1e-6)))
+    if HAND in observations:
+        motion = np.gradient(observations[HAND].astype(np.float64), axis=0)[at]
+        moves = np.linalg.norm(motion, axis=1) > MIN_MOTION
+        if moves.sum() >= MIN_STEPS:
+            length = np.linalg.norm(force, axis=1) * np.linalg.norm(motion, axis=1)
+            cosine = (force * motion).sum(1) / np.maximum(length, 1e-12)
+            values[f"direction/{FORCE}/contact"] = float(np.median(cosine[moves]))
+    return values
+
+
+def lever(force: Array, torque: Array) -> tuple[Array, float]:
+    """(3,) m: least-squares lever r of ``torque = r x force + constant`` (T, 3), and the share of variance left."""
+    f, t = force - force.mean(0), torque - torque.mean(0)
+    # Normal equations of t = -[f]x r: sum([f]x' [f]x) r = sum(f x t).
+    gram = np.square(f).sum() * np.eye(3) - f.T @ f
+    arm = np.linalg.pinv(gram, rcond=1e-6) @ np.cross(f, t).sum(0)
+    left = np.square(t - np.cross(arm, f)).sum() / max(np.square(t).sum(), 1e-12)
+    return arm, float(left)
+
+
+def control_statistics(episode: Episode) -> dict[str, float]:
+    """Delay, scale and offset of controls that command a hand position, against the measured position."""
+    if HAND not in episode.observations or episode.controls.shape[1] < CHANGE.stop:
+        return {}
+    hand, controls = episode.observations[HAND].astype(np.float64), episode.controls.astype(np.float64)
+    if hand.shape[1] != 3:
+        return {}
+    moved, change = np.diff(hand, axis=0, prepend=hand[:1]), controls[:, CHANGE]
+    delay = lag(change, moved)[0]
+    shift = 0 if np.isnan(delay) else int(delay)
+    steps = np.arange(len(hand))
+    known = (steps - shift >= 1) & (steps - shift < len(hand))
+    a, b = change[known], moved[steps[known] - shift]
+    offset = np.median(controls[known][:, POSITION] - hand[steps[known] - shift - 1], axis=0)
+    power = np.square(b).sum()
+    return {
+        "lag/control/all": delay,
+        "scale/control/all": float((a * b).sum() / power) if power > 1e-12 else np.nan,
+        **{f"offset/control {axis}/all": float(m) for axis, m in zip(AXES, offset, strict=True)},
+    }
+
+
+def in_contact(episode: Episode) -> Mask:
+    """(T,): steps with the contact flag; all without such a sensor."""
+    if CONTACT not in episode.observations:
+        return np.ones(len(episode), dtype=bool)
+    return np.asarray(episode.observations[CONTACT][:, 0] > 0.5)
+
+
+def free_motion(episode: Episode) -> Mask:
+    """(T,): steps without the contact flag, and their neighbours without it, since readings are means over a step."""
+    touched = in_contact(episode) if CONTACT in episode.observations else np.zeros(len(episode), dtype=bool)
+    return np.convolve(touched, np.ones(3), mode="same") == 0
+
+
+def vector_statistics(episode: Episode) -> Mapping[str, float]:
+    """Statistics of all vector sensors and controls."""
+    values: dict[str, float] = {}
+    for key, readings in episode.observations.items():
+        if readings.ndim == 2 and key not in (CONTACT, HAND):
+            values |= axis_statistics(episode, key)
+    if HAND in episode.observations:
+        noise = noise_level(episode.observations[HAND].astype(np.float64))
+        values[f"position noise/{HAND}/all"] = float(np.sqrt(np.square(noise).mean()))
+        values[f"stuck/{HAND}/all"] = float(repeats(episode.observations[HAND]).mean())
+    return values | contact_statistics(episode) | wrench_statistics(episode) | control_statistics(episode)
+
+
+def _moving(episode: Episode) -> Mask:
+    """(T,): whether the measured hand or, without one, anything moves."""
+    if HAND not in episode.observations:
+        return np.ones(len(episode), dtype=bool)
+    hand = episode.observations[HAND]
+    return np.concatenate([[False], (hand[1:] != hand[:-1]).any(1)])
+
+
+def saturated(values: Array) -> Mask:
+    """(T,): readings at the largest magnitude of the axis, if it occurs more than once; False for a constant axis."""
+    size = np.abs(values)
+    at = size == size.max()
+    return at if at.sum() > 1 and np.ptp(values) > 0 else np.zeros(len(values), dtype=bool)
+
+
+def _axis(key: str, i: int, count: int) -> str:
+    """Display name of an axis: ``force x``."""
+    return f"{key} {AXES[i] if count <= 3 else i}"

@@ -1,0 +1,61 @@
+"""Planted lags and offsets of labels and modalities are found, on traces with known measurements."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.store import open_dataset
+from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
+from beliefscope.inspect.diagnosis.label_checks import label_statistics
+from beliefscope.inspect.trace import Trace, trace
+
+
+@pytest.fixture(scope="module")
+def exact() -> Trace:
+    """A trace of a door whose virtual sensors measure the true states."""
+    with open_dataset("datasets/samples/door.h5") as data:
+        result = trace(load_checkpoint(PRETRAINED / "door-crossmodal-ekf.safetensors"), data[140])
+    return replace(result, observation_mean=np.repeat(result.episode.states[:, None], 2, axis=1))
+
+
+def with_labels(run: Trace, states: np.ndarray) -> Trace:
+    return replace(run, episode=replace(run.episode, states=states))
+
+
+def delayed(values: np.ndarray, steps: int) -> np.ndarray:
+    return values[np.maximum(np.arange(len(values)) - steps, 0)]
+
+
+def test_clean_labels_have_neither_lag_nor_offset(exact: Trace) -> None:
+    assert max(abs(value) for value in label_statistics(exact).values()) < 1e-6
+
+
+@pytest.mark.parametrize("steps", [2, 5])
+def test_late_labels_are_late_against_all_modalities(exact: Trace, steps: int) -> None:
+    values = label_statistics(with_labels(exact, delayed(exact.episode.states, steps)))
+    for name in ("lag/labels image/all", "lag/labels haptics/all", "lag/labels/all"):
+        assert values[name] == steps
+
+
+def test_a_late_modality_is_not_a_late_label(exact: Trace) -> None:
+    assert exact.observation_mean is not None
+    measured = exact.observation_mean.copy()
+    measured[:, 0] = delayed(measured[:, 0], 3)
+    values = label_statistics(replace(exact, observation_mean=measured))
+    assert values["lag/labels image/all"] == -3.0
+    assert values["lag/labels haptics/all"] == values["lag/labels/all"] == 0.0
+
+
+def test_offsets_are_shared_only_if_all_modalities_have_them(exact: Trace) -> None:
+    assert exact.observation_mean is not None
+    offset = np.array([0.02, -0.01, 0.1], dtype=np.float32)
+    values = label_statistics(with_labels(exact, exact.episode.states + offset))
+    for component, amount in zip(("hinge_x", "hinge_y", "angle"), offset, strict=True):
+        assert values[f"offset/labels {component}/all"] == pytest.approx(amount, abs=1e-6)
+    measured = exact.observation_mean.copy()
+    measured[:, 0] -= offset
+    values = label_statistics(replace(exact, observation_mean=measured))
+    assert values["offset/labels hinge_x/all"] == 0.0

@@ -1,0 +1,200 @@
+"""Laws of sensor statistics on simulated episodes: a fault changes its own statistic by the planted amount."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from beliefscope.datasets.catalog import load_task
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.store import open_dataset
+from beliefscope.inspect.diagnosis.reference import Reference, measure_reference
+from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
+
+TASKS = ("door", "push")
+
+
+@lru_cache
+def episodes(task: str) -> tuple[Episode, ...]:
+    """Ten clean episodes of the sample set: the last six for the reference."""
+    with open_dataset(f"datasets/samples/{task}.h5") as data:
+        return tuple(data[i] for i in range(140, 150))
+
+
+@lru_cache
+def reference(task: str) -> Reference:
+    result = measure_reference(episodes(task)[4:])
+    assert result is not None
+    return result
+
+
+@lru_cache
+def medians(task: str, faults: str = "") -> Mapping[str, float]:
+    """Statistic -> median over four episodes that are not in the reference; NaN where it is never defined."""
+    rows = [sensor_statistics(Faults.parse(faults).apply(e), reference(task)) for e in episodes(task)[:4]]
+    values = {
+        name: [row[name] for row in rows if np.isfinite(row.get(name, np.nan))] for name in {**rows[0], **rows[1]}
+    }
+    return {name: float(np.median(column)) if column else np.nan for name, column in values.items()}
+
+
+def change(task: str, faults: str, statistic: str) -> float:
+    return medians(task, faults)[statistic] - medians(task)[statistic]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    ("faults", "statistic", "amount", "tolerance"),
+    [
+        ("image_frozen:from=60", "frozen/image/all", 0.39, 0.01),
+        ("blackout:from=60", "black/image/all", 0.4, 1e-6),
+        ("image_underexposed=0.5", "brightness/image/all", -0.5, 0.01),
+        ("image_noise=20", "noise/image/all", 20.0, 1.0),
+        ("delay=image:steps=4", "lag/image/all", 4.0, 0.2),
+        ("delay=haptics:steps=4", "lag/image/all", -4.0, 0.2),
+        ("image_occluded=10:gray=255", "occlusion/image/all", 0.09, 0.03),
+        ("effector_offset=0.04", "offset/effector_position x/all", -0.04, 1e-6),
+        ("force_bias=5", "level/force x/free motion", 5.0, 0.01),
+        ("force_drift:y=0.5", "drift/force y/free motion", 0.5, 1e-3),
+        ("torque_bias=0.2", "level/torque x/free motion", 0.2, 1e-3),
+        ("force_noise=4", "noise/force z/all", 4.0, 0.7),
+        ("force_stuck=x:from=20", "stuck/force x/all", 0.65, 0.25),
+        ("contact_delayed=3", "lag/contact/all", 3.0, 0.3),
+        ("effector_noise=0.004", "position noise/effector_position/all", 0.004, 4e-4),
+        ("drop=haptics:from=50", "stuck/effector_position/all", 0.5, 0.01),
+    ],
+)
+def test_the_statistic_changes_by_the_planted_amount(
+    task: str, faults: str, statistic: str, amount: float, tolerance: float
+) -> None:
+    assert change(task, faults, statistic) == pytest.approx(amount, abs=tolerance)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    ("faults", "own"),
+    [
+        ("force_bias=5:y=-3", "level/force direction"),
+        ("torque_bias=0.3", "level/torque"),
+        ("force_drift=0.4", "drift/force stuck noise unflagged agreement lag/contact axes lever size direction"),
+        ("delay=image:steps=4", "lag/image shift offset sharpness occlusion"),
+        ("image_underexposed=0.5", "brightness occlusion sharpness shift offset frozen lag/image"),
+        ("contact_delayed=3", "lag/contact agreement unflagged share level drift size lever axes direction"),
+    ],
+)
+def test_other_statistics_do_not_change(task: str, faults: str, own: str) -> None:
+    """All but the statistics of these names are invariant."""
+    clean, faulty = medians(task), medians(task, faults)
+    allowed = tuple(own.split())
+    for name, value in clean.items():
+        if not name.startswith(allowed):
+            assert faulty[name] == pytest.approx(value, rel=1e-3, abs=2e-2, nan_ok=True), name
+
+
+def with_force(task: str, scale: float, order: tuple[int, int, int]) -> Mapping[str, float]:
+    rows = []
+    for episode in episodes(task)[:4]:
+        force = scale * episode.observations["force"][:, order]
+        faulty = replace(episode, observations={**episode.observations, "force": force})
+        rows.append(sensor_statistics(faulty, reference(task)))
+    return {name: float(np.nanmean([row.get(name, np.nan) for row in rows])) for name in rows[0]}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_laws_of_contact_separate_gain_sign_and_axes(task: str) -> None:
+    identity = (0, 1, 2)
+    healthy, half, inverted = (with_force(task, scale, identity) for scale in (1.0, 0.5, -1.0))
+    for axis in "xyz":
+        name = f"lever/force {axis}/contact"
+        assert half[name] == pytest.approx(2.0 * healthy[name], rel=1e-4)
+        assert inverted[name] == pytest.approx(-healthy[name], rel=1e-4)
+    assert half["direction/force/contact"] == pytest.approx(healthy["direction/force/contact"], rel=1e-4)
+    assert healthy["direction/force/contact"] < -0.3
+    assert inverted["direction/force/contact"] > 0.3
+    assert half["size/force/contact"] == pytest.approx(0.5 * healthy["size/force/contact"], rel=1e-4)
+    exchanged = with_force(task, 1.0, (1, 0, 2))
+    assert healthy["axes/force/contact"] > 0.5
+    assert exchanged["axes/force/contact"] < -0.5
+    assert exchanged["size/force/contact"] == pytest.approx(healthy["size/force/contact"], rel=1e-4)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_delay_and_scale_of_controls(task: str) -> None:
+    first = episodes(task)[0]
+    controls = first.controls[np.maximum(np.arange(len(first)) - 3, 0)].copy()
+    controls[:, 3:6] *= 0.5
+    values = sensor_statistics(replace(first, controls=controls), None)
+    assert values["lag/control/all"] == 3.0
+    assert values["scale/control/all"] == pytest.approx(0.5, abs=0.01)
+    healthy = sensor_statistics(first, None)
+    assert (healthy["lag/control/all"], healthy["scale/control/all"]) == (0.0, pytest.approx(1.0))
+    assert max(abs(healthy[f"offset/control {axis}/all"]) for axis in "xyz") < 1e-6
+
+
+def test_image_shift_is_registered() -> None:
+    def shifted(episode: Episode) -> Episode:
+        image = np.roll(episode.observations["image"], (-2, 3), axis=(1, 2))
+        return replace(episode, observations={**episode.observations, "image": image})
+
+    rows = [sensor_statistics(shifted(e), reference("door")) for e in episodes("door")[:4]]
+    x, y = (np.median([row[f"shift/image {axis}/all"] for row in rows]) for axis in "xy")
+    assert x == pytest.approx(3.0, abs=0.7)
+    assert y == pytest.approx(-2.0, abs=0.7)
+
+
+@pytest.mark.parametrize(
+    ("faults", "statistic", "steps"),
+    [
+        ("image_frozen:from=40:to=70", "frozen/image/all", (41, 69)),
+        ("blackout:from=12:to=30", "black/image/all", (12, 29)),
+        ("force_noise=6:from=35", "noise/force y/all", (35, 99)),
+        ("image_noise=30:from=50:to=80", "noise/image/all", (50, 79)),
+        ("image_underexposed=0.4:from=64", "brightness/image/all", (64, 99)),
+        ("drop=haptics:from=25", "stuck/effector_position/all", (25, 99)),
+    ],
+)
+def test_faults_are_localised(faults: str, statistic: str, steps: tuple[int, int]) -> None:
+    faulty = Faults.parse(faults).apply(episodes("push")[0])
+    found = localise(statistic, faulty, reference("push"))
+    assert found is not None
+    assert np.abs(np.subtract(found, steps)).max() <= 2
+    assert localise("lag/image/all", faulty, reference("push")) is None
+
+
+def test_reference_survives_json() -> None:
+    before = reference("push")
+    again = Reference.from_json(before.to_json())
+    np.testing.assert_array_equal(again.image, before.image)
+    episode = episodes("push")[0]
+    exact, stored = (sensor_statistics(episode, r) for r in (before, again))
+    for name, value in exact.items():
+        assert stored[name] == pytest.approx(value, abs=0.05, nan_ok=True), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["door-field", "push-field"])
+def test_field_tasks(task: str) -> None:
+    """A delay of haptics shows in the lag of commanded paths, despite noise and lost images."""
+    simulate = load_task(task).simulate
+    assert simulate is not None
+    clean = [simulate(5, i, 60) for i in (1, 2)]
+    rows = [sensor_statistics(episode, None) for episode in clean]
+    assert 0.0 < np.mean([row["black/image/all"] for row in rows]) < 1.0
+    lag = np.nanmean([row["lag/control/all"] for row in rows])
+    assert abs(lag) <= 3.0
+    delayed = [Faults.parse("delay=haptics:steps=4").apply(episode) for episode in clean]
+    lags = [sensor_statistics(episode, None)["lag/control/all"] for episode in delayed]
+    assert np.nanmean(lags) == pytest.approx(lag - 4.0, abs=0.5)
+
+
+def test_empty_and_other_tasks() -> None:
+    """Sensors that a task lacks have no statistics."""
+    first = episodes("push")[0]
+    bare = replace(first, observations={"sound": np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)})
+    values = sensor_statistics(bare, reference("push"))
+    assert {name.split("/")[1] for name in values} == {"sound x", "sound y"}

@@ -1,0 +1,76 @@
+"""Laws of the robust estimates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beliefscope.inspect.diagnosis.signals import (
+    MAX_LAG,
+    deviating_interval,
+    lag,
+    long_runs,
+    noise_level,
+    repeats,
+    robust_line,
+)
+
+
+def smooth(steps: int, columns: int, seed: int = 0) -> np.ndarray:
+    values = np.random.default_rng(seed).normal(size=(steps + 8, columns))
+    return np.stack([np.convolve(column, np.ones(9) / 3.0, mode="valid") for column in values.T], axis=1)
+
+
+def test_line_is_equivariant_and_ignores_outliers() -> None:
+    rng = np.random.default_rng(1)
+    values, at = rng.normal(size=(60, 2)), rng.random(60) < 0.7
+    level, slope = robust_line(values, at)
+    moved = values + 3.0 + 0.25 * np.arange(60)[:, None]
+    np.testing.assert_allclose(robust_line(moved, at)[0] - level, 3.0, atol=1e-9)
+    np.testing.assert_allclose(robust_line(moved, at)[1] - slope, 0.25, atol=1e-9)
+    outliers = np.where((np.arange(60) % 6 == 0)[:, None], 1e6, values)
+    assert np.abs(robust_line(outliers, at)[0] - level).max() < 1.0
+    assert np.isnan(robust_line(values, np.arange(60) < 5)[0]).all()
+
+
+def test_noise_level_is_that_of_the_noise_whatever_the_signal() -> None:
+    noise = np.random.default_rng(2).normal(0.0, 0.3, 4000)
+    for signal in (np.zeros(4000), np.sin(np.arange(4000) / 50.0), 0.01 * np.arange(4000)):
+        assert noise_level(noise + signal) == pytest.approx(0.3, rel=0.06)
+
+
+@pytest.mark.parametrize("delay", [-MAX_LAG, -3, 0, 1, 7, MAX_LAG])
+def test_lag_is_the_planted_delay(delay: int) -> None:
+    signal = smooth(140, 2)
+    late, early = signal[20 - delay : 120 - delay], signal[20:120]
+    rng = np.random.default_rng(3)
+    steps, correlation = lag(-5.0 + 4.0 * late + rng.normal(0.0, 0.3, late.shape), early)
+    assert steps == delay
+    assert correlation > 0.9
+    assert lag(early, late)[0] == -delay
+    some = np.where(rng.random((100, 1)) < 0.3, np.nan, late)
+    assert lag(some, early)[0] == delay
+
+
+def test_unrelated_and_constant_signals_have_no_lag() -> None:
+    rng = np.random.default_rng(4)
+    lags = [lag(rng.normal(size=(100, 1)), rng.normal(size=(100, 1)))[0] for _ in range(50)]
+    assert np.isnan(lags).sum() >= 45
+    assert np.isnan(lag(np.ones((100, 1)), rng.normal(size=(100, 1)))[0])
+
+
+def test_interval_and_runs() -> None:
+    series = np.random.default_rng(5).normal(0.0, 0.2, 100)
+    series[37:61] += 1.0
+    assert deviating_interval(series) == (37, 60)
+    mask = np.array([1, 0, 1, 1, 0, 1, 1, 1, 0, 1, 1, 1, 1], dtype=bool)
+    np.testing.assert_array_equal(np.flatnonzero(long_runs(mask)), [5, 6, 7, 9, 10, 11, 12])
+    assert not long_runs(np.zeros(5, dtype=bool)).any()
+
+
+def test_repeats_at_the_start_are_a_delay() -> None:
+    values = np.arange(40.0)[:, None] * np.ones(2)
+    delayed = values[np.maximum(np.arange(40) - 5, 0)]
+    assert not repeats(delayed).any()
+    assert repeats(np.where(np.arange(40)[:, None] < 20, values, values[20])).sum() == 19
+    assert repeats(np.zeros((40, 1))).sum() == 39
