@@ -23,7 +23,6 @@ from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile
 from beliefscope.inspect.healthy import profile_of
-from beliefscope.inspect.traces.batch import trace_all
 
 FIELD = "beliefscope collect {0} --episodes 60 --steps 200 --seed 1 --split test -o {0}.h5"
 COUNTS = {"door": 600, "push": 500}
@@ -58,9 +57,8 @@ def main() -> None:
         task = checkpoint.task.name
         if task not in episodes:
             episodes[task] = held_out(task, folder)
-        traces = trace_all(checkpoint, episodes[task], range(len(episodes[task])))
         collected = FIELD.format(task) if checkpoint.task.start_distance else COLLECTED[task]
-        profile = profile_of(checkpoint, traces, collected)
+        profile = profile_of(checkpoint, episodes[task], collected)
         write(path.with_name(path.stem + SUFFIX), checkpoint.hash, profile)
         print(f"{path.stem}: {profile.episodes} episodes, {len(profile.statistics)} statistics", flush=True)
 

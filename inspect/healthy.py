@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,25 +10,34 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter
+from beliefscope.inspect.diagnosis.reference import measure_reference
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
-from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
 MAX_EPISODES = 120
 """Maximum number of episodes of a profile; more hardly change it."""
 
 
-def profile_of(checkpoint: Checkpoint, traces: Iterable[Trace], data: str) -> HealthyProfile:
-    """The healthy profile of clean traces of a filter. ``data``: where their episodes come from."""
+FOLDS = 4
+"""Number of groups of episodes."""
+
+
+def profile_of(checkpoint: Checkpoint, episodes: Sequence[Episode], data: str) -> HealthyProfile:
+    """The healthy profile of a filter over clean episodes. ``data``: where they come from.
+
+    Images are compared with a reference of the other groups of episodes, so that the statistics are those of new ones.
+    """
     rows: list[dict[str, float]] = []
     particles = None
-    for trace in traces:
-        rows.append(episode_statistics(trace, checkpoint))
+    groups = [[e for i, e in enumerate(episodes) if i % FOLDS != fold] for fold in range(FOLDS)]
+    references = [measure_reference(group) for group in groups]
+    for trace in trace_all(checkpoint, episodes, range(len(episodes))):
+        rows.append(episode_statistics(trace, checkpoint, references[trace.episode_index % FOLDS]))
         particles = None if trace.particles is None else trace.particles.shape[1]
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-    return HealthyProfile(data, len(rows), particles, columns)
+    return HealthyProfile(data, len(rows), particles, columns, measure_reference(episodes))
 
 
 def measure_profile(filter_: Filter, name: str, episodes: Sequence[Episode], data: str) -> dict[str, Any] | None:
@@ -36,5 +45,4 @@ def measure_profile(filter_: Filter, name: str, episodes: Sequence[Episode], dat
     held_out = [episode for episode in episodes if episode.split != "train"][-MAX_EPISODES:]
     if not held_out:
         return None
-    checkpoint = Checkpoint(filter_, name, "", {})
-    return profile_of(checkpoint, trace_all(checkpoint, held_out, range(len(held_out))), data).to_json()
+    return profile_of(Checkpoint(filter_, name, "", {}), held_out, data).to_json()

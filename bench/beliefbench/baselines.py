@@ -80,7 +80,7 @@ def features(case: Case) -> dict[str, float]:
     State components are averaged, so that features of different tasks agree.
     """
     profile = HealthyProfile.from_json(case.checkpoint.healthy_profile)
-    rows = [episode_statistics(trace, case.checkpoint) for trace in traces_of(case)]
+    rows = [episode_statistics(trace, case.checkpoint, profile.reference) for trace in traces_of(case)]
     groups: dict[str, list[float]] = {}
     for name, healthy in profile.statistics.items():
         values = np.array([row.get(name, np.nan) for row in rows])

@@ -126,7 +126,7 @@ def diagnose(
 
 def examine(setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, alarm_rate: float) -> Case:
     """Compare all statistics of traces with the healthy profile."""
-    rows = [episode_statistics(trace, setting.checkpoint) for trace in traces]
+    rows = [episode_statistics(trace, setting.checkpoint, profile.reference) for trace in traces]
     profile, rows = with_scatter(profile, rows)
     comparison = compare(profile, rows, significance=alarm_rate)
     names = [deviation.statistic for deviation in comparison.deviations]

@@ -114,8 +114,8 @@ def measure_reference(episodes: Sequence[Episode]) -> Reference | None:
     medians = np.stack([median_image(episode.observations[key]) for episode in episodes])
     image = np.nanmedian(medians, axis=0)
     spread = np.nanmax(np.abs(medians - image), axis=0)
-    gray = (np.rint(values).clip(0, 255).astype(np.uint8) for values in (image, np.ceil(spread)))
-    return Reference(key, *gray, *_hand_camera(episodes, key))
+    gray, spread = (np.rint(values).clip(0, 255).astype(np.uint8) for values in (image, np.ceil(spread)))
+    return Reference(key, gray, spread, *_hand_camera(episodes, key))
 
 
 def _hand_camera(episodes: Sequence[Episode], key: str) -> tuple[Array, Array, Array]:

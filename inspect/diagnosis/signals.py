@@ -73,7 +73,8 @@ def lag(late: Array, early: Array, valid: Mask | None = None) -> tuple[float, fl
     steps, lags = len(late), np.arange(-MAX_LAG, MAX_LAG + 1)
     source = np.arange(steps)[:, None] - lags  # (T, L): step of ``early`` that belongs to a step of ``late``
     known = (source >= 0) & (source < steps)
-    known &= np.isfinite(early).all(1)[source.clip(0, steps - 1)] & np.isfinite(late).all(1)[:, None]
+    late_known, early_known = (np.asarray(np.isfinite(values).all(axis=1)) for values in (late, early))
+    known &= late_known[:, None] & early_known[source.clip(0, steps - 1)]
     if valid is not None:
         known &= valid[:, None]
     count = known.sum(0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import permutations
 
 import numpy as np
@@ -27,7 +26,7 @@ def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
     readings = episode.observations[key].astype(np.float64)
     level, slope = robust_line(readings, free_motion(episode))
     noise = noise_level(readings)
-    values = {}
+    values: dict[str, float] = {}
     for i in range(readings.shape[1]):
         axis = _axis(key, i, readings.shape[1])
         values |= {
@@ -149,7 +148,7 @@ def free_motion(episode: Episode) -> Mask:
     return np.convolve(touched, np.ones(3), mode="same") == 0
 
 
-def vector_statistics(episode: Episode) -> Mapping[str, float]:
+def vector_statistics(episode: Episode) -> dict[str, float]:
     """Statistics of all vector sensors and controls."""
     values: dict[str, float] = {}
     for key, readings in episode.observations.items():

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.filters.checkpoint import Checkpoint, shipped
+from beliefscope.inspect.diagnosis.reference import Reference
 
 Array = NDArray[np.float64]
 
-FORMAT = 1
+FORMAT = 2
+"""Version 1 had no reference and no statistics of sensors and modules; it is still read."""
 SUFFIX = ".profile.json"
 """Of the file beside a shipped checkpoint."""
 
@@ -36,12 +38,14 @@ class HealthyProfile:
         particles: number of particles, or None.
         statistics: ``KIND/SUBJECT/PHASE`` -> (E,) values by trajectory, SI units; NaN where there is none, such as
             in a phase of too few steps.
+        reference: healthy images; None in profiles of format 1 and for tasks without images.
     """
 
     data: str
     episodes: int
     particles: int | None
     statistics: Mapping[str, Array]
+    reference: Reference | None = None
 
     def to_json(self) -> dict[str, Any]:
         """JSON values, rounded to ``DIGITS``; NaN as null."""
@@ -50,26 +54,28 @@ class HealthyProfile:
             for name, values in self.statistics.items()
         }
         head = {"format": FORMAT, "data": self.data, "episodes": self.episodes, "particles": self.particles}
-        return {**head, "statistics": rows}
+        reference = None if self.reference is None else self.reference.to_json()
+        return {**head, "statistics": rows, "reference": reference}
 
     @classmethod
     def from_json(cls, document: Any) -> HealthyProfile:
         """Inverse of ``to_json``. Raises BadInput for another format or malformed values."""
         try:
-            if document["format"] != FORMAT:
-                raise BadInput(f"healthy profile of format {document['format']!r}; this version reads format {FORMAT}")
+            if document["format"] not in (1, FORMAT):
+                raise BadInput(f"healthy profile of format {document['format']!r}; this version reads 1 and {FORMAT}")
             count, particles = int(document["episodes"]), document["particles"]
             rows = {
                 str(name): np.array([np.nan if value is None else value for value in values], dtype=np.float64)
                 for name, values in document["statistics"].items()
             }
-            data = str(document["data"])
+            data, images = str(document["data"]), document.get("reference")
+            reference = None if images is None else Reference.from_json(images)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"the healthy profile is malformed: {error!r}") from None
         for name, values in rows.items():
             if values.shape != (count,) or name.count("/") != 2:
                 raise BadInput(f"the healthy profile is malformed: {name!r} has {len(values)} values of {count}")
-        return cls(data, count, None if particles is None else int(particles), rows)
+        return cls(data, count, None if particles is None else int(particles), rows, reference)
 
 
 def find_profile(task: str, filter_: str, checkpoint_hash: str, checkpoint: Checkpoint | None) -> HealthyProfile | None:

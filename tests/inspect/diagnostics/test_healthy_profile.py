@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, save_checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
+from beliefscope.inspect.diagnosis.reference import measure_reference
+from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import SINGLE_SIGNIFICANCE, Comparison, compare
 from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile, find_profile
+from beliefscope.inspect.healthy import measure_profile
+from beliefscope.inspect.traces.batch import trace_all
 
 NAMES = [f"nees/{layer}/{phase}" for layer in ("image", "haptics", "fused") for phase in ("all", "contact")]
 NAMES += [f"weight/image/{phase}" for phase in ("all", "contact")]
@@ -115,10 +121,38 @@ def test_json_round_trip() -> None:
         np.testing.assert_allclose(again.statistics[name], reference.statistics[name], rtol=1e-3)
 
 
+def test_profiles_of_format_1_have_no_reference() -> None:
+    document = profile(trajectories(12, np.random.default_rng(8))).to_json()
+    del document["reference"]
+    again = HealthyProfile.from_json(document | {"format": 1})
+    assert again.reference is None
+    assert set(again.statistics) == set(NAMES)
+
+
+def test_a_measured_profile_is_that_of_new_episodes() -> None:
+    """Statistics of images are measured with references that the episode is not part of."""
+    checkpoint = load_checkpoint(PRETRAINED / "push-image-ekf.safetensors")
+    with open_dataset("datasets/samples/push.h5") as data:
+        episodes = [data[i] for i in range(140, 152)]
+    document = measure_profile(checkpoint.filter, checkpoint.name, [*episodes, replace(episodes[0], split="train")], "")
+    assert document is not None
+    measured = HealthyProfile.from_json(json.loads(json.dumps(document, allow_nan=False)))
+    assert measured.episodes == 12
+    assert measured.reference is not None
+    assert measured.reference.image.shape == (32, 32)
+    trace = next(trace_all(checkpoint, episodes, [0]))
+    own, others = (measure_reference(chosen) for chosen in (episodes, [e for i, e in enumerate(episodes) if i % 4]))
+    name = "offset/effector_position x/all"
+    values = [episode_statistics(trace, checkpoint, reference)[name] for reference in (own, others)]
+    assert measured.statistics[name][0] == pytest.approx(values[1], abs=1e-5)
+    assert abs(values[0]) < abs(values[1])
+
+
 @pytest.mark.parametrize(
     "change",
     [
         {"format": 9},
+        {"reference": {"key": "image"}},
         {"episodes": 3},
         {"statistics": {"nees": [1.0]}},
         {"statistics": {"nees/fused/all": "abc"}},
