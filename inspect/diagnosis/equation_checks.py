@@ -15,7 +15,7 @@ from torch import Tensor
 from beliefscope.filters.belief import Gaussian, moments
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
-from beliefscope.filters.models.fusion import powers, product_of_experts, weighted_average, weighted_product
+from beliefscope.filters.models.fusion import product_of_experts, weighted_average
 from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -31,8 +31,11 @@ def equation_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
     Particle filters also have ``particles``: number M; ``ancestors``: share of particles with offspring;
     ``offspring``: mean square of the difference between the number of offspring and its expectation M w; and
     ``prior ess``: relative effective sample size of the weights after resampling.
+    Information filters have none of them: their belief is larger than that of the trace.
     """
     filter_ = checkpoint.filter
+    if filter_.architecture.fusion == "information":
+        return {}
     if isinstance(filter_, ParticleFilter) and trace.particles is not None:
         return _particle_statistics(trace, filter_)
     if isinstance(filter_, ExtendedKalmanFilter) and trace.predicted_covariance is not None and len(trace) > 1:
@@ -46,7 +49,7 @@ def _kalman_statistics(trace: Trace, filter_: ExtendedKalmanFilter) -> dict[str,
     variance, by_rule = (matrix.diagonal(dim1=-2, dim2=-1).log() for matrix in (covariance, rule.covariance))
     distance = measures.wrapped(filter_.task, (mean - rule.mean).numpy()) / by_rule.exp().sqrt().numpy()
     values = {"fusion mean//all": float(np.sqrt(np.square(distance).mean()))}
-    if filter_.architecture.feedback or filter_.architecture.fusion == "information":
+    if filter_.architecture.feedback:
         used = _belief_before(trace, filter_).diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).log()
         values["fusion variance//all"] = float((used - by_rule[:-1]).median())
         values["reported variance//all"] = float((variance[:-1] - used).median())
@@ -64,15 +67,7 @@ def _fused(trace: Trace, filter_: ExtendedKalmanFilter) -> Gaussian:
         return Gaussian(bank.mean[:, 0], bank.covariance[:, 0])
     if log_weights is None:
         return product_of_experts(bank)
-    if architecture.fusion != "information":
-        return weighted_average(bank, log_weights, architecture.covariance)
-    prior, sensors = (
-        (_tensor(getattr(trace, f"{name}_mean")), _tensor(getattr(trace, f"{name}_covariance")))
-        for name in ("predicted", "observation")
-    )
-    experts = Gaussian(torch.cat([prior[0][:, :1], sensors[0]], 1), torch.cat([prior[1][:, :1], sensors[1]], 1))
-    power = powers(log_weights)
-    return weighted_product(experts, torch.cat([torch.ones_like(power[:, :1]), power], 1))
+    return weighted_average(bank, log_weights, architecture.covariance)
 
 
 def _belief_before(trace: Trace, filter_: ExtendedKalmanFilter) -> Tensor:

@@ -71,8 +71,8 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
 
     ``module bias``: mean of r. ``module spread``: standard deviation of r. ``module error``: root mean square of r.
     ``module std``: root mean square of s. ``module nis``: mean of (r / s)^2. ``module power``: in a Kalman filter the
-    geometric mean of 1 / s^2, in a particle filter the variance of the log-likelihood over fixed states, of which r is
-    independent. Steps with image blackout do not count for images.
+    geometric mean of 1 / s^2, in a particle filter the variance of the log-likelihood over fixed states, which does
+    not affect r. Steps with image blackout do not count for images.
     """
     if trace.observation_mean is not None and trace.observation_covariance is not None:
         steps = np.arange(len(trace))

@@ -11,8 +11,8 @@ WEIGHTS = f"beta logit/*|beta spread/*|beta contact/*|{FILTER}"
 DYNAMICS = f"dynamics */*|{FILTER}"
 """The dynamics model."""
 
-IMAGE = f"module */*image*|label_*/*image*|{WEIGHTS}"
+IMAGE = f"module */*image*|lag/labels *image*|{WEIGHTS}"
 """Modules that use the image."""
 
-HAPTICS = f"module */*haptics*|label_*/*haptics*|{WEIGHTS}"
+HAPTICS = f"module */*haptics*|lag/labels *haptics*|{WEIGHTS}"
 """Modules that use haptics."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, WEIGHTS
 
-LABELS = "label_lag/*|label_offset/*|shared_label_*"
+LABELS = "lag/labels*|offset/labels*"
 """Labels against the modalities."""
 
 MODULES = f"module */*|{WEIGHTS}|{DYNAMICS}"
@@ -14,15 +14,26 @@ CAUSES = (
     Cause(
         "labels.delay",
         "Labels delayed",
-        (Symptom("shared_label_lag/*", 0),),
+        (Symptom("lag/labels/*", 0),),
         f"{LABELS}|{MODULES}",
         "Synchronise the clock of the motion capture with the sensors.",
     ),
     Cause(
         "labels.offset",
         "Labels offset",
-        (Symptom("shared_label_offset/*", 0),),
+        (Symptom("offset/labels*", 0),),
         f"{LABELS}|{MODULES}",
         "Register the frame of the motion capture with the robot's.",
+    ),
+    Cause(
+        "data.shift",
+        "Data differ from the training data as a whole",
+        (
+            Symptom("sharpness/image/*|occlusion/image/*|shift/image*", 0),
+            Symptom("lever/force*|size/force/*|size/torque/*|axes/force/*", 0),
+            Symptom("module error/*", 1),
+        ),
+        f"*/image*|*/force*|*/torque*|*/contact/*|*/effector_position*|{LABELS}|{MODULES}",
+        "Collect data of these conditions and fine-tune: beliefscope finetune {task} --filter {filter} --data NEW.h5.",
     ),
 )

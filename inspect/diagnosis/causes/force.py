@@ -5,7 +5,7 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import HAPTICS
 
-CONTACT = "agreement/contact/*|unflagged_force/contact/*|lag/contact/*"
+CONTACT = "agreement/contact/*|unflagged force/contact/*|lag/contact/*"
 """Relations of the force and the contact flag."""
 
 CAUSES = (

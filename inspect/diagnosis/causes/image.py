@@ -5,7 +5,7 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import IMAGE
 
-HAND = "hand_offset/effector_position*"
+HAND = "offset/effector_position*"
 """Position of the hand in the image against the measured one."""
 
 CHECK = "Check the camera and its driver; until then, run the filter without the image."
@@ -23,7 +23,7 @@ CAUSES = (
         "image.frozen",
         "Image frozen",
         (Symptom("frozen/image/*"),),
-        f"lag/image/*|pixel_noise/image/*|{IMAGE}",
+        f"lag/image/*|noise/image/*|{IMAGE}",
         CHECK,
         "drop image",
     ),
@@ -46,7 +46,7 @@ CAUSES = (
     Cause(
         "image.noise",
         "Image noisy",
-        (Symptom("pixel_noise/image/*"),),
+        (Symptom("noise/image/*"),),
         f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|{HAND}|{IMAGE}",
         "Reduce the camera's gain, or train with noisy images: beliefscope finetune {task} --filter {filter} "
         "--faults image_noise=40.",
@@ -56,7 +56,7 @@ CAUSES = (
         "image.exposure",
         "Exposure changed",
         (Symptom("brightness/image/*", 0),),
-        f"pixel_noise/image/*|sharpness/image/*|occlusion/image/*|offset/effector_position*|shift/image*|{IMAGE}",
+        f"noise/image/*|sharpness/image/*|occlusion/image/*|offset/effector_position*|shift/image*|{IMAGE}",
         "Restore the camera's exposure or the lighting.",
         "expose image",
     ),
@@ -64,7 +64,7 @@ CAUSES = (
         "image.occlusion",
         "Camera occluded",
         (Symptom("occlusion/image/*"),),
-        f"sharpness/image/*|shift/image*|brightness/image/*|pixel_noise/image/*|{HAND}|{IMAGE}",
+        f"sharpness/image/*|shift/image*|brightness/image/*|noise/image/*|{HAND}|{IMAGE}",
         "Clear the camera's view.",
         "drop image",
     ),

@@ -10,6 +10,7 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
     """Causes of one modality's measurement model."""
     name, title = f"model.{modality}", f"{modality.capitalize()} model"
     module = f"*{modality}*"
+    labels = f"lag/labels {module}|offset/labels*"
     retrain = f"Fine-tune it: beliefscope finetune {{task}} --filter {{filter}} --train {modality}-only."
     calibrate = "Calibrate it: beliefscope finetune {task} --filter {filter} --train noise-only."
     return (
@@ -17,7 +18,7 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
             f"{name}.bias",
             f"{title} biased",
             (Symptom(f"module bias/{module}", 0),),
-            f"module error/{module}|module nis/{module}|label_*/{module}|module std/{module}|{FILTER}",
+            f"module error/{module}|module nis/{module}|{labels}|module std/{module}|{FILTER}",
             retrain,
             f"shift {modality}",
         ),
@@ -25,7 +26,7 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
             f"{name}.overconfident",
             f"{title} overconfident",
             (Symptom(f"module power/{module}", 1),),
-            f"module std/{module}|module nis/{module}|label_*/{module}|{FILTER}",
+            f"module std/{module}|module nis/{module}|{labels}|{FILTER}",
             calibrate,
             f"rescale {modality}",
         ),
@@ -33,7 +34,7 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
             f"{name}.underconfident",
             f"{title} underconfident",
             (Symptom(f"module power/{module}", -1),),
-            f"module std/{module}|module nis/{module}|label_*/{module}|{FILTER}",
+            f"module std/{module}|module nis/{module}|{labels}|{FILTER}",
             calibrate,
             f"rescale {modality}",
         ),
@@ -41,7 +42,7 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
             f"{name}.broken",
             f"{title} broken",
             (Symptom(f"module spread/{module}|module scatter/{module}", 1), Symptom(f"module error/{module}", 1)),
-            f"module */{module}|label_*/{module}|shared_label_*|{FILTER}",
+            f"module */{module}|{labels}|{FILTER}",
             retrain,
             f"restore {modality}",
         ),

@@ -1,0 +1,142 @@
+"""The catalog of causes: complete, documented and separable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beliefscope.inspect.diagnosis.catalog import CAUSES
+from beliefscope.inspect.diagnosis.cause import Cause, Symptom
+from beliefscope.inspect.diagnosis.scoring import applicable, burden, probabilities, score, strength, support
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
+
+PAGE = Path(__file__).parents[3] / "docs" / "diagnose.md"
+
+REQUIRED = {
+    "image": ("blackout", "frozen", "delay", "shift", "noise", "exposure", "occlusion"),
+    "force": ("bias", "drift", "gain", "sign", "axes", "noise", "stuck"),
+    "effector": ("offset",),
+    "contact": ("stuck",),
+    "haptics": ("delay",),
+    "control": ("delay", "scale"),
+    "labels": ("delay", "offset"),
+    "model.image": ("bias", "overconfident", "underconfident", "broken"),
+    "model.haptics": ("bias", "overconfident", "underconfident", "broken"),
+    "dynamics": ("bias", "frozen", "broken"),
+    "process_noise": ("small", "large"),
+    "covariance": ("small", "large"),
+    "weights": ("constant", "inverted", "ignores_image", "ignores_haptics"),
+    "particles": ("few", "deprived"),
+    "resampling": ("off", "biased"),
+    "fusion": ("shared_prior", "miscalibrated"),
+    "data": ("shift",),
+}
+"""Component -> mechanisms."""
+
+CRITICAL = 5.0
+
+
+def deviation(statistic: str, t: float, value: float = 0.0, healthy: float = 0.0) -> Deviation:
+    return Deviation(statistic, value, healthy, healthy, healthy, 0.0, abs(t) > CRITICAL, t)
+
+
+def row(cause: Cause) -> str:
+    """Row of a cause in the table of the documentation."""
+    sign = {-1: "decreases", 0: "deviates", 1: "increases"}
+    symptoms = "; ".join(
+        f"`{s.statistics.replace('|', '`, `')}` {'is ' + s.target if s.target else sign[s.direction]}"
+        for s in cause.symptoms
+    )
+    return f"| `{cause.name}` | {cause.title} | {symptoms} | {cause.undo or 'none'} |"
+
+
+def test_the_catalog_has_every_required_cause_once() -> None:
+    names = [cause.name for cause in CAUSES]
+    assert len(names) == len(set(names))
+    assert not {f"{part}.{mechanism}" for part, group in REQUIRED.items() for mechanism in group} - set(names)
+
+
+@pytest.mark.parametrize("cause", CAUSES, ids=lambda cause: cause.name)
+def test_the_catalog_is_documented(cause: Cause) -> None:
+    assert row(cause) in PAGE.read_text().splitlines()
+
+
+def ideal(cause: Cause) -> list[Deviation]:
+    """Deviations of exactly the first statistic of each symptom, in the right direction."""
+    result = {}
+    for symptom in cause.symptoms:
+        name = symptom.statistics.split("|")[0].replace("*", "x")
+        value = {"mirrored": -3.0, "shifted": 8.0, "": 8.0}[symptom.target]
+        sign = symptom.direction or 1
+        if name not in result or symptom.target:
+            result[name] = deviation(name, (-20.0 if symptom.target == "mirrored" else 20.0) * sign, value, 3.0)
+    return list(result.values())
+
+
+@pytest.mark.parametrize("cause", CAUSES, ids=lambda cause: cause.name)
+def test_a_cause_explains_its_own_symptoms_best(cause: Cause) -> None:
+    deviations = ideal(cause)
+    scores = {other.name: score(other, deviations, CRITICAL) for other in CAUSES}
+    assert scores[cause.name] == max(scores.values())
+    assert scores[cause.name] > 0.5
+
+
+def test_an_unexplained_deviation_upstream_excludes_a_cause() -> None:
+    bias = next(cause for cause in CAUSES if cause.name == "model.image.bias")
+    module, camera = deviation("module bias/image x/all", 50.0), deviation("shift/image x/all", 50.0)
+    belief = deviation("nees/fused/all", 50.0)
+    alone, with_belief, with_camera = (
+        score(bias, deviations, CRITICAL) for deviations in ([module], [module, belief], [module, camera])
+    )
+    assert alone == with_belief > 0.9  # the filter follows from its modules
+    assert with_camera < 0.1
+
+
+def test_the_wrong_direction_counts_against_a_cause() -> None:
+    symptom = Symptom("module power/*", 1)
+    assert support(symptom, [deviation("module power/image/all", 50.0)], CRITICAL) > 0.9
+    assert support(symptom, [deviation("module power/image/all", -50.0)], CRITICAL) == -1.0
+    assert support(symptom, [], CRITICAL) == -1.0
+
+
+def test_mirrored_and_shifted_statistics_are_told_apart_by_their_values() -> None:
+    mirrored, shifted = (Symptom("beta logit/*", target=target) for target in ("mirrored", "shifted"))
+
+    def found(values: tuple[float, float]) -> list[Deviation]:
+        healthy = (11.0, 5.0)
+        return [
+            deviation(f"beta logit/image {c}/all", -50.0, v, h) for c, v, h in zip("xy", values, healthy, strict=True)
+        ]
+
+    assert (
+        support(mirrored, found((-11.0, -5.0)), CRITICAL) > 0.9 > 0.0 > support(shifted, found((-11.0, -5.0)), CRITICAL)
+    )
+    assert support(shifted, found((3.0, -3.0)), CRITICAL) > 0.9 > 0.0 > support(mirrored, found((3.0, -3.0)), CRITICAL)
+
+
+def test_strength_grows_from_insignificance_to_one() -> None:
+    ratios = np.linspace(0.0, 20.0, 50)
+    values = [strength(ratio) for ratio in ratios]
+    assert values[0] == 0.0
+    assert np.all(np.diff(values) >= 0.0)
+    assert 0.99 < values[-1] <= 1.0
+
+
+def test_probabilities_include_an_unknown_cause() -> None:
+    assert probabilities({"a": -2.0})["a"] < 0.01
+    assert probabilities({"a": 1.0})["a"] > 0.99
+    both = probabilities({"a": 0.5, "b": 0.5})
+    assert both["a"] == both["b"] == pytest.approx(0.5, abs=0.01)
+
+
+def test_causes_that_cannot_be_observed_are_left_out() -> None:
+    names = {cause.name for cause in applicable(CAUSES, ["module bias/image x/all", "particles//all"])}
+    assert names == {"model.image.bias", "particles.few"}
+
+
+def test_the_burden_counts_phases_once_and_the_filter_less() -> None:
+    upstream = [deviation("black/image/all", 100.0), deviation("black/image/contact", 100.0)]
+    assert burden(upstream, CRITICAL) == pytest.approx(1.0, abs=1e-3)
+    assert burden([deviation("nees/fused/all", 100.0)], CRITICAL) < 0.5
