@@ -27,7 +27,7 @@ def frozen_images(images: Gray) -> Mask:
 
 
 def image_statistics(episode: Episode, key: str, reference: Reference | None) -> dict[str, float]:
-    """Statistics of one image sensor; those that need a reference of the same sensor and size only with one."""
+    """Statistics of one image sensor; some only with a reference of the same sensor and size."""
     images = episode.observations[key]
     lost = lost_images(images)
     middle = median_image(images)
@@ -112,7 +112,7 @@ def brightness_of(images: Array, reference: Reference) -> Array:
 
 
 def _noise(images: Gray) -> float:
-    """Gray levels: noise of the median pixel of those that are neither dark nor bright."""
+    """Gray levels: median noise of the pixels between ``DARK`` and ``BRIGHT``."""
     if len(images) < MIN_STEPS:
         return np.nan
     middle = np.median(images, axis=0)

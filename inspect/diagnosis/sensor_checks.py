@@ -15,7 +15,7 @@ from beliefscope.inspect.diagnosis.vector_checks import AXES, free_motion, satur
 
 
 def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:
-    """All statistics of sensors and controls; those that need a healthy reference only with one."""
+    """All statistics of sensors and controls; some of images only with a reference."""
     values: dict[str, float] = {}
     for key in image_keys(episode):
         values |= image_statistics(episode, key, reference)

@@ -48,7 +48,7 @@ def traces(run: Setting) -> list[Trace]:
 
 def deviations(healthy: Setting, faulty: Setting) -> dict[str, Deviation]:
     """Mean statistics of two runs."""
-    rows = [[episode_statistics(trace, run.checkpoint) for trace in traces(run)] for run in (healthy, faulty)]
+    rows = [[episode_statistics(trace, run.checkpoint, None) for trace in traces(run)] for run in (healthy, faulty)]
     result = {}
     for name in rows[0][0]:
         mean = [float(np.nanmean([row.get(name, np.nan) for row in group])) for group in rows]
