@@ -1,4 +1,4 @@
-"""Build the sample sets: 140 episodes of seed 0, followed by 50 test episodes of seed 2.
+"""Build the sample sets: 140 episodes of seed 0, followed by 50 test episodes of seed 2; field tasks: 40 of seed 2.
 
     python tools/sample_sets.py [FOLDER]
 
@@ -15,19 +15,24 @@ from beliefscope.datasets.simulation.collect import collect
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 
 KEPT, ADDED, STEPS, SEED = 140, 50, 100, 2
+FIELD, FIELD_EPISODES, FIELD_STEPS = ("door-field", "push-field"), 40, 200
+"""Field tasks: test episodes only, at most 5 MB."""
 
 
 def main() -> None:
+    target = Path(sys.argv[1]) if len(sys.argv) > 1 else sample_path("door").parent
     with tempfile.TemporaryDirectory() as folder:
         for task in ("door", "push"):
             path = Path(folder) / f"{task}.h5"
             collect(task, ADDED, STEPS, SEED, None, path, split="test")
-            target = (Path(sys.argv[1]) if len(sys.argv) > 1 else sample_path(task).parent) / f"{task}.h5"
             with open_dataset(sample_path(task)) as current, open_dataset(path) as added:
                 episodes = [current[i] for i in range(KEPT)] + list(added)
-                write_dataset(target, current.task, episodes)
-            with open_dataset(target) as data:
-                print(task, len(data), data.hash, target.stat().st_size)
+                write_dataset(target / f"{task}.h5", current.task, episodes)
+    for task in FIELD:
+        collect(task, FIELD_EPISODES, FIELD_STEPS, SEED, None, target / f"{task}.h5", split="test")
+    for task in ("door", "push", *FIELD):
+        with open_dataset(target / f"{task}.h5") as data:
+            print(task, len(data), data.hash, data.path.stat().st_size)
 
 
 if __name__ == "__main__":

@@ -115,14 +115,15 @@ def study_cells(
     """All cells by task, then seed, then filter, so that a table of all filters is available early.
 
     Args:
-        tasks: names or ``path/to/file.py:NAME``; empty for all with data. filters: names; empty for all of each task.
+        tasks: names or ``path/to/file.py:NAME``; empty for all with training data. filters: names; empty for all of
+            each task.
         files: data of tasks without a sample dataset, or in its place. note: receives each skipped trajectory.
 
     Raises BadInput for unknown names and unusable data.
     """
     if preset not in PLANS:
         raise unknown_name("preset", preset, PLANS)
-    sources = list(dict.fromkeys(tasks or [*(name for name in TASKS if name in files or has_sample(name)), *files]))
+    sources = list(dict.fromkeys(tasks or [*(name for name in TASKS if name in files or _trains(name)), *files]))
     available = {name for source in sources for name in filters_of(load_task(source))}
     for name in filters:
         if name not in available:
@@ -146,6 +147,14 @@ def study_cells(
             if not filters or name in filters
         ]
     return cells
+
+
+def _trains(task: str) -> bool:
+    """Whether the task has a sample dataset with training episodes; those of the field tasks are for testing only."""
+    if not has_sample(task):
+        return False
+    with open_dataset(sample_path(task)) as episodes:
+        return any(summary.split == "train" for summary in episodes.summaries)
 
 
 def run_cell(cell: Cell, folder: Path, report: Report | None = None, wait: bool = True) -> Document | None:
