@@ -19,6 +19,9 @@ Truth = Mapping[str, Any]
 BINS = 10
 """Bins of equal width of the expected calibration error."""
 
+MODEL_COMPONENTS = ("model", "dynamics", "process_noise", "covariance", "weights", "particles", "resampling", "fusion")
+"""First words of the causes in a filter; others are in its data."""
+
 RESAMPLES = 2000
 Z = 1.959964
 """0.975 quantile of the normal distribution."""
@@ -49,7 +52,8 @@ def component(cause: str) -> str:
 def score_card(truths: Sequence[Truth], answers: Sequence[Answer]) -> list[Score]:
     """All scores. Accuracy counts visible single faults; a single fault is masked if it is not visible.
 
-    - exact cause first, component first, exact cause in the first three: of visible single faults.
+    - exact cause first, component first, exact cause in the first three: of visible single faults. The first also by
+      the place of the fault: in data (sensors, controls, labels, physics) or in the model.
     - precision: the first cause was planted, of all answers ``fault``.
     - clean accused: controls that were not answered ``healthy``.
     - calibration: expected calibration error of the first cause's probability, of all answers that name a cause.
@@ -70,9 +74,13 @@ def score_card(truths: Sequence[Truth], answers: Sequence[Answer]) -> list[Score
     def share(name: str, bar: str, cases: Sequence[int], correct: Callable[[int], bool]) -> Score:
         return proportion(name, [correct(i) for i in cases], bar)
 
+    in_model = {i for i in singles if planted[i][0].split(".")[0] in MODEL_COMPONENTS}
+    in_data = [i for i in singles if i not in in_model]
     components = [[component(cause) for cause in causes] for causes in names]
     return [
         share("exact cause first", ">= 0.80", singles, lambda i: names[i][:1] == planted[i]),
+        share("exact cause first, data", "", in_data, lambda i: names[i][:1] == planted[i]),
+        share("exact cause first, model", "", sorted(in_model), lambda i: names[i][:1] == planted[i]),
         share("component first", ">= 0.92", singles, lambda i: components[i][:1] == [component(planted[i][0])]),
         share("exact cause in first three", ">= 0.95", singles, lambda i: planted[i][0] in names[i][:3]),
         share("precision", "", accusing, lambda i: names[i][0] in planted[i]),

@@ -47,6 +47,7 @@ def test_perfect_tool() -> None:
         assert score.value == (0.0 if name in ("clean accused", "expected calibration error") else 1.0), name
     counts = {name: score.count for name, score in result.items()}
     assert counts["exact cause first"] == 4
+    assert counts["exact cause first, data"] == counts["exact cause first, model"] == 2
     assert counts["precision"] == 7
     assert counts["masked recognised"] == counts["clean accused"] == 2
     assert counts["pairs with both in first three"] == 1
