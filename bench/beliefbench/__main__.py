@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import random
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -19,8 +21,13 @@ from beliefbench.tools import Tool, answers_of, command_tool, find_tool, mean_cp
 BASELINES = ("first-alarm", "nearest-neighbour", "decision-tree")
 
 
+def part(items: list[Any], arguments: argparse.Namespace) -> list[Any]:
+    """Every Nth item in a random order that is always the same: what an interrupted run has done is a random sample."""
+    return random.Random(0).sample(items, len(items))[arguments.first :: arguments.every]
+
+
 def generate(arguments: argparse.Namespace) -> None:
-    specs = plan(arguments.split, arguments.repeats)[arguments.first :: arguments.every]
+    specs = part(plan(arguments.split, arguments.repeats), arguments)
     for number, spec in enumerate(specs, 1):
         if not (arguments.directory / spec.name / "truth.json").exists():
             began = time.process_time()
@@ -42,7 +49,7 @@ def tool_of(arguments: argparse.Namespace) -> Tool:
 
 
 def answer(arguments: argparse.Namespace) -> None:
-    cases = folders(arguments.directory)[arguments.first :: arguments.every]
+    cases = part(folders(arguments.directory), arguments)
     answers_of(tool_of(arguments), cases, arguments.answers, lambda line: print(line, flush=True))
 
 
@@ -67,7 +74,7 @@ def score(arguments: argparse.Namespace) -> None:
 
 
 def add_part(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--first", type=int, default=0, help="skip the first N cases")
+    command.add_argument("--first", type=int, default=0, help="skip N cases of a fixed random order")
     command.add_argument("--every", type=int, default=1, help="only every Nth case")
 
 
