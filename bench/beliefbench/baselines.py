@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import Any
 import numpy as np
 from sklearn.tree import DecisionTreeClassifier
 
-from beliefbench.cases import Case, load_case, read_truth
+from beliefbench.cases import Case, healthy_profile, load_case, read_truth
 from beliefbench.scorecard import Answer, component
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
@@ -74,7 +76,17 @@ def cause_of_alarm(alarm: Deviation) -> str:
             return "particles.deprived"
 
 
-def features(case: Case) -> dict[str, float]:
+def features(folder: Path) -> dict[str, float]:
+    """``deviations`` of a case, kept in its folder until the healthy profile changes."""
+    truth = read_truth(folder)
+    profile = json.dumps(healthy_profile(truth["task"], truth["filter"]), sort_keys=True)
+    path = folder / f"features-{hashlib.sha256(profile.encode()).hexdigest()[:12]}.json"
+    if not path.exists():
+        path.write_text(json.dumps(deviations(load_case(folder))))
+    return json.loads(path.read_text())
+
+
+def deviations(case: Case) -> dict[str, float]:
     """``KIND/MODALITY/PHASE`` -> mean deviation from the healthy profile, in its standard deviations.
 
     State components are averaged, so that features of different tasks agree.
@@ -107,14 +119,14 @@ class Learned:
         for folder in folders:
             planted = read_truth(folder)["planted"]
             if len(planted) < 2:
-                rows.append(features(load_case(folder)))
+                rows.append(features(folder))
                 causes.append(planted[0]["cause"] if planted else HEALTHY)
         names = sorted({name for row in rows for name in row})
         return cls(names, np.array([_vector(row, names) for row in rows]), causes)
 
     def nearest_neighbour(self, case: Case) -> Answer:
         """Causes of the ``NEIGHBOURS`` nearest cases, each with the weight 1 / (1 + distance)."""
-        distance = np.linalg.norm(self.matrix - _vector(features(case), self.names), axis=1)
+        distance = np.linalg.norm(self.matrix - _vector(features(case.folder), self.names), axis=1)
         votes: dict[str, float] = {}
         for i in np.argsort(distance, kind="stable")[:NEIGHBOURS]:
             votes[self.causes[i]] = votes.get(self.causes[i], 0.0) + 1.0 / (1.0 + float(distance[i]))
@@ -123,7 +135,7 @@ class Learned:
 
     def decision_tree(self, case: Case) -> Answer:
         tree = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(self.matrix, self.causes)
-        share = tree.predict_proba(_vector(features(case), self.names)[None])[0]
+        share = tree.predict_proba(_vector(features(case.folder), self.names)[None])[0]
         return answer_of({str(c): float(p) for c, p in zip(tree.classes_, share, strict=True) if p > 0})
 
 
