@@ -22,7 +22,7 @@ from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
 from beliefscope.inspect.diagnosis.scoring import applicable, burden, probabilities, score
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnosis.undo import Setting
-from beliefscope.inspect.diagnostics.healthy_comparison import Comparison, Deviation, compare, critical_value
+from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
@@ -59,21 +59,26 @@ class Case:
     """Episodes of a filter and their deviations from the healthy profile.
 
     Attributes:
-        rows: statistics by episode. critical: t-value of a significant deviation.
+        rows: statistics by episode.
+        deviations: with t-values relative to their critical values, largest first.
     """
 
     setting: Setting
     traces: Sequence[Trace]
     rows: Rows
     profile: HealthyProfile
-    comparison: Comparison
-    critical: float
+    deviations: Sequence[Deviation]
     alarm_rate: float
 
     @property
-    def deviations(self) -> dict[str, Deviation]:
-        """By statistic."""
-        return {deviation.statistic: deviation for deviation in self.comparison.deviations}
+    def by_statistic(self) -> dict[str, Deviation]:
+        """The deviations by statistic."""
+        return {deviation.statistic: deviation for deviation in self.deviations}
+
+    @property
+    def alarms(self) -> list[Deviation]:
+        """Significant deviations, largest first."""
+        return [deviation for deviation in self.deviations if deviation.alarm]
 
 
 def diagnose(
@@ -114,7 +119,7 @@ def diagnose(
     case = examine(setting, traces, profile, alarm_rate)
     report(0.5)
     provenance = _provenance(case)
-    if not case.comparison.alarms:
+    if not case.alarms:
         text = f"Healthy: all statistics are within the record of {profile.episodes} healthy episodes."
         report(1.0)
         return Diagnosis("healthy", False, text, (), provenance)
@@ -128,16 +133,14 @@ def examine(setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, 
     """Compare all statistics of traces with the healthy profile."""
     rows = [episode_statistics(trace, setting.checkpoint, profile.reference) for trace in traces]
     profile, rows = with_scatter(profile, rows)
-    comparison = compare(profile, rows, significance=alarm_rate)
-    names = [deviation.statistic for deviation in comparison.deviations]
-    critical = critical_value(profile, names, len(rows), alarm_rate)
-    return Case(setting, traces, rows, profile, comparison, critical, alarm_rate)
+    deviations = with_critical_values(profile, compare(profile, rows), alarm_rate)
+    return Case(setting, traces, rows, profile, deviations, alarm_rate)
 
 
 def signature_scores(case: Case) -> dict[str, float]:
     """Score by name of the causes that can be observed."""
-    causes = applicable(CAUSES, case.deviations)
-    return {cause.name: score(cause, case.comparison.deviations, case.critical) for cause in causes}
+    causes = applicable(CAUSES, case.by_statistic)
+    return {cause.name: score(cause, case.deviations) for cause in causes}
 
 
 def confirm(
@@ -146,16 +149,16 @@ def confirm(
     """Undo the most probable causes; updates their scores by the share of all deviations that disappears."""
     by_name = {cause.name: cause for cause in CAUSES}
     likely = sorted(((p, name) for name, p in probabilities(scores).items() if p >= WORTH_UNDOING), reverse=True)
-    before = burden(case.comparison.deviations, case.critical)
+    before = burden(case.deviations)
     recovered: dict[str, Recovery] = {}
     for number, (_, name) in enumerate(likely[:UNDONE], 1):
         affected = _affected(case, _evidence_alarms(case, by_name[name]))
         indices = [trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit]
         setting = Setting(case.setting.checkpoint, case.setting.episodes, case.setting.particles, frozenset(indices))
-        if (replay := replay_without(by_name[name], setting, case.deviations, seed, base)) is not None:
+        if (replay := replay_without(by_name[name], setting, case.by_statistic, seed, base)) is not None:
             recovered[name] = recovery(case.traces, replay)
             after = examine(setting, replay, case.profile, case.alarm_rate)
-            left = burden(after.comparison.deviations, case.critical)
+            left = burden(after.deviations)
             scores[name] += RESTORED * max(-1.0, 1.0 - left / before)
         progress(number / min(UNDONE, len(likely)))
     return recovered
@@ -169,7 +172,7 @@ def _conclude(
     candidates = tuple(_candidate(case, by_name[name], p, recovered.get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    masked = not any(matches(VISIBLE, alarm.statistic) for alarm in case.comparison.alarms)
+    masked = not any(matches(VISIBLE, alarm.statistic) for alarm in case.alarms)
     if candidates and (first := candidates[0].recovered) is not None and first.error > VISIBLE_SHARE:
         masked = False
     return Diagnosis(state, masked, _headline(case, candidates, masked), candidates, provenance)
@@ -192,7 +195,7 @@ def _candidate(case: Case, cause: Cause, probability: float, recovered: Recovery
 
 def _evidence_alarms(case: Case, cause: Cause) -> list[Deviation]:
     """The alarms among the symptoms of a cause, largest first."""
-    return [d for d in case.comparison.alarms if any(s.matches(d.statistic) for s in cause.symptoms)]
+    return [d for d in case.alarms if any(s.matches(d.statistic) for s in cause.symptoms)]
 
 
 def _evidence(case: Case, deviation: Deviation) -> Evidence:
@@ -215,7 +218,7 @@ def _affected(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
 def _headline(case: Case, candidates: Sequence[Candidate], masked: bool) -> str:
     """The first cause with its probability; two causes that cannot be separated; or the largest deviation."""
     if not candidates or not candidates[0].evidence:
-        return f"Fault of unknown cause: {case.comparison.alarms[0].text}."
+        return f"Fault of unknown cause: {case.alarms[0].text}."
     first, count = candidates[0], len(case.rows)
     if first.probability < SURE and len(candidates) > 1:
         return f"Cannot separate {first.cause.name} from {candidates[1].cause.name}; try: {first.next}"

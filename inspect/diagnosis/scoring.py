@@ -2,7 +2,8 @@
 
 A cause must explain every deviation: its own symptoms must deviate in the right direction, and whatever it cannot
 change must not. An unexplained deviation upstream, of a sensor or an equation, weighs most, since a fault downstream
-cannot produce it; the filter's belief, at the end of the chain, is changed by everything.
+cannot produce it; the filter's belief, at the end of the chain, is changed by everything. The t-values of deviations
+are relative to their critical values (``with_critical_values``).
 """
 
 from __future__ import annotations
@@ -34,18 +35,19 @@ def strength(ratio: float) -> float:
     return max(0.0, 1.0 - math.exp((NOISE - ratio) / GROWTH))
 
 
-def support(symptom: Symptom, deviations: Sequence[Deviation], critical: float) -> float:
+def support(symptom: Symptom, deviations: Sequence[Deviation]) -> float:
     """How well the symptom's statistics agree with it, -1 to 1; -1 if none deviates."""
     if not deviations:
         return -1.0
-    sizes = [strength(abs(deviation.t) / critical) for deviation in deviations]
+    sizes = [strength(abs(deviation.t)) for deviation in deviations]
     if not symptom.target:
         agrees = (symptom.direction * deviation.t >= 0.0 for deviation in deviations)
         return 2.0 * max(size if yes else 0.0 for size, yes in zip(sizes, agrees, strict=True)) - 1.0
     value, healthy = (np.array([getattr(d, name) for d in deviations]) for name in ("value", "healthy"))
     shift = value - healthy
-    if symptom.target == "shifted":
-        quality = 1.0 - 2.0 * np.ptp(shift) / max(float(np.abs(shift).mean()), 1e-9)
+    if symptom.target == "shifted":  # a single statistic cannot contradict it
+        equal = 1.0 - 2.0 * np.ptp(shift) / max(float(np.abs(shift).mean()), 1e-9)
+        quality = equal if len(shift) > 1 else 0.0
     else:
         distance = np.abs(value + healthy) / np.maximum(np.abs(shift), 1e-9)
         width = np.array([d.high - d.low for d in deviations])
@@ -54,13 +56,10 @@ def support(symptom: Symptom, deviations: Sequence[Deviation], critical: float) 
     return max(sizes) * (1.0 + max(-1.0, float(quality))) - 1.0
 
 
-def score(cause: Cause, deviations: Iterable[Deviation], critical: float) -> float:
+def score(cause: Cause, deviations: Iterable[Deviation]) -> float:
     """How well a cause explains all deviations, -2 to 1: support of its symptoms minus unexplained deviations.
 
     Statistics of one kind and subject in several phases count once, by their largest deviation.
-
-    Args:
-        critical: t-value from which a deviation is significant.
     """
     members: list[list[Deviation]] = [[] for _ in cause.symptoms]
     unexplained: dict[str, float] = {}
@@ -71,22 +70,22 @@ def score(cause: Cause, deviations: Iterable[Deviation], critical: float) -> flo
             members[i].append(deviation)
         if not hits and not matches(cause.consequences, name):
             group = name.rpartition("/")[0]
-            size = (OF_FILTER if matches(FILTER, name) else 1.0) * strength(abs(deviation.t) / critical)
+            size = (OF_FILTER if matches(FILTER, name) else 1.0) * strength(abs(deviation.t))
             unexplained[group] = max(unexplained.get(group, 0.0), size)
     weights = [symptom.weight for symptom in cause.symptoms]
-    supports = [support(s, found, critical) for s, found in zip(cause.symptoms, members, strict=True)]
+    supports = [support(s, found) for s, found in zip(cause.symptoms, members, strict=True)]
     total = sum(w * s for w, s in zip(weights, supports, strict=True)) / sum(weights)
     # Probability that at least one unexplained deviation is real, if they are independent.
     return total - (1.0 - math.prod(1.0 - size for size in unexplained.values()))
 
 
-def burden(deviations: Iterable[Deviation], critical: float) -> float:
+def burden(deviations: Iterable[Deviation]) -> float:
     """Sum of the strengths of all deviations, one by kind and subject; those of the filter count less."""
     largest: dict[str, float] = {}
     for deviation in deviations:
         group = deviation.statistic.rpartition("/")[0]
         weight = OF_FILTER if matches(FILTER, deviation.statistic) else 1.0
-        largest[group] = max(largest.get(group, 0.0), weight * strength(abs(deviation.t) / critical))
+        largest[group] = max(largest.get(group, 0.0), weight * strength(abs(deviation.t)))
     return sum(largest.values())
 
 

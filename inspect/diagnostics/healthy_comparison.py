@@ -6,8 +6,9 @@ probability of an alarm is at most ``SIGNIFICANCE`` for any number of trajectori
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -25,6 +26,12 @@ SINGLE_SIGNIFICANCE = 0.02
 
 PERMUTATIONS = 1999
 """Number of random divisions into tested and healthy trajectories."""
+
+TAIL = 0.99
+"""Quantile of a statistic's t-values over healthy samples to which its critical value is proportional."""
+
+SMALLEST_T = 2.0
+"""Lower limit of this quantile."""
 
 MIN_EFFECT = 0.5
 """Minimum difference of an alarm, in standard deviations between healthy trajectories."""
@@ -99,7 +106,7 @@ class Deviation:
         low, high: 95 % range of means over as many healthy trajectories as were tested.
         p_value: probability of a deviation of this size in any statistic, if the trajectories are healthy.
         alarm: whether it is significant and at least ``MIN_EFFECT``.
-        t: difference of the means over its standard error.
+        t: difference of the means over its standard error; of ``with_critical_values``, relative to its critical value.
     """
 
     statistic: str
@@ -218,11 +225,24 @@ def compare(
     return Comparison(count, profile.episodes, profile.data, tuple(deviations[i] for i in order))
 
 
-def critical_value(profile: HealthyProfile, names: Sequence[str], count: int, significance: float) -> float:
-    """Quantile of the largest absolute t-value of ``count`` healthy trajectories against the other healthy ones."""
+def with_critical_values(profile: HealthyProfile, comparison: Comparison, significance: float) -> tuple[Deviation, ...]:
+    """The deviations with t-values relative to critical ones, and alarms where the ratio is at least 1; largest first.
+
+    Distributions of t-values differ between statistics; those of rare events have heavy tails. The critical value of a
+    statistic is proportional to its own high quantile, so that a share of healthy samples has an alarm.
+    """
+    names = [deviation.statistic for deviation in comparison.deviations]
     values, floor = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
-    divisions = _divisions(profile.episodes, min(count, profile.episodes // 2), 0)
-    return float(np.quantile(np.abs(_t_values(values, divisions, floor)[0]).max(1), 1.0 - significance))
+    count = min(comparison.trajectories, profile.episodes // 2)
+    t = np.abs(_t_values(values, _divisions(profile.episodes, count, 0), floor)[0])
+    own = np.maximum(np.quantile(t, TAIL, axis=0), SMALLEST_T)
+    critical = own * np.quantile((t / own).max(1), 1.0 - significance)
+    error = math.sqrt(1.0 / comparison.trajectories + 1.0 / profile.episodes)
+    result = [
+        replace(d, t=d.t / c, alarm=bool(abs(d.t) >= max(c, MIN_EFFECT / error)))
+        for d, c in zip(comparison.deviations, critical, strict=True)
+    ]
+    return tuple(sorted(result, key=lambda deviation: -abs(deviation.t)))
 
 
 def _scaled(names: Sequence[str], values: Array) -> tuple[Array, Array]:

@@ -41,7 +41,10 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
         Cause(
             f"{name}.broken",
             f"{title} broken",
-            (Symptom(f"module spread/{module}|module scatter/{module}", 1), Symptom(f"module error/{module}", 1)),
+            (
+                Symptom(f"module error/{module}|module spread/{module}|module scatter/{module}", 0),
+                Symptom(f"module power/{module}|module spread/{module}|module scatter/{module}", 0, 0.5),
+            ),
             f"module */{module}|{labels}|{FILTER}",
             retrain,
             f"restore {modality}",

@@ -35,11 +35,9 @@ REQUIRED = {
 }
 """Component -> mechanisms."""
 
-CRITICAL = 5.0
-
 
 def deviation(statistic: str, t: float, value: float = 0.0, healthy: float = 0.0) -> Deviation:
-    return Deviation(statistic, value, healthy, healthy, healthy, 0.0, abs(t) > CRITICAL, t)
+    return Deviation(statistic, value, healthy, healthy, healthy, 0.0, abs(t) > 1.0, t)
 
 
 def row(cause: Cause) -> str:
@@ -71,24 +69,24 @@ def ideal(cause: Cause) -> list[Deviation]:
         value = {"mirrored": -3.0, "shifted": 8.0, "": 8.0}[symptom.target]
         sign = symptom.direction or 1
         if name not in result or symptom.target:
-            result[name] = deviation(name, (-20.0 if symptom.target == "mirrored" else 20.0) * sign, value, 3.0)
+            result[name] = deviation(name, (-10.0 if symptom.target == "mirrored" else 10.0) * sign, value, 3.0)
     return list(result.values())
 
 
 @pytest.mark.parametrize("cause", CAUSES, ids=lambda cause: cause.name)
 def test_a_cause_explains_its_own_symptoms_best(cause: Cause) -> None:
     deviations = ideal(cause)
-    scores = {other.name: score(other, deviations, CRITICAL) for other in CAUSES}
+    scores = {other.name: score(other, deviations) for other in CAUSES}
     assert scores[cause.name] == max(scores.values())
     assert scores[cause.name] > 0.5
 
 
 def test_an_unexplained_deviation_upstream_excludes_a_cause() -> None:
     bias = next(cause for cause in CAUSES if cause.name == "model.image.bias")
-    module, camera = deviation("module bias/image x/all", 50.0), deviation("shift/image x/all", 50.0)
-    belief = deviation("nees/fused/all", 50.0)
+    module, camera = deviation("module bias/image x/all", 10.0), deviation("shift/image x/all", 10.0)
+    belief = deviation("nees/fused/all", 10.0)
     alone, with_belief, with_camera = (
-        score(bias, deviations, CRITICAL) for deviations in ([module], [module, belief], [module, camera])
+        score(bias, deviations) for deviations in ([module], [module, belief], [module, camera])
     )
     assert alone == with_belief > 0.9  # the filter follows from its modules
     assert with_camera < 0.1
@@ -96,9 +94,9 @@ def test_an_unexplained_deviation_upstream_excludes_a_cause() -> None:
 
 def test_the_wrong_direction_counts_against_a_cause() -> None:
     symptom = Symptom("module power/*", 1)
-    assert support(symptom, [deviation("module power/image/all", 50.0)], CRITICAL) > 0.9
-    assert support(symptom, [deviation("module power/image/all", -50.0)], CRITICAL) == -1.0
-    assert support(symptom, [], CRITICAL) == -1.0
+    assert support(symptom, [deviation("module power/image/all", 10.0)]) > 0.9
+    assert support(symptom, [deviation("module power/image/all", -10.0)]) == -1.0
+    assert support(symptom, []) == -1.0
 
 
 def test_mirrored_and_shifted_statistics_are_told_apart_by_their_values() -> None:
@@ -107,13 +105,11 @@ def test_mirrored_and_shifted_statistics_are_told_apart_by_their_values() -> Non
     def found(values: tuple[float, float]) -> list[Deviation]:
         healthy = (11.0, 5.0)
         return [
-            deviation(f"beta logit/image {c}/all", -50.0, v, h) for c, v, h in zip("xy", values, healthy, strict=True)
+            deviation(f"beta logit/image {c}/all", -10.0, v, h) for c, v, h in zip("xy", values, healthy, strict=True)
         ]
 
-    assert (
-        support(mirrored, found((-11.0, -5.0)), CRITICAL) > 0.9 > 0.0 > support(shifted, found((-11.0, -5.0)), CRITICAL)
-    )
-    assert support(shifted, found((3.0, -3.0)), CRITICAL) > 0.9 > 0.0 > support(mirrored, found((3.0, -3.0)), CRITICAL)
+    assert support(mirrored, found((-11.0, -5.0))) > 0.9 > 0.0 > support(shifted, found((-11.0, -5.0)))
+    assert support(shifted, found((3.0, -3.0))) > 0.9 > 0.0 > support(mirrored, found((3.0, -3.0)))
 
 
 def test_strength_grows_from_insignificance_to_one() -> None:
@@ -137,6 +133,6 @@ def test_causes_that_cannot_be_observed_are_left_out() -> None:
 
 
 def test_the_burden_counts_phases_once_and_the_filter_less() -> None:
-    upstream = [deviation("black/image/all", 100.0), deviation("black/image/contact", 100.0)]
-    assert burden(upstream, CRITICAL) == pytest.approx(1.0, abs=1e-3)
-    assert burden([deviation("nees/fused/all", 100.0)], CRITICAL) < 0.5
+    upstream = [deviation("black/image/all", 20.0), deviation("black/image/contact", 20.0)]
+    assert burden(upstream) == pytest.approx(1.0, abs=1e-3)
+    assert burden([deviation("nees/fused/all", 20.0)]) < 0.5
