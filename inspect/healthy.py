@@ -10,9 +10,9 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import Filter
-from beliefscope.inspect.diagnosis.reference import measure_reference
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.statistics.reference_images import measure_reference
 from beliefscope.inspect.traces.batch import trace_all
 
 MAX_EPISODES = 120

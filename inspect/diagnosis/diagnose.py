@@ -20,6 +20,7 @@ from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence, Recovery, matches
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
 from beliefscope.inspect.diagnosis.scoring import applicable, burden, probabilities, score
+from beliefscope.inspect.diagnosis.sensor_checks import localise
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
 from beliefscope.inspect.diagnosis.undo import Setting
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
@@ -186,7 +187,7 @@ def _candidate(case: Case, cause: Cause, probability: float, recovered: Recovery
         cause=cause,
         probability=probability,
         episodes=tuple(trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit),
-        steps=None,
+        steps=_steps(case, alarms[0], affected) if alarms else None,
         evidence=tuple(_evidence(case, alarm) for alarm in alarms[:EVIDENCE]),
         recovered=recovered,
         next=cause.next.format(task=task, filter=name),
@@ -201,8 +202,18 @@ def _evidence_alarms(case: Case, cause: Cause) -> list[Deviation]:
 def _evidence(case: Case, deviation: Deviation) -> Evidence:
     """A deviation and the episode that shows it most."""
     distance = [abs(row.get(deviation.statistic, np.nan) - deviation.healthy) for row in case.rows]
-    episode = case.traces[int(np.nanargmax(distance))].episode_index
-    return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, episode)
+    trace = case.traces[int(np.nanargmax(distance))]
+    steps = localise(deviation.statistic, trace.episode, case.profile.reference)
+    step = None if steps is None else steps[0]
+    return Evidence(deviation.text, deviation.value, deviation.low, deviation.high, trace.episode_index, step)
+
+
+def _steps(case: Case, deviation: Deviation, affected: np.ndarray) -> tuple[int, int] | None:
+    """First step that shows a deviation and the first step after it, over the affected episodes; None if unknown."""
+    episodes = [trace.episode for trace, hit in zip(case.traces, affected, strict=True) if hit]
+    found = [localise(deviation.statistic, episode, case.profile.reference) for episode in episodes]
+    known = [steps for steps in found if steps is not None]
+    return (min(first for first, _ in known), 1 + max(last for _, last in known)) if known else None
 
 
 def _affected(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
@@ -222,9 +233,10 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool) -> str:
     first, count = candidates[0], len(case.rows)
     if first.probability < SURE and len(candidates) > 1:
         return f"Cannot separate {first.cause.name} from {candidates[1].cause.name}; try: {first.next}"
+    since = f" from step {first.steps[0]}" if first.steps is not None and first.steps[0] > 0 else ""
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
-    text = f"{first.cause.title}{where}, probability {first.probability:.2f}"
+    text = f"{first.cause.title}{since}{where}, probability {first.probability:.2f}"
     return f"{text}; the filter is unaffected" if masked else text
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.diagnosis.reference import HAND, Gray, Reference, lost_images, median_image, normalised
-from beliefscope.inspect.diagnosis.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats
+from beliefscope.inspect.statistics.reference_images import HAND, Gray, Reference, lost_images, median_image, normalised
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats
 
 BLACK = 8
 """Gray level up to which a pixel says nothing about the exposure."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from beliefscope.inspect.diagnosis.signals import MIN_STEPS, Array, Mask, lag
 from beliefscope.inspect.statistics.measures import counted, task_of, wrapped
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag
 from beliefscope.inspect.trace import Trace
 
 SMALLEST_MOTION = 1e-2

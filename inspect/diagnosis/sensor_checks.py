@@ -9,9 +9,9 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
-from beliefscope.inspect.diagnosis.reference import Reference, image_keys, lost_images
-from beliefscope.inspect.diagnosis.signals import Array, Mask, deviating_interval, long_runs, repeats
 from beliefscope.inspect.diagnosis.vector_checks import AXES, free_motion, saturated, stuck, vector_statistics
+from beliefscope.inspect.statistics.reference_images import Reference, image_keys, lost_images
+from beliefscope.inspect.statistics.signals import Array, Mask, deviating_interval, long_runs, repeats
 
 
 def sensor_statistics(episode: Episode, reference: Reference | None) -> dict[str, float]:

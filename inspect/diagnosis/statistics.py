@@ -11,9 +11,9 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnosis.label_checks import label_statistics
 from beliefscope.inspect.diagnosis.model_checks import model_statistics
-from beliefscope.inspect.diagnosis.reference import Reference
 from beliefscope.inspect.diagnosis.sensor_checks import sensor_statistics
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.statistics.reference_images import Reference
 from beliefscope.inspect.trace import Trace
 
 SCATTER = {"module bias": "module scatter"}

@@ -7,8 +7,8 @@ from itertools import permutations
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.diagnosis.reference import HAND
-from beliefscope.inspect.diagnosis.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats, robust_line
+from beliefscope.inspect.statistics.reference_images import HAND
+from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats, robust_line
 
 AXES = "xyz"
 FORCE, TORQUE, CONTACT = "force", "torque", "contact"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.filters.checkpoint import Checkpoint, shipped
-from beliefscope.inspect.diagnosis.reference import Reference
+from beliefscope.inspect.statistics.reference_images import Reference
 
 Array = NDArray[np.float64]
 

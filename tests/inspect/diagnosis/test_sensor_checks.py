@@ -13,8 +13,8 @@ from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset
-from beliefscope.inspect.diagnosis.reference import Reference, measure_reference
 from beliefscope.inspect.diagnosis.sensor_checks import localise, sensor_statistics
+from beliefscope.inspect.statistics.reference_images import Reference, measure_reference
 
 TASKS = ("door", "push")
 

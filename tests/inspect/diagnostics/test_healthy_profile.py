@@ -14,11 +14,11 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, save_checkpoint
 from beliefscope.inspect.catalog import DIAGNOSTICS
-from beliefscope.inspect.diagnosis.reference import measure_reference
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
 from beliefscope.inspect.diagnostics.healthy_comparison import SINGLE_SIGNIFICANCE, Comparison, compare
 from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfile, find_profile
 from beliefscope.inspect.healthy import measure_profile
+from beliefscope.inspect.statistics.reference_images import measure_reference
 from beliefscope.inspect.traces.batch import trace_all
 
 NAMES = [f"nees/{layer}/{phase}" for layer in ("image", "haptics", "fused") for phase in ("all", "contact")]

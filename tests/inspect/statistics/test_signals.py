@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beliefscope.inspect.diagnosis.signals import (
+from beliefscope.inspect.statistics.signals import (
     MAX_LAG,
     deviating_interval,
     lag,

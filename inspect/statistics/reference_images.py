@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.diagnosis.signals import Array, Mask
+from beliefscope.inspect.statistics.signals import Array, Mask
 
 Gray = NDArray[np.uint8]
 
