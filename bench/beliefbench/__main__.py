@@ -12,7 +12,6 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from beliefbench.baselines import Learned, first_alarm
 from beliefbench.cases import FILTERS, folders, plan, read_truth
 from beliefbench.generate import write_case
 from beliefbench.scorecard import confusion, score_card, table
@@ -40,6 +39,8 @@ def tool_of(arguments: argparse.Namespace) -> Tool:
         return command_tool(arguments.command)
     if arguments.tool not in BASELINES:
         return find_tool(arguments.tool)
+    from beliefbench.baselines import Learned, first_alarm  # imports scikit-learn
+
     if arguments.tool == "first-alarm":
         return first_alarm
     if arguments.tuning is None:
