@@ -122,7 +122,7 @@ class FusionEfficiency(Diagnostic):
             tables.append(
                 Table(
                     "Reasons for a gap",
-                    ("reason", "modality", "quantity", "ideal", "value", "95 % from", "to", "contributes"),
+                    ("reason", "modality", "quantity", "ideal", "value", "95 % from", "to", "significant"),
                     tuple(reason.row() for reason in self.reasons),
                 )
             )

@@ -68,7 +68,8 @@ def reasons_of(traces: Sequence[Trace], checkpoint: Checkpoint) -> tuple[Reason,
     one_prior = architecture.fusion in ("crossmodal", "unimodal") and architecture.feedback
     reasons = []
     if traces[0].observation_covariance is not None:
-        reasons += _sensor_reasons(traces)
+        std = checkpoint.filter.statistics.mean_std("state")[1]
+        reasons += _sensor_reasons(traces, np.square(std.double().numpy()))
     if traces[0].predicted_covariance is not None and len(traces[0].modalities) > 1 and one_prior:
         reasons.append(_prior(traces))
     if traces[0].effective_weights is not None and traces[0].modalities_with_posterior:
@@ -85,8 +86,16 @@ def _sensor_errors(trace: Trace) -> tuple[Array, Array]:
     return error[keep], np.linalg.inv(trace.observation_covariance[keep].astype(np.float64))
 
 
-def _sensor_reasons(traces: Sequence[Trace]) -> list[Reason]:
-    """Bias and calibration of each virtual sensor; the calibration is that of the errors about the bias."""
+def _sensor_reasons(traces: Sequence[Trace], spread: Array) -> list[Reason]:
+    """Bias and calibration of each virtual sensor.
+
+    The calibration is that of the errors about the bias, at steps with an informative reading: R below ``spread`` in
+    every component, or at all steps if there are none. A blacked-out image has a large R, but its error is no larger
+    than the spread of the states.
+
+    Args:
+        spread: (n,) variance of the states in the training data.
+    """
     task = measures.task_of(traces[0])
     units, scale = measures.display_units(task)
     sensors = [_sensor_errors(trace) for trace in traces]
@@ -98,13 +107,16 @@ def _sensor_reasons(traces: Sequence[Trace]) -> list[Reason]:
     total = sums.sum(0)
     bias = total[..., 1] / total[..., 0]  # (K, n)
     value, low, high = jackknife(sums, lambda s: s[..., 1] / np.sqrt(s[..., 0] * s[..., 2]))
-    nees = np.stack(
-        [np.einsum("tki,tkij,tkj->k", e - bias, p, e - bias, optimize=True) / e.shape[-1] for e, p in sensors]
-    )
-    factor, factor_low, factor_high = mean_interval(nees, np.array([[len(e)] for e, _ in sensors]))
+    informative = [(np.einsum("tknn->tkn", np.linalg.inv(p)) < spread).all(-1) for _, p in sensors]
+    never = ~np.concatenate(informative).any(0)
+    used = [mask | never for mask in informative]
+    squares = [np.einsum("tki,tkij,tkj->tk", e - bias, p, e - bias, optimize=True) / e.shape[-1] for e, p in sensors]
+    nees = np.stack([(value * mask).sum(0) for value, mask in zip(squares, used, strict=True)])
+    counts = np.stack([mask.sum(0) for mask in used])
     reasons = []
     for k, name in enumerate(traces[0].modalities):
-        i = int(np.abs(value[k]).argmax())
+        i, has = int(np.abs(value[k]).argmax()), counts[:, k] > 0
+        factor, factor_low, factor_high = map(float, mean_interval(nees[has, k], counts[has, k]))
         size = f"{scale[i] * bias[k, i]:+.2f} {units[i]}"
         relevant = abs(value[k, i]) > MIN_BIAS and (low[k, i] > 0.0 or high[k, i] < 0.0)
         reasons.append(
@@ -113,13 +125,13 @@ def _sensor_reasons(traces: Sequence[Trace]) -> list[Reason]:
                 modality=name,
                 quantity="NEES/n of the sensor about its bias",
                 ideal=1.0,
-                value=float(factor[k]),
-                low=float(factor_low[k]),
-                high=float(factor_high[k]),
-                contributes=bool(factor_low[k] > 1.0 and factor[k] > MIN_FACTOR)
-                or bool(factor_high[k] < 1.0 and factor[k] < 1.0 / MIN_FACTOR),
+                value=factor,
+                low=factor_low,
+                high=factor_high,
+                contributes=(factor_low > 1.0 and factor > MIN_FACTOR)
+                or (factor_high < 1.0 and factor < 1.0 / MIN_FACTOR),
                 headline=f"uncalibrated R: standard deviations of the {name} sensor are "
-                f"{'too small' if factor[k] > 1.0 else 'too large'} (NEES/n {factor[k]:.2f})",
+                f"{'too small' if factor > 1.0 else 'too large'} (NEES/n {factor:.2f})",
             )
         )
         reasons.append(

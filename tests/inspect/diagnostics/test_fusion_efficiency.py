@@ -148,6 +148,12 @@ def test_overconfident_sensor() -> None:
     assert "deviations of the image sensor are too small" in reason.headline
 
 
+def test_readings_without_information_are_no_reason() -> None:
+    """In half of the steps, R exceeds the variance of the states."""
+    wide = np.where(np.arange(90) % 2, 1.0, 1e4)[:, None, None, None]
+    assert not contributing(simulated(observation_covariance=lambda r: r * wide), "information-ekf")
+
+
 def test_biased_sensor_is_drifted_not_uncalibrated() -> None:
     shift = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0]])
     found = contributing(simulated(observation_mean=lambda z: z + shift), "information-ekf")
