@@ -56,6 +56,7 @@ PLAN = Plan(
 )
 DEFAULT = ("information-ekf", "information-ekf:image", "information-ekf:haptics")
 TESTS = ("outages", "no_outages")
+"""Test sets; those that do not exist are omitted."""
 DROPPED = 20
 """Steps without haptics after the first contact."""
 
@@ -155,8 +156,11 @@ def haptics_share(filter_: ExtendedKalmanFilter, episodes: Sequence[Episode]) ->
     return result
 
 
-def dropped_haptics(filter_: Filter, episodes: Sequence[Episode]) -> str:
-    """Error over the 2 s from the first contact with haptics dropped there, over that of clean haptics."""
+def dropped_haptics(filter_: Filter, episodes: Sequence[Episode]) -> str | None:
+    """Error over the 2 s from the first contact with haptics dropped there, over that of clean haptics.
+
+    None if all episodes begin in contact.
+    """
     clean, faulty = [], []
     for episode in episodes:
         first = int(episode.contact.argmax())
@@ -165,6 +169,8 @@ def dropped_haptics(filter_: Filter, episodes: Sequence[Episode]) -> str:
         part = shortened(episode, first + DROPPED)
         clean.append(evaluate(filter_, [part]))
         faulty.append(evaluate(filter_, [part], faults=Faults.parse(f"drop=haptics:from={first}")))
+    if not clean:
+        return None
     sums = np.array(
         [[m.rmse_after_contact["position_cm"] ** 2 for m in pair] for pair in zip(faulty, clean, strict=True)]
     )
@@ -219,7 +225,7 @@ def main(folder: Path, names: Sequence[str]) -> None:
     torch.set_num_threads(1)
     filters = {name: trained(folder, name) for name in names}
     document = {}
-    for test in TESTS:
+    for test in (name for name in TESTS if (folder / f"{name}.h5").exists()):
         with open_dataset(folder / f"{test}.h5") as data:
             document[test] = {"episodes": len(data), **report(filters, list(data))}
     print(json.dumps(document, indent=1))
