@@ -19,18 +19,21 @@ class Symptom:
         statistics: patterns of names ``KIND/SUBJECT/PHASE``, joined by ``|``; ``*`` matches any text.
         direction: 1 if they increase, -1 if they decrease, 0 for either.
         weight: relative to the other symptoms of the cause.
-        target: how the statistics together must deviate: ``mirrored``, to the healthy values with the opposite sign; or
-            ``shifted``, all by the same amount.
+        target: how the statistics together must deviate: ``mirrored``, to the healthy values with the opposite sign;
+            ``shifted``, all by the same amount; ``common``, those of all modalities by the same amount in each
+            component; ``alone``, the opposite of ``common``.
+        otherwise: symptoms that may occur in its place.
     """
 
     statistics: str
     direction: Literal[-1, 0, 1] = 1
     weight: float = 1.0
-    target: Literal["", "mirrored", "shifted"] = ""
+    target: Literal["", "mirrored", "shifted", "common", "alone"] = ""
+    otherwise: tuple[Symptom, ...] = ()
 
     def matches(self, statistic: str) -> bool:
-        """Whether a statistic belongs to the symptom, whatever its value."""
-        return matches(self.statistics, statistic)
+        """Whether a statistic belongs to the symptom or those in its place, whatever its value."""
+        return matches(self.statistics, statistic) or any(other.matches(statistic) for other in self.otherwise)
 
 
 def matches(patterns: str, statistic: str) -> bool:
@@ -46,9 +49,10 @@ class Cause:
         name: ``component.mechanism``, such as ``image.frozen`` or ``model.image.bias``.
         title: what has happened, such as ``Image frozen``; start of the headline.
         symptoms: deviations that the cause always produces.
-        consequences: patterns of statistics that it may change as well.
+        consequences: patterns of statistics that it may change as well. lowers: of those that it may only decrease.
         undo: name of the intervention that undoes it (``inspect/diagnosis/interventions.py``); empty if there is none.
         next: next action; may have the placeholders ``{task}`` and ``{filter}``.
+        prior: added to the score; negative for a cause that would explain almost everything.
     """
 
     name: str
@@ -57,6 +61,8 @@ class Cause:
     consequences: str
     next: str
     undo: str = ""
+    lowers: str = ""
+    prior: float = 0.0
 
     @property
     def component(self) -> str:

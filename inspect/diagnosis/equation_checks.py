@@ -109,7 +109,7 @@ def _particle_statistics(trace: Trace, filter_: ParticleFilter) -> dict[str, flo
 def _likelihood_power(trace: Trace, filter_: ParticleFilter, prior: Tensor, log_weights: Tensor) -> float:
     """Power to which the fused likelihood has been raised: slope of ``log w - log w'`` on its logarithm."""
     log_likelihood = _tensor(trace.log_likelihood)
-    scaled = log_likelihood - filter_.scale(prior, log_likelihood)
+    scaled = log_likelihood - ParticleFilter.scale(filter_, prior, log_likelihood)
     if trace.weights is not None:
         scaled = scaled + _tensor(trace.weights).log()
     fused = torch.logsumexp(scaled, dim=1)

@@ -36,24 +36,39 @@ def strength(ratio: float) -> float:
 
 
 def support(symptom: Symptom, deviations: Sequence[Deviation]) -> float:
-    """How well the symptom's statistics agree with it, -1 to 1; -1 if none deviates."""
-    if not deviations:
-        return -1.0
-    sizes = [strength(abs(deviation.t)) for deviation in deviations]
-    if not symptom.target:
-        agrees = (symptom.direction * deviation.t >= 0.0 for deviation in deviations)
-        return 2.0 * max(size if yes else 0.0 for size, yes in zip(sizes, agrees, strict=True)) - 1.0
-    value, healthy = (np.array([getattr(d, name) for d in deviations]) for name in ("value", "healthy"))
-    shift = value - healthy
-    if symptom.target == "shifted":  # a single statistic cannot contradict it
-        equal = 1.0 - 2.0 * np.ptp(shift) / max(float(np.abs(shift).mean()), 1e-9)
-        quality = equal if len(shift) > 1 else 0.0
-    else:
+    """How well its statistics agree with a symptom, or with one in its place, -1 to 1; -1 if none deviates."""
+    own = [deviation for deviation in deviations if matches(symptom.statistics, deviation.statistic)]
+    best = max((support(other, deviations) for other in symptom.otherwise), default=-1.0)
+    if not own:
+        return best
+    sizes = [strength(abs(deviation.t)) for deviation in own]
+    if symptom.target:
+        return max(best, max(sizes) * (1.0 + _agreement(symptom.target, own)) - 1.0)
+    agrees = (symptom.direction * deviation.t >= 0.0 for deviation in own)
+    return max(best, 2.0 * max(size if yes else 0.0 for size, yes in zip(sizes, agrees, strict=True)) - 1.0)
+
+
+def _agreement(target: str, deviations: Sequence[Deviation]) -> float:
+    """How well values agree with a target, -1 to 1; 0 if they cannot tell."""
+    value, healthy, low, high = np.array([(d.value, d.healthy, d.low, d.high) for d in deviations]).T
+    shift, width = value - healthy, np.maximum(high - low, 1e-9)
+    if target == "shifted":  # a single statistic cannot contradict it
+        unequal = float(np.ptp(shift) / max(np.abs(shift).mean(), 1e-9))
+        return max(-1.0, 1.0 - 2.0 * unequal) if len(shift) > 1 else 0.0
+    if target == "mirrored":
         distance = np.abs(value + healthy) / np.maximum(np.abs(shift), 1e-9)
-        width = np.array([d.high - d.low for d in deviations])
-        informative = np.minimum(1.0, np.abs(healthy) / np.maximum(width, 1e-9))
-        quality = float((informative * (1.0 - 2.0 * distance)).sum() / max(informative.sum(), 1e-9))
-    return max(sizes) * (1.0 + max(-1.0, float(quality))) - 1.0
+        informative = np.minimum(1.0, np.abs(healthy) / width)
+        return max(-1.0, float((informative * (1.0 - 2.0 * distance)).sum() / max(informative.sum(), 1e-9)))
+    # Log-likelihood ratio of equal shifts against a shift of the most precise modality only; the width is 4 sigma.
+    ratio = 0.0
+    components = [d.statistic.split("/")[1].rpartition(" ")[2] for d in deviations]
+    for component in dict.fromkeys(components):
+        index = np.flatnonzero([c == component for c in components])
+        first, *others = index[np.argsort(width[index])]
+        for k in others:
+            sigma = np.hypot(width[k], width[first]) / 4.0
+            ratio += float(shift[k] ** 2 - (shift[k] - shift[first]) ** 2) / (2.0 * sigma**2)
+    return math.tanh(ratio if target == "common" else -ratio)
 
 
 def score(cause: Cause, deviations: Iterable[Deviation]) -> float:
@@ -68,7 +83,11 @@ def score(cause: Cause, deviations: Iterable[Deviation]) -> float:
         hits = [i for i, symptom in enumerate(cause.symptoms) if symptom.matches(name)]
         for i in hits:
             members[i].append(deviation)
-        if not hits and not matches(cause.consequences, name):
+        if (
+            not hits
+            and not matches(cause.consequences, name)
+            and not (deviation.t < 0.0 and matches(cause.lowers, name))
+        ):
             group = name.rpartition("/")[0]
             size = (OF_FILTER if matches(FILTER, name) else 1.0) * strength(abs(deviation.t))
             unexplained[group] = max(unexplained.get(group, 0.0), size)
@@ -76,7 +95,7 @@ def score(cause: Cause, deviations: Iterable[Deviation]) -> float:
     supports = [support(s, found) for s, found in zip(cause.symptoms, members, strict=True)]
     total = sum(w * s for w, s in zip(weights, supports, strict=True)) / sum(weights)
     # Probability that at least one unexplained deviation is real, if they are independent.
-    return total - (1.0 - math.prod(1.0 - size for size in unexplained.values()))
+    return cause.prior + total - (1.0 - math.prod(1.0 - size for size in unexplained.values()))
 
 
 def burden(deviations: Iterable[Deviation]) -> float:

@@ -11,8 +11,11 @@ WEIGHTS = f"beta logit/*|beta spread/*|beta contact/*|{FILTER}"
 DYNAMICS = f"dynamics */*|{FILTER}"
 """The dynamics model."""
 
-IMAGE = f"module */*image*|lag/labels *image*|{WEIGHTS}"
+LABELS = "lag/labels*|offset/labels*"
+"""Labels against the modalities."""
+
+IMAGE = f"module */*image*|{LABELS}|{WEIGHTS}"
 """Modules that use the image."""
 
-HAPTICS = f"module */*haptics*|lag/labels *haptics*|{WEIGHTS}"
+HAPTICS = f"module */*haptics*|{LABELS}|{WEIGHTS}"
 """Modules that use haptics."""

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, WEIGHTS
-
-LABELS = "lag/labels*|offset/labels*"
-"""Labels against the modalities."""
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, LABELS, WEIGHTS
 
 MODULES = f"module */*|{WEIGHTS}|{DYNAMICS}"
 
@@ -14,14 +11,14 @@ CAUSES = (
     Cause(
         "labels.delay",
         "Labels delayed",
-        (Symptom("lag/labels/*", 0),),
+        (Symptom("lag/labels*", 1), Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0)),
         f"{LABELS}|{MODULES}",
         "Synchronise the clock of the motion capture with the sensors.",
     ),
     Cause(
         "labels.offset",
         "Labels offset",
-        (Symptom("offset/labels*", 0),),
+        (Symptom("module bias/*image*", 0), Symptom("module bias/*", 0, 0.3, "common")),
         f"{LABELS}|{MODULES}",
         "Register the frame of the motion capture with the robot's.",
     ),
@@ -33,7 +30,8 @@ CAUSES = (
             Symptom("lever/force*|size/force/*|size/torque/*|axes/force/*", 0),
             Symptom("module error/*", 1),
         ),
-        f"*/image*|*/force*|*/torque*|*/contact/*|*/effector_position*|{LABELS}|{MODULES}",
+        f"sharpness/*|occlusion/*|shift/*|brightness/*|offset/*|*/force*|*/torque*|*/contact/*|{LABELS}|{MODULES}",
         "Collect data of these conditions and fine-tune: beliefscope finetune {task} --filter {filter} --data NEW.h5.",
+        prior=-0.4,
     ),
 )

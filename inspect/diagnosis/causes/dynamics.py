@@ -24,6 +24,7 @@ CAUSES = (
         f"dynamics error/*|dynamics nis/*|dynamics bias/*|{FILTER}",
         RETRAIN,
         "scale dynamics",
+        lowers="dynamics spread/*",
     ),
     Cause(
         "dynamics.broken",

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import FILTER
+from beliefscope.inspect.diagnosis.causes.consequences import FILTER, LABELS
 
 
 def causes_of(modality: str) -> tuple[Cause, ...]:
     """Causes of one modality's measurement model."""
     name, title = f"model.{modality}", f"{modality.capitalize()} model"
     module = f"*{modality}*"
-    labels = f"lag/labels {module}|offset/labels*"
     retrain = f"Fine-tune it: beliefscope finetune {{task}} --filter {{filter}} --train {modality}-only."
     calibrate = "Calibrate it: beliefscope finetune {task} --filter {filter} --train noise-only."
     return (
         Cause(
             f"{name}.bias",
             f"{title} biased",
-            (Symptom(f"module bias/{module}", 0),),
-            f"module error/{module}|module nis/{module}|{labels}|module std/{module}|{FILTER}",
+            (Symptom(f"module bias/{module}", 0), Symptom("module bias/*", 0, 0.3, "alone")),
+            "|".join(f"module {kind}/{module}" for kind in ("error", "nis", "std", "power")) + f"|{LABELS}|{FILTER}",
             retrain,
             f"shift {modality}",
+            lowers=f"module spread/{module}|module scatter/{module}",
         ),
         Cause(
             f"{name}.overconfident",
             f"{title} overconfident",
             (Symptom(f"module power/{module}", 1),),
-            f"module std/{module}|module nis/{module}|{labels}|{FILTER}",
+            f"module std/{module}|module nis/{module}|{LABELS}|{FILTER}",
             calibrate,
             f"rescale {modality}",
         ),
@@ -34,7 +34,7 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
             f"{name}.underconfident",
             f"{title} underconfident",
             (Symptom(f"module power/{module}", -1),),
-            f"module std/{module}|module nis/{module}|{labels}|{FILTER}",
+            f"module std/{module}|module nis/{module}|{LABELS}|{FILTER}",
             calibrate,
             f"rescale {modality}",
         ),
@@ -43,9 +43,9 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
             f"{title} broken",
             (
                 Symptom(f"module error/{module}|module spread/{module}|module scatter/{module}", 0),
-                Symptom(f"module power/{module}|module spread/{module}|module scatter/{module}", 0, 0.5),
+                Symptom(f"module power/{module}", -1, 0.5),
             ),
-            f"module */{module}|{labels}|{FILTER}",
+            f"module */{module}|{LABELS}|{FILTER}",
             retrain,
             f"restore {modality}",
         ),

@@ -43,10 +43,12 @@ def deviation(statistic: str, t: float, value: float = 0.0, healthy: float = 0.0
 def row(cause: Cause) -> str:
     """Row of a cause in the table of the documentation."""
     sign = {-1: "decreases", 0: "deviates", 1: "increases"}
-    symptoms = "; ".join(
-        f"`{s.statistics.replace('|', '`, `')}` {'is ' + s.target if s.target else sign[s.direction]}"
-        for s in cause.symptoms
-    )
+
+    def text(s: Symptom) -> str:
+        own = f"`{s.statistics.replace('|', '`, `')}` {'is ' + s.target if s.target else sign[s.direction]}"
+        return " or ".join([own, *map(text, s.otherwise)])
+
+    symptoms = "; ".join(map(text, cause.symptoms))
     return f"| `{cause.name}` | {cause.title} | {symptoms} | {cause.undo or 'none'} |"
 
 
@@ -66,7 +68,7 @@ def ideal(cause: Cause) -> list[Deviation]:
     result = {}
     for symptom in cause.symptoms:
         name = symptom.statistics.split("|")[0].replace("*", "x")
-        value = {"mirrored": -3.0, "shifted": 8.0, "": 8.0}[symptom.target]
+        value = -3.0 if symptom.target == "mirrored" else 8.0
         sign = symptom.direction or 1
         if name not in result or symptom.target:
             result[name] = deviation(name, (-10.0 if symptom.target == "mirrored" else 10.0) * sign, value, 3.0)
@@ -82,11 +84,11 @@ def test_a_cause_explains_its_own_symptoms_best(cause: Cause) -> None:
 
 
 def test_an_unexplained_deviation_upstream_excludes_a_cause() -> None:
-    bias = next(cause for cause in CAUSES if cause.name == "model.image.bias")
-    module, camera = deviation("module bias/image x/all", 10.0), deviation("shift/image x/all", 10.0)
+    overconfident = next(cause for cause in CAUSES if cause.name == "model.image.overconfident")
+    module, camera = deviation("module power/image/all", 10.0), deviation("shift/image x/all", 10.0)
     belief = deviation("nees/fused/all", 10.0)
     alone, with_belief, with_camera = (
-        score(bias, deviations) for deviations in ([module], [module, belief], [module, camera])
+        score(overconfident, deviations) for deviations in ([module], [module, belief], [module, camera])
     )
     assert alone == with_belief > 0.9  # the filter follows from its modules
     assert with_camera < 0.1
@@ -128,11 +130,30 @@ def test_probabilities_include_an_unknown_cause() -> None:
 
 
 def test_causes_that_cannot_be_observed_are_left_out() -> None:
-    names = {cause.name for cause in applicable(CAUSES, ["module bias/image x/all", "particles//all"])}
-    assert names == {"model.image.bias", "particles.few"}
+    names = {cause.name for cause in applicable(CAUSES, ["black/image/all", "particles//all"])}
+    assert names == {"image.blackout", "particles.few"}
 
 
 def test_the_burden_counts_phases_once_and_the_filter_less() -> None:
     upstream = [deviation("black/image/all", 20.0), deviation("black/image/contact", 20.0)]
     assert burden(upstream) == pytest.approx(1.0, abs=1e-3)
     assert burden([deviation("nees/fused/all", 20.0)]) < 0.5
+
+
+@pytest.mark.parametrize(("haptics", "shared"), [(0.02, True), (0.0, False)])
+def test_a_shift_of_all_modalities_is_common(haptics: float, shared: bool) -> None:
+    """The haptics model has a standard error of 5 mm; the image model has moved by 2 cm."""
+    found = [
+        Deviation(f"module bias/{name} x/all", value, 0.0, -2 * sigma, 2 * sigma, 0.0, True, value / sigma)
+        for name, value, sigma in (("image", 0.02, 0.001), ("haptics", haptics, 0.005))
+    ]
+    common, alone = (support(Symptom("module bias/*", target=target), found) for target in ("common", "alone"))
+    assert (common > 0.9 and alone < -0.9) if shared else (alone > 0.9 and common < -0.9)
+
+
+def test_a_cause_may_lower_statistics_without_raising_them() -> None:
+    bias = next(cause for cause in CAUSES if cause.name == "model.image.bias")
+    module = deviation("module bias/image x/all", 10.0)
+    lower, higher = (score(bias, [module, deviation("module spread/image x/all", t)]) for t in (-10.0, 10.0))
+    assert lower == score(bias, [module])
+    assert higher < lower - 0.9
