@@ -17,7 +17,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.catalog import CAUSES
-from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence, Recovery, matches
+from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence, Recovery
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
 from beliefscope.inspect.diagnosis.scoring import applicable, burden, probabilities, score
 from beliefscope.inspect.diagnosis.sensor_checks import localise
@@ -46,11 +46,8 @@ WORTH_UNDOING = 0.02
 RESTORED = 0.3
 """Weight of the restored share of all deviations in the score of a cause that was undone."""
 
-VISIBLE = "error/*|nees/fused/*"
-"""Statistics of a fault that affects the filter."""
-
-VISIBLE_SHARE = 0.17
-"""Share of the position error from which a fault affects the filter if undoing it removes more: 1 - 1 / 1.2."""
+VISIBLE = {"error//all": 1.2, "nees/fused/all": 2.0}
+"""Statistic -> ratio to its healthy value, or inverse ratio, from which a fault affects the filter."""
 
 Rows = Sequence[Mapping[str, float]]
 
@@ -173,10 +170,16 @@ def _conclude(
     candidates = tuple(_candidate(case, by_name[name], p, recovered.get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    masked = not any(matches(VISIBLE, alarm.statistic) for alarm in case.alarms)
-    if candidates and (first := candidates[0].recovered) is not None and first.error > VISIBLE_SHARE:
-        masked = False
+    masked = not _visible(case, candidates[0].recovered if candidates else None)
     return Diagnosis(state, masked, _headline(case, candidates, masked), candidates, provenance)
+
+
+def _visible(case: Case, recovered: Recovery | None) -> bool:
+    """Whether a fault affects the filter: its error or calibration differ, or undoing the fault reduces the error."""
+    if recovered is not None and recovered.error > 1.0 - 1.0 / VISIBLE["error//all"]:
+        return True
+    found = ((case.by_statistic.get(name), limit) for name, limit in VISIBLE.items())
+    return any(d is not None and not d.healthy / limit < d.value < d.healthy * limit for d, limit in found)
 
 
 def _candidate(case: Case, cause: Cause, probability: float, recovered: Recovery | None) -> Candidate:

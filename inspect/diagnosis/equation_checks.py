@@ -16,7 +16,7 @@ from beliefscope.filters.belief import Gaussian, moments
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.fusion import product_of_experts, weighted_average
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 
@@ -36,7 +36,7 @@ def equation_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
     filter_ = checkpoint.filter
     if filter_.architecture.fusion == "information":
         return {}
-    if isinstance(filter_, ParticleFilter) and trace.particles is not None:
+    if isinstance(filter_, MixtureParticleFilter) and trace.particles is not None:
         return _particle_statistics(trace, filter_)
     if isinstance(filter_, ExtendedKalmanFilter) and trace.predicted_covariance is not None and len(trace) > 1:
         return _kalman_statistics(trace, filter_)
@@ -83,7 +83,7 @@ def _belief_before(trace: Trace, filter_: ExtendedKalmanFilter) -> Tensor:
     return before * std * std[:, None]
 
 
-def _particle_statistics(trace: Trace, filter_: ParticleFilter) -> dict[str, float]:
+def _particle_statistics(trace: Trace, filter_: MixtureParticleFilter) -> dict[str, float]:
     assert trace.log_weights is not None
     assert trace.prior_log_weights is not None
     steps, count = trace.log_weights.shape
@@ -106,10 +106,10 @@ def _particle_statistics(trace: Trace, filter_: ParticleFilter) -> dict[str, flo
     }
 
 
-def _likelihood_power(trace: Trace, filter_: ParticleFilter, prior: Tensor, log_weights: Tensor) -> float:
+def _likelihood_power(trace: Trace, filter_: MixtureParticleFilter, prior: Tensor, log_weights: Tensor) -> float:
     """Power to which the fused likelihood has been raised: slope of ``log w - log w'`` on its logarithm."""
     log_likelihood = _tensor(trace.log_likelihood)
-    scaled = log_likelihood - ParticleFilter.scale(filter_, prior, log_likelihood)
+    scaled = log_likelihood - filter_.scale(prior, log_likelihood)
     if trace.weights is not None:
         scaled = scaled + _tensor(trace.weights).log()
     fused = torch.logsumexp(scaled, dim=1)

@@ -18,7 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import MAX_LOGIT
 from beliefscope.filters.models.dynamics import Dynamics
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
@@ -79,7 +79,7 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
         observed = trace.observation_mean.astype(np.float64)
         variance = np.diagonal(trace.observation_covariance, axis1=-2, axis2=-1).astype(np.float64)
         power = 1.0 / variance
-    elif trace.log_likelihood is not None and isinstance(checkpoint.filter, ParticleFilter):
+    elif trace.log_likelihood is not None and isinstance(checkpoint.filter, MixtureParticleFilter):
         steps = np.arange(0, len(trace), EVERY)
         observed, variance, power = likelihood_moments(checkpoint.filter, trace.episode, steps)
     else:
@@ -109,7 +109,9 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
 
 
 @torch.no_grad()
-def likelihood_moments(filter_: ParticleFilter, episode: Episode, steps: np.ndarray) -> tuple[Array, Array, Array]:
+def likelihood_moments(
+    filter_: MixtureParticleFilter, episode: Episode, steps: np.ndarray
+) -> tuple[Array, Array, Array]:
     """Means (S, K, n) and variances (S, K, n) of the likelihoods at some steps, as densities of the state; SI units.
 
     The means are those of likelihoods raised to a power, so that they have the same variance ``POWER^2`` of their
@@ -205,7 +207,7 @@ def weight_statistics(trace: Trace) -> dict[str, float]:
     if trace.weights is None or len(trace) < MIN_STEPS or trace.weights.shape[1] < 2:
         return {}
     names = [c.name for c in measures.task_of(trace).components] if trace.weights.shape[-1] > 1 else [""]
-    weights = trace.weights.astype(np.float64)
+    weights = np.clip(trace.weights.astype(np.float64), 1e-9, 1.0 - 1e-9)
     odds = np.log(weights / (1.0 - weights))
     logits = 2.0 * MAX_LOGIT * np.arctanh(np.clip(odds / (2.0 * MAX_LOGIT), -LARGEST, LARGEST))
     contact = trace.episode.contact.astype(np.float64)

@@ -23,7 +23,7 @@ from beliefscope.filters.catalog import build
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import MAX_LOGIT, Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
 POSITION, CHANGE = slice(0, 3), slice(3, 6)
@@ -155,10 +155,10 @@ def shift(modality: str, setting: Setting, deviations: Deviations) -> Setting | 
 
 def _with_likelihood(setting: Setting, k: int, change: Callable[..., Tensor]) -> Setting | None:
     """A particle filter with another likelihood of model k."""
-    if not isinstance(setting.checkpoint.filter, ParticleFilter):
+    if not isinstance(setting.checkpoint.filter, MixtureParticleFilter):
         return None
     filter_ = _copy(setting.checkpoint)
-    assert isinstance(filter_, ParticleFilter)
+    assert isinstance(filter_, MixtureParticleFilter)
     likelihood = filter_.log_likelihood
 
     def changed(evidence: Evidence, states: Tensor) -> Tensor:

@@ -1,14 +1,87 @@
-"""Diagnosis of shipped filters."""
+"""Diagnosis of filters with planted faults, against a healthy profile of fresh episodes."""
 
 from __future__ import annotations
 
-from beliefscope.datasets.store import open_dataset, sample_path
-from beliefscope.filters.checkpoint import load_checkpoint, shipped
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from beliefscope.datasets.catalog import load_task
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+from beliefscope.inspect.healthy import profile_of
+
+
+@cache
+def checkpoint() -> Checkpoint:
+    return load_checkpoint(shipped("push", "crossmodal-ekf"))
+
+
+@cache
+def simulated(first: int, count: int) -> dict[int, Episode]:
+    simulate = load_task("push").simulate
+    assert simulate is not None
+    return {i: simulate(77, first + i, 60) for i in range(count)}
+
+
+@cache
+def profile() -> HealthyProfile:
+    return profile_of(checkpoint(), list(simulated(0, 20).values()), "seed 77")
+
+
+def faulty(faults: str) -> Mapping[int, Episode]:
+    return {index: Faults.parse(faults).apply(episode) for index, episode in simulated(100, 6).items()}
 
 
 def test_clean_episodes_are_healthy() -> None:
-    with open_dataset(sample_path("door")) as data:
-        episodes = {index: data[index] for index in data.held_out()}
-    result = diagnose(load_checkpoint(shipped("door", "crossmodal-ekf")), episodes)
+    result = diagnose(checkpoint(), simulated(100, 6), profile=profile())
     assert (result.state, result.masked, result.causes) == ("healthy", False, ())
+    assert "Healthy" in result.headline
+
+
+@pytest.mark.parametrize(
+    ("faults", "cause"), [("image_frozen:from=30", "image.frozen"), ("force_bias=3", "force.bias")]
+)
+def test_a_planted_sensor_fault_is_named(faults: str, cause: str) -> None:
+    progress: list[float] = []
+    result = diagnose(checkpoint(), faulty(faults), profile=profile(), progress=progress.append)
+    first = result.causes[0]
+    assert (result.state, first.cause.name) == ("fault", cause)
+    assert first.evidence[0].value > first.evidence[0].high
+    assert first.cause.title in result.headline
+    assert progress == sorted(progress)
+    assert progress[-1] == pytest.approx(1.0)
+    if cause == "image.frozen":
+        assert first.steps is not None
+        assert 28 <= first.steps[0] <= 32
+
+
+def test_a_biased_module_is_named_and_its_error_recovered() -> None:
+    filter_ = copy.deepcopy(checkpoint().filter)
+    filter_.get_submodule("virtual_sensors.image.state").bias += 0.7
+    planted = replace(checkpoint(), filter=filter_)
+    result = diagnose(planted, simulated(100, 6), profile=profile())
+    first = result.causes[0]
+    assert (result.state, result.masked, first.cause.name) == ("fault", False, "model.image.bias")
+    assert first.recovered is not None
+    assert first.recovered.low > 0.3
+    document = result.to_json()
+    assert set(document["causes"][0]) == {
+        *("cause", "component", "probability", "episodes", "steps", "evidence", "recovered", "next")
+    }
+    assert sum(cause["probability"] for cause in document["causes"]) <= 1.0
+    assert result.tables()
+
+
+def test_a_filter_needs_episodes_and_a_healthy_profile() -> None:
+    with pytest.raises(BadInput, match="no episodes"):
+        diagnose(checkpoint(), {}, profile=profile())
+    with pytest.raises(BadInput, match="no healthy profile"):
+        diagnose(replace(checkpoint(), hash="other", name="crossmodal-ekf"), simulated(100, 1))

@@ -13,7 +13,7 @@ import torch
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.models.pf import ParticleFilter
+from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
 from beliefscope.inspect.diagnosis.model_checks import (
     dynamics_statistics,
@@ -92,7 +92,7 @@ def test_moments_of_a_gaussian_likelihood(monkeypatch: pytest.MonkeyPatch) -> No
     """Importance sampling recovers mean and variance of a Gaussian of any width between the scales."""
     checkpoint, _ = run("crossmodal-pf")
     filter_ = checkpoint.filter
-    assert isinstance(filter_, ParticleFilter)
+    assert isinstance(filter_, MixtureParticleFilter)
     truth = filter_.statistics.standardise("state", torch.from_numpy(episode().states[:8]))
     for bias, std in ((0.0, 0.1), (0.2, 0.2), (0.3, 0.5)):
         centre = (truth + bias)[:, None, None]
@@ -107,7 +107,7 @@ def test_moments_of_a_gaussian_likelihood(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_the_power_of_a_likelihood_does_not_change_its_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     filter_ = run("crossmodal-pf")[0].filter
-    assert isinstance(filter_, ParticleFilter)
+    assert isinstance(filter_, MixtureParticleFilter)
     before = likelihood_moments(filter_, episode(), np.arange(8))
     likelihood = filter_.log_likelihood
     monkeypatch.setattr(filter_, "log_likelihood", lambda evidence, states: 4.0 * likelihood(evidence, states))
