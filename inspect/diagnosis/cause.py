@@ -49,7 +49,8 @@ class Cause:
         name: ``component.mechanism``, such as ``image.frozen`` or ``model.image.bias``.
         title: what has happened, such as ``Image frozen``; start of the headline.
         symptoms: deviations that the cause always produces.
-        consequences: patterns of statistics that it may change as well. lowers: of those that it may only decrease.
+        consequences: patterns of statistics that it may change as well.
+        lowers: patterns of statistics that it may decrease, but not increase.
         undo: name of the intervention that undoes it (``inspect/diagnosis/interventions.py``); empty if there is none.
         next: next action; may have the placeholders ``{task}`` and ``{filter}``.
         prior: added to the score; negative for a cause that would explain almost everything.

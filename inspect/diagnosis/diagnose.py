@@ -31,6 +31,9 @@ from beliefscope.inspect.traces.batch import trace_all
 SURE = 0.5
 """Smallest probability of the first cause with which the state is ``fault`` rather than ``unsure``."""
 
+COMPARABLE = 0.3
+"""Smallest ratio of their probabilities for two causes that cannot be separated."""
+
 LISTED = 5
 """Maximum number of listed causes."""
 
@@ -157,7 +160,7 @@ def confirm(
             recovered[name] = recovery(case.traces, replay)
             after = examine(setting, replay, case.profile, case.alarm_rate)
             left = burden(after.deviations)
-            scores[name] += RESTORED * max(-1.0, 1.0 - left / before)
+            scores[name] += RESTORED * max(0.0, 1.0 - left / before)
         progress(number / min(UNDONE, len(likely)))
     return recovered
 
@@ -234,12 +237,13 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool) -> str:
     if not candidates or not candidates[0].evidence:
         return f"Fault of unknown cause: {case.alarms[0].text}."
     first, count = candidates[0], len(case.rows)
-    if first.probability < SURE and len(candidates) > 1:
+    if first.probability < SURE and len(candidates) > 1 and candidates[1].probability > COMPARABLE * first.probability:
         return f"Cannot separate {first.cause.name} from {candidates[1].cause.name}; try: {first.next}"
     since = f" from step {first.steps[0]}" if first.steps is not None and first.steps[0] > 0 else ""
     where = f" in {len(first.episodes)} of {count} episodes" if len(first.episodes) < count else ""
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
-    text = f"{first.cause.title}{since}{where}, probability {first.probability:.2f}"
+    title = first.cause.title if first.probability >= SURE else f"Possibly: {first.cause.title}"
+    text = f"{title}{since}{where}, probability {first.probability:.2f}"
     return f"{text}; the filter is unaffected" if masked else text
 
 

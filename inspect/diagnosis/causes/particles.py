@@ -26,7 +26,7 @@ CAUSES = (
         "resampling.off",
         "Resampling off",
         (Symptom("prior ess/*", -1),),
-        FILTER,
+        f"fusion mean/*|fusion variance/*|{FILTER}",
         "Resample at every step.",
         "restore equations",
     ),
