@@ -25,6 +25,7 @@ from beliefscope.inspect.diagnostics.healthy_profile import SUFFIX, HealthyProfi
 from beliefscope.inspect.healthy import profile_of
 
 FIELD = "beliefscope collect {0} --episodes 60 --steps 200 --seed 1 --split test -o {0}.h5"
+RECORDED = {"push-real": "beliefscope convert push-real --data mit_push -o push-real.h5"}
 COUNTS = {"door": 600, "push": 500}
 STEPS, SEED = 100, 1
 
@@ -57,7 +58,7 @@ def main() -> None:
         task = checkpoint.task.name
         if task not in episodes:
             episodes[task] = held_out(task, folder)
-        collected = FIELD.format(task) if checkpoint.task.start_distance else COLLECTED[task]
+        collected = FIELD.format(task) if checkpoint.task.start_distance else (COLLECTED | RECORDED)[task]
         profile = profile_of(checkpoint, episodes[task], collected)
         write(path.with_name(path.stem + SUFFIX), checkpoint.hash, profile)
         print(f"{path.stem}: {profile.episodes} episodes, {len(profile.statistics)} statistics", flush=True)

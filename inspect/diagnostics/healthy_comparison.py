@@ -77,7 +77,7 @@ KINDS = {
     "shift": ("shift in pixels", False, 0.2),
     "lag": ("delay in steps", False, 0.25),
     "offset": ("offset from the measured hand or the estimates (m, rad)", False, 0.002),
-    "level": ("reading (N, N m) at the start", False, 0.02),
+    "level": ("reading (N, N m) at the start", False, 0.05),
     "drift": ("drift (N/s, N m/s)", False, 0.01),
     "noise": ("noise (gray levels, N, N m)", False, 0.02),
     "position noise": ("noise in m", False, 5e-4),

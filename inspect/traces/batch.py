@@ -15,9 +15,10 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
-from beliefscope.inspect.traces.run import assemble_trace, check_task
+from beliefscope.inspect.traces.run import assemble_trace, check_task, trace
 
 AT_ONCE = 32
 """Episodes in one run; limits memory."""
@@ -32,7 +33,7 @@ def trace_all(
     particles: int = 300,
     faults: Faults = NO_FAULTS,
 ) -> Iterator[Trace]:
-    """Trace the episodes with these indices, those of equal length together. Not for external filters.
+    """Trace the episodes with these indices, those of equal length together, with an external filter one by one.
 
     Traces without random numbers differ from those of ``trace`` by rounding only. The random numbers of a particle
     filter differ, as ``trace`` has one generator per episode: same distribution, other values. Raises BadInput as
@@ -41,6 +42,9 @@ def trace_all(
     generator = torch.Generator().manual_seed(seed)
     settings = {"particles": particles, "torch": torch.__version__}
     remaining = iter(indices)
+    if isinstance(checkpoint, ExternalFilter):
+        for index in remaining:
+            yield trace(checkpoint, data[index], index, seed=seed, particles=particles, faults=faults)
     while episodes := {index: data[index] for index in islice(remaining, AT_ONCE)}:
         lengths: dict[int, list[int]] = {}
         for index, episode in episodes.items():

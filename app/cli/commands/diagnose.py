@@ -1,36 +1,50 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
 from beliefscope.datasets.errors import BadInput
+
+if TYPE_CHECKING:
+    from beliefscope.filters.checkpoint import Checkpoint
+    from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 
 
 @opt.with_options(
     episode=opt.option("I", "Diagnose only this episode. Default: the held-out ones.", parser=opt.integer(0)),
     base=opt.option("CHECKPOINT", "Checkpoint whose modules are tried in place of the filter's."),
     alarm_rate=opt.option("P", "Probability that a healthy filter raises an alarm."),
+    profile_from=opt.option("DATA", "Clean episodes whose held-out ones become the healthy record."),
+    repair=opt.option("I", "Also search the smallest repair of this episode's failure.", parser=opt.integer(0)),
 )
 def diagnose(
     runs: opt.Runs,
     episode: int | None = None,
     base: Path | None = None,
     alarm_rate: float = 0.05,
+    profile_from: Path | None = None,
+    repair: int | None = None,
 ) -> console.Result:
     """Name the probable cause of a filter's fault.
 
     Compares sensors, labels, modules and the filter with its healthy record, ranks the causes that explain all
-    deviations, and confirms them by undoing them. Details: docs/diagnose.md.
+    deviations, and confirms them by undoing them. --repair drops sensors, and with --faults restores them, over the
+    shortest interval that removes the episode's largest failure. Details: docs/diagnose.md.
 
     \b
     Examples:
       beliefscope diagnose door --filter crossmodal-ekf
       beliefscope diagnose push --filter crossmodal-pf --data push.h5 --json -
       beliefscope diagnose door --filter mine.safetensors --data door.h5 --base crossmodal-ekf --episode 3
+      beliefscope diagnose push --filter crossmodal-pf --faults image_occluded=14:from=40:to=60 --repair 142
+      beliefscope diagnose door --filter examples/04_own_filter.py:build --profile-from door.h5
     """
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.diagnosis.diagnose import diagnose as run
+    from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
+    from beliefscope.inspect.trace import trace
 
     if not 0.0 < alarm_rate < 1.0:
         raise BadInput(f"--alarm-rate is {alarm_rate:g}, not a probability between 0 and 1")
@@ -39,6 +53,8 @@ def diagnose(
     with runs.episodes(checkpoint.task) as data:
         indices = data.held_out() if episode is None else [episode]
         episodes = {index: faults.apply(data[index], runs.seed) for index in indices}
+        failed = None if repair is None else data[repair]
+    profile = _profile(checkpoint, profile_from)
     with console.progress("Diagnosing") as advance:
         result = run(
             checkpoint,
@@ -47,6 +63,30 @@ def diagnose(
             particles=runs.particles,
             alarm_rate=alarm_rate,
             base=other,
+            profile=profile,
             progress=advance,
         )
-    return console.Result(result.to_json(), "\n\n".join([result.headline, *console.grids(result.tables())]))
+    document, parts = result.to_json(), [result.headline, *console.grids(result.tables())]
+    if failed is not None:
+        run_ = trace(checkpoint, failed, repair or 0, seed=runs.seed, particles=runs.particles, faults=faults)
+        smallest = smallest_repair(checkpoint, run_, healthy_bound(profile.statistics), failed if faults else None)
+        document["repair"] = None if smallest is None else smallest.to_json()
+        parts.append(f"Episode {repair} has no failure." if smallest is None else smallest.sentence)
+    return console.Result(document, "\n\n".join(parts))
+
+
+def _profile(checkpoint: Checkpoint, clean: Path | None) -> HealthyProfile:
+    """The healthy record of a filter, or of its runs over the held-out episodes of ``clean``."""
+    from beliefscope.datasets.store import open_dataset
+    from beliefscope.inspect.diagnostics.healthy_profile import find_profile
+    from beliefscope.inspect.healthy import profile_of
+
+    if clean is None:
+        profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
+        if profile is None:
+            raise BadInput(
+                f"filter {checkpoint.name!r} has no healthy record; give clean episodes, --profile-from DATA"
+            )
+        return profile
+    with open_dataset(clean) as data:
+        return profile_of(checkpoint, [data[index] for index in data.held_out()], str(clean))

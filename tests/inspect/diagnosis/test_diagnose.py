@@ -13,7 +13,9 @@ from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
 from beliefscope.inspect.healthy import profile_of
@@ -85,3 +87,13 @@ def test_a_filter_needs_episodes_and_a_healthy_profile() -> None:
         diagnose(checkpoint(), {}, profile=profile())
     with pytest.raises(BadInput, match="no healthy profile"):
         diagnose(replace(checkpoint(), hash="other", name="crossmodal-ekf"), simulated(100, 1))
+
+
+def test_external_filters_are_compared_with_a_measured_profile() -> None:
+    external = open_filter("door", "examples/04_own_filter.py:build")
+    with open_dataset(sample_path("door")) as data:
+        healthy = [data[index] for index in range(150, 164)]
+        frozen = {index: Faults.parse("image_frozen:from=20").apply(data[index]) for index in range(140, 143)}
+    result = diagnose(external, frozen, profile=profile_of(external, healthy, "test"))
+    assert result.state == "fault"
+    assert "image.frozen" in [candidate.cause.name for candidate in result.causes]
