@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.cause import Cause, Recovery
 from beliefscope.inspect.diagnosis.undo import Deviations, Setting, undo
@@ -23,7 +24,10 @@ def replay_without(
     """Traces of the episodes without a cause, in their order; None if it cannot be undone."""
     if not cause.undo:
         return None
-    changed = undo(cause.undo, setting, deviations, base)
+    try:
+        changed = undo(cause.undo, setting, deviations, base)
+    except BadInput:  # modules of an external filter cannot be changed
+        return None
     if changed is None:
         return None
     return list(trace_all(changed.checkpoint, changed.episodes, changed.episodes, seed, changed.particles))

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.catalog import build
@@ -66,10 +65,7 @@ def undo(name: str, setting: Setting, deviations: Deviations, base: Checkpoint |
     if base is not None and name in MODULES:
         return _with_modules(setting, base, MODULES[name])
     function = UNDO.get(name) or partial(BY_SUBJECT[action], subject)
-    try:
-        return function(setting, deviations)
-    except BadInput:  # modules of an external filter cannot be changed
-        return None
+    return function(setting, deviations)
 
 
 def _with_modules(setting: Setting, base: Checkpoint, prefixes: Sequence[str]) -> Setting | None:
