@@ -62,6 +62,7 @@ class Case:
     Attributes:
         rows: statistics by episode.
         deviations: with t-values relative to their critical values, largest first.
+        p_value: probability of deviations of this size in a healthy filter.
     """
 
     setting: Setting
@@ -69,6 +70,7 @@ class Case:
     rows: Rows
     profile: HealthyProfile
     deviations: Sequence[Deviation]
+    p_value: float
     alarm_rate: float
 
     @property
@@ -78,8 +80,8 @@ class Case:
 
     @property
     def alarms(self) -> list[Deviation]:
-        """Significant deviations, largest first."""
-        return [deviation for deviation in self.deviations if deviation.alarm]
+        """Significant deviations, largest first; none if all deviations together are not significant."""
+        return [deviation for deviation in self.deviations if deviation.alarm and self.p_value <= self.alarm_rate]
 
 
 def diagnose(
@@ -134,8 +136,9 @@ def examine(setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, 
     """Compare all statistics of traces with the healthy profile."""
     rows = [episode_statistics(trace, setting.checkpoint, profile.reference) for trace in traces]
     profile, rows = with_scatter(profile, rows)
-    deviations = with_critical_values(profile, compare(profile, rows), alarm_rate)
-    return Case(setting, traces, rows, profile, deviations, alarm_rate)
+    comparison = compare(profile, rows)
+    deviations = with_critical_values(profile, comparison, alarm_rate)
+    return Case(setting, traces, rows, profile, deviations, comparison.p_value, alarm_rate)
 
 
 def signature_scores(case: Case) -> dict[str, float]:

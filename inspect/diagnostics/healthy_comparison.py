@@ -141,12 +141,15 @@ class Comparison:
         trajectories, healthy_trajectories: number of tested trajectories, and of those in the profile.
         data: of the profile.
         deviations: by statistic.
+        p_value: probability of a deviation of this size in any statistic, each relative to a high quantile of its own
+            t-values over the divisions.
     """
 
     trajectories: int
     healthy_trajectories: int
     data: str
     deviations: tuple[Deviation, ...]
+    p_value: float = 1.0
 
     @property
     def alarms(self) -> tuple[Deviation, ...]:
@@ -222,7 +225,15 @@ def compare(
     rows: Iterable[tuple[Any, ...]] = zip(names, *columns, strict=True)
     deviations = [Deviation(*row) for row in rows]
     order = np.argsort(-np.abs(t[0]), kind="stable")
-    return Comparison(count, profile.episodes, profile.data, tuple(deviations[i] for i in order))
+    relative = (np.abs(t) / _own_scale(t)).max(1) * (1.0 + 1e-9)
+    extreme = int((relative[1:] >= relative[0] / (1.0 + 1e-9)).sum())
+    p_any = extreme / len(values) if count == 1 else (1.0 + extreme) / len(divisions)
+    return Comparison(count, profile.episodes, profile.data, tuple(deviations[i] for i in order), p_any)
+
+
+def _own_scale(t: Array) -> Array:
+    """(S,) high quantile of absolute t-values (B, S) of each statistic over divisions."""
+    return np.maximum(np.quantile(np.abs(t), TAIL, axis=0), SMALLEST_T)
 
 
 def with_critical_values(profile: HealthyProfile, comparison: Comparison, significance: float) -> tuple[Deviation, ...]:
@@ -235,7 +246,7 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, signif
     values, floor = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
     count = min(comparison.trajectories, profile.episodes // 2)
     t = np.abs(_t_values(values, _divisions(profile.episodes, count, 0), floor)[0])
-    own = np.maximum(np.quantile(t, TAIL, axis=0), SMALLEST_T)
+    own = _own_scale(t)
     critical = own * np.quantile((t / own).max(1), 1.0 - significance)
     error = math.sqrt(1.0 / comparison.trajectories + 1.0 / profile.episodes)
     result = [

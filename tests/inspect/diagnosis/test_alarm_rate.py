@@ -1,0 +1,43 @@
+"""Alarms of the diagnosis on simulated statistics with light and heavy tails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beliefscope.inspect.diagnostics.healthy_comparison import compare, with_critical_values
+from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile
+
+NAMES = [f"module bias/image {i}/all" for i in range(10)] + [f"frozen/image {i}/all" for i in range(10)]
+RATE = 0.05
+
+
+def rows(count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 20): ten normal statistics, and ten that are rarely nonzero."""
+    rare = rng.exponential(size=(count, 10)) * (rng.random((count, 10)) < 0.05)
+    return np.concatenate([rng.normal(size=(count, 10)), rare], axis=1)
+
+
+def alarms(healthy: np.ndarray, tested: np.ndarray) -> list[str]:
+    profile = HealthyProfile("simulated", len(healthy), None, dict(zip(NAMES, healthy.T, strict=True)))
+    comparison = compare(profile, [dict(zip(NAMES, row.tolist(), strict=True)) for row in tested])
+    if comparison.p_value > RATE:
+        return []
+    return [d.statistic for d in with_critical_values(profile, comparison, RATE) if d.alarm]
+
+
+@pytest.mark.parametrize("count", [1, 3, 8])
+def test_healthy_samples_rarely_raise_an_alarm(count: int) -> None:
+    rng = np.random.default_rng(count)
+    raised = [bool(alarms(rows(60, rng), rows(count, rng))) for _ in range(60)]
+    assert np.mean(raised) <= 0.12  # 5 % expected; exceeded with probability 2 %
+
+
+def test_heavy_tails_of_other_statistics_do_not_hide_a_fault() -> None:
+    rng = np.random.default_rng(0)
+    found = 0
+    for _ in range(20):
+        tested = rows(6, rng)
+        tested[:, 3] += 2.5
+        found += NAMES[3] in alarms(rows(60, rng), tested)
+    assert found >= 17
