@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -228,3 +229,10 @@ def test_a_case_is_a_function_of_its_specification(tmp_path: Path) -> None:
     assert case.runnable
     assert case.checkpoint.healthy_profile is not None
     assert len(case.episodes) == 1
+
+
+def test_every_cause_is_documented_with_its_magnitudes() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "beliefbench.md").read_text()
+    rows = {m[1]: m[2] for m in re.finditer(r"^\| `([\w.]+)` \| .* \| ([^|]+) \|$", page, re.MULTILINE)}
+    for cause, values in magnitudes().items():
+        assert rows[cause] == ", ".join(v if isinstance(v, str) else f"{v:g}" for v in values)
