@@ -34,6 +34,7 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.io.atomic_write import write_atomically, write_error
 
 KINDS: dict[str, str] = {
+    "diagnosis": "beliefscope.app.jobs.diagnosis:run",
     "diagnostic": "beliefscope.app.jobs.diagnostic:run",
     "failures": "beliefscope.app.jobs.failures:run",
     "finetune": "beliefscope.app.jobs.finetune:run",

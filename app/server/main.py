@@ -23,6 +23,7 @@ from starlette.exceptions import HTTPException
 from beliefscope import __version__
 from beliefscope.app.api import (
     comparison,
+    diagnosis,
     diagnostics,
     failures,
     finetune,
@@ -111,6 +112,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
         traces.routes(store, views),
         api_views.routes(views),
         api_jobs.routes(jobs),
+        diagnosis.routes(store, jobs),
         diagnostics.routes(store, jobs),
         comparison.routes(store),
         failures.routes(store, jobs),

@@ -36,6 +36,7 @@ export function bindControls(page) {
     1: openTab('scene'),
     2: openTab('rerun'),
     3: openTab('diagnostics'),
+    g: openTab('diagnosis'),
     f: openTab('failures'),
     o: openTab('compare'),
     r: openTab('recordings'),

@@ -16,6 +16,7 @@ import { SceneFrame } from '../scene/scene_frame.js';
 import { SceneMenu } from '../scene/scene_menu.js';
 import { StepTable } from '../step/step_table.js';
 import { ComparisonTab } from '../tabs/comparison.js';
+import { Diagnosis } from '../tabs/diagnosis.js';
 import { Diagnostics } from '../tabs/diagnostics.js';
 import { Failures } from '../tabs/failures.js';
 import { Finetune } from '../tabs/finetune.js';
@@ -104,6 +105,7 @@ export class Page {
     this.rerun = new Rerun(html('#rerun'), this.jobs, (/** @type {number} */ step) =>
       store.set({ step, playing: false }, { origin: 'rerun' }),
     );
+    this.diagnosis = new Diagnosis(html('#diagnosis'), store, this.jobs);
     this.diagnostics = new Diagnostics(html('#diagnostics'), store, this.jobs);
     this.failures = new Failures(html('#failures'), store, this.jobs, this.timeline, catalog);
     this.compare = new ComparisonTab(
@@ -239,6 +241,7 @@ export class Page {
     if (any('task', 'filter', 'data', 'episode', 'faults')) this.#load();
     if (any('tab')) this.#showTab(state.tab);
     if (any('diagnostic', 'options', 'over')) this.diagnostics.choose();
+    if (any('over')) this.diagnosis.load();
     if (any('against') && this.#trace) this.compare.choose();
     if (any('task', 'filter', 'data', 'faults', 'among')) this.failures.load();
     else if (any('by', 'phase', 'list')) this.failures.draw();
@@ -288,6 +291,7 @@ export class Page {
     this.timeline.show(trace);
     this.angleSlider.show(trace);
     this.rerun.show(trace);
+    this.diagnosis.show(trace);
     this.diagnostics.show(trace);
     this.failures.show(trace);
     this.report.show(trace);
@@ -378,6 +382,7 @@ export class Page {
   #showTab(tab) {
     this.selectTab(tab);
     this.rerun.open = tab === 'rerun';
+    this.diagnosis.open = tab === 'diagnosis';
     this.diagnostics.open = tab === 'diagnostics';
     this.failures.draw();
     this.compare.open = tab === 'compare';

@@ -23,7 +23,7 @@ import { displayName } from './units.js';
  * @property {string} window visible steps such as 20-60, empty for all
  * @property {string} diagnostic selected diagnostic, empty for the list
  * @property {string} options of the diagnostic, URL-encoded: size=21
- * @property {string} over episodes of diagnostics: `episode` (the selected one) or `held-out`
+ * @property {string} over episodes of the diagnosis and of diagnostics: `episode` (the selected one) or `held-out`
  * @property {string} among episodes searched for failures: `held-out` or `all`
  * @property {string} list content of the list of failures: `events` or `episodes`
  * @property {string} by score that ranks failures
@@ -52,7 +52,9 @@ import { displayName } from './units.js';
  */
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
+/** In the order of the tab bar. */
 export const TABS = [
+  'diagnosis',
   'scene',
   'rerun',
   'diagnostics',
@@ -66,7 +68,7 @@ export const TABS = [
 /** Keys with a fixed set of values, the default first. @type {Record<string, readonly string[]>} */
 const CHOICES = {
   ...SCENE_CHOICES,
-  tab: TABS,
+  tab: ['scene', ...TABS],
   weights: ['raw', 'effective'],
   track: Object.keys(TRACKS),
   over: ['episode', 'held-out'],

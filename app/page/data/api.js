@@ -14,6 +14,7 @@ export { ServerError };
  * @typedef {import('../types/server.js').Comparison} Comparison
  * @typedef {import('../types/server.js').DiagnosticResult} DiagnosticResult
  * @typedef {import('../types/server.js').FailureEvent} FailureEvent
+ * @typedef {import('../types/server.js').Diagnosis} Diagnosis
  * @typedef {import('../types/server.js').Failures} Failures
  * @typedef {import('../types/server.js').FineTuneDetails} FineTuneDetails
  * @typedef {import('../types/server.js').FineTuneOffer} FineTuneOffer
@@ -213,6 +214,30 @@ export const diagnostic = (selection, name, query, signal) =>
  */
 export const startDiagnostic = (selection, name, query) =>
   send(diagnosticUrl(selection, [name], query));
+
+/**
+ * @param {Selection} selection
+ * @param {string} over episodes: `episode` or `held-out`
+ */
+const diagnosisUrl = ({ task, filter, episode, data, faults }, over) =>
+  path(['diagnosis', task, filter, episode], { data, faults, over });
+
+/**
+ * Gets the diagnosis of a filter, or its job.
+ * @param {Selection} selection
+ * @param {string} over
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<Diagnosis | JobReply>}
+ */
+export const diagnosis = (selection, over, signal) => poll(diagnosisUrl(selection, over), signal);
+
+/**
+ * Starts the diagnosis as a job.
+ * @param {Selection} selection
+ * @param {string} over
+ * @returns {Promise<StartedJob>}
+ */
+export const startDiagnosis = (selection, over) => send(diagnosisUrl(selection, over));
 
 /** @typedef {Pick<State, 'task' | 'filter' | 'data' | 'faults' | 'among'>} FailureQuery */
 

@@ -138,6 +138,88 @@ export interface components {
             deleted: string;
         };
         /**
+         * Diagnosis
+         * @description The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected.
+         */
+        Diagnosis: {
+            /**
+             * State
+             * @enum {string}
+             */
+            state: "healthy" | "fault" | "unsure";
+            /** Masked */
+            masked: boolean;
+            /** Headline */
+            headline: string;
+            /** Causes */
+            causes: components["schemas"]["DiagnosisCause"][];
+            /** Task */
+            task: string;
+            /** Filter */
+            filter: string;
+            /** Checkpoint Hash */
+            checkpoint_hash: string;
+            /** Episodes */
+            episodes: number;
+            /** Healthy Episodes */
+            healthy_episodes: number;
+            /** Alarm Rate */
+            alarm_rate: number;
+        };
+        /**
+         * DiagnosisCause
+         * @description A ranked cause. steps: first affected step, and first step after it; None for complete episodes.
+         */
+        DiagnosisCause: {
+            /** Cause */
+            cause: string;
+            /** Component */
+            component: string;
+            /** Probability */
+            probability: number;
+            /** Episodes */
+            episodes: number[];
+            /** Steps */
+            steps: number[] | null;
+            /** Evidence */
+            evidence: components["schemas"]["DiagnosisEvidence"][];
+            recovered: components["schemas"]["DiagnosisRecovery"] | null;
+            /** Next */
+            next: string;
+        };
+        /**
+         * DiagnosisEvidence
+         * @description A deviation that supports a cause. low, high: healthy range. episode, step: moment that shows it best.
+         */
+        DiagnosisEvidence: {
+            /** Text */
+            text: string;
+            /** Value */
+            value: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Episode */
+            episode: number | null;
+            /** Step */
+            step: number | null;
+        };
+        /**
+         * DiagnosisRecovery
+         * @description Effect of undoing a cause: share of the excess error with its 95 % interval, and decrease of the NLL, nats.
+         */
+        DiagnosisRecovery: {
+            /** Error */
+            error: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Nll */
+            nll: number | null;
+        };
+        /**
          * DiagnosticInfo
          * @description A diagnostic. slow: computed by a job.
          */
@@ -1547,6 +1629,10 @@ export type Curve = components['schemas']['Curve'];
 export type DataInfo = components['schemas']['DataInfo'];
 export type DeletedFile = components['schemas']['DeletedFile'];
 export type DeletedId = components['schemas']['DeletedId'];
+export type Diagnosis = components['schemas']['Diagnosis'];
+export type DiagnosisCause = components['schemas']['DiagnosisCause'];
+export type DiagnosisEvidence = components['schemas']['DiagnosisEvidence'];
+export type DiagnosisRecovery = components['schemas']['DiagnosisRecovery'];
 export type DiagnosticInfo = components['schemas']['DiagnosticInfo'];
 export type DiagnosticOption = components['schemas']['DiagnosticOption'];
 export type DiagnosticResult = components['schemas']['DiagnosticResult'];

@@ -1,0 +1,55 @@
+"""Models of JSON responses: diagnosis."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from beliefscope.app.api.models.catalog import Number, Reply
+
+
+class DiagnosisEvidence(Reply):
+    """A deviation that supports a cause. low, high: healthy range. episode, step: moment that shows it best."""
+
+    text: str
+    value: Number
+    low: Number
+    high: Number
+    episode: int | None
+    step: int | None
+
+
+class DiagnosisRecovery(Reply):
+    """Effect of undoing a cause: share of the excess error with its 95 % interval, and decrease of the NLL, nats."""
+
+    error: Number
+    low: Number
+    high: Number
+    nll: Number
+
+
+class DiagnosisCause(Reply):
+    """A ranked cause. steps: first affected step, and first step after it; None for complete episodes."""
+
+    cause: str
+    component: str
+    probability: float
+    episodes: list[int]
+    steps: list[int] | None
+    evidence: list[DiagnosisEvidence]
+    recovered: DiagnosisRecovery | None
+    next: str
+
+
+class Diagnosis(Reply):
+    """The probable causes of a filter's fault. masked: a sensor is faulty, and the filter is unaffected."""
+
+    state: Literal["healthy", "fault", "unsure"]
+    masked: bool
+    headline: str
+    causes: list[DiagnosisCause]
+    task: str
+    filter: str
+    checkpoint_hash: str
+    episodes: int
+    healthy_episodes: int
+    alarm_rate: float
