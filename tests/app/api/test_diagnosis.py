@@ -1,0 +1,62 @@
+"""Diagnosis of a filter over HTTP."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from urllib.parse import parse_qsl
+
+import pytest
+from starlette.testclient import TestClient
+
+from beliefscope.app.runs.settings import Settings
+from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnostics.views import as_json
+
+pytestmark = pytest.mark.slow
+
+TIMEOUT = 90.0  # s, including the import of PyTorch by a job
+URL = "/api/diagnosis/door/crossmodal-ekf/1"
+FAULTS = "image_frozen:from=5"
+
+
+def test_diagnosis_is_a_job_and_equals_that_of_the_command(
+    settings: Settings, open_client: Callable[..., TestClient]
+) -> None:
+    query = {"faults": FAULTS, "over": "episode"}
+    with open_client(settings) as client:
+        assert client.get(URL, params=query).json() == {"job": None}
+        response = client.post(URL, params=query)
+        assert response.status_code == 202
+        job = response.json()["job"]
+        assert job["title"] == f"Diagnosis of crossmodal-ekf, door episode 1, {FAULTS}"
+        link = dict(parse_qsl(job["link"].removeprefix("?")))
+        run = {"task": "door", "filter": "crossmodal-ekf", "data": "mine", "episode": "1", "tab": "diagnosis"}
+        assert link == run | query
+        end = time.monotonic() + TIMEOUT
+        while (answer := client.get(URL, params=query)).status_code == 202:
+            assert answer.json()["job"]["state"] in ("waiting", "running"), answer.json()
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        result = answer.json()
+    store = TraceStore(settings)
+    episode = Faults.parse(FAULTS).apply(store.dataset("door", "")[1][1], settings.seed)
+    expected = diagnose(
+        store.checkpoint("door", "crossmodal-ekf"), {1: episode}, seed=settings.seed, particles=settings.particles
+    )
+    store.close()
+    assert result == json.loads(json.dumps(as_json(expected.to_json())))
+
+
+def test_unknown_names_are_reported(client: TestClient) -> None:
+    for url, name in (
+        ("/api/diagnosis/door/crossmodal-ekg/1", "crossmodal-ekg"),
+        (f"{URL}?faults=image_frozzen", "image_frozzen"),
+        (f"{URL}?over=all", "over"),
+    ):
+        reply = client.post(url)
+        assert reply.status_code in (400, 404, 422)
+        assert name in reply.text

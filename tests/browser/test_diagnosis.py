@@ -1,0 +1,30 @@
+"""Diagnosis tab: from the button to the causes, and the links to their moments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+READY = "() => document.querySelector('#diagnosis').dataset.state === 'ready'"
+
+
+def test_diagnosis_names_causes_and_opens_their_moments(open_page: Any) -> None:
+    page = open_page("?task=door&filter=crossmodal-ekf&faults=image_frozen%3Afrom%3D10&tab=scene", size=(1280, 720))
+    page.page.keyboard.press("g")
+    page.until("() => document.querySelector('#diagnosis').dataset.state === 'absent'")
+    tab = page.page.locator("#diagnosis")
+    tab.get_by_role("button", name="Diagnose").click()
+    page.until(READY)
+    headline = tab.locator(".headline").text_content()
+    assert headline
+    assert not page.violations()
+    causes = page.page.evaluate("() => document.querySelectorAll('#diagnosis .causes > li').length")
+    assert causes >= 1
+    values = page.page.evaluate("() => [...document.querySelectorAll('#diagnosis meter')].map((m) => m.value)")
+    assert values == sorted(values, reverse=True)
+    tab.locator(".details ul button").first.click()
+    assert page.state["tab"] == "diagnosis"
+    page.screenshot("diagnosis")
+
+    again = open_page("?" + page.page.url.partition("?")[2])  # the result is stored
+    again.until(READY)
+    assert again.page.locator("#diagnosis .headline").text_content() == headline
