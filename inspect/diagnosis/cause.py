@@ -186,4 +186,7 @@ def _share(recovery: Recovery | None) -> str:
     """Recovered share of the error with its interval, empty without one."""
     if recovery is None or math.isnan(recovery.error):
         return ""
-    return f"{100 * recovery.error:.0f} % ({100 * recovery.low:.0f} to {100 * recovery.high:.0f})"
+    share = f"{100 * recovery.error:.0f} %"
+    if math.isnan(recovery.low):  # a single episode has no interval
+        return share
+    return f"{share} ({100 * recovery.low:.0f} to {100 * recovery.high:.0f})"

@@ -8,7 +8,7 @@ with the same random numbers. The right undo restores the healthy statistics.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -156,9 +156,11 @@ def confirm(
     before = burden(case.deviations)
     recovered: dict[str, Recovery] = {}
     for number, (_, name) in enumerate(likely[:UNDONE], 1):
-        affected = _affected(case, _evidence_alarms(case, by_name[name]))
+        alarms = _evidence_alarms(case, by_name[name])
+        affected = _affected(case, alarms)
+        steps = _steps(case, alarms[0], affected) if alarms else None
         indices = [trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit]
-        setting = Setting(case.setting.checkpoint, case.setting.episodes, case.setting.particles, frozenset(indices))
+        setting = replace(case.setting, affected=frozenset(indices), steps=steps)
         if (replay := replay_without(by_name[name], setting, case.by_statistic, seed, base)) is not None:
             recovered[name] = recovery(case.traces, replay)
             after = examine(setting, replay, case.profile, case.alarm_rate)

@@ -39,12 +39,14 @@ class Setting:
 
     Attributes:
         affected: episodes to which changes of sensors apply.
+        steps: first affected step and first step after it; None for all.
     """
 
     checkpoint: Checkpoint
     episodes: Mapping[int, Episode]
     particles: int
     affected: frozenset[int]
+    steps: tuple[int, int] | None = None
 
 
 Deviations = Mapping[str, Deviation]
@@ -119,11 +121,17 @@ def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], f
 
 
 def drop(modality: str, setting: Setting, deviations: Deviations) -> Setting | None:
-    """Without all models that use a modality; None if no other model remains."""
+    """Without all models that use a modality in the affected steps; None if no other model remains."""
     keep = torch.tensor([modality not in model.split("+") for model in setting.checkpoint.filter.names])
     if keep.all() or not keep.any():
         return None
-    return _with_evidence(setting, lambda e: e.select_models(keep.expand(*e.observation.shape[:3])))
+
+    def select(evidence: Evidence) -> Evidence:
+        present = torch.ones(evidence.observation.shape[:3], dtype=torch.bool)
+        present[slice(*(setting.steps or (None,)))] = keep
+        return evidence.select_models(present)
+
+    return _with_evidence(setting, select)
 
 
 def rescale(modality: str, setting: Setting, deviations: Deviations) -> Setting | None:

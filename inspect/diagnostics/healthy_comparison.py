@@ -225,15 +225,23 @@ def compare(
     rows: Iterable[tuple[Any, ...]] = zip(names, *columns, strict=True)
     deviations = [Deviation(*row) for row in rows]
     order = np.argsort(-np.abs(t[0]), kind="stable")
-    relative = (np.abs(t) / _own_scale(t)).max(1) * (1.0 + 1e-9)
-    extreme = int((relative[1:] >= relative[0] / (1.0 + 1e-9)).sum())
+    relative = (np.abs(t) / _own_scale(t[1:], t, count == 1)).max(1)
+    extreme = int((relative[1:] * (1.0 + 1e-9) >= relative[0]).sum())
     p_any = extreme / len(values) if count == 1 else (1.0 + extreme) / len(divisions)
     return Comparison(count, profile.episodes, profile.data, tuple(deviations[i] for i in order), p_any)
 
 
-def _own_scale(t: Array) -> Array:
-    """(S,) high quantile of absolute t-values (B, S) of each statistic over divisions."""
-    return np.maximum(np.quantile(np.abs(t), TAIL, axis=0), SMALLEST_T)
+def _own_scale(distribution: Array, t: Array, single: bool) -> Array:
+    """High quantile of absolute t-values of each statistic: (S,), or (B, S) for the t-values (B, S) of one trajectory.
+
+    The scale of one trajectory is the largest of the other ones in the distribution (D, S), because it would hide
+    itself among few others.
+    """
+    size = np.abs(distribution)
+    if not single:
+        return np.maximum(np.quantile(size, TAIL, axis=0), SMALLEST_T)
+    second, largest = np.partition(size, -2, axis=0)[-2:]
+    return np.maximum(np.where(np.abs(t) >= largest, second, largest), SMALLEST_T)
 
 
 def with_critical_values(profile: HealthyProfile, comparison: Comparison, significance: float) -> tuple[Deviation, ...]:
@@ -246,8 +254,9 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, signif
     values, floor = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
     count = min(comparison.trajectories, profile.episodes // 2)
     t = np.abs(_t_values(values, _divisions(profile.episodes, count, 0), floor)[0])
-    own = _own_scale(t)
-    critical = own * np.quantile((t / own).max(1), 1.0 - significance)
+    own = _own_scale(t, t, count == 1)
+    limit = np.quantile((t / own).max(1), 1.0 - significance)
+    critical = limit * (own if own.ndim == 1 else np.maximum(t.max(0), SMALLEST_T))
     error = math.sqrt(1.0 / comparison.trajectories + 1.0 / profile.episodes)
     result = [
         replace(d, t=d.t / c, alarm=bool(abs(d.t) >= max(c, MIN_EFFECT / error)))

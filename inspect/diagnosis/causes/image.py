@@ -23,7 +23,7 @@ CAUSES = (
         "image.frozen",
         "Image frozen",
         (Symptom("frozen/image/*"),),
-        f"lag/image/*|noise/image/*|{IMAGE}",
+        f"lag/image/*|noise/image/*|occlusion/image/*|{HAND}|{IMAGE}",
         CHECK,
         "drop image",
     ),

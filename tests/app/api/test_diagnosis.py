@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from pathlib import Path
 from urllib.parse import parse_qsl
 
 import pytest
@@ -19,35 +20,37 @@ from beliefscope.inspect.diagnostics.views import as_json
 pytestmark = pytest.mark.slow
 
 TIMEOUT = 90.0  # s, including the import of PyTorch by a job
-URL = "/api/diagnosis/door/crossmodal-ekf/1"
-FAULTS = "image_frozen:from=5"
+URL = "/api/diagnosis/door/crossmodal-ekf/9"
+FAULTS = "image_frozen=5"
 
 
 def test_diagnosis_is_a_job_and_equals_that_of_the_command(
-    settings: Settings, open_client: Callable[..., TestClient]
+    tmp_path: Path, open_client: Callable[..., TestClient]
 ) -> None:
+    settings = Settings(workspace=tmp_path)  # the shipped filter has a healthy profile
     query = {"faults": FAULTS, "over": "episode"}
     with open_client(settings) as client:
         assert client.get(URL, params=query).json() == {"job": None}
         response = client.post(URL, params=query)
         assert response.status_code == 202
         job = response.json()["job"]
-        assert job["title"] == f"Diagnosis of crossmodal-ekf, door episode 1, {FAULTS}"
+        assert job["title"] == f"Diagnosis of crossmodal-ekf, door episode 9, {FAULTS}"
         link = dict(parse_qsl(job["link"].removeprefix("?")))
-        run = {"task": "door", "filter": "crossmodal-ekf", "data": "mine", "episode": "1", "tab": "diagnosis"}
+        run = {"task": "door", "filter": "crossmodal-ekf", "data": "sample", "episode": "9", "tab": "diagnosis"}
         assert link == run | query
         end = time.monotonic() + TIMEOUT
         while (answer := client.get(URL, params=query)).status_code == 202:
-            assert answer.json()["job"]["state"] in ("waiting", "running"), answer.json()
+            assert answer.json()["job"]["state"] in ("waiting", "running"), answer.text
             assert time.monotonic() < end
             time.sleep(0.05)
         result = answer.json()
     store = TraceStore(settings)
-    episode = Faults.parse(FAULTS).apply(store.dataset("door", "")[1][1], settings.seed)
+    episode = Faults.parse(FAULTS).apply(store.dataset("door", "")[1][9], settings.seed)
     expected = diagnose(
-        store.checkpoint("door", "crossmodal-ekf"), {1: episode}, seed=settings.seed, particles=settings.particles
+        store.checkpoint("door", "crossmodal-ekf"), {9: episode}, seed=settings.seed, particles=settings.particles
     )
     store.close()
+    assert result["causes"][0]["cause"] == "image.frozen"
     assert result == json.loads(json.dumps(as_json(expected.to_json())))
 
 
