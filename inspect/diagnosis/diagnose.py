@@ -21,8 +21,8 @@ from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evi
 from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
 from beliefscope.inspect.diagnosis.scoring import applicable, burden, probabilities, score
 from beliefscope.inspect.diagnosis.sensor_checks import localise
+from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
-from beliefscope.inspect.diagnosis.undo import Setting
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation, compare, with_critical_values
 from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find_profile
 from beliefscope.inspect.trace import Trace

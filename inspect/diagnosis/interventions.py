@@ -9,7 +9,8 @@ import numpy as np
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.cause import Cause, Recovery
-from beliefscope.inspect.diagnosis.undo import Deviations, Setting, undo
+from beliefscope.inspect.diagnosis.setting import Deviations, Setting
+from beliefscope.inspect.diagnosis.undo import undo
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.innovations import innovations
 from beliefscope.inspect.statistics.intervals import jackknife

@@ -6,8 +6,8 @@ Sizes come from the deviations: a bias is subtracted, a factor divided out, a de
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from beliefscope.datasets.episode import Episode
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.catalog import build
@@ -24,6 +23,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.filter import MAX_LOGIT, Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
+from beliefscope.inspect.diagnosis.setting import Deviations, Setting
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
 POSITION, CHANGE = slice(0, 3), slice(3, 6)
@@ -32,25 +32,6 @@ POSITION, CHANGE = slice(0, 3), slice(3, 6)
 MIN_SLOPE = 0.2
 """Smallest slope of a dynamics model that can be rescaled."""
 
-
-@dataclass(frozen=True)
-class Setting:
-    """Inputs of a run.
-
-    Attributes:
-        affected: episodes to which changes of sensors apply.
-        steps: first affected step and first step after it; None for all.
-    """
-
-    checkpoint: Checkpoint
-    episodes: Mapping[int, Episode]
-    particles: int
-    affected: frozenset[int]
-    steps: tuple[int, int] | None = None
-
-
-Deviations = Mapping[str, Deviation]
-"""Statistic -> deviation."""
 
 Undo = Callable[[Setting, Deviations], Setting | None]
 """Returns the setting without the fault; None if it cannot be undone."""

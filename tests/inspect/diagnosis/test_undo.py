@@ -19,8 +19,9 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.filter import Filter
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.interventions import negative_log_likelihood, recovery
+from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics
-from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, Setting, undo
+from beliefscope.inspect.diagnosis.undo import BY_SUBJECT, UNDO, undo
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
