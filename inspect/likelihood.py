@@ -116,6 +116,8 @@ class MapEngine:
 
     @torch.no_grad()
     def _encode(self) -> Evidence | None:
+        if isinstance(self.checkpoint, ExternalFilter):
+            return None
         filter_ = self.checkpoint.filter
         if not isinstance(filter_, MixtureParticleFilter):
             return None

@@ -59,7 +59,7 @@ class Reference:
             "image": self.image.tolist(),
             "spread": self.spread.tolist(),
             "weights": _rounded(self.weights.T),
-            "expected": {"size": size.tolist(), "levels": levels.reshape(len(levels), -1).tolist()},
+            "expected": {"size": size.tolist(), "levels": levels.reshape(len(levels), self.image.size).tolist()},
             "scale": self.scale.tolist(),
         }
 

@@ -37,6 +37,7 @@ def test_intervention_is_selected_by_keys_shared_and_undone(open_page: Any) -> N
     for _ in range(11):
         keyboard.press("ArrowLeft")
     page.until("() => beliefscope.state().step === 44 && document.querySelector('#readout b').textContent[0] === '4'")
+    page.settle(44)
     assert difference(page) == 0.0  # at the last step before it
     page.until("() => location.search.includes('against=') && location.search.includes('step=44')")
 

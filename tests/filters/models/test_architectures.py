@@ -50,7 +50,7 @@ def randomise(filter_: Filter) -> Filter:
 def test_catalog_has_the_filters_of_the_paper_and_a_ukf() -> None:
     fused = {f"{how}-{kind}" for how in ("feature", "unimodal", "crossmodal") for kind in ("ekf", "pf")}
     single = {f"{modality}-{kind}" for modality in ("image", "haptics") for kind in ("ekf", "pf")}
-    assert set(NAMES) == fused | single | {"lstm", "crossmodal-ukf", "information-ekf", "information-pf"}
+    assert set(NAMES) == fused | single | {"lstm", "transformer", "crossmodal-ukf", "information-ekf", "information-pf"}
 
 
 @pytest.fixture
@@ -180,7 +180,7 @@ def test_one_hot_beta_equals_the_unimodal_filter(name: str, k: int, feedback: bo
     torch.testing.assert_close(fused.covariance, single.covariance, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "lstm"])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("lstm", "transformer")])
 def test_covariances_are_positive_definite(name: str, window: MakeWindow) -> None:
     with torch.no_grad():
         covariance = run(randomise(build(architecture("door", name))), window(12, 4)).estimate.covariance
