@@ -72,6 +72,7 @@ def test_from_collect_to_record(run: Run, folder: Path) -> None:
     assert [len(row) for (row,) in maps.to_pylist()] == [11 * 11, 11 * 11]
 
 
+@pytest.mark.long  # six seconds
 def test_figures_of_the_paper(run: Run, folder: Path) -> None:
     """Output is deterministic, and --step changes only the map of its own phase."""
     line = f"figure maps {EKF} --json - -o"

@@ -53,6 +53,7 @@ def test_repeated_runs_are_identical_and_threads_only_change_rounding(name: str,
     np.testing.assert_allclose(second["estimate_mean"], first["estimate_mean"], atol=2e-3)
 
 
+@pytest.mark.long  # two processes
 def test_another_process_gives_an_identical_trace(tmp_path: Path) -> None:
     command = [sys.executable, "-c", MAKE, str(Path(__file__).parent), str(tmp_path / "other")]
     subprocess.run(command, check=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=300)

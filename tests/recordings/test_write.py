@@ -242,6 +242,7 @@ for limit in {limits}:
 """
 
 
+@pytest.mark.long  # ten seconds
 def test_full_disk_raises(new_trace: Callable[..., Trace], tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     size = write_recording(new_trace("pf", steps=100), path).stat().st_size

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.slow
 TIMEOUT = 120.0  # s, including the import of PyTorch by a job
 
 
+@pytest.mark.long  # nine seconds
 def test_run_equals_the_recorded_one(settings: Settings, open_client: Callable[..., TestClient]) -> None:
     checkpoint = load_checkpoint(Path(str(settings.checkpoints["crossmodal-pf"])))
     with open_dataset(settings.data["mine"], DOOR) as data:

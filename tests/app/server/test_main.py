@@ -146,6 +146,7 @@ def test_invalid_address_is_reported(settings: Settings, host: str, port: int) -
         serve(settings, host=host, port=port, access=Access("a token of this test"))
 
 
+@pytest.mark.long  # nine seconds; test_serve_command.py has the same for SIGTERM
 def test_sigint_stops_the_server(settings: Settings) -> None:
     """Without the command line; see ``test_serve_command.py`` for other signals."""
     code = (

@@ -133,6 +133,7 @@ def test_poll_without_new_steps_reads_nothing(run: Trace, tmp_path: Path, monkey
     assert (reader.poll(), len(reader.read())) == (30, 0)
 
 
+@pytest.mark.long  # six seconds
 @pytest.mark.parametrize("run", ["crossmodal-pf"], indirect=True)
 def test_truncation_at_every_byte(short: Trace, tmp_path: Path) -> None:
     """Complete steps are readable; an incomplete header is a one-line error."""
