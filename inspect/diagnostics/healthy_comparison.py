@@ -182,16 +182,8 @@ class Comparison:
         return Table("Comparison with the healthy record", columns, rows)
 
 
-def compare(
-    profile: HealthyProfile,
-    trajectories: Sequence[Mapping[str, float]],
-    seed: int = 0,
-    significance: float | None = None,
-) -> Comparison:
+def compare(profile: HealthyProfile, trajectories: Sequence[Mapping[str, float]], seed: int = 0) -> Comparison:
     """Compare trajectory statistics with those of a profile; statistics that only one of them has are omitted.
-
-    significance: probability of an alarm for healthy trajectories; default: ``SIGNIFICANCE``, or
-    ``SINGLE_SIGNIFICANCE`` for one trajectory.
 
     Max-T test of Westfall and Young: in a division of all trajectories into n and the others, each statistic has a
     t-value, the difference of the means over its standard error, with the spread of the others. ``p_value`` is the
@@ -216,9 +208,7 @@ def compare(
     at_least = (largest[1:, None] >= np.abs(t[0])).sum(0)
     # All divisions with one tested trajectory are enumerated, including the actual one.
     p_value = at_least / len(values) if count == 1 else (1.0 + at_least) / len(divisions)
-    if significance is None:
-        significance = SINGLE_SIGNIFICANCE if count == 1 else SIGNIFICANCE
-    alarm = (p_value <= significance) & (np.abs(effect[0]) >= MIN_EFFECT)
+    alarm = (p_value <= (SINGLE_SIGNIFICANCE if count == 1 else SIGNIFICANCE)) & (np.abs(effect[0]) >= MIN_EFFECT)
     low, high = _ranges(values[count:], count, seed)
     mean, healthy = np.nanmean(values[:count], axis=0), np.nanmean(values[count:], axis=0)
     columns = [column.tolist() for column in (mean, healthy, low, high, p_value, alarm, t[0])]

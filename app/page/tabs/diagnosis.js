@@ -5,7 +5,6 @@
 /** @import { Diagnosis as Result, DiagnosisCause, DiagnosisEvidence, Job } from '../types/server.js' */
 /** @import { Jobs, Pending } from '../widgets/jobs.js' */
 
-import { copyText } from '../core/clipboard.js';
 import { create, html, isAbort, messageOf } from '../core/dom.js';
 import { percent, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
@@ -194,7 +193,7 @@ export class Diagnosis {
       create('ul', {}, ...evidence.map((item) => this.#evidence(item))),
     ];
     if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
-    lines.push(nextAction(cause.next));
+    lines.push(create('p', { textContent: `Next: ${cause.next}` }));
     return create(
       'li',
       {},
@@ -240,19 +239,4 @@ function recoveredText({ error, low, high, nll }) {
   if (error === null) return `If undone, ${likelihood}.`;
   const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
   return `Undoing it recovers ${percent(error)}${range} of the excess error; ${likelihood}.`;
-}
-
-/** @param {string} text with the command in backticks, if it has one */
-function nextAction(text) {
-  const line = create('p', { className: 'next' }, 'Next: ');
-  const [before, command, ...after] = text.split('`');
-  line.append(before);
-  if (command === undefined) return line;
-  const copy = create('button', { type: 'button', className: 'text quiet', textContent: 'Copy' });
-  copy.setAttribute('aria-label', `Copy ${command}`);
-  copy.addEventListener('click', async () => {
-    copy.textContent = (await copyText(command)) ? 'Copied' : 'Not copied';
-  });
-  line.append(create('code', { textContent: command }), ' ', copy, after.join(''));
-  return line;
 }
