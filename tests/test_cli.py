@@ -15,6 +15,7 @@ import pytest
 import typer.main
 
 from beliefscope.app.cli.main import COMMANDS, cli, main
+from beliefscope.inspect.diagnosis.catalog import CAUSES
 
 pytestmark = pytest.mark.slow
 
@@ -54,12 +55,14 @@ Run = Callable[[str], tuple[int, str, str]]
 
 
 def examples() -> list[str]:
-    """Every command line in the help texts and the documentation."""
+    """Every command line in the help texts, the documentation and the next actions of diagnosed causes."""
     callbacks = [cli.registered_callback, *cli.registered_commands]
     text = "\n".join(inspect.getdoc(info.callback) or "" for info in callbacks if info is not None and info.callback)
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         if page.is_file():
             text += "\n" + "\n".join(re.findall(r"```(?:sh|bash)?\n(.*?)```", page.read_text(), re.DOTALL))
+    actions = "\n".join(cause.next.format(task="door", filter="crossmodal-ekf") for cause in CAUSES)
+    text += "\n" + "\n".join(re.findall("`(.*?)`", actions))
     return list(dict.fromkeys(re.findall(r"^ *(beliefscope (?:-|[a-z]+).*?)(?:   .*| +#.*)?$", text, re.MULTILINE)))
 
 

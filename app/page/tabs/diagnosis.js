@@ -2,16 +2,19 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
-/** @import { Diagnosis as Result, DiagnosisCause, DiagnosisEvidence, Job } from '../types/server.js' */
-/** @import { Jobs, Pending } from '../widgets/jobs.js' */
+/** @import { Diagnosis as Result, DiagnosisCause, DiagnosisEvidence } from '../types/server.js' */
+/** @import { JobResult } from '../widgets/job_results.js' */
+/** @import { Jobs } from '../widgets/jobs.js' */
 
-import { create, html, isAbort, messageOf } from '../core/dom.js';
-import { percent, sentence } from '../core/units.js';
+import { create, html } from '../core/dom.js';
+import { fixed, percent, sentence } from '../core/units.js';
 import * as api from '../data/api.js';
-import { isActive, jobState, jobSummary, pending } from '../widgets/jobs.js';
+import { copyButton } from '../widgets/copy_button.js';
+import { JobResults, showJobButton } from '../widgets/job_results.js';
+import { jobSummary } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
 
-/** @typedef {Pending<Result> | {state: 'loading', job?: undefined} | {state: 'error' | 'live', error: string, job?: undefined}} Entry */
+/** @typedef {JobResult<Result> | {state: 'live', job?: undefined}} Entry */
 
 /** @type {[string, string][]} */
 const OVER = [
@@ -25,11 +28,10 @@ const MAX_RESULTS = 24; // in the cache
 export class Diagnosis {
   #host;
   #store;
-  #jobs;
   /** @type {Trace | null} */
   #trace = null;
-  /** @type {Map<string, Entry>} */
-  #entries = new Map();
+  /** @type {JobResults<Result>} */
+  #results;
   #loading = new AbortController();
   #open = false;
   #listed = ''; // key of the listed causes
@@ -42,8 +44,9 @@ export class Diagnosis {
   constructor(host, store, jobs) {
     this.#host = host;
     this.#store = store;
-    this.#jobs = jobs;
-    jobs.listen((list) => this.#followJobs(list));
+    this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
+      finished.includes(this.#key) ? this.load() : this.#draw(),
+    );
   }
 
   /** Whether the panel is visible; nothing is requested before. */
@@ -64,23 +67,9 @@ export class Diagnosis {
     if (!this.#open || !trace) return;
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
-    const key = this.#key;
-    if (trace.live) {
-      const error = 'A live run has no diagnosis: its trace holds no data set.';
-      this.#cache(key, { state: 'live', error });
-      return this.#draw();
-    }
-    if (!this.#entries.has(key)) this.#cache(key, { state: 'loading' });
-    this.#draw();
-    if (this.#entry.state === 'ready') return;
-    try {
-      const reply = await api.diagnosis(trace.selection, this.#store.state.over, signal);
-      this.#cache(key, pending(reply));
-    } catch (error) {
-      if (isAbort(error)) return;
-      this.#cache(key, { state: 'error', error: messageOf(error) });
-    }
-    this.#draw();
+    if (trace.live) return this.#draw();
+    const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
+    await this.#results.load(this.#key, get, signal);
   }
 
   get #key() {
@@ -91,47 +80,14 @@ export class Diagnosis {
 
   /** @returns {Entry} */
   get #entry() {
-    return this.#entries.get(this.#key) ?? { state: 'loading' };
+    return this.#trace?.live ? { state: 'live' } : this.#results.get(this.#key);
   }
 
-  /**
-   * @param {string} key
-   * @param {Entry} entry
-   */
-  #cache(key, entry) {
-    this.#entries.delete(key);
-    this.#entries.set(key, entry);
-    const [oldest] = this.#entries.keys();
-    if (this.#entries.size > MAX_RESULTS) this.#entries.delete(oldest);
-  }
-
-  async #start() {
+  #startOrCancel() {
     const trace = this.#trace;
     if (!trace) return;
-    const key = this.#key;
-    try {
-      const { job } = await api.startDiagnosis(trace.selection, this.#store.state.over);
-      this.#cache(key, jobState(job));
-    } catch (error) {
-      this.#cache(key, { state: 'error', error: messageOf(error) });
-    }
-    this.#draw();
-    this.#jobs.refresh();
-  }
-
-  /**
-   * Updates the states of jobs; the result of a finished job is loaded.
-   * @param {Job[]} list
-   */
-  #followJobs(list) {
-    for (const [key, { job }] of [...this.#entries]) {
-      if (!job) continue;
-      const update = list.find(({ id }) => id === job.id) ?? null;
-      if (update?.state === 'done') this.#entries.delete(key);
-      else this.#cache(key, jobState(update));
-    }
-    if (this.#entries.has(this.#key)) this.#draw();
-    else this.load();
+    const start = () => api.startDiagnosis(trace.selection, this.#store.state.over);
+    this.#results.startOrCancel(this.#key, start);
   }
 
   #draw() {
@@ -146,8 +102,14 @@ export class Diagnosis {
     this.#host.ariaBusy = String(entry.state === 'loading' || entry.state === 'active');
     const headline = html('.headline', this.#host);
     const text = headlineOf(entry);
-    if (headline.textContent !== text) headline.textContent = text;
-    this.#drawButton(entry);
+    if (headline.dataset.text !== text) headline.replaceChildren(...withCode(text));
+    headline.dataset.text = text;
+    showJobButton(html('.doing', this.#host), entry, {
+      action: ACTIONS[entry.state] ?? '',
+      progress: 'Progress of the diagnosis',
+      press: () => this.#startOrCancel(),
+      next: html('.scroll', this.#host),
+    });
     const key = result ? this.#key : '';
     if (key === this.#listed) return;
     this.#listed = key;
@@ -157,43 +119,19 @@ export class Diagnosis {
     html('.about', this.#host).textContent = result ? aboutOf(result) : '';
   }
 
-  /** @param {Entry} entry */
-  #drawButton(entry) {
-    const host = html('.doing', this.#host);
-    const action = ACTIONS[entry.state] ?? '';
-    if (host.dataset.action !== action) {
-      const hadFocus = host.contains(document.activeElement);
-      host.dataset.action = action;
-      const button = create('button', { type: 'button', className: 'text', textContent: action });
-      button.addEventListener('click', () => {
-        const { job } = this.#entry;
-        if (job && isActive(job)) this.#jobs.cancel(job.id);
-        else this.#start();
-      });
-      const progress = create('progress', { ariaLabel: 'Progress of the diagnosis' });
-      host.replaceChildren(
-        ...(entry.state === 'active' ? [progress] : []),
-        ...(action ? [button] : []),
-      );
-      if (hadFocus && action) button.focus();
-    }
-    const progress = host.querySelector('progress');
-    if (progress) progress.value = entry.job?.progress ?? 0;
-  }
-
   /** @param {DiagnosisCause} cause */
   #row(cause) {
     const { probability, recovered, evidence, steps } = cause;
     const bar = create('meter', { min: 0, max: 1, value: probability });
     bar.setAttribute('aria-label', `Probability of ${cause.cause}`);
-    const where = [`episodes ${cause.episodes.join(', ')}`];
+    const where = [`${plural('episode', cause.episodes)} ${cause.episodes.join(', ')}`];
     if (steps) where.push(`steps ${steps[0]} to ${steps[1] - 1}`);
     const lines = [
       create('p', { className: 'where', textContent: sentence(where.join(', ')) }),
       create('ul', {}, ...evidence.map((item) => this.#evidence(item))),
     ];
     if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
-    lines.push(create('p', { textContent: `Next: ${cause.next}` }));
+    lines.push(nextAction(cause.next));
     return create(
       'li',
       {},
@@ -221,7 +159,8 @@ export class Diagnosis {
 /** @param {Entry} entry */
 function headlineOf(entry) {
   if (entry.state === 'ready') return entry.result.headline;
-  if (entry.state === 'error' || entry.state === 'live') return sentence(entry.error);
+  if (entry.state === 'error') return sentence(entry.error);
+  if (entry.state === 'live') return 'A live run has no diagnosis: its trace holds no data set.';
   if (entry.state === 'active' || entry.state === 'ended') return jobSummary(entry.job);
   if (entry.state === 'loading') return 'Loading …';
   return 'No diagnosis yet. It compares sensors, labels, modules and filter with the healthy record.';
@@ -234,9 +173,38 @@ function aboutOf({ episodes, healthy_episodes: healthy, alarm_rate: rate }) {
 }
 
 /** @param {NonNullable<DiagnosisCause['recovered']>} recovered */
-function recoveredText({ error, low, high, nll }) {
-  const likelihood = `the negative log-likelihood decreases by ${nll === null ? '?' : nll.toFixed(2)} nats a step`;
+export function recoveredText({ error, low, high, nll }) {
+  const change = (nll ?? 0) < 0 ? 'increases' : 'decreases';
+  const size = nll === null ? '?' : fixed(Math.abs(nll), 2);
+  const likelihood = `the negative log-likelihood ${change} by ${size} nats a step`;
   if (error === null) return `If undone, ${likelihood}.`;
   const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
   return `Undoing it recovers ${percent(error)}${range} of the excess error; ${likelihood}.`;
 }
+
+/**
+ * The next action; its commands, between backticks, can be copied.
+ * @param {string} text
+ */
+function nextAction(text) {
+  const line = create('p', { className: 'next' }, 'Next: ', ...withCode(text));
+  for (const code of line.querySelectorAll('code'))
+    code.after(
+      ' ',
+      copyButton('Copy', 'Copy the command', () => code.textContent ?? ''),
+    );
+  return line;
+}
+
+/**
+ * Parts of a text; those between backticks are code.
+ * @param {string} text
+ */
+const withCode = (text) =>
+  text.split('`').map((part, i) => (i % 2 ? create('code', { textContent: part }) : part));
+
+/**
+ * @param {string} noun
+ * @param {readonly unknown[]} list
+ */
+const plural = (noun, list) => (list.length === 1 ? noun : `${noun}s`);

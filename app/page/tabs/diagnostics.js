@@ -2,20 +2,22 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
-/** @import { DiagnosticResult, Job, TraceDiagnosticInfo } from '../types/server.js' */
-/** @import { Jobs, Pending } from '../widgets/jobs.js' */
+/** @import { DiagnosticResult, TraceDiagnosticInfo } from '../types/server.js' */
+/** @import { JobResult } from '../widgets/job_results.js' */
+/** @import { Jobs } from '../widgets/jobs.js' */
 
 import { create, element, html, isAbort, messageOf } from '../core/dom.js';
 import { sentence } from '../core/units.js';
 import * as api from '../data/api.js';
 import { Figures } from '../widgets/figures.js';
-import { isActive, jobState, jobSummary, pending } from '../widgets/jobs.js';
+import { JobResults, showJobButton } from '../widgets/job_results.js';
+import { jobSummary } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice } from '../widgets/pickers.js';
 
 /**
  * Result of a diagnostic with its options, or why there is none.
- * @typedef {Pending<DiagnosticResult> | {state: 'loading', job?: undefined} | {state: 'error' | 'refused', error: string, job?: undefined}} Result
+ * @typedef {JobResult<DiagnosticResult> | {state: 'refused', error: string, job?: undefined}} Result
  */
 
 /** @type {[string, string][]} */
@@ -30,7 +32,6 @@ const ACTIONS = { absent: 'Compute', ended: 'Try again', active: 'Cancel' };
 export class Diagnostics {
   #host;
   #store;
-  #jobs;
   #figures;
   #list;
   #article;
@@ -42,8 +43,8 @@ export class Diagnostics {
   #entries = [];
   /** @type {Map<string, HTMLElement>} */
   #rows = new Map();
-  /** @type {Map<string, Result>} */
-  #results = new Map();
+  /** @type {JobResults<DiagnosticResult>} */
+  #results;
   #loading = new AbortController();
   #open = false;
   #stale = true; // whether the entries are those of another trace
@@ -56,7 +57,6 @@ export class Diagnostics {
   constructor(host, store, jobs) {
     this.#host = host;
     this.#store = store;
-    this.#jobs = jobs;
     this.#figures = new Figures(html('.figures', host), store);
     this.#list = html('.list', host);
     this.#article = html('article', host);
@@ -70,7 +70,9 @@ export class Diagnostics {
     });
     this.#form.addEventListener('submit', (event) => (event.preventDefault(), this.#setOptions()));
     this.#form.addEventListener('change', () => this.#setOptions());
-    jobs.listen((list) => this.#updateJobs(list));
+    this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
+      this.#update(finished.length > 0),
+    );
     setPanelState(host, 'loading', 'Loading …');
   }
 
@@ -147,64 +149,23 @@ export class Diagnostics {
   async #requestEntry(entry, signal) {
     const trace = this.#trace;
     if (!trace) return;
-    const key = this.#key(entry);
-    if (this.#results.get(key)?.state === 'ready') return this.#draw(entry);
-    if (!this.#results.has(key)) this.#setResult(key, { state: 'loading' });
-    this.#draw(entry);
-    try {
-      const query = this.#query(entry);
-      const body = await api.diagnostic(trace.selection, entry.name, query, signal);
-      this.#setResult(key, pending(body));
-    } catch (error) {
-      if (isAbort(error)) return;
-      this.#setResult(key, { state: 'error', error: messageOf(error) });
-    }
-    this.#draw(entry);
+    const get = () => api.diagnostic(trace.selection, entry.name, this.#query(entry), signal);
+    await this.#results.load(this.#key(entry), get, signal);
   }
 
   /** @param {TraceDiagnosticInfo} entry */
-  async #compute(entry) {
+  #computeOrCancel(entry) {
     const trace = this.#trace;
     if (!trace) return;
-    const key = this.#key(entry);
-    try {
-      const body = await api.startDiagnostic(trace.selection, entry.name, this.#query(entry));
-      this.#setResult(key, jobState(body.job));
-    } catch (error) {
-      this.#setResult(key, { state: 'error', error: messageOf(error) });
-    }
-    this.#draw(entry);
-    this.#jobs.refresh();
+    const start = () => api.startDiagnostic(trace.selection, entry.name, this.#query(entry));
+    this.#results.startOrCancel(this.#key(entry), start);
   }
 
-  /**
-   * Updates the states of jobs, and requests the results of finished jobs.
-   * @param {Job[]} jobs
-   */
-  #updateJobs(jobs) {
+  /** @param {boolean} hasFinished whether jobs have finished, whose results are loaded */
+  #update(hasFinished) {
     if (this.#stale) return;
-    let isDone = false;
-    for (const [key, { job }] of [...this.#results]) {
-      if (!job) continue;
-      const update = jobs.find(({ id }) => id === job.id) ?? null;
-      if (update?.state === 'done') {
-        isDone = true;
-        this.#results.delete(key);
-      } else this.#setResult(key, jobState(update));
-    }
     for (const entry of this.#entries) this.#draw(entry);
-    if (isDone && this.#open) this.#request();
-  }
-
-  /**
-   * @param {string} key
-   * @param {Result} result
-   */
-  #setResult(key, result) {
-    this.#results.delete(key);
-    this.#results.set(key, result);
-    const [oldest] = this.#results.keys();
-    if (this.#results.size > MAX_RESULTS) this.#results.delete(oldest);
+    if (hasFinished && this.#open) this.#request();
   }
 
   get #selected() {
@@ -333,7 +294,7 @@ export class Diagnostics {
     /** @type {Result} */
     const result = entry.why_not
       ? { state: 'refused', error: entry.why_not }
-      : (this.#results.get(this.#key(entry)) ?? { state: 'loading' });
+      : this.#results.get(this.#key(entry));
     const row = this.#rows.get(entry.name);
     if (row) this.#drawState(row, entry, result);
     if (entry !== this.#selected) return;
@@ -347,39 +308,20 @@ export class Diagnostics {
    * @param {Result} result
    */
   #drawState(host, entry, result) {
-    const [verdict, controls] = [html('.verdict', host), html('.doing', host)];
+    const verdict = html('.verdict', host);
     const { state } = result;
     const text = summary(result);
     if (verdict.textContent !== text) verdict.textContent = verdict.title = text;
-    const isNew = host.dataset.state !== state;
     host.dataset.state = state;
     host.setAttribute('aria-busy', String(state === 'loading' || state === 'active'));
-    const action = ACTIONS[state];
-    if (isNew || (action && !controls.firstChild)) {
-      const hadFocus = controls.contains(document.activeElement);
-      controls.replaceChildren(...(action ? [this.#button(action, entry)] : []));
-      if (state === 'active') controls.prepend(document.createElement('progress'));
-      if (hadFocus) (controls.querySelector('button') ?? this.#backButton).focus();
-    }
-    const progress = controls.querySelector('progress');
-    if (!progress) return;
-    progress.setAttribute('aria-label', `Progress of ${entry.title}`);
-    progress.value = result.job?.progress ?? 0;
-  }
-
-  /**
-   * @param {string} action
-   * @param {TraceDiagnosticInfo} entry
-   */
-  #button(action, entry) {
-    const button = create('button', { type: 'button', className: 'text', textContent: action });
-    button.setAttribute('aria-label', `${action}: ${entry.title}`);
-    button.addEventListener('click', () => {
-      const job = this.#results.get(this.#key(entry))?.job;
-      if (job && isActive(job)) this.#jobs.cancel(job.id);
-      else this.#compute(entry);
+    const action = ACTIONS[state] ?? '';
+    showJobButton(html('.doing', host), result, {
+      action,
+      label: `${action}: ${entry.title}`,
+      progress: `Progress of ${entry.title}`,
+      press: () => this.#computeOrCancel(entry),
+      next: this.#backButton,
     });
-    return button;
   }
 }
 

@@ -3,13 +3,15 @@
 /** @import { State, Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Timeline } from '../timeline/timeline.js' */
-/** @import { Catalog, FailureEvent, FailureScore, Failures as Search, Job, JobReply } from '../types/server.js' */
-/** @import { Jobs, Pending } from '../widgets/jobs.js' */
+/** @import { Catalog, FailureEvent, FailureScore, Failures as Search } from '../types/server.js' */
+/** @import { JobResult } from '../widgets/job_results.js' */
+/** @import { Jobs } from '../widgets/jobs.js' */
 
-import { create, element, html, messageOf } from '../core/dom.js';
+import { element, html } from '../core/dom.js';
 import { fixed, percent, sentence, significant } from '../core/units.js';
 import * as api from '../data/api.js';
-import { isActive, jobSummary, pending } from '../widgets/jobs.js';
+import { JobResults, showJobButton } from '../widgets/job_results.js';
+import { jobSummary } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
 import { Episodes } from './episodes.js';
 import { EventTable } from './event_table.js';
@@ -36,20 +38,19 @@ const MAX_RESULTS = 8; // in the cache
 
 /**
  * Result of the search for failures of a filter over a data set; `live`: available after the end of the live run.
- * @typedef {Pending<Search> | {state: 'loading' | 'live'} | {state: 'error', error: string}} Result
+ * @typedef {JobResult<Search> | {state: 'live', job?: undefined}} Result
  */
 
 export class Failures {
   #host;
   #store;
-  #jobs;
   #timeline;
   #episodes;
   #table;
   /** @type {Trace | null} */
   #trace = null;
-  /** @type {Map<string, Result>} */
-  #results = new Map();
+  /** @type {JobResults<Search>} */
+  #results;
   #loading = new AbortController();
   #last = -1; // index of the event opened last
   #tableKey = ''; // of the listed events
@@ -65,13 +66,14 @@ export class Failures {
   constructor(host, store, jobs, timeline, catalog) {
     this.#host = host;
     this.#store = store;
-    this.#jobs = jobs;
     this.#timeline = timeline;
     this.#episodes = new Episodes(element('.episodes', HTMLTableElement, host), store, catalog);
     this.#table = new EventTable(element('.events', HTMLTableElement, host), (event, time) =>
       this.#open(event, time),
     );
-    jobs.listen((list) => this.#followJobs(list));
+    this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
+      finished.includes(this.#key) ? this.load() : this.draw(),
+    );
     this.load();
   }
 
@@ -104,16 +106,8 @@ export class Failures {
     this.#last = -1;
     if (this.#targetKey !== key) this.#targetKey = '';
     if (this.#liveState) return this.draw();
-    if (!this.#results.has(key)) this.#cache(key, { state: 'loading' });
-    this.draw();
-    if (this.#result.state === 'ready') return;
-    try {
-      this.#cache(key, pending(await api.failures(this.#store.state, signal)));
-    } catch (error) {
-      if (signal.aborted) return;
-      this.#cache(key, { state: 'error', error: messageOf(error) });
-    }
-    this.draw();
+    await this.#results.load(key, () => api.failures(this.#store.state, signal), signal);
+    if (signal.aborted) return;
     this.#openTarget();
   }
 
@@ -139,7 +133,7 @@ export class Failures {
   #openTarget() {
     if (this.#targetKey !== this.#key) return;
     const { state } = this.#result;
-    if (state === 'absent') this.#search();
+    if (state === 'absent') this.#searchOrCancel();
     if (state !== 'ready') return;
     this.#targetKey = '';
     this.#last = -1;
@@ -162,7 +156,12 @@ export class Failures {
     html('.episodes', this.#host).hidden = state.list !== 'episodes';
     this.#host.dataset.state = result.state;
     this.#host.ariaBusy = String(result.state === 'loading' || result.state === 'active');
-    this.#drawButton(result);
+    showJobButton(html('.doing', this.#host), result, {
+      action: ACTIONS[result.state] ?? '',
+      progress: 'Progress of the search for failures',
+      press: () => this.#searchOrCancel(),
+      next: html('.scroll', this.#host),
+    });
     this.#drawScores(failures?.scores ?? []);
     const text = score ? scoreSummary(score) : statusText(result);
     const verdict = html('.verdict', this.#host);
@@ -190,7 +189,7 @@ export class Failures {
 
   /** @returns {Result} */
   get #result() {
-    return this.#liveState ?? this.#results.get(this.#key) ?? { state: 'loading' };
+    return this.#liveState ?? this.#results.get(this.#key);
   }
 
   /** The selected score, or the first one if the task does not have it. @returns {FailureScore | undefined} */
@@ -213,72 +212,8 @@ export class Failures {
     return phase ? events.filter((event) => event.phase === phase.name) : events;
   }
 
-  /**
-   * @param {string} key
-   * @param {Result} result
-   */
-  #cache(key, result) {
-    this.#results.delete(key);
-    this.#results.set(key, result);
-    const [oldest] = this.#results.keys();
-    if (this.#results.size > MAX_RESULTS) this.#results.delete(oldest);
-  }
-
-  async #search() {
-    const key = this.#key;
-    try {
-      const { job } = await api.startFailureSearch(this.#store.state);
-      this.#cache(key, jobResult(job));
-    } catch (error) {
-      this.#cache(key, { state: 'error', error: messageOf(error) });
-    }
-    this.draw();
-    this.#jobs.refresh();
-  }
-
-  /**
-   * Updates the results; the result of a finished job is loaded.
-   * @param {Job[]} list
-   */
-  #followJobs(list) {
-    const jobs = new Map(list.map((job) => [job.id, job]));
-    for (const [key, result] of [...this.#results]) {
-      if (result.state !== 'active' && result.state !== 'ended') continue;
-      const job = jobs.get(result.job.id) ?? null;
-      if (job?.state === 'done') this.#results.delete(key);
-      else this.#cache(key, jobResult(job));
-    }
-    if (this.#results.has(this.#key)) this.draw();
-    else this.load();
-  }
-
-  /**
-   * Shows the button that starts, repeats or cancels the search, and the progress.
-   * @param {Result} result
-   */
-  #drawButton(result) {
-    const host = html('.doing', this.#host);
-    const action = ACTIONS[result.state] ?? '';
-    if (host.dataset.action !== action) {
-      const hadFocus = host.contains(document.activeElement);
-      const button = create('button', { type: 'button', className: 'text', textContent: action });
-      button.addEventListener('click', () => this.#searchOrCancel());
-      const progress = create('progress', { ariaLabel: 'Progress of the search for failures' });
-      host.dataset.action = action;
-      host.replaceChildren(
-        ...(result.state === 'active' ? [progress] : []),
-        ...(action ? [button] : []),
-      );
-      if (hadFocus) (action ? button : html('.scroll', this.#host)).focus();
-    }
-    const progress = host.querySelector('progress');
-    if (progress && result.state === 'active') progress.value = result.job.progress;
-  }
-
   #searchOrCancel() {
-    const result = this.#result;
-    if (result.state === 'active' && isActive(result.job)) this.#jobs.cancel(result.job.id);
-    else this.#search();
+    this.#results.startOrCancel(this.#key, () => api.startFailureSearch(this.#store.state));
   }
 
   /**
@@ -364,12 +299,6 @@ export class Failures {
     );
   }
 }
-
-/**
- * @param {Job | null} job
- * @returns {Result}
- */
-const jobResult = (job) => pending(/** @type {Search | JobReply} */ ({ job }));
 
 /** @param {FailureScore} score */
 const scoreSummary = (score) =>

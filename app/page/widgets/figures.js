@@ -4,12 +4,12 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Curve, DiagnosticResult, Table } from '../types/server.js' */
 
-import { copyText } from '../core/clipboard.js';
 import { create } from '../core/dom.js';
 import { scaled, swatch } from '../core/palette.js';
 import { significant } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { GUTTER, LABEL, shadeBounds, shadeIntervals } from '../timeline/chart.js';
+import { copyButton } from './copy_button.js';
 import {
   axisStyle,
   drawPixelMap,
@@ -26,7 +26,6 @@ import {
 /** @typedef {{plot: uPlot, cursor: HTMLElement, values: HTMLElement[], curves: Curve[]}} CurveChart */
 
 const HEIGHT = { chart: scaled(104), axis: scaled(30) }; // px
-const MESSAGE_TIME = 1500; // ms
 
 export class Figures {
   #host;
@@ -192,7 +191,8 @@ export class Figures {
   /** @param {Table} table */
   #table({ title, columns, rows }) {
     const head = heading(title);
-    head.append(copyButton(title, [columns, ...rows]));
+    const copied = () => csv([columns, ...rows]);
+    head.append(copyButton('Copy CSV', `Copy ${title} as CSV`, copied));
     const table = document.createElement('table');
     table.setAttribute('aria-label', title);
     const classes = columns.map((_, i) =>
@@ -226,21 +226,8 @@ export class Figures {
   }
 }
 
-/**
- * @param {string} title
- * @param {(string | number | null)[][]} rows
- */
-function copyButton(title, rows) {
-  const text = 'Copy CSV';
-  const button = create('button', { type: 'button', className: 'text quiet', textContent: text });
-  button.ariaLabel = `Copy ${title} as CSV`;
-  button.addEventListener('click', async () => {
-    const csv = rows.map((row) => row.map(csvField).join(',')).join('\n') + '\n';
-    button.textContent = (await copyText(csv)) ? 'Copied' : 'Not permitted';
-    setTimeout(() => (button.textContent = text), MESSAGE_TIME);
-  });
-  return button;
-}
+/** @param {(string | number | null)[][]} rows */
+const csv = (rows) => rows.map((row) => row.map(csvField).join(',')).join('\n') + '\n';
 
 /**
  * Adds the unit to a title that does not name it.

@@ -1,6 +1,6 @@
 /** Background jobs: their state, progress and log. Jobs continue when the page is closed. */
 
-/** @import { Job, JobReply } from '../types/server.js' */
+/** @import { Job } from '../types/server.js' */
 
 import { element, html } from '../core/dom.js';
 import { percent, sentence } from '../core/units.js';
@@ -211,29 +211,4 @@ export function remaining({ started, progress }, now) {
   if (!started || progress < 0.05 || progress >= 1) return '';
   const seconds = ((now - started) * (1 - progress)) / progress;
   return seconds < 90 ? `${Math.ceil(seconds)} s left` : `${Math.round(seconds / 60)} min left`;
-}
-
-/**
- * State of a result that a job may compute.
- * @template T
- * @typedef {{state: 'ready', result: T, job?: undefined} | {state: 'absent', job?: undefined} | {state: 'active' | 'ended', job: Job}} Pending
- */
-
-/**
- * Returns the result in a server's reply, or the state of the job that computes it.
- * @template {object} T
- * @param {T | JobReply} body
- * @returns {Pending<T>}
- */
-export const pending = (body) =>
-  'job' in body ? jobState(body.job) : { state: 'ready', result: body };
-
-/**
- * Returns the state of a result whose job is not done; null if there is no job.
- * @param {Job | null} job
- * @returns {{state: 'absent', job?: undefined} | {state: 'active' | 'ended', job: Job}}
- */
-export function jobState(job) {
-  if (!job) return { state: 'absent' };
-  return { state: isActive(job) ? 'active' : 'ended', job };
 }

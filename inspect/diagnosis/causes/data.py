@@ -31,7 +31,8 @@ CAUSES = (
             Symptom("module error/*", 1),
         ),
         f"sharpness/*|occlusion/*|shift/*|brightness/*|offset/*|*/force*|*/torque*|*/contact/*|{LABELS}|{MODULES}",
-        "Collect data of these conditions and fine-tune: beliefscope finetune {task} --filter {filter} --data NEW.h5.",
+        "Collect data of these conditions and fine-tune: `beliefscope finetune {task} --filter {filter} --data NEW.h5 "
+        "-o tuned.safetensors`.",
         prior=-0.4,
     ),
 )

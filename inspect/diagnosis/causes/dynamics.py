@@ -5,8 +5,8 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER
 
-RETRAIN = "Fine-tune it: beliefscope finetune {task} --filter {filter} --train dynamics-only."
-CALIBRATE = "Calibrate it: beliefscope finetune {task} --filter {filter} --train noise-only."
+RETRAIN = "Fine-tune it: `beliefscope finetune {task} --filter {filter} --train dynamics-only -o tuned.safetensors`."
+CALIBRATE = "Calibrate it: `beliefscope finetune {task} --filter {filter} --train noise-only -o tuned.safetensors`."
 
 CAUSES = (
     Cause(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import FILTER, WEIGHTS
 
-RETRAIN = "Fine-tune them: beliefscope finetune {task} --filter {filter} --train weights-only."
+RETRAIN = "Fine-tune them: `beliefscope finetune {task} --filter {filter} --train weights-only -o tuned.safetensors`."
 
 CAUSES = (
     Cause(

@@ -48,8 +48,8 @@ CAUSES = (
         "Image noisy",
         (Symptom("noise/image/*"),),
         f"sharpness/image/*|shift/image*|brightness/image/*|occlusion/image/*|lag/image/*|{HAND}|{IMAGE}",
-        "Reduce the camera's gain, or train with noisy images: beliefscope finetune {task} --filter {filter} "
-        "--faults image_noise=40.",
+        "Reduce the camera's gain, or train with noisy images: `beliefscope finetune {task} --filter {filter} "
+        "--faults image_noise=40 -o tuned.safetensors`.",
         "drop image",
     ),
     Cause(

@@ -10,8 +10,9 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
     """Causes of one modality's measurement model."""
     name, title = f"model.{modality}", f"{modality.capitalize()} model"
     module = f"*{modality}*"
-    retrain = f"Fine-tune it: beliefscope finetune {{task}} --filter {{filter}} --train {modality}-only."
-    calibrate = "Calibrate it: beliefscope finetune {task} --filter {filter} --train noise-only."
+    finetune = "`beliefscope finetune {task} --filter {filter} --train"
+    retrain = f"Fine-tune it: {finetune} {modality}-only -o tuned.safetensors`."
+    calibrate = f"Calibrate it: {finetune} noise-only -o tuned.safetensors`."
     return (
         Cause(
             f"{name}.bias",

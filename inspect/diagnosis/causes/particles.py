@@ -11,7 +11,7 @@ CAUSES = (
         "Too few particles",
         (Symptom("particles/*", -1),),
         FILTER,
-        "Use more particles: beliefscope evaluate {task} --filter {filter} --particles 1000.",
+        "Use more particles: `beliefscope evaluate {task} --filter {filter} --particles 1000`.",
         "10 x particles",
     ),
     Cause(

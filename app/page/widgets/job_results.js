@@ -1,0 +1,154 @@
+/** Results that background jobs compute: loaded, started, followed and kept by key; and their button. */
+
+/** @import { Job, JobReply } from '../types/server.js' */
+/** @import { Jobs } from './jobs.js' */
+
+import { create, html, messageOf } from '../core/dom.js';
+import { isActive } from './jobs.js';
+
+/**
+ * A result, or why there is none yet. absent: not requested; active: its job waits or runs; ended: without a result.
+ * @template T
+ * @typedef {{state: 'ready', result: T, job?: undefined}
+ *   | {state: 'absent' | 'loading', job?: undefined}
+ *   | {state: 'active' | 'ended', job: Job}
+ *   | {state: 'error', error: string, job?: undefined}} JobResult
+ */
+
+/**
+ * @template {object} T
+ */
+export class JobResults {
+  #jobs;
+  #capacity;
+  #changed;
+  /** @type {Map<string, JobResult<T>>} least recently changed first */
+  #results = new Map();
+
+  /**
+   * @param {Jobs} jobs
+   * @param {number} capacity number of results that are kept
+   * @param {(finished: string[]) => void} changed called after a change, with the keys of finished jobs: load them again
+   */
+  constructor(jobs, capacity, changed) {
+    this.#jobs = jobs;
+    this.#capacity = capacity;
+    this.#changed = changed;
+    jobs.listen((list) => this.#follow(list));
+  }
+
+  /**
+   * @param {string} key
+   * @returns {JobResult<T>}
+   */
+  get(key) {
+    return this.#results.get(key) ?? { state: 'loading' };
+  }
+
+  /** @param {string} key */
+  delete(key) {
+    this.#results.delete(key);
+  }
+
+  /**
+   * Loads a result, unless it is known, or the state of its job.
+   * @param {string} key
+   * @param {() => Promise<T | JobReply>} request
+   * @param {AbortSignal} signal of the request
+   */
+  async load(key, request, signal) {
+    if (!this.#results.has(key)) this.#set(key, { state: 'loading' });
+    this.#changed([]);
+    if (this.get(key).state === 'ready') return;
+    try {
+      const reply = await request();
+      this.#set(key, 'job' in reply ? jobState(reply.job) : { state: 'ready', result: reply });
+    } catch (error) {
+      if (signal.aborted) return;
+      this.#set(key, { state: 'error', error: messageOf(error) });
+    }
+    this.#changed([]);
+  }
+
+  /**
+   * Starts the job of a result, or cancels it if it is active.
+   * @param {string} key
+   * @param {() => Promise<JobReply>} request
+   */
+  async startOrCancel(key, request) {
+    const { job } = this.get(key);
+    if (job && isActive(job)) return this.#jobs.cancel(job.id);
+    try {
+      this.#set(key, jobState((await request()).job));
+    } catch (error) {
+      this.#set(key, { state: 'error', error: messageOf(error) });
+    }
+    this.#changed([]);
+    this.#jobs.refresh();
+  }
+
+  /** @param {Job[]} list */
+  #follow(list) {
+    const finished = [];
+    for (const [key, { job }] of [...this.#results]) {
+      if (!job) continue;
+      const update = list.find(({ id }) => id === job.id) ?? null;
+      if (update?.state === 'done') {
+        this.#results.delete(key);
+        finished.push(key);
+      } else this.#set(key, jobState(update));
+    }
+    this.#changed(finished);
+  }
+
+  /**
+   * @param {string} key
+   * @param {JobResult<T>} result
+   */
+  #set(key, result) {
+    this.#results.delete(key);
+    this.#results.set(key, result);
+    const [oldest] = this.#results.keys();
+    if (this.#results.size > this.#capacity) this.#results.delete(oldest);
+  }
+}
+
+/**
+ * Returns the state of a result whose job is not done; null if there is no job.
+ * @param {Job | null} job
+ * @returns {{state: 'absent', job?: undefined} | {state: 'active' | 'ended', job: Job}}
+ */
+function jobState(job) {
+  if (!job) return { state: 'absent' };
+  return { state: isActive(job) ? 'active' : 'ended', job };
+}
+
+/**
+ * Shows the button that starts or cancels a job, and the progress of an active one.
+ * @param {HTMLElement} host
+ * @param {{state: string, job?: Job}} result
+ * @param {object} button
+ * @param {string} button.action text; empty: no button
+ * @param {string} [button.label] accessible name, if it is not the text
+ * @param {string} button.progress accessible name of the progress
+ * @param {() => void} button.press
+ * @param {HTMLElement} [button.next] gets the focus when the button disappears
+ */
+export function showJobButton(host, { state, job }, { action, label, progress, press, next }) {
+  const key = `${state} ${label ?? action}`;
+  if (host.dataset.key !== key) {
+    const hadFocus = host.contains(document.activeElement);
+    host.dataset.key = key;
+    host.replaceChildren();
+    if (state === 'active') host.append(create('progress', { ariaLabel: progress }));
+    if (action) {
+      const button = create('button', { type: 'button', className: 'text', textContent: action });
+      if (label) button.ariaLabel = label;
+      button.addEventListener('click', press);
+      host.append(button);
+    }
+    if (hadFocus) (action ? html('button', host) : next)?.focus();
+  }
+  const bar = host.querySelector('progress');
+  if (bar) bar.value = job?.progress ?? 0;
+}

@@ -1,0 +1,60 @@
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import './browser.js';
+import { recoveredText } from '../../app/page/tabs/diagnosis.js';
+import { JobResults } from '../../app/page/widgets/job_results.js';
+
+const { signal } = new AbortController();
+
+/** @param {string} state */
+const job = (state) => /** @type {any} */ ({ id: 'a', state });
+
+/** Results with a list of jobs that the test controls. */
+function setUp(capacity = 2) {
+  /** @type {(list: any[]) => void} */
+  let update = () => {};
+  /** @type {string[]} */
+  const [cancelled, finished] = [[], []];
+  const jobs = /** @type {any} */ ({
+    listen: (/** @type {typeof update} */ listener) => (update = listener),
+    cancel: (/** @type {string} */ id) => cancelled.push(id),
+    refresh() {},
+  });
+  const results = new JobResults(jobs, capacity, (keys) => finished.push(...keys));
+  return { results, cancelled, finished, update: (/** @type {any[]} */ ...list) => update(list) };
+}
+
+test('a job is started, followed and cancelled; its result is loaded again when it is done', async () => {
+  const { results, cancelled, finished, update } = setUp();
+  await results.load('run', async () => ({ job: null }), signal);
+  assert.equal(results.get('run').state, 'absent');
+  await results.startOrCancel('run', async () => ({ job: job('waiting') }));
+  assert.equal(results.get('run').state, 'active');
+  await results.startOrCancel('run', () => assert.fail('it is active'));
+  assert.deepEqual(cancelled, ['a']);
+  update(job('failed'));
+  assert.equal(results.get('run').state, 'ended');
+  update(job('done'));
+  assert.deepEqual(finished, ['run']);
+  await results.load('run', async () => ({ value: 1 }), signal);
+  assert.deepEqual(results.get('run'), { state: 'ready', result: { value: 1 } });
+  await results.load('run', () => assert.fail('it is known'), signal);
+});
+
+test('an error is kept, an aborted request is not, and the oldest result is dropped', async () => {
+  const { results } = setUp();
+  const fail = () => Promise.reject(new Error('no such filter'));
+  await results.load('one', fail, signal);
+  assert.deepEqual(results.get('one'), { state: 'error', error: 'no such filter' });
+  await results.load('two', fail, AbortSignal.abort());
+  assert.equal(results.get('two').state, 'loading');
+  await results.load('three', async () => ({}), signal);
+  assert.equal(results.get('one').state, 'loading');
+});
+
+test('the effect of undoing a cause has a direction and no sign', () => {
+  const effect = { error: null, low: null, high: null };
+  assert.match(recoveredText({ ...effect, nll: -0.154 }), /increases by 0\.15 nats/);
+  assert.match(recoveredText({ ...effect, nll: 0.154 }), /decreases by 0\.15 nats/);
+});
