@@ -1,4 +1,8 @@
-"""The page in headless Chromium: first paint, latency, and memory during playback."""
+"""The page in headless Chromium: first paint, latency, diagnosis, and memory during playback.
+
+python bench/page.py                # all but the playback
+python bench/page.py --diagnosis    # only the diagnosis
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 from served import serving
@@ -20,6 +25,13 @@ from beliefscope.datasets.store import write_dataset
 
 KEYS = 200
 VISITS = 5
+DIAGNOSED = (
+    ("door", "crossmodal-ekf"),
+    ("door", "crossmodal-pf"),
+    ("push", "crossmodal-ekf"),
+    ("push", "crossmodal-pf"),
+)
+FROZEN = "image_frozen:from=10"
 SWEEP = 3.0  # s, duration of a drag over the timeline
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 
@@ -76,7 +88,7 @@ def measure() -> list[Row]:
     if find_chromium() is None:
         return [("page", "skipped: no Chromium on the path", "")]
     with browsing() as page, serving() as served:
-        rows = paint(page, served.url)
+        rows = [*paint(page, served.url), *diagnosis(page, served.url)]
     with tempfile.TemporaryDirectory() as folder:
         long = Path(folder) / "long.h5"
         write_dataset(long, find_task("door"), [episode()])
@@ -121,6 +133,24 @@ def keys(page: Any, url: str) -> list[Row]:
     ]
     if scenes:
         rows.append((f"key to scene sent, {len(scenes)} keys, p95", f"{np.percentile(scenes, 95):.0f} ms", "<= 100 ms"))
+    return rows
+
+
+def diagnosis(page: Any, url: str) -> list[Row]:
+    """Time from the key that opens the Diagnosis tab to the preliminary headline, and to the confirmed diagnosis."""
+    rows: list[Row] = []
+    for task, filter_ in DIAGNOSED:
+        page.goto(f"{url}?" + urlencode({"task": task, "filter": filter_, "faults": FROZEN, "tab": "compare"}))
+        usable(page)
+        page.wait_for_timeout(3000)
+        start = time.perf_counter()
+        page.keyboard.press("g")
+        page.wait_for_function("() => diagnosis.dataset.finding")
+        first = time.perf_counter() - start
+        page.wait_for_function("() => diagnosis.dataset.state === 'ready'", timeout=120_000)
+        confirmed = time.perf_counter() - start
+        rows.append((f"key to headline, {task} {filter_}", f"{first:.2f} s", "<= 3 s"))
+        rows.append((f"key to confirmed diagnosis, {task} {filter_}", f"{confirmed:.1f} s", ""))
     return rows
 
 
@@ -178,8 +208,14 @@ def play(minutes: float) -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--play", type=float, metavar="MINUTES", help="only measure the memory during playback")
+    parser.add_argument("--diagnosis", action="store_true", help="only measure the diagnosis")
     args = parser.parse_args()
-    for quantity, measured, bar in measure() if args.play is None else play(args.play):
+    if args.diagnosis:
+        with browsing() as page, serving() as served:
+            rows = diagnosis(page, served.url)
+    else:
+        rows = measure() if args.play is None else play(args.play)
+    for quantity, measured, bar in rows:
         print(f"{quantity}: {measured}{bar and f' (bar: {bar})'}", flush=True)
 
 

@@ -1,20 +1,25 @@
-"""Routes under ``/api/diagnosis``: the probable cause of a fault, found by a job."""
+"""Routes under ``/api/diagnosis``: the probable cause of a fault, preliminary from a trace and confirmed by a job."""
 
 from __future__ import annotations
 
+import json
+import threading
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query
-from fastapi.responses import Response
+from fastapi.responses import FileResponse, JSONResponse, Response
 
-from beliefscope.app.api.jobs import result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
-from beliefscope.app.api.models.diagnosis import Diagnosis
-from beliefscope.app.api.traces import RequestedRun
+from beliefscope.app.api.models.diagnosis import Diagnosis, DiagnosisJob
+from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.traced_run import TracedRun
+from beliefscope.inspect.diagnosis.diagnose import preliminary
+from beliefscope.inspect.diagnostics.views import as_json
 
 Over = Annotated[Literal["episode", "held-out"], Query(description="the run's episode, or held-out ones")]
 
@@ -24,14 +29,23 @@ MAX_EPISODES = 10
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     router = APIRouter()
+    computing = threading.Lock()  # one preliminary diagnosis at a time
 
     @router.get(
         "/api/diagnosis/{task}/{filter}/{episode}",
         response_model=Diagnosis,
-        responses={202: {"model": JobReply | Progress}},
+        responses={202: {"model": DiagnosisJob | Progress}},
     )
     def get_diagnosis(selection: RequestedRun, over: Over = "episode") -> Response:
-        return result_or_job(jobs, "diagnosis", _key(store, _arguments(store, selection, over)))
+        job = jobs.find("diagnosis", _key(store, _arguments(store, selection, over)))
+        if path := jobs.finished_result(job):
+            return FileResponse(path, media_type="application/json")
+        run = finished_run(store, selection)
+        with computing:
+            first = _preliminary(run, store.settings.particles)
+        if over == "episode" and first["state"] == "healthy":
+            return JSONResponse(first)
+        return JSONResponse({"job": job and asdict(job), "preliminary": first}, status_code=202)
 
     @router.post("/api/diagnosis/{task}/{filter}/{episode}", status_code=202)
     def find_cause(selection: RequestedRun, over: Over = "episode") -> JobReply:
@@ -44,6 +58,14 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         return JobReply(job=jobs.submit("diagnosis", title, arguments, _key(store, arguments), link))
 
     return router
+
+
+def _preliminary(run: TracedRun, particles: int) -> Any:
+    """The preliminary diagnosis as JSON values, kept with the run. Raises BadInput without a healthy profile."""
+    if "diagnosis" not in run.diagnostics:
+        result = preliminary(run.checkpoint, run.trace, particles)
+        run.diagnostics["diagnosis"] = json.dumps(as_json(result.to_json()), allow_nan=False).encode()
+    return json.loads(run.diagnostics["diagnosis"])
 
 
 def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, Any]:

@@ -31,7 +31,7 @@ class TracedRun:
         future: the trace, or the error that ended its computation.
         progress: completed fraction, 0..1.
         scene_key: identifies what a 3D scene draws; equal for all states of a live run.
-        diagnostics: results of fast diagnostics, as JSON; kept by ``app/api/diagnostics.py``.
+        diagnostics: results of fast diagnostics and the preliminary diagnosis, as JSON; kept by their routes.
         growing: whether the run is live and may get more steps (``app/runs/live_runs.py``).
     """
 

@@ -109,11 +109,7 @@ def diagnose(
     report = progress or (lambda fraction: None)
     if not episodes:
         raise BadInput("no episodes to diagnose")
-    profile = profile or find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
-    if profile is None:
-        raise BadInput(
-            f"filter {checkpoint.name!r} has no healthy profile, which new checkpoints and shipped ones have"
-        )
+    profile = profile or _profile(checkpoint)
     traces = []
     for trace in trace_all(checkpoint, episodes, episodes, seed, particles):
         traces.append(trace)
@@ -121,15 +117,29 @@ def diagnose(
     setting = Setting(checkpoint, episodes, particles, frozenset(episodes))
     case = examine(setting, traces, profile, alarm_rate)
     report(0.5)
-    provenance = _provenance(case)
-    if not case.alarms:
-        text = f"Healthy: all statistics are within the record of {profile.episodes} healthy episodes."
-        report(1.0)
-        return Diagnosis("healthy", False, text, (), provenance)
     scores = signature_scores(case)
-    recovered = confirm(case, scores, seed, base, lambda share: report(0.5 + 0.5 * share))
+    recovered = confirm(case, scores, seed, base, lambda share: report(0.5 + 0.5 * share)) if case.alarms else {}
     report(1.0)
-    return _conclude(case, scores, recovered, provenance)
+    return _conclude(case, scores, recovered)
+
+
+def preliminary(checkpoint: Checkpoint, trace: Trace, particles: int = 300, alarm_rate: float = 0.05) -> Diagnosis:
+    """The diagnosis of one run before any cause is undone, within a fraction of a second; final if it is healthy.
+
+    Raises BadInput without a healthy profile.
+    """
+    setting = Setting(checkpoint, {trace.episode_index: trace.episode}, particles, frozenset({trace.episode_index}))
+    case = examine(setting, [trace], _profile(checkpoint), alarm_rate)
+    return _conclude(case, signature_scores(case), {})
+
+
+def _profile(checkpoint: Checkpoint) -> HealthyProfile:
+    profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
+    if profile is None:
+        raise BadInput(
+            f"filter {checkpoint.name!r} has no healthy profile, which new checkpoints and shipped ones have"
+        )
+    return profile
 
 
 def examine(setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, alarm_rate: float) -> Case:
@@ -170,9 +180,11 @@ def confirm(
     return recovered
 
 
-def _conclude(
-    case: Case, scores: Mapping[str, float], recovered: Mapping[str, Recovery], provenance: Mapping[str, Any]
-) -> Diagnosis:
+def _conclude(case: Case, scores: Mapping[str, float], recovered: Mapping[str, Recovery]) -> Diagnosis:
+    provenance = _provenance(case)
+    if not case.alarms:
+        text = f"Healthy: all statistics are within the record of {case.profile.episodes} healthy episodes."
+        return Diagnosis("healthy", False, text, (), provenance)
     by_name = {cause.name: cause for cause in CAUSES}
     ranked = sorted(probabilities(scores).items(), key=lambda item: -item[1])[:LISTED]
     candidates = tuple(_candidate(case, by_name[name], p, recovered.get(name)) for name, p in ranked)

@@ -42,6 +42,19 @@ test('a job is started, followed and cancelled; its result is loaded again when 
   await results.load('run', () => assert.fail('it is known'), signal);
 });
 
+test('a preliminary result is kept until the result replaces it', async () => {
+  const { results, update } = setUp();
+  const preliminary = { value: 0 };
+  await results.load('run', async () => ({ job: null, preliminary }), signal);
+  await results.startOrCancel('run', async () => ({ job: job('waiting') }));
+  for (const state of ['running', 'done']) {
+    update(job(state));
+    assert.equal(results.get('run').preliminary, preliminary);
+  }
+  await results.load('run', async () => ({ value: 1 }), signal);
+  assert.deepEqual(results.get('run'), { state: 'ready', result: { value: 1 } });
+});
+
 test('an error is kept, an aborted request is not, and the oldest result is dropped', async () => {
   const { results } = setUp();
   const fail = () => Promise.reject(new Error('no such filter'));

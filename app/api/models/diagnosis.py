@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from beliefscope.app.api.models.catalog import Number, Reply
+from beliefscope.app.api.models.catalog import JobReply, Number, Reply
 
 
 class DiagnosisEvidence(Reply):
@@ -53,3 +53,9 @@ class Diagnosis(Reply):
     episodes: int
     healthy_episodes: int
     alarm_rate: float
+
+
+class DiagnosisJob(JobReply):
+    """Body of a 202 response: the job, and the diagnosis of the selected run before any cause is undone."""
+
+    preliminary: Diagnosis

@@ -227,7 +227,7 @@ const diagnosisUrl = ({ task, filter, episode, data, faults }, over) =>
  * @param {Selection} selection
  * @param {string} over
  * @param {AbortSignal} [signal]
- * @returns {Promise<Diagnosis | JobReply>}
+ * @returns {Promise<Diagnosis | import('../types/server.js').JobReply<Diagnosis>>}
  */
 export const diagnosis = (selection, over, signal) => poll(diagnosisUrl(selection, over), signal);
 

@@ -2,7 +2,7 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
-/** @import { Diagnosis as Result, DiagnosisCause, DiagnosisEvidence } from '../types/server.js' */
+/** @import { Catalog, Diagnosis as Result, DiagnosisCause, DiagnosisEvidence } from '../types/server.js' */
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
 
@@ -14,7 +14,7 @@ import { JobResults, showJobButton } from '../widgets/job_results.js';
 import { jobSummary } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
 
-/** @typedef {JobResult<Result> | {state: 'live', job?: undefined}} Entry */
+/** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */
 
 /** @type {[string, string][]} */
 const OVER = [
@@ -24,26 +24,31 @@ const OVER = [
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MAX_RESULTS = 24; // in the cache
+const SETTLING = 500; // ms until the job of a selection starts
 
 export class Diagnosis {
   #host;
   #store;
+  #starts;
   /** @type {Trace | null} */
   #trace = null;
   /** @type {JobResults<Result>} */
   #results;
   #loading = new AbortController();
   #open = false;
-  #listed = ''; // key of the listed causes
+  /** @type {Result | null | undefined} */
+  #listed; // result whose causes are listed
 
   /**
    * @param {HTMLElement} host
+   * @param {Catalog} catalog
    * @param {Store} store
    * @param {Jobs} jobs
    */
-  constructor(host, store, jobs) {
+  constructor(host, catalog, store, jobs) {
     this.#host = host;
     this.#store = store;
+    this.#starts = !catalog.read_only;
     this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
       finished.includes(this.#key) ? this.load() : this.#draw(),
     );
@@ -61,7 +66,7 @@ export class Diagnosis {
     this.load();
   }
 
-  /** Loads the diagnosis of the selected run, or the state of its job. */
+  /** Loads the diagnosis of the selected run, or a preliminary one and the state of its job, which it starts. */
   async load() {
     const trace = this.#trace;
     if (!this.#open || !trace) return;
@@ -70,6 +75,9 @@ export class Diagnosis {
     if (trace.live) return this.#draw();
     const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
     await this.#results.load(this.#key, get, signal);
+    if (this.#entry.state !== 'absent' || !this.#starts) return;
+    await new Promise((resolve) => setTimeout(resolve, SETTLING));
+    if (!signal.aborted && this.#open && this.#entry.state === 'absent') this.#startOrCancel();
   }
 
   get #key() {
@@ -96,23 +104,27 @@ export class Diagnosis {
     const { over } = this.#store.state;
     const set = (/** @type {string} */ value) => this.#store.set({ over: value });
     choice(html('.choice', this.#host), OVER, over, set);
-    const result = entry.state === 'ready' ? entry.result : null;
+    const result = entry.state === 'ready' ? entry.result : entry.preliminary;
     this.#host.dataset.state = entry.state;
     this.#host.dataset.finding = result ? (result.masked ? 'masked' : result.state) : '';
     this.#host.ariaBusy = String(entry.state === 'loading' || entry.state === 'active');
+    const state = stateOf(entry);
+    const text = result?.headline ?? state;
     const headline = html('.headline', this.#host);
-    const text = headlineOf(entry);
     if (headline.dataset.text !== text) headline.replaceChildren(...withCode(text));
     headline.dataset.text = text;
+    const { episode } = this.#store.state;
+    html('.status', this.#host).textContent = entry.preliminary
+      ? `Preliminary, from episode ${episode} alone and before any cause is undone. ${state}`
+      : '';
     showJobButton(html('.doing', this.#host), entry, {
       action: ACTIONS[entry.state] ?? '',
       progress: 'Progress of the diagnosis',
       press: () => this.#startOrCancel(),
       next: html('.scroll', this.#host),
     });
-    const key = result ? this.#key : '';
-    if (key === this.#listed) return;
-    this.#listed = key;
+    if (result === this.#listed) return;
+    this.#listed = result;
     html('.causes', this.#host).replaceChildren(
       ...(result?.causes ?? []).map((cause) => this.#row(cause)),
     );
@@ -156,14 +168,16 @@ export class Diagnosis {
   }
 }
 
-/** @param {Entry} entry */
-function headlineOf(entry) {
-  if (entry.state === 'ready') return entry.result.headline;
+/**
+ * The state of a diagnosis that is not ready.
+ * @param {Entry} entry
+ */
+function stateOf(entry) {
   if (entry.state === 'error') return sentence(entry.error);
   if (entry.state === 'live') return 'A live run has no diagnosis: its trace holds no data set.';
   if (entry.state === 'active' || entry.state === 'ended') return jobSummary(entry.job);
   if (entry.state === 'loading') return 'Loading …';
-  return 'No diagnosis yet. It compares sensors, labels, modules and filter with the healthy record.';
+  return '';
 }
 
 /** @param {Result} result */
@@ -179,7 +193,8 @@ export function recoveredText({ error, low, high, nll }) {
   const likelihood = `the negative log-likelihood ${change} by ${size} nats a step`;
   if (error === null) return `If undone, ${likelihood}.`;
   const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
-  return `Undoing it recovers ${percent(error)}${range} of the excess error; ${likelihood}.`;
+  if (error < 0) return `Undoing it increases the error by ${percent(-error)}; ${likelihood}.`;
+  return `Undoing it recovers ${percent(error)}${range} of the error; ${likelihood}.`;
 }
 
 /**
@@ -188,10 +203,10 @@ export function recoveredText({ error, low, high, nll }) {
  */
 function nextAction(text) {
   const line = create('p', { className: 'next' }, 'Next: ', ...withCode(text));
-  for (const code of line.querySelectorAll('code'))
-    code.after(
+  for (const { textContent } of line.querySelectorAll('code'))
+    line.append(
       ' ',
-      copyButton('Copy', 'Copy the command', () => code.textContent ?? ''),
+      copyButton('Copy', 'Copy the command', () => textContent ?? ''),
     );
   return line;
 }

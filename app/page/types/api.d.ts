@@ -206,6 +206,14 @@ export interface components {
             step: number | null;
         };
         /**
+         * DiagnosisJob
+         * @description Body of a 202 response: the job, and the diagnosis of the selected run before any cause is undone.
+         */
+        DiagnosisJob: {
+            job: components["schemas"]["Job"] | null;
+            preliminary: components["schemas"]["Diagnosis"];
+        };
+        /**
          * DiagnosisRecovery
          * @description Effect of undoing a cause: share of the excess error with its 95 % interval, and decrease of the NLL, nats.
          */
@@ -1632,6 +1640,7 @@ export type DeletedId = components['schemas']['DeletedId'];
 export type Diagnosis = components['schemas']['Diagnosis'];
 export type DiagnosisCause = components['schemas']['DiagnosisCause'];
 export type DiagnosisEvidence = components['schemas']['DiagnosisEvidence'];
+export type DiagnosisJob = components['schemas']['DiagnosisJob'];
 export type DiagnosisRecovery = components['schemas']['DiagnosisRecovery'];
 export type DiagnosticInfo = components['schemas']['DiagnosticInfo'];
 export type DiagnosticOption = components['schemas']['DiagnosticOption'];

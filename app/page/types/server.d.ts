@@ -62,8 +62,10 @@ export type Job = Required<api.Job>;
 
 export type JobWithLog = Required<api.JobWithLog>;
 
-export interface JobReply {
+/** preliminary: result that is available before the job is done. */
+export interface JobReply<T = never> {
   job: Job | null;
+  preliminary?: T;
 }
 
 export interface StartedJob {

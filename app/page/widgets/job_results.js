@@ -8,11 +8,12 @@ import { isActive } from './jobs.js';
 
 /**
  * A result, or why there is none yet. absent: not requested; active: its job waits or runs; ended: without a result.
+ * preliminary: the server's estimate of the result until then.
  * @template T
- * @typedef {{state: 'ready', result: T, job?: undefined}
+ * @typedef {({state: 'ready', result: T, job?: undefined}
  *   | {state: 'absent' | 'loading', job?: undefined}
  *   | {state: 'active' | 'ended', job: Job}
- *   | {state: 'error', error: string, job?: undefined}} JobResult
+ *   | {state: 'error', error: string, job?: undefined}) & {preliminary?: T}} JobResult
  */
 
 /**
@@ -53,7 +54,7 @@ export class JobResults {
   /**
    * Loads a result, unless it is known, or the state of its job.
    * @param {string} key
-   * @param {() => Promise<T | JobReply>} request
+   * @param {() => Promise<T | JobReply<T>>} request
    * @param {AbortSignal} signal of the request
    */
   async load(key, request, signal) {
@@ -62,10 +63,11 @@ export class JobResults {
     if (this.get(key).state === 'ready') return;
     try {
       const reply = await request();
-      this.#set(key, 'job' in reply ? jobState(reply.job) : { state: 'ready', result: reply });
+      if ('job' in reply) this.#wait(key, jobState(reply.job), reply.preliminary);
+      else this.#set(key, { state: 'ready', result: reply });
     } catch (error) {
       if (signal.aborted) return;
-      this.#set(key, { state: 'error', error: messageOf(error) });
+      this.#wait(key, { state: 'error', error: messageOf(error) });
     }
     this.#changed([]);
   }
@@ -79,9 +81,9 @@ export class JobResults {
     const { job } = this.get(key);
     if (job && isActive(job)) return this.#jobs.cancel(job.id);
     try {
-      this.#set(key, jobState((await request()).job));
+      this.#wait(key, jobState((await request()).job));
     } catch (error) {
-      this.#set(key, { state: 'error', error: messageOf(error) });
+      this.#wait(key, { state: 'error', error: messageOf(error) });
     }
     this.#changed([]);
     this.#jobs.refresh();
@@ -94,11 +96,20 @@ export class JobResults {
       if (!job) continue;
       const update = list.find(({ id }) => id === job.id) ?? null;
       if (update?.state === 'done') {
-        this.#results.delete(key);
+        this.#wait(key, { state: 'loading' });
         finished.push(key);
-      } else this.#set(key, jobState(update));
+      } else this.#wait(key, jobState(update));
     }
     this.#changed(finished);
+  }
+
+  /**
+   * @param {string} key
+   * @param {JobResult<T>} result that is not ready
+   * @param {T} [preliminary]
+   */
+  #wait(key, result, preliminary = this.get(key).preliminary) {
+    this.#set(key, preliminary ? { ...result, preliminary } : result);
   }
 
   /**

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qsl
 
 import pytest
@@ -30,7 +31,10 @@ def test_diagnosis_is_a_job_and_equals_that_of_the_command(
     settings = Settings(workspace=tmp_path)  # the shipped filter has a healthy profile
     query = {"faults": FAULTS, "over": "episode"}
     with open_client(settings) as client:
-        assert client.get(URL, params=query).json() == {"job": None}
+        first = wait_for_trace(client, query)
+        assert first["job"] is None
+        assert first["preliminary"]["causes"][0]["cause"] == "image.frozen"
+        assert all(cause["recovered"] is None for cause in first["preliminary"]["causes"])
         response = client.post(URL, params=query)
         assert response.status_code == 202
         job = response.json()["job"]
@@ -52,6 +56,27 @@ def test_diagnosis_is_a_job_and_equals_that_of_the_command(
     store.close()
     assert result["causes"][0]["cause"] == "image.frozen"
     assert result == json.loads(json.dumps(as_json(expected.to_json())))
+
+
+def test_a_healthy_run_needs_no_job(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
+    settings = Settings(workspace=tmp_path)
+    with open_client(settings) as client:
+        result = wait_for_trace(client, {})
+        assert result["state"] == "healthy"
+        both = wait_for_trace(client, {"over": "held-out"})
+        assert both == {"job": None, "preliminary": result}
+    store = TraceStore(settings)
+    episodes = {9: store.dataset("door", "")[1][9]}
+    expected = diagnose(store.checkpoint("door", "crossmodal-ekf"), episodes, particles=settings.particles)
+    store.close()
+    assert result == as_json(expected.to_json())
+
+
+def wait_for_trace(client: TestClient, query: dict[str, str]) -> Any:
+    """Reply to the request for a diagnosis when the trace has been computed."""
+    while "progress" in (reply := client.get(URL, params=query).json()):
+        time.sleep(0.05)
+    return reply
 
 
 def test_unknown_names_are_reported(client: TestClient) -> None:
