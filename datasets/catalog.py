@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io import user_code
@@ -12,12 +13,14 @@ from beliefscope.datasets.simulation.door_field import DOOR_FIELD
 from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.datasets.simulation.push_field import PUSH_FIELD
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import check_definition, difference, task_from_json, with_functions
 
 TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, DOOR_FIELD, PUSH_FIELD, *PUSH_REAL_TASKS)}
+"""Shipped tasks by name."""
 
 
 def find_task(name: str) -> Task:
-    """Return a registered task. Runs no user code, so names read from files are safe.
+    """Return a shipped task. Runs no user code, so names read from files are safe.
 
     Raises:
         BadInput: for an unknown name.
@@ -26,6 +29,23 @@ def find_task(name: str) -> Task:
         return TASKS[name]
     unknown = unknown_name("task", name, TASKS)
     raise BadInput(f"{unknown} Give a task of your own as path/to/file.py:NAME.")
+
+
+def stored_task(stored: Any, given: Task | None = None) -> Task:
+    """Task of a file: its definition, or the name that earlier versions stored. Runs no code.
+
+    Args:
+        stored: JSON value of the file. given: task that the user has loaded for the file. Functions of the task are
+            those of the given task, else of the shipped one, if it has the same name and layout.
+
+    Raises:
+        BadInput: for an invalid definition, and for a name that is not given nor shipped.
+    """
+    if isinstance(stored, str):
+        return given if given is not None and given.name == stored else find_task(stored)
+    task = task_from_json(stored)
+    source = TASKS.get(task.name) if given is None or difference(given, task) else given
+    return task if source is None or difference(source, task) else with_functions(task, source)
 
 
 def load_task(name: str) -> Task:
@@ -52,25 +72,8 @@ def _load_user_task(name: str) -> Task:
         if not isinstance(task, Task):
             available = ", ".join(n for n, value in vars(module).items() if isinstance(value, Task)) or "none"
             raise BadInput(f"{place} has no task {attribute!r}. Available: {available}.")
-        _check(task, name)
+        check_definition(task, name)
+        if task.name in TASKS:
+            raise BadInput(f"{name} is named {task.name!r}, which is already used. Existing tasks: {', '.join(TASKS)}.")
         _user_tasks[key] = TASKS[task.name] = task
     return _user_tasks[key]
-
-
-def _check(task: Task, name: str) -> None:
-    """Raise BadInput for a duplicate name or inconsistent fields."""
-    if task.name in TASKS:
-        raise BadInput(f"{name} is named {task.name!r}, which is already used. Existing tasks: {', '.join(TASKS)}.")
-    if not task.name or set(task.name) & set("/\\: "):
-        raise BadInput(f"{name} is named {task.name!r}, expected a name without spaces, colons and slashes.")
-    for component in task.map_components:
-        task.index(component)
-    for modality, keys in task.modalities.items():
-        missing = [key for key in keys if key not in task.observations]
-        if missing:
-            raise BadInput(f"{name}: modality {modality!r} has {missing[0]!r}, which is not an observation.")
-        ranks = [len(task.observations[key]) for key in keys]
-        if ranks != [2] and set(ranks) != {1}:
-            raise BadInput(f"{name}: modality {modality!r} has {', '.join(keys)}, expected one image or only vectors.")
-    if task.dt <= 0 or task.map_half_width <= 0:
-        raise BadInput(f"{name}: dt is {task.dt} s and map_half_width {task.map_half_width} m, expected more than 0.")

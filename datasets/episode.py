@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.task import Task
+
 FloatArray = NDArray[np.float32]
 
 
@@ -18,7 +20,7 @@ class Episode:
     """A trajectory of T steps. The first axis of every array is time.
 
     Attributes:
-        task: key of ``TASKS``.
+        task: definition of the state, the sensors and the control.
         states: (T, n) true state, components as in ``Task.components`` (m, rad), float32.
         controls: (T, c) control applied between steps t-1 and t, float32.
         observations: observation key -> (T, ...) sensor readings (images uint8, others float32).
@@ -30,7 +32,7 @@ class Episode:
         provenance: JSON values: origin and replay parameters (hinge position, policy, versions).
     """
 
-    task: str
+    task: Task
     states: FloatArray
     controls: FloatArray
     observations: Mapping[str, NDArray[Any]]
@@ -48,7 +50,7 @@ class Episode:
         """SHA-256 over the names, shapes, types and bytes of the arrays, independent of the file format."""
         arrays = {"states": self.states, "controls": self.controls, "contact": self.contact, "qpos": self.qpos}
         arrays |= {f"observations/{key}": value for key, value in self.observations.items()}
-        digest = hashlib.sha256(f"{self.task} {self.dt} {self.seed} {self.split}".encode())
+        digest = hashlib.sha256(f"{self.task.name} {self.dt} {self.seed} {self.split}".encode())
         for name in sorted(arrays):
             array = np.ascontiguousarray(arrays[name])
             digest.update(f"{name} {array.shape} {array.dtype.str}".encode())

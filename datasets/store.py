@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.catalog import find_task, stored_task
 from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
@@ -34,6 +34,7 @@ from beliefscope.datasets.readers.mit_push import MitPushDataset, is_mit_push
 from beliefscope.datasets.readers.paper_authors import PaperDataset, is_paper_file
 from beliefscope.datasets.readers.push_real_task import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import task_to_json
 
 FORMAT = "beliefscope-episodes"
 VERSION = 1
@@ -64,7 +65,7 @@ def open_dataset(path: str | Path, task: Task | None = None, skip_bad: bool = Fa
     Args:
         path: HDF5 file written by ``write_dataset``; file or folder (searched recursively) of the MIT Push dataset;
             file or folder of the HDF5 files of the paper's authors.
-        task: which of the ``push-real`` tasks to use for MIT Push files.
+        task: which of the ``push-real`` tasks to use for MIT Push files; provides the functions of a custom task.
         skip_bad: skip unusable trajectories and list them in ``Dataset.skipped``.
 
     Raises:
@@ -79,7 +80,7 @@ def open_dataset(path: str | Path, task: Task | None = None, skip_bad: bool = Fa
         return PaperDataset(path, files, skip_bad)
     if path.is_dir():
         raise BadInput(f"{path} contains datasets, such as {files[0].name}: give one of the files.")
-    return EpisodeFile(path, skip_bad)
+    return EpisodeFile(path, task, skip_bad)
 
 
 def data_files(path: Path) -> list[Path]:
@@ -100,11 +101,11 @@ class EpisodeFile(Dataset):
     Its arrays must have the task's shapes and types, be finite and match their digest.
     """
 
-    def __init__(self, path: Path, skip_bad: bool = False) -> None:
+    def __init__(self, path: Path, given: Task | None = None, skip_bad: bool = False) -> None:
         self.path = path
         self._file = open_hdf5(path)
         try:
-            self.task = self._read_task()
+            self.task = self._read_task(given)
             self._groups = self._usable_groups() if skip_bad else self._find_groups()
             self.summaries = tuple(self._summary(group, i) for i, group in enumerate(self._groups))
             digests = "\n".join(self._attribute(group, "digest", str) for group in self._groups)
@@ -134,7 +135,7 @@ class EpisodeFile(Dataset):
     def close(self) -> None:
         self._file.close()
 
-    def _read_task(self) -> Task:
+    def _read_task(self, given: Task | None) -> Task:
         format_ = self._file.attrs.get("format")
         if format_ != FORMAT:
             raise BadInput(
@@ -144,10 +145,12 @@ class EpisodeFile(Dataset):
         version = self._file.attrs.get("version")
         if version != VERSION:
             raise BadInput(f"{self.path} has version {version} of the layout; this release reads version {VERSION}.")
-        name = self._file.attrs.get("task")
-        if name not in TASKS:
-            raise BadInput(f"{self.path} is of task {name!r}. Available: {', '.join(TASKS)}.")
-        return TASKS[str(name)]
+        try:
+            definition = self._file.attrs.get("definition")
+            name = str(self._file.attrs.get("task"))
+            return stored_task(name if definition is None else read_json(definition), given)
+        except (TypeError, ValueError) as error:
+            raise BadInput(f"{self.path}: {error}") from None
 
     def _find_groups(self) -> list[h5py.Group]:
         count = sum(1 for name in self._file if name.startswith("trajectory"))
@@ -205,7 +208,7 @@ class EpisodeFile(Dataset):
         if not math.isclose(dt, task.dt) and dt != provenance.get("recorded_dt"):
             raise BadInput(f"{self._place(group, 'dt')} is {dt} s; task {task.name!r} has steps of {task.dt} s.")
         episode = Episode(
-            task=task.name,
+            task=task,
             states=self._array(group, "states", (steps, len(task.components))),
             controls=self._array(group, "controls", (steps, task.control_size)),
             observations={
@@ -287,6 +290,7 @@ def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> 
         with DeferredErrorFile(partial, "w+b") as output:
             with h5py.File(output, "w", libver=("v110", "v110")) as file:
                 file.attrs["format"], file.attrs["version"], file.attrs["task"] = FORMAT, VERSION, task.name
+                file.attrs["definition"] = json.dumps(task_to_json(task), sort_keys=True)
                 for index, episode in enumerate(episodes):
                     _write_episode(file.create_group(f"trajectory{index}"), episode)
                     output.check()

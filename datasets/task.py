@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.simulation.camera import Camera
 
@@ -66,12 +65,12 @@ class Outline:
     shape: Literal["box", "cylinder"] = "box"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Task:
     """A state-estimation task.
 
     Attributes:
-        name: key of ``TASKS``.
+        name: without spaces, colons and slashes.
         components: n state components, in order.
         observations: observation key -> shape per step, e.g. ``{"image": (32, 32), "force": (3,)}``.
         modalities: modality -> its observation keys: one image, or vectors to concatenate.
@@ -104,11 +103,11 @@ class Task:
     map_components: tuple[str, str]
     map_half_width: float
     positions: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    replay: Callable[[Episode], Any] | None = None
+    replay: Callable[[Any], Any] | None = None
     outline: Callable[[ArrayLike], Outline] | None = None
     camera: Camera | None = None
     ridge_direction: Callable[[ArrayLike], Array] | None = None
-    simulate: Callable[..., Episode] | None = None
+    simulate: Callable[..., Any] | None = None
     ingredients: Mapping[str, Ingredient] = field(default_factory=dict)
     start_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warmup: int = 30

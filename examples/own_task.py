@@ -41,7 +41,7 @@ def roll(seed: int, steps: int = 60) -> Episode:
     noise = rng.normal(0, np.where(loud, 0.01, 0.3), (steps, 2))
     distances = np.linalg.norm(position[:, None] - MICROPHONES, axis=-1) + noise
     return Episode(
-        task=TASK.name,
+        task=TASK,
         states=position.astype(np.float32),
         controls=wind.astype(np.float32),
         observations={"image": image, "distances": distances.astype(np.float32), "loud": loud.astype(np.float32)},

@@ -135,7 +135,7 @@ def single_step(task: Task, observations: Mapping[str, np.ndarray], control: np.
     Raises BadInput for arrays that do not have the task's shape.
     """
     row = Episode(
-        task=task.name,
+        task=task,
         states=np.full((1, len(task.components)), np.nan, np.float32),
         controls=np.asarray(control, np.float32)[None],
         observations={key: np.asarray(value)[None] for key, value in observations.items()},

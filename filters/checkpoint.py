@@ -20,10 +20,12 @@ from safetensors.torch import save
 from torch.overrides import TorchFunctionMode
 
 from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.legacy_names import training_record
@@ -56,6 +58,11 @@ class Checkpoint:
     @property
     def kind(self) -> Kind:
         return self.filter.architecture.kind
+
+    def check_task(self, episode: Episode) -> None:
+        """Raise BadInput for an episode of another task, or of one with the same name and other arrays."""
+        if other := difference(self.task, episode.task):
+            raise BadInput(f"filter {self.name!r} is for task {self.task.name!r}, the episode is of {other}")
 
 
 def save_checkpoint(

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.inspect.diagnostics.views import as_json
@@ -177,7 +176,7 @@ def _particles(trace: Trace) -> tuple[dict[str, Any], Callable[[int], dict[str, 
     """Predicted particles on the plane of the map, and their weights after the observation, before resampling."""
     assert trace.particles is not None
     assert trace.log_weights is not None
-    task = find_task(trace.episode.task)
+    task = trace.task
     places = trace.particles[..., list(task.map_indices)]
     height = np.full_like(places[..., :1], plane_height(trace, task))
     points = np.concatenate([places, height, np.exp(trace.log_weights)[..., None]], axis=-1, dtype=np.float32)

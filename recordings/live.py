@@ -259,7 +259,7 @@ class LiveRecorder:
     def _part(self, rows: Sequence[_Row]) -> Trace:
         """Steps as a trace, of a Beliefscope or an external filter."""
         episode = Episode(
-            task=self._task.name,
+            task=self._task,
             states=np.stack([row.truth for row in rows]),
             controls=np.stack([row.control for row in rows]),
             observations={key: np.stack([row.observations[key] for row in rows]) for key in rows[0].observations},

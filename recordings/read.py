@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.trace import Trace
@@ -70,7 +71,7 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
     stored = {current_array(name.removeprefix("trace/")): a for name, a in arrays.items() if name.startswith("trace/")}
     episode_fields = {field.name for field in fields(Episode)} & stored.keys()
     episode = Episode(
-        task=header["task"],
+        task=stored_task(_parsed(header, "definition").get("definition", header["task"])),
         observations=observations,
         dt=float(header["dt"]),
         seed=origin["seed"],
@@ -121,7 +122,7 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
         raise BadInput(
             f"{path}: recording format {version}, written by {versions}; this version reads format {FORMAT_VERSION}."
         )
-    if missing := PROPERTIES.keys() - header.keys() - {"faults"}:
+    if missing := PROPERTIES.keys() - header.keys() - {"faults", "definition"}:
         raise BadInput(f"{path}: the recording lacks the properties {', '.join(sorted(missing))}.")
     return header, rows
 

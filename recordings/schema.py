@@ -209,6 +209,7 @@ PROPERTIES: dict[str, str] = {
     "format_version": "version of this schema",
     "versions": "JSON: versions of beliefscope, rerun-sdk and numpy that wrote the file",
     "task": "name of the task",
+    "definition": "definition of the task, JSON",
     "filter": "name of the filter",
     "kind": "`ekf`, `ukf`, `pf`, `lstm`, `transformer`, or `external` for an external filter",
     "modalities": "JSON list: the K modalities in order",

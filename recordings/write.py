@@ -26,11 +26,11 @@ from rerun.chunk import RrdReader
 from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
 import beliefscope
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import task_to_json
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace, arrays_of, header_of, trace_from_arrays
@@ -74,7 +74,7 @@ def write_recording(
         BadInput: the folder does not exist or is not writable; maps have different sizes or invalid steps; a
             diagnostic has curves with another number of steps.
     """
-    task = find_task(trace.episode.task)
+    task = trace.task
     report = progress or (lambda fraction: None)
     blocks = _blocks(maps or (), MAPS_PER_CHUNK)
     first = next(blocks, [])
@@ -185,7 +185,7 @@ def send_header(stream: rr.RecordingStream, trace: Trace, bodies: Bodies, steps:
         steps: number of all steps; ``GROWING`` if not known yet.
     """
     _send_properties(stream, trace, steps)
-    _send_static(stream, trace, find_task(trace.episode.task), steps)
+    _send_static(stream, trace, trace.task, steps)
     for entity, mesh in bodies.meshes():
         stream.log(entity, mesh, static=True)
 
@@ -207,7 +207,8 @@ def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> No
     properties = {
         "format_version": FORMAT_VERSION,
         "versions": text({"beliefscope": beliefscope.__version__} | versions),
-        "task": episode.task,
+        "task": episode.task.name,
+        "definition": text(task_to_json(episode.task)),
         "filter": trace.filter,
         "kind": trace.kind,
         "modalities": text(trace.modalities),
@@ -225,7 +226,7 @@ def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> No
     # As arrays, because Rerun omits empty strings of new names.
     values = {name: pa.array([value]) for name, value in properties.items()}
     stream.send_property("beliefscope", rr.AnyValues(**values))
-    stream.send_recording_name(f"{episode.task} {trace.episode_index}, {trace.filter}")
+    stream.send_recording_name(f"{episode.task.name} {trace.episode_index}, {trace.filter}")
 
 
 def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task, steps: int) -> None:

@@ -17,7 +17,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save
 
 from beliefscope.app.runs.catalog import task_catalogs
-from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
@@ -106,7 +106,7 @@ def test_tasks_named_in_files_are_not_run(tmp_path: Path, malicious_task: str) -
         metadata = {key: value.replace('"door"', json.dumps(malicious_task)) for key, value in file.metadata().items()}
     (tmp_path / "run.trace").write_bytes(save(load_file(tmp_path / "run.trace"), metadata=metadata))
     with pytest.raises(BadInput):
-        find_task(load_trace(tmp_path / "run.trace").episode.task)
+        load_trace(tmp_path / "run.trace")
 
     catalogs, problems = task_catalogs({"filter": path}, {"data": data})
     assert catalogs.keys() == TASKS.keys()

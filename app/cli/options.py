@@ -321,7 +321,7 @@ def trace_result(trace: Trace, path: Path, **extra: Any) -> console.Result:
     """Description of a file created from a trace. extra: additional values of the JSON document."""
     from beliefscope.inspect.traces.provenance import describe
 
-    run = f"{trace.filter} over {len(trace)} steps of {trace.episode.task} episode {trace.episode_index}"
+    run = f"{trace.filter} over {len(trace)} steps of {trace.task.name} episode {trace.episode_index}"
     text = run + (f" with {trace.faults}" if trace.faults else "")
     return console.Result(describe(trace) | extra, text, path)
 

@@ -93,7 +93,7 @@ def effect_of(clean: Sequence[Trace], faulty: Sequence[Trace]) -> dict[str, Any]
 
 
 def _scores(traces: Sequence[Trace]) -> tuple[dict[str, float], float]:
-    components = find_task(traces[0].episode.task).components
+    components = traces[0].task.components
     squares = np.concatenate([errors(t)[counted(t), -1] ** 2 for t in traces])  # (S, n)
     units = [component.unit for component in components]
     rmse = {unit: float(np.sqrt(squares[:, [u == unit for u in units]].sum(1).mean())) for unit in dict.fromkeys(units)}

@@ -81,7 +81,7 @@ def inject(
     cause: str, magnitude: float | str, episodes: Sequence[Episode], seed: int, rng: np.random.Generator
 ) -> tuple[list[Episode], str, list[int]]:
     """Faulty episodes, the faults as text, and the positions of the affected episodes."""
-    faults = SENSOR_CAUSES[cause].faults(episodes[0].task, magnitude, rng)
+    faults = SENSOR_CAUSES[cause].faults(episodes[0].task.name, magnitude, rng)
     every = 2 if rng.random() < SOME_EPISODES else 1
     affected = list(range(0, len(episodes), every))
     faulty = [faults.apply(e, seed) if i in affected else e for i, e in enumerate(episodes)]

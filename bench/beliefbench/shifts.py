@@ -8,10 +8,10 @@ import numpy as np
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.door import CAMERA as DOOR_CAMERA
+from beliefscope.datasets.simulation.door import DOOR, door_model, draw_door, policy_name
 from beliefscope.datasets.simulation.door import IMPEDANCE as DOOR_IMPEDANCE
-from beliefscope.datasets.simulation.door import door_model, draw_door, policy_name
 from beliefscope.datasets.simulation.door_policies import POLICIES
-from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, RADIUS, PuckPhysics, PushPuck, push_model
+from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS, PuckPhysics, PushPuck, push_model
 from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, episode_rng, simulate
 
 MAGNITUDES = (0.1, 0.15, 0.5, 0.4)
@@ -27,7 +27,7 @@ def shifted_episode(task: str, seed: int, index: int, steps: int, magnitude: flo
         door = replace(door, width=door.width * (1 + 0.4 * magnitude), bar_offset=door.bar_offset * (1 - magnitude))
         hinge = np.array(door.hinge, np.float32)
         return simulate(
-            "door",
+            DOOR,
             Scene(door_model(door), DOOR_IMPEDANCE, DOOR_CAMERA),
             POLICIES[policy](door, rng),
             lambda qpos: np.concatenate([np.broadcast_to(hinge, (steps, 2)), qpos[:, -1:]], axis=1),
@@ -38,7 +38,7 @@ def shifted_episode(task: str, seed: int, index: int, steps: int, magnitude: flo
         )
     puck = PuckPhysics(RADIUS * (1 + 0.5 * magnitude), 0.6 * (1 + 2 * magnitude), 0.45 * (1 - magnitude))
     return simulate(
-        "push",
+        PUSH,
         Scene(push_model(puck=puck), IMPEDANCE, CAMERA),
         PushPuck(rng, puck),
         lambda qpos: qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 2],

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.control_faults import ControlFault
@@ -85,9 +84,9 @@ class Faults:
         """
         if not self.sequence:
             return episode
-        task, observations, digest = find_task(episode.task), dict(episode.observations), int(episode.digest()[:16], 16)
+        observations, digest = dict(episode.observations), int(episode.digest()[:16], 16)
         for position, fault in enumerate(self.sequence):
-            for key in fault.keys(task):
+            for key in fault.keys(episode.task):
                 if key not in observations:
                     raise unknown_name("observation of the episode", key, observations)
                 # The same random numbers for all sensors of a modality: they drop out together.

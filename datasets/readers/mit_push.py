@@ -315,7 +315,7 @@ class MitPushDataset(Dataset):
         haptics = haptic_observations(push.tips, push.force, push.torque, contact)
         path, draws = haptics["effector_position"], draw(self.task, self._seed, index)
         episode = Episode(
-            task=self.task.name,
+            task=self.task,
             states=qpos[:, : len(self.task.components)],
             # The robot is stiff, so that the measured path of the tip stands for the commanded one.
             controls=path_controls(path) if draws else hand_controls(path, haptics["contact"]),

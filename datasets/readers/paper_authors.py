@@ -229,7 +229,7 @@ class PaperDataset(Dataset):
         data = {key: self._array(source, key, steps) for key in layout.keys}
         haptics = {key: np.ascontiguousarray(v, np.float32) for key, v in layout.haptics(data).items()}
         return Episode(
-            task=layout.task,
+            task=self.task,
             states=np.ascontiguousarray(layout.state(data), np.float32),
             controls=hand_controls(haptics["effector_position"], haptics["contact"]),
             observations={"image": _to_bytes(source, data["image"]), **haptics},

@@ -183,7 +183,7 @@ def simulate_door(seed: int, index: int, steps: int) -> Episode:
     door = draw_door(rng, name)
     hinge = np.array(door.hinge, np.float32)
     return simulate(
-        "door",
+        DOOR,
         Scene(door_model(door), IMPEDANCE, CAMERA),
         POLICIES[name](door, rng),
         lambda qpos: np.concatenate([np.broadcast_to(hinge, (steps, 2)), qpos[:, -1:]], axis=1),

@@ -65,7 +65,7 @@ def simulate_door_field(seed: int, index: int, steps: int, without: Collection[s
     scene = Scene(model, IMPEDANCE, moved_camera(CAMERA, draws), open_loop=True, disturb=nudges)
     hinge = np.array(door.hinge, np.float32)
     episode = simulate(
-        "door-field",
+        DOOR_FIELD,
         scene,
         POLICIES[name](door, rng, aim),
         lambda qpos: np.concatenate([np.broadcast_to(hinge, (steps, 2)), qpos[:, -1:]], axis=1),

@@ -148,7 +148,7 @@ def finish(task: Task, episode: Episode, draws: Draws, extra: Mapping[str, Any])
     provenance["ingredients"] = {name: dict(drawn.values) for name, drawn in draws.items()}
     if "start" in draws:
         provenance["start_offset"] = _start_offset(task, draws["start"]).tolist()
-    return replace(episode, task=task.name, observations=observations, provenance=provenance)
+    return replace(episode, task=task, observations=observations, provenance=provenance)
 
 
 def start_ingredient(distances: Mapping[str, tuple[float, float]]) -> Ingredient:

@@ -202,7 +202,7 @@ def push_model(
 def simulate_push(seed: int, index: int, steps: int) -> Episode:
     """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
     return simulate(
-        "push",
+        PUSH,
         Scene(push_model(), IMPEDANCE, CAMERA),
         PushPuck(episode_rng(seed, index)),
         lambda qpos: qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 2],

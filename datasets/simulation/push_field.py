@@ -89,7 +89,7 @@ def simulate_push_field(seed: int, index: int, steps: int, without: Collection[s
         disturb=nudges,
     )
     episode = simulate(
-        "push-field",
+        PUSH_FIELD,
         scene,
         PushPuckWithAimError(episode_rng(seed, index), puck, aim),
         lambda qpos: qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 2],

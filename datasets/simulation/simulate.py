@@ -17,6 +17,7 @@ from beliefscope.datasets.simulation.camera import Camera, Image, RayCaster
 from beliefscope.datasets.simulation.controller import HandController, Impedance
 from beliefscope.datasets.simulation.panda import ARM_JOINTS, FINGERS
 from beliefscope.datasets.simulation.sensors import HandSensors
+from beliefscope.datasets.task import Task
 
 Vector = NDArray[np.float64]
 
@@ -99,7 +100,7 @@ def episode_rng(seed: int, index: int) -> Generator:
 
 
 def simulate(
-    task: str,
+    task: Task,
     scene: Scene,
     policy: Policy,
     states: Callable[[FloatArray], FloatArray],

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics.measures import (
@@ -55,7 +55,7 @@ class Counterfactual(Diagnostic):
         recovery: first step after the edit from which ``sigmas`` stays at most ``RECOVERED``; None if there is none.
     """
 
-    task: str
+    task: Task
     filter: str
     modalities: tuple[str, ...]
     edit: str
@@ -126,12 +126,12 @@ class Counterfactual(Diagnostic):
         return f"; {name} {'became dominant' if before[k] < 0.5 <= after[k] else 'gained weight'} ({change})"
 
     def _mapped(self) -> tuple[str, ...]:
-        task = find_task(self.task)
+        task = self.task
         return tuple(task.components[i].label for i in task.map_indices)
 
     def _peaks(self) -> dict[str, tuple[float, int, str]]:
         """Component -> largest difference in display units, step, unit."""
-        task = find_task(self.task)
+        task = self.task
         units, factors = display_units(task)
         difference = np.abs(wrapped(task, self.edited - self.original)) * factors
         steps = difference.argmax(0)
@@ -186,7 +186,7 @@ class Counterfactual(Diagnostic):
             for k, m in enumerate(self.modalities):
                 for weights, name in ((self.effective_weights, m), (self.edited_weights, f"{m} edited")):
                     curves.append(Curve(name, weights[:, k], "Effective weights", "", m))
-        task = find_task(self.task)
+        task = self.task
         units, factors = display_units(task)
         for i, component in enumerate(task.components):
             for values, name, layer in (
@@ -216,7 +216,7 @@ def compare(original: Trace, edited: Trace, edit: Edit) -> Counterfactual:
     ]
     sigmas = _mahalanobis(original, fused)
     return Counterfactual(
-        task=task.name,
+        task=task,
         filter=original.filter,
         modalities=original.modalities,
         edit=str(edit),

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
@@ -50,7 +50,7 @@ class Comparison(Diagnostic):
     Arrays have a last axis of two: this run and the comparison run. Units are m and rad.
 
     Attributes:
-        task: task name.
+        task: definition of the task.
         names: display names of the runs.
         modalities: modalities of both runs.
         phases: phases with steps.
@@ -69,7 +69,7 @@ class Comparison(Diagnostic):
         contact, blackout: (T,) bool; image blackout in either run.
     """
 
-    task: str
+    task: Task
     names: tuple[str, str]
     modalities: tuple[str, ...]
     phases: tuple[str, ...]
@@ -111,7 +111,7 @@ class Comparison(Diagnostic):
 
     def _other_components(self) -> str:
         """Errors of components that are not on the map."""
-        task = find_task(self.task)
+        task = self.task
         units, factors = display_units(task)
         return "".join(
             f"; {c.label} {factors[i] * self.rmse[0, i, 0]:.2f} -> {factors[i] * self.rmse[0, i, 1]:.2f} {units[i]}"
@@ -140,7 +140,7 @@ class Comparison(Diagnostic):
         return f"{text}, {'more' if closer else 'less'} consistent (ideal 1)."
 
     def tables(self) -> list[Table]:
-        task = find_task(self.task)
+        task = self.task
         units, factors = display_units(task)
         rows: list[tuple[Value, ...]] = []
         for s, phase in enumerate(self.phases):
@@ -163,7 +163,7 @@ class Comparison(Diagnostic):
         return [Table("By phase", columns, tuple(rows))]
 
     def curves(self) -> list[Curve]:
-        task = find_task(self.task)
+        task = self.task
         units, factors = display_units(task)
         chart = "Distance between the estimates"
         curves = [Curve("fused", 100 * self.distance, chart, "cm", "fused")]
@@ -191,7 +191,7 @@ class Comparison(Diagnostic):
         return curves
 
     def _bounds(self) -> tuple[float, float]:
-        low, high = nees_bounds(len(find_task(self.task).components), 1)
+        low, high = nees_bounds(len(self.task.components), 1)
         return math.sqrt(low), math.sqrt(high)
 
     def bands(self) -> dict[str, NDArray[np.bool_]]:
@@ -242,7 +242,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
         return np.stack([statistic(mask) for mask in masks.values()])
 
     return Comparison(
-        task=task.name,
+        task=task,
         names=names or _names(this, other),
         modalities=shared if share is None else this.modalities,
         phases=tuple(masks),

@@ -116,7 +116,7 @@ class Entry:
     def compare(self, traces: Sequence[Trace], checkpoint: Checkpoint | None) -> Comparison | None:
         """Compare the traces with the filter's healthy profile; None without one."""
         first = traces[0]
-        profile = find_profile(first.episode.task, first.filter, first.checkpoint_hash, checkpoint)
+        profile = find_profile(first.task.name, first.filter, first.checkpoint_hash, checkpoint)
         if self.statistics is None or profile is None:
             return None
         return compare(profile, [self.statistics(trace) for trace in traces])

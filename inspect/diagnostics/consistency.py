@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.task import display_name
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
@@ -55,7 +54,7 @@ class Consistency(Diagnostic):
         healthy: comparison with the filter's healthy record, if it has one.
     """
 
-    task: str
+    task: Task
     filter: str
     trajectories: int
     by_layer: tuple[LayerConsistency, ...]
@@ -133,7 +132,7 @@ class Consistency(Diagnostic):
         return f"{text}."
 
     def tables(self) -> list[Table]:
-        task = find_task(self.task)
+        task = self.task
         units, scale = measures.display_units(task)
         rows: list[tuple[Value, ...]] = []
         error_rows: list[tuple[Value, ...]] = []
@@ -176,7 +175,7 @@ class Consistency(Diagnostic):
         """Roots of NEES / n and NIS / n: errors in predicted standard deviations, with 95 % bounds."""
         if not len(self.nees):
             return []
-        low, high = nees_bounds(len(find_task(self.task).components), 1)
+        low, high = nees_bounds(len(self.task.components), 1)
         bounds = (math.sqrt(low), math.sqrt(high))
         title = "Error in predicted standard deviations (root of NEES/n)"
         charts: list[tuple[str, str, Array, tuple[str, ...], Callable[[str], str]]]
@@ -236,7 +235,7 @@ def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> C
     keep = len(first) if len(traces) == 1 else 0
     has_nis = first.observation_mean is not None
     return Consistency(
-        task=first.episode.task,
+        task=first.task,
         filter=first.filter,
         trajectories=len(traces),
         by_layer=tuple(by_layer),

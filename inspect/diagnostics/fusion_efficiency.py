@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
@@ -73,7 +73,7 @@ class FusionEfficiency(Diagnostic):
         contact, blackout: (T,) masks.
     """
 
-    task: str
+    task: Task
     filter: str
     modalities: tuple[str, ...]
     trajectories: int
@@ -104,7 +104,7 @@ class FusionEfficiency(Diagnostic):
         return f"{sentence} Reasons: {'; '.join(texts)}."
 
     def tables(self) -> list[Table]:
-        task = find_task(self.task)
+        task = self.task
         units, scale = measures.display_units(task)
         names = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
         rows: list[tuple[Value, ...]] = []
@@ -164,7 +164,7 @@ def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequen
     best = np.einsum("tk,tkn->tn", weights, errors[0][:, 1:])
     position = np.linalg.norm(errors[0][..., where], axis=-1)[:keep]
     return FusionEfficiency(
-        task=first.episode.task,
+        task=first.task,
         filter=first.filter,
         modalities=input_modalities(checkpoint.filter),
         trajectories=len(traces),

@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import display_name
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.subsets import input_modalities
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
@@ -69,7 +68,7 @@ class Saliency(Diagnostic):
         attributions: one per baseline; a filter without images has one baseline.
     """
 
-    task: str
+    task: Task
     filter: str
     episode: int
     step: int
@@ -136,7 +135,7 @@ class Saliency(Diagnostic):
 
     def _strongest(self, attribution: Attribution) -> str:
         """The channel with the largest attribution; empty if all round to zero."""
-        channels = channel_names(find_task(self.task), attribution.integrated)
+        channels = channel_names(self.task, attribution.integrated)
         candidates = [
             (abs(value), f"{channel.name} ({self._format(float(value), '+')})")
             for modality, names in channels.items()
@@ -161,7 +160,7 @@ class Saliency(Diagnostic):
             )
         ]
         rows: list[tuple[Value, ...]] = []
-        for modality, channels in channel_names(find_task(self.task), self.inputs).items():
+        for modality, channels in channel_names(self.task, self.inputs).items():
             for i, channel in enumerate(channels):
                 observations = [channel.factor * values[modality][i] for values in (self.inputs, self.means)]
                 sources = [*(attribution.integrated for attribution in self.attributions), self.occlusion]
@@ -240,7 +239,7 @@ def saliency(
         value = float(explained(*single_step.inputs))
     components = [c.name for c in checkpoint.task.components]
     return Saliency(
-        task=checkpoint.task.name,
+        task=checkpoint.task,
         filter=trace.filter,
         episode=trace.episode_index,
         step=step,

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.common_random_numbers import Common
@@ -73,7 +73,7 @@ class Shapley(Diagnostic):
         contact, blackout: (T,) masks.
     """
 
-    task: str
+    task: Task
     filter: str
     kind: str
     modalities: tuple[str, ...]
@@ -123,7 +123,7 @@ class Shapley(Diagnostic):
         return " + ".join(subset) or self.baseline
 
     def tables(self) -> list[Table]:
-        task = find_task(self.task)
+        task = self.task
         units, scale = measures.display_units(task)
         names = ["position", *(component.label for component in task.components)]
         titles = [f"{name} ({unit})" for name, unit in zip(names, ("cm", *units), strict=True)]
@@ -167,7 +167,7 @@ class Shapley(Diagnostic):
     def curves(self) -> list[Curve]:
         if not len(self.position_values):
             return []
-        task = find_task(self.task)
+        task = self.task
         curves = [
             Curve(name, 100.0 * self.position_values[:, k], "Shapley values of the position error", "cm", name)
             for k, name in enumerate(self.modalities)
@@ -265,7 +265,7 @@ def shapley(
     position = [np.linalg.norm(error[..., list(task.map_indices)], axis=-1) for error in errors]
     keep = len(first) if len(traces) == 1 else 0
     return Shapley(
-        task=task.name,
+        task=task,
         filter=first.filter,
         kind=first.kind,
         modalities=modalities,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.subsets import input_modalities
@@ -64,7 +64,7 @@ class StandaloneModalities(Diagnostic):
         contact, blackout: (T,) masks.
     """
 
-    task: str
+    task: Task
     filter: str
     modalities: tuple[str, ...]
     trajectories: int
@@ -100,7 +100,7 @@ class StandaloneModalities(Diagnostic):
         return " ".join(sentences)
 
     def tables(self) -> list[Table]:
-        task = find_task(self.task)
+        task = self.task
         units, scale = measures.display_units(task)
         names = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
         rows: list[tuple[Value, ...]] = []
@@ -163,7 +163,7 @@ def standalone_modalities(
     keep = len(first) if len(traces) == 1 else 0
     position = errors[0][:keep, :, 0]
     return StandaloneModalities(
-        task=first.episode.task,
+        task=first.task,
         filter=first.filter,
         modalities=modalities,
         trajectories=len(traces),

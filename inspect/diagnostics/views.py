@@ -15,6 +15,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.task import Task
+
 Array = NDArray[np.float64]
 Value = str | int | float | None
 VIEWS = ("tables", "curves", "bands", "plots", "images")
@@ -145,7 +147,9 @@ def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Val
 
 
 def as_json(value: Any) -> Any:
-    """Dataclasses, arrays and mappings as JSON values; non-finite floats as None."""
+    """Dataclasses, arrays and mappings as JSON values; tasks as their names; non-finite floats as None."""
+    if isinstance(value, Task):
+        return value.name
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: as_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):

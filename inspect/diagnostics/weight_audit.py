@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
-from beliefscope.datasets.task import display_name
+from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import NO_RECORD, Diagnostic, Entry
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
@@ -100,7 +99,7 @@ class WeightAudit(Diagnostic):
         healthy: comparison with the filter's healthy record, if it has one.
     """
 
-    task: str
+    task: Task
     filter: str
     modalities: tuple[str, ...]
     trajectories: int
@@ -183,7 +182,7 @@ class WeightAudit(Diagnostic):
     @property
     def _columns(self) -> tuple[str | None, ...]:
         """Names of the W columns: components, or None for a scalar weight."""
-        names = tuple(c.label for c in find_task(self.task).components)
+        names = tuple(c.label for c in self.task.components)
         return names if self.oracle.shape[-1] == len(names) else (None,)
 
     @property
@@ -198,7 +197,7 @@ class WeightAudit(Diagnostic):
         return self.modalities[:1] if len(self.modalities) == 2 else self.modalities
 
     def tables(self) -> list[Table]:
-        task = find_task(self.task)
+        task = self.task
         units, scale = measures.display_units(task)
         quantities = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
         means: list[tuple[Value, ...]] = []
@@ -243,7 +242,7 @@ class WeightAudit(Diagnostic):
         """Weights by component, then regrets. With two modalities, only the weights of the first."""
         if not len(self.oracle):
             return []
-        task = find_task(self.task)
+        task = self.task
         units, scale = measures.display_units(task)
         curves, regrets = [], []
         for w, column in enumerate(self._columns):
@@ -295,7 +294,7 @@ def audit(traces: Sequence[Trace], healthy: Comparison | None = None) -> WeightA
             )
     keep = len(first) if len(traces) == 1 else 0
     return WeightAudit(
-        task=first.episode.task,
+        task=first.task,
         filter=first.filter,
         modalities=first.modalities,
         trajectories=len(traces),

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import UNITS
 from beliefscope.inspect.traces.data import Trace
@@ -25,7 +24,7 @@ MIN_STEPS = 10
 
 def task_of(trace: Trace) -> Task:
     """The task of a trace's episode."""
-    return find_task(trace.episode.task)
+    return trace.task
 
 
 def layers(trace: Trace) -> tuple[str, ...]:

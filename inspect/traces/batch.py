@@ -18,7 +18,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
-from beliefscope.inspect.traces.run import assemble_trace, check_task, trace
+from beliefscope.inspect.traces.run import assemble_trace, trace
 
 AT_ONCE = 32
 """Episodes in one run; limits memory."""
@@ -48,7 +48,7 @@ def trace_all(
     while episodes := {index: data[index] for index in islice(remaining, AT_ONCE)}:
         lengths: dict[int, list[int]] = {}
         for index, episode in episodes.items():
-            check_task(checkpoint, episode)
+            checkpoint.check_task(episode)
             lengths.setdefault(len(episode), []).append(index)
         for length, members in sorted(lengths.items()):
             inputs = [faults.apply(episodes[index], seed) for index in members]

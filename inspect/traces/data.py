@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.task import Task
 from beliefscope.filters.models.resampling import effective_sample_size
 
 Array = NDArray[np.float32]
@@ -89,6 +90,11 @@ class Trace:
 
     def __len__(self) -> int:
         return len(self.estimate_mean)
+
+    @property
+    def task(self) -> Task:
+        """Definition of the task, which travels with the trace."""
+        return self.episode.task
 
     @property
     def has_covariance(self) -> bool:

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
@@ -31,10 +30,7 @@ def trace_external(
 
     Raises BadInput as ``trace``, and if the filter fails or returns invalid values.
     """
-    if episode.task != external.task.name:
-        raise BadInput(
-            f"filter {external.name!r} is for task {external.task.name!r}, the episode is of {episode.task!r}"
-        )
+    external.check_task(episode)
     data_hash = episode.digest()
     episode = faults.apply(episode, seed)
     values, modalities = external.run([episode], seed, progress)

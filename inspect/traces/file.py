@@ -12,11 +12,13 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.datasets.task_json import task_to_json
 from beliefscope.inspect.traces.data import ARRAYS, Trace, arrays_of
 from beliefscope.inspect.traces.validate import validate_trace
 
@@ -44,7 +46,7 @@ def header_of(trace: Trace) -> dict[str, Any]:
         "faults": trace.faults.to_json(),
         "settings": dict(trace.settings),
         "episode": {
-            "task": episode.task,
+            "task": task_to_json(episode.task),
             "dt": episode.dt,
             "seed": episode.seed,
             "split": episode.split,
@@ -84,8 +86,9 @@ def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> T
         name.removeprefix("episode/"): a for name, a in arrays.items() if name.startswith("episode/")
     }
     prefix = "observations/"
+    origin = header["episode"]
     episode = Episode(
-        **header["episode"],
+        **origin | {"task": stored_task(origin["task"])},
         **{name: episode_arrays[name] for name in ("states", "controls", "contact", "qpos")},
         observations={n.removeprefix(prefix): a for n, a in episode_arrays.items() if n.startswith(prefix)},
     )

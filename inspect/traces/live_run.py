@@ -7,7 +7,6 @@ import threading
 import time
 from pathlib import Path
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileReader
 
@@ -32,7 +31,7 @@ class LiveRun:
         self.reader = LiveFileReader(path)
         try:
             self.template = self.reader.part(0, 0)
-            self.task = find_task(self.template.episode.task)
+            self.task = self.template.task
         except BadInput:
             self.reader.close()
             raise

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -17,7 +16,7 @@ from beliefscope.inspect.traces.data import Trace
 def describe(trace: Trace) -> dict[str, Any]:
     """Filter, episode, faults, seed and hashes of a trace, as JSON values."""
     return {
-        "task": trace.episode.task,
+        "task": trace.task.name,
         "filter": trace.filter,
         "episode": trace.episode_index,
         "steps": len(trace),
@@ -43,12 +42,12 @@ def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str =
         if trace.checkpoint_hash != first.checkpoint_hash:
             raise BadInput(f"{file} and {files[0]} are from different checkpoints; give traces of one filter")
     if filter_:
-        checkpoint = open_filter(find_task(first.episode.task).name, filter_)
+        checkpoint = open_filter(first.task.name, filter_)
         if checkpoint.hash != first.checkpoint_hash:
             raise BadInput(f"{files[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}")
         return checkpoint
     try:
-        checkpoint = load_checkpoint(shipped(first.episode.task, first.filter))
+        checkpoint = load_checkpoint(shipped(first.task.name, first.filter))
     except BadInput:
         return None
     return checkpoint if checkpoint.hash == first.checkpoint_hash else None
@@ -60,7 +59,7 @@ def reproducible(traces: Sequence[Trace], data: Path | None) -> set[int]:
     Args:
         data: file or folder; None for the sample dataset. Runs have the seed of the first trace and 300 particles.
     """
-    task = find_task(traces[0].episode.task)
+    task = traces[0].task
     try:
         with open_dataset(sample_path(task.name) if data is None else data, task) as episodes:
             return {

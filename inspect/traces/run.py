@@ -84,21 +84,13 @@ def start_run(
     """Inject faults and encode the episode. Arguments and errors as for ``trace``."""
     if particles < 1:
         raise BadInput(f"particles must be at least 1, not {particles}")
-    check_task(checkpoint, episode)
+    checkpoint.check_task(episode)
     filter_ = checkpoint.filter
     provenance = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "faults": faults}
     episode = faults.apply(episode, seed)
     batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
     settings = {"particles": particles, "torch": torch.__version__}
     return FilterRun(episode, first_belief(filter_, batch), filter_.encode(batch), provenance | {"settings": settings})
-
-
-def check_task(checkpoint: Checkpoint, episode: Episode) -> None:
-    """Raise BadInput for an episode of another task."""
-    if episode.task != checkpoint.task.name:
-        raise BadInput(
-            f"filter {checkpoint.name!r} is for task {checkpoint.task.name!r}, the episode is of {episode.task!r}"
-        )
 
 
 def assemble_trace(

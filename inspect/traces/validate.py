@@ -29,7 +29,6 @@ def validate_trace(trace: Trace) -> None:
         _check(type(index) is int and 0 <= index <= LARGEST_SEED, name, index)
     _check(all(isinstance(name, str) for name in trace.modalities), "modalities", trace.modalities)
     _check(isinstance(trace.settings, Mapping), "settings", trace.settings)
-    _check(isinstance(episode.task, str), "task of the episode", episode.task)
     _check(type(episode.dt) in (int, float) and 0 < episode.dt < math.inf, "dt of the episode", episode.dt)
     _check(type(episode.seed) is int and abs(episode.seed) <= LARGEST_SEED, "seed of the episode", episode.seed)
     _check(episode.split in SPLITS, "split of the episode", episode.split)

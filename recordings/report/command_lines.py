@@ -29,7 +29,7 @@ def trace_command(trace: Trace, file: str, filter_: str, data: Path | None) -> s
     if trace.settings.get("edits"):
         return f"# {file} contains interventions: see its settings in manifest.json"
     particles = trace.settings.get("particles", 300)
-    words = ["beliefscope", "trace", trace.episode.task, "--filter", filter_ or trace.filter]
+    words = ["beliefscope", "trace", trace.task.name, "--filter", filter_ or trace.filter]
     words += ["--episode", str(trace.episode_index), *_options("--data", [data] if data else [])]
     words += _options("--faults", [trace.faults] if trace.faults else [])
     words += _options("--particles", [particles] if particles != 300 else [])

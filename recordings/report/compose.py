@@ -95,7 +95,7 @@ def compose(
     results, reasons = run_diagnostics(traces, checkpoint, options, slow, progress)
     events = [Event(index, step) for index, step in steps] or worst_events(traces)
     return Report(
-        title=title or f"{first.filter} on {first.episode.task}",
+        title=title or f"{first.filter} on {first.task.name}",
         traces=tuple(traces),
         checkpoint=checkpoint,
         results=results,
@@ -291,7 +291,7 @@ def manifest(report: Report, folder: Path) -> dict[str, Any]:
         "format": FORMAT,
         "title": report.title,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
-        "task": first.episode.task,
+        "task": first.task.name,
         "filter": first.filter,
         "checkpoint_hash": first.checkpoint_hash,
         "training": None if checkpoint is None else dict(checkpoint.record),

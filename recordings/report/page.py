@@ -86,7 +86,7 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
     steps = sum(map(len, report.traces))
     facts = {
         "Filter": f"{first.filter} ({first.kind.upper()})",
-        "Task": first.episode.task,
+        "Task": first.task.name,
         "Modalities": ", ".join(first.modalities) or "not distinguished",
         "Episodes": f"{episodes} ({steps} steps in total, {first.episode.dt:g} s each)",
         "Sensor faults": "; ".join(dict.fromkeys(str(trace.faults) or "none" for trace in report.traces)),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
@@ -184,7 +183,7 @@ def _external(trace: Trace) -> Passage:
 
 
 def _run(trace: Trace) -> Passage:
-    task = find_task(trace.episode.task)
+    task = trace.task
     start = "Runs start at the true state"
     if task.start_distance:
         start = "Runs start beside the true state, with a covariance that matches the distance"

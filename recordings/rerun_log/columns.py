@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import SCHEMA
@@ -43,7 +42,7 @@ class Column:
 
 def columns(trace: Trace) -> Iterator[Column]:
     """Every array over steps, with one column per modality and component."""
-    task = find_task(trace.episode.task)
+    task = trace.task
     for entity in SCHEMA:
         if entity.archetype != "Trace" or entity.static:
             continue

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import rerun as rr
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.traces.live_file import LiveFileReader
 from beliefscope.recordings.rerun_log.blueprint import blueprint
@@ -67,7 +66,7 @@ class LiveViews:
                 self.behind = max(self.behind, waiting)
                 if written == 0 and waiting:
                     first = reader.part(0, 1)
-                    task = find_task(first.episode.task)
+                    task = first.task
                     layout, bodies = blueprint(first, task, growing=True), Bodies(first, task)
                     with closing_layout(layout):
                         # Without footer: the index of all chunks would fill the memory of a long run.
@@ -97,7 +96,7 @@ def write_live(live: Path, path: Path) -> Path:
         if not reader.poll():
             raise BadInput(f"{str(live)!r} has no step yet")
         sample = reader.part(0, stride=thinning(reader.steps))
-        task = find_task(sample.episode.task)
+        task = sample.task
         bodies = Bodies(sample, task)
         with new_recording(path, sample, bodies, reader.steps, blueprint(sample, task)) as stream:
             for first, last in chunks(reader.steps):
@@ -112,4 +111,4 @@ def send_part(stream: rr.RecordingStream, reader: LiveFileReader, bodies: Bodies
     """Steps ``first`` to ``last - 1`` of a live run, stored and drawn."""
     before = max(0, first - 1)
     part = reader.part(before, last)
-    send_steps(stream, part, find_task(part.episode.task), bodies, slice(first - before, last - before), before)
+    send_steps(stream, part, part.task, bodies, slice(first - before, last - before), before)

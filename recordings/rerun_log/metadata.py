@@ -25,7 +25,7 @@ from beliefscope.recordings.schema import APPLICATION, EARLIER_PROPERTIES, FORMA
 MEMORY = 4 * 2**30  # bytes of address space; Rerun's libraries use 1.7 GB
 SECONDS = 120  # of CPU time, enough for about 10 GB
 TEXT = 200  # maximum length of names from the file
-OMITTED = ("shapes", "episode", "versions", "modalities")  # properties not needed to list a recording
+OMITTED = ("definition", "shapes", "episode", "versions", "modalities")  # properties not needed to list a recording
 
 
 def describe(path: str | Path) -> dict[str, Any]:

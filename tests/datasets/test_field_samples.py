@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import open_dataset, sample_path
 
@@ -41,7 +40,7 @@ def test_every_episode_has_all_ingredients(episodes: list[Episode]) -> None:
 
 def test_simulation_reproduces_the_samples(episodes: list[Episode]) -> None:
     """Approximately, because processors round differently."""
-    simulate = find_task(episodes[0].task).simulate
+    simulate = episodes[0].task.simulate
     assert simulate is not None
     simulated, stored = simulate(2, 0, 200), episodes[0]
     np.testing.assert_allclose(simulated.states[:20], stored.states[:20], atol=1e-3)

@@ -21,7 +21,7 @@ def episode(states: list[list[float]], position: list[list[float]], contact: lis
         "force": np.outer(np.arange(steps) % 2, (2.0, 4.0, 0.0)).astype(np.float32),
     }
     return Episode(
-        "door",
+        DOOR,
         np.array(states, np.float32),
         np.zeros((steps, 7), np.float32),
         observations,

@@ -31,7 +31,7 @@ def random_episode(seed: int = 0, split: str = "train") -> Episode:
 
     contact = rng.random(STEPS) < 0.5
     return Episode(
-        task="door",
+        task=DOOR,
         states=floats(3),
         controls=floats(7),
         observations={
@@ -215,7 +215,8 @@ def with_nan(shape: tuple[int, ...]) -> np.ndarray:
         (no_attribute("/", "format"), r"not a dataset: its attribute 'format' is None, expected 'beliefscope-"),
         (attribute("/", "format", 3), "not a dataset"),
         (attribute("/", "version", 9), "version 9 of the layout; this release reads version 1"),
-        (attribute("/", "task", "drawer"), r"of task 'drawer'\. Available: door"),
+        (attribute("/", "definition", "{"), "property name"),
+        (attribute("/", "definition", "{}"), "incomplete definition of a task: KeyError: 'name'"),
         (lambda f: [f.__delitem__(k) for k in list(f)], "has no trajectory"),
         (without("trajectory0"), r"has 1 trajectories, but no group 'trajectory0'"),
         (replaced("trajectory1", np.zeros(3)), "no group 'trajectory1'"),

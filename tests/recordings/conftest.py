@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
@@ -44,7 +45,7 @@ def _episode(rng: np.random.Generator, steps: int) -> Episode:
         "contact": contact[:, None].astype(np.float32),
     }
     return Episode(
-        task="door",
+        task=DOOR,
         states=states,
         controls=_smooth(rng, steps, 7),
         observations=observations,

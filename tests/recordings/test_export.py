@@ -47,7 +47,7 @@ def test_columns_contain_every_number_once(run: Trace) -> None:
     arrays = {column.name: column.values for column in columns(run)}
     expected = {name: a for name, a in arrays_of(run).items() if not name.startswith("start_") and a.size}
     assert sum(values.size for values in arrays.values()) == sum(array.size for array in expected.values())
-    components = ("hinge_x", "hinge_y", "angle") if run.episode.task == "door" else ("x", "y")
+    components = ("hinge_x", "hinge_y", "angle") if run.task.name == "door" else ("x", "y")
     for i, component in enumerate(components):
         np.testing.assert_array_equal(arrays[f"states.{component}"], run.episode.states[:, i])
         np.testing.assert_array_equal(arrays[f"estimate_mean.{component}"], run.estimate_mean[:, i])
@@ -90,7 +90,7 @@ def test_parquet_in_pandas(run: Trace, tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas")
     export_trace(run, tmp_path / "run.parquet")
     frame = pandas.read_parquet(tmp_path / "run.parquet").set_index("step")
-    component = "hinge_x" if run.episode.task == "door" else "x"
+    component = "hinge_x" if run.task.name == "door" else "x"
     error = frame[f"estimate_mean.{component}"] - frame[f"states.{component}"]
     np.testing.assert_array_equal(error, run.estimate_mean[:, 0] - run.episode.states[:, 0])
     assert np.stack(frame["observations.image"].to_list()).reshape(-1, 32, 32).dtype == np.uint8
@@ -155,7 +155,7 @@ def test_mcap(run: Trace, tmp_path: Path) -> None:
 def test_non_finite_numbers_are_null_in_json(run: Trace, tmp_path: Path) -> None:
     odd = replace(run, estimate_covariance=np.full_like(run.estimate_covariance, np.nan))
     export_trace(odd, tmp_path / "odd.mcap")
-    component = "hinge_x" if run.episode.task == "door" else "x"
+    component = "hinge_x" if run.task.name == "door" else "x"
     (_, message, _), *_ = messages(tmp_path / "odd.mcap")["/trace/estimate_covariance"]
     assert message[component][component] is None
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
@@ -30,7 +29,7 @@ Compare = Callable[[Trace, Trace], None]
 
 def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
     """Paths of one row of the schema in the recording of this trace."""
-    task = find_task(trace.episode.task)
+    task = trace.task
     present = {
         "always": True,
         "modalities": len(trace.modalities) > 0,

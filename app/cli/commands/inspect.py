@@ -70,7 +70,7 @@ def inspect(
     ]
     text += [f"{DIAGNOSTICS[name].title}: not available: {reason}" for name, reason in reasons.items()]
     document = {
-        "task": traces[0].episode.task,
+        "task": traces[0].task.name,
         "filter": traces[0].filter,
         "checkpoint_hash": traces[0].checkpoint_hash,
         "traces": [{"path": str(p), "episode": t.episode_index} for p, t in zip(paths, traces, strict=True)],

@@ -37,7 +37,7 @@ def serve(tmp_path: Path, open_client: Callable[..., TestClient]) -> Iterator[Se
         assert simulate is not None
         episode = simulate(0, 0, 20)
         observations = {key: episode.observations[key] for key in task.observations}
-        episode = replace(episode, task=task.name, observations=observations)
+        episode = replace(episode, task=task, observations=observations)
         write_dataset(tmp_path / "episode.h5", task, [episode])
         filter_ = build(architecture(task.name, name))
         filter_.statistics.fit(Steps.from_episodes(task, [episode]))

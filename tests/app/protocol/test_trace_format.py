@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from beliefscope.app.protocol.trace_format import columns, header
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -30,7 +29,7 @@ def read(run: Trace) -> tuple[Trace, Columns, dict[str, Any]]:
         c["name"]: np.frombuffer(buffer, "<f4", int(np.prod(c["shape"])), c["offset"]).reshape(c["shape"])
         for c in descriptions
     }
-    return run, values, header(run, descriptions, find_task(run.episode.task), None, {})
+    return run, values, header(run, descriptions, run.task, None, {})
 
 
 @pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])

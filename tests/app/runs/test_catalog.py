@@ -44,7 +44,7 @@ def test_each_unusable_input_is_reported_in_one_line(tmp_path: Path, monkeypatch
     bare = task_without_files(monkeypatch)
     simulate = DOOR.simulate
     assert simulate is not None
-    write_dataset(tmp_path / "bare.h5", bare, [replace(simulate(0, 0, 10), task=bare.name)])
+    write_dataset(tmp_path / "bare.h5", bare, [replace(simulate(0, 0, 10), task=bare)])
     save_checkpoint(build(architecture(bare.name, "image-ekf")), "image-ekf", {}, tmp_path / "bare.safetensors")
     missing = tmp_path / "missing"
     _, problems = task_catalogs({"a": missing}, {"b": missing, "c": tmp_path / "bare.h5"})

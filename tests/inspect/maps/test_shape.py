@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.inspect.diagnostics.likelihood_maps import median_interval
 from beliefscope.inspect.likelihood import COARSE, FINE, LikelihoodMap
 from beliefscope.inspect.maps.shape import SHAPES
@@ -41,7 +42,7 @@ class Grid:
     def measure(self, *layers: np.ndarray) -> MapStatistics:
         names, log = tuple(f"layer{i}" for i in range(len(layers))), np.stack(layers).astype(np.float32)
         map_ = LikelihoodMap(0, math.nan, names, self.offsets, self.offsets, np.zeros(2, np.float32), log)
-        run: Any = SimpleNamespace(episode=SimpleNamespace(task="push", states=np.zeros((1, 2))))
+        run: Any = SimpleNamespace(task=PUSH, episode=SimpleNamespace(states=np.zeros((1, 2))))
         return measure_maps([map_], run)
 
 

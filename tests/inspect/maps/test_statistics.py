@@ -37,7 +37,7 @@ def rotated(sd: tuple[float, float], angle: float) -> np.ndarray:
 def numbers(*layers: np.ndarray) -> MapStatistics:
     names = tuple(f"layer{i}" for i in range(len(layers)))
     map_ = LikelihoodMap(0, math.nan, names, OFFSETS, OFFSETS, np.zeros(2, np.float32), np.stack(layers))
-    trace: Any = SimpleNamespace(episode=SimpleNamespace(task="door", states=STATES))
+    trace: Any = SimpleNamespace(task=find_task("door"), episode=SimpleNamespace(states=STATES))
     return measure_maps([map_], trace)
 
 

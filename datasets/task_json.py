@@ -1,0 +1,156 @@
+"""The definition of a task as JSON, which data sets, traces, live files, recordings and checkpoints contain.
+
+A definition is data: reading one runs no code. The functions of a task (``FUNCTIONS``) are not part of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, get_args
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.camera import Camera
+from beliefscope.datasets.task import Component, Ingredient, Task, Unit
+
+FUNCTIONS = ("replay", "outline", "ridge_direction", "simulate")
+"""Fields of a task that are code."""
+
+LAYOUT = ("name", "components", "observations", "modalities", "control_size")
+"""Fields that determine the arrays of a task's episodes."""
+
+LARGEST_SIZE = 1 << 24  # of one axis of an observation, and of other whole numbers
+
+
+def task_to_json(task: Task) -> dict[str, Any]:
+    """All fields except the functions, as JSON values."""
+    return {f.name: _plain(getattr(task, f.name)) for f in fields(Task) if f.name not in FUNCTIONS}
+
+
+def task_from_json(values: Any) -> Task:
+    """Inverse of ``task_to_json``, without functions. Raises BadInput for an invalid definition."""
+    try:
+        task = Task(
+            name=values["name"],
+            components=tuple(Component(c["name"], c["unit"], c["static"]) for c in values["components"]),
+            observations=_tuples(values["observations"]),
+            modalities=_tuples(values["modalities"]),
+            control_size=values["control_size"],
+            dt=values["dt"],
+            map_components=(values["map_components"][0], values["map_components"][1]),
+            map_half_width=values["map_half_width"],
+            positions=_tuples(values["positions"]),
+            camera=None if values["camera"] is None else _camera(values["camera"]),
+            ingredients={
+                name: Ingredient(i["meaning"], _tuples(i["ranges"])) for name, i in values["ingredients"].items()
+            },
+            start_distance=_tuples(values["start_distance"]),
+            warmup=values["warmup"],
+        )
+        check_definition(task)
+    except BadInput:
+        raise
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise BadInput(f"incomplete definition of a task: {type(error).__name__}: {error!s:.200}") from None
+    return task
+
+
+def _camera(values: Mapping[str, Any]) -> Camera:
+    """Raises BadInput for values of the wrong type."""
+    vectors = [tuple(map(float, values[name])) for name in ("position", "forward", "up")]
+    if any(len(vector) != 3 or not math.isfinite(sum(vector)) for vector in vectors):
+        raise BadInput(f"the camera of a task is {values!r:.200}")
+    (px, py, pz), (fx, fy, fz), (ux, uy, uz) = vectors
+    camera = Camera(
+        (px, py, pz), (fx, fy, fz), (ux, uy, uz), values["field_of_view"], values["size"], values["oversampling"]
+    )
+    sizes = all(_whole(size, 1) and size <= 4096 for size in (camera.size, camera.oversampling))
+    if not (sizes and _positive(camera.field_of_view)):
+        raise BadInput(f"the camera of a task is {values!r:.200}")
+    return camera
+
+
+def with_functions(task: Task, source: Task) -> Task:
+    """The task with the functions of another one of the same layout; the other one itself if they are equal."""
+    if task_to_json(task) == task_to_json(source):
+        return source
+    return replace(task, **{name: getattr(source, name) for name in FUNCTIONS})
+
+
+def difference(task: Task, other: Task) -> str:
+    """The first difference of ``other`` in the name and the arrays of episodes; empty if there is none."""
+    for name in LAYOUT:
+        expected, value = (_plain(getattr(t, name)) for t in (task, other))
+        if value != expected:
+            same = name != "name" and f" with the same name {task.name!r} but other {name}"
+            return f"a task{same}: {value!r:.200}" if same else f"task {other.name!r}"
+    return ""
+
+
+def check_definition(task: Task, where: str = "") -> None:
+    """Raise BadInput for a wrong type or inconsistent fields. where: origin of the task, for messages."""
+    place = where or f"task {task.name!r:.200}"
+    if not isinstance(task.name, str) or not task.name or len(task.name) > 100 or set(task.name) & set("/\\: "):
+        raise BadInput(f"{place} is named {task.name!r:.200}, expected a name without spaces, colons and slashes.")
+    names = [component.name for component in task.components]
+    if not names or len(set(map(repr, names))) < len(names):
+        raise BadInput(f"{place} has the components {names!r:.200}, expected one or more with different names.")
+    for component in task.components:
+        if (
+            not isinstance(component.name, str)
+            or component.unit not in get_args(Unit)
+            or component.static not in (0, 1)
+        ):
+            raise BadInput(f"{place}: component {component.name!r:.200} has unit {component.unit!r:.200}, "
+                           f"expected one of {', '.join(get_args(Unit))}.")  # fmt: skip
+    for name in task.map_components:
+        task.index(name)
+    for key, shape in task.observations.items():
+        if not all(_whole(size, 1) for size in shape):
+            raise BadInput(f"{place}: observation {key!r} has shape {shape!r:.200}, expected whole numbers above 0.")
+    for modality, keys in task.modalities.items():
+        missing = [key for key in keys if key not in task.observations]
+        if missing:
+            raise BadInput(f"{place}: modality {modality!r} has {missing[0]!r}, which is not an observation.")
+        ranks = [len(task.observations[key]) for key in keys]
+        if ranks != [2] and set(ranks) != {1}:
+            raise BadInput(f"{place}: modality {modality!r} has {', '.join(keys)}, expected one image or only vectors.")
+    for name, value in (("control_size", task.control_size), ("warmup", task.warmup)):
+        if not _whole(value, 0):
+            raise BadInput(f"{place}: {name} is {value!r:.200}, expected a whole number.")
+    if not (_positive(task.dt) and _positive(task.map_half_width)):
+        raise BadInput(
+            f"{place}: dt is {task.dt!r} s and map_half_width {task.map_half_width!r} m, expected more than 0."
+        )
+    for key, channels in task.positions.items():
+        if len(channels) != 2 or not all(_whole(channel, 0) for channel in channels):
+            raise BadInput(f"{place}: positions of {key!r} are {channels!r:.200}, expected two channels.")
+    for unit, ends in task.start_distance.items():
+        if unit not in get_args(Unit) or len(ends) != 2 or not all(_number(end) for end in ends):
+            raise BadInput(f"{place}: start distance of {unit!r} is {ends!r:.200}, expected two numbers.")
+
+
+def _whole(value: Any, smallest: int) -> bool:
+    return type(value) is int and smallest <= value <= LARGEST_SIZE
+
+
+def _number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _positive(value: Any) -> bool:
+    return _number(value) and value > 0
+
+
+def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) for name, value in values.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses and mappings as dictionaries, tuples as lists."""
+    if is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {name: _plain(v) for name, v in value.items()}
+    return [*map(_plain, value)] if isinstance(value, list | tuple) else value
