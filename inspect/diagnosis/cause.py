@@ -173,11 +173,11 @@ class Diagnosis:
             (c.cause.name, c.probability, _share(c.recovered), ", ".join(map(str, c.episodes))) for c in self.causes
         )
         tables = [Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), rows)]
-        evidence = tuple((c.cause.name, e.text) for c in self.causes for e in c.evidence)
+        evidence = tuple((c.cause.name, e.text, e.episode, e.step) for c in self.causes for e in c.evidence)
         actions = tuple((c.cause.name, c.next) for c in self.causes)
         return [
             *tables,
-            Table("Evidence", ("cause", "deviation"), evidence),
+            Table("Evidence", ("cause", "deviation", "episode", "step"), evidence),
             Table("Next", ("cause", "action"), actions),
         ]
 

@@ -37,6 +37,7 @@ from beliefscope.inspect.likelihood import FINE, MapEngine, Quantity, no_maps
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.report.diagnosis import diagnose_traces
 from beliefscope.recordings.report.figures import error_figure, event_figure, zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
 from beliefscope.recordings.report.page import page
@@ -78,7 +79,7 @@ def compose(
     quantity: Quantity | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Report:
-    """Compute the contents of a report, including every applicable diagnostic.
+    """Compute the contents of a report, including the diagnosis and every applicable diagnostic.
 
     Args:
         checkpoint: of the filter; without it there are no maps.
@@ -92,12 +93,14 @@ def compose(
     """
     first = traces[0]
     options = {name: {"quantity": quantity} if "quantity" in e.options else {} for name, e in DIAGNOSTICS.items()}
-    results, reasons = run_diagnostics(traces, checkpoint, options, slow, progress)
+    diagnosis = diagnose_traces(traces, checkpoint, link, lambda share: progress(0.5 * share))
+    results, reasons = run_diagnostics(traces, checkpoint, options, slow, lambda share: progress(0.5 + 0.5 * share))
     events = [Event(index, step) for index, step in steps] or worst_events(traces)
     return Report(
         title=title or f"{first.filter} on {first.task.name}",
         traces=tuple(traces),
         checkpoint=checkpoint,
+        diagnosis=diagnosis,
         results=results,
         titles={name: (DIAGNOSTICS[name].title, DIAGNOSTICS[name].question) for name in results},
         reasons={DIAGNOSTICS[name].title: reason for name, reason in reasons.items()},
@@ -199,6 +202,18 @@ class Writer:
             items.append(self.figure("maps-by-contact", caption, figure))
         return Section("summary", "Accuracy", "", "", tuple(items))
 
+    def diagnosis(self) -> Section:
+        """Headline of the diagnosis, ranked causes, evidence and next actions; or why there is none."""
+        diagnosis = self.report.diagnosis
+        result, title, question = diagnosis.result, "Diagnosis", "What is the probable cause of a fault?"
+        if result is None:
+            return Section("diagnosis", title, question, f"Not available: {diagnosis.reason}.", ())
+        items = [self.table(f"diagnosis-{i}", table) for i, table in enumerate(result.tables(), start=1)]
+        if items:
+            data = self.write("data/diagnosis.json", _json(result.to_json()))
+            items[0] = replace(items[0], files=(*items[0].files, data))
+        return Section("diagnosis", title, question, result.headline, tuple(items), diagnosis.link)
+
     def diagnostic(self, name: str) -> Section:
         """Figure, tables and data of a diagnostic."""
         result, (title, question) = self.report.results[name], self.report.titles[name]
@@ -263,19 +278,20 @@ def write_report(
     Raises:
         BadInput: the folder contains something other than a report.
     """
-    total = 2 + len(report.results) + len(report.events)
+    total = 3 + len(report.results) + len(report.events)
     with new_folder(folder) as target:
         writer = Writer(report, target)
-        sections: list[Section] = [writer.summary()]
-        progress(1 / total)
+        sections: list[Section] = [writer.diagnosis(), writer.summary()]
+        progress(2 / total)
         for name in report.results:
             sections.append(writer.diagnostic(name))
             progress(len(sections) / total)
         for index in range(len(report.events)):
             sections.append(writer.event(index))
             progress(len(sections) / total)
-        diagnostics, events = sections[1 : 1 + len(report.results)], sections[1 + len(report.results) :]
-        writer.write("report.html", page(report, sections[0], diagnostics, events).encode())
+        diagnosis, summary, *others = sections
+        diagnostics, events = others[: len(report.results)], others[len(report.results) :]
+        writer.write("report.html", page(report, diagnosis, summary, diagnostics, events).encode())
         if pdf is not None:
             pdf(target / "report.html", target / "report.pdf")
         document = manifest(report, target)
@@ -308,6 +324,7 @@ def manifest(report: Report, folder: Path) -> dict[str, Any]:
             for source, trace in zip(report.sources or ({},) * len(report.traces), report.traces, strict=True)
         ],
         "events": [{"episode": report.traces[e.trace].episode_index, **asdict(e)} for e in report.events],
+        "diagnosis": None if report.diagnosis.result is None else report.diagnosis.result.headline,
         "diagnostics": {name: result.verdict for name, result in report.results.items()},
         "not_made": dict(report.reasons),
         "versions": dict(report.versions),

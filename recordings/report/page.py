@@ -24,7 +24,9 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """Content security policy: the page cannot load anything, whatever text it contains."""
 
 
-def page(report: Report, summary: Section, diagnostics: Sequence[Section], events: Sequence[Section]) -> str:
+def page(
+    report: Report, diagnosis: Section, summary: Section, diagnostics: Sequence[Section], events: Sequence[Section]
+) -> str:
     """The complete HTML page."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -34,6 +36,7 @@ def page(report: Report, summary: Section, diagnostics: Sequence[Section], event
         undefined=StrictUndefined,
     )
     environment.filters |= {
+        "code": _code,
         "inline_math": _inline_math,
         "inline_svg": lambda item, number: inline_svg(item, f"f{number}-"),
         "math": mathml,
@@ -47,6 +50,7 @@ def page(report: Report, summary: Section, diagnostics: Sequence[Section], event
         version=__version__,
         numbers=SimpleNamespace(figure=lambda: next(figures), table=lambda: next(tables)),
         report=report,
+        diagnosis=diagnosis,
         summary=summary,
         diagnostics=diagnostics,
         events=events,
@@ -67,6 +71,12 @@ def _inline_math(text: str) -> Markup:
     """Text with TeX between dollars; every second part is an equation."""
     parts = text.replace("\n", " ").split("$")
     return Markup("").join(mathml(part) if i % 2 else escape(part) for i, part in enumerate(parts))
+
+
+def _code(text: str) -> Markup:
+    """Text with commands between backticks."""
+    code = Markup("<code>{}</code>")
+    return Markup("").join(code.format(part) if i % 2 else escape(part) for i, part in enumerate(text.split("`")))
 
 
 def inline_svg(item: Item, prefix: str) -> Markup:
@@ -128,6 +138,6 @@ def _number(value: Value) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "\N{EN DASH}"
     if not isinstance(value, float):
-        return str(value)
+        return _code(str(value))
     text = f"{value:#.3g}".rstrip(".") if abs(value) < 1000.0 else f"{value:.0f}"
     return text.replace("-", "\N{MINUS SIGN}")

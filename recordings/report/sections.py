@@ -18,6 +18,7 @@ from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.maps.statistics import measure_maps
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.report.diagnosis import ReportedDiagnosis
 
 DEFAULT_EVENTS = 3
 """Number of events if none are given."""
@@ -70,6 +71,7 @@ class Report:
     Attributes:
         traces: of one filter.
         checkpoint: of the filter, if available.
+        diagnosis: probable cause of a fault.
         results: diagnostics by name.
         titles: diagnostic -> title and question.
         reasons: title of an omitted diagnostic -> reason.
@@ -85,6 +87,7 @@ class Report:
     title: str
     traces: tuple[Trace, ...]
     checkpoint: Checkpoint | None
+    diagnosis: ReportedDiagnosis
     results: Mapping[str, Diagnostic]
     titles: Mapping[str, tuple[str, str]]
     reasons: Mapping[str, str]

@@ -18,17 +18,20 @@ import pytest
 
 from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate
+from beliefscope.inspect.diagnosis.diagnose import diagnose
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.trace import Trace, save_trace, trace
 from beliefscope.recordings.report.compose import compose, write_report
+from beliefscope.recordings.report.diagnosis import diagnose_traces
 from beliefscope.recordings.report.figures import zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
-from beliefscope.recordings.report.page import mathml
+from beliefscope.recordings.report.page import _code, mathml
 from beliefscope.recordings.report.sections import accuracy, event_table, worst_events
 from beliefscope.recordings.report.text import definitions, methods
 
@@ -241,8 +244,38 @@ def test_without_checkpoint_there_are_no_maps(new_trace: Callable[..., Trace], t
     document = write_report(content, tmp_path / "report")
     text = (tmp_path / "report" / "report.html").read_text()
     assert "No maps: the filter&#39;s checkpoint is not available." in text
+    assert '<p class="verdict">Not available: the filter&#39;s checkpoint is not available.</p>' in text
+    assert document["diagnosis"] is None
     assert set(document["not_made"]) >= {"Likelihood maps"}
     assert set(document["diagnostics"]) >= {"consistency", "weights"}
+
+
+def test_the_diagnosis_is_that_of_the_traces_and_links_to_its_moment(checkpoint: Checkpoint) -> None:
+    faults = Faults.parse("image_frozen=5")
+    with open_dataset(sample_path("door")) as data:
+        frozen = trace(checkpoint, data[EPISODE], EPISODE, faults=faults)
+        expected = diagnose(checkpoint, {EPISODE: faults.apply(data[EPISODE], 0)})
+    link: Callable[[int, int], str] = "{}:{}".format
+    result = diagnose_traces([frozen], checkpoint, link, lambda share: None)
+    assert result.result is not None
+    assert result.result.headline == expected.headline
+    assert result.link == "0:6"
+    edited = replace(frozen, settings={**frozen.settings, "edits": [{"from": 0, "to": 5}]})
+    for traces, reason in (([edited], "interventions"), ([frozen, frozen], "several traces")):
+        refused = diagnose_traces(traces, checkpoint, link, lambda share: None)
+        assert refused.result is None
+        assert reason in refused.reason
+
+
+def test_the_diagnosis_comes_first(report: Path) -> None:
+    text = (report / "report.html").read_text()
+    headline = json.loads((report / "manifest.json").read_text())["diagnosis"]
+    assert headline.startswith("Healthy: ")
+    assert text.index("<h2>Diagnosis</h2>") < text.index(headline) < text.index("<h2>Verdicts</h2>")
+
+
+def test_commands_are_code() -> None:
+    assert _code("Train: `a <b>`.") == "Train: <code>a &lt;b&gt;</code>."
 
 
 def test_command_adds_permalinks(run: Any, run_: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,54 @@
+"""The diagnosis at the start of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.inspect.diagnosis.cause import Diagnosis
+from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.trace import Trace
+
+
+@dataclass(frozen=True)
+class ReportedDiagnosis:
+    """The diagnosis of the traces, or the reason why there is none.
+
+    Attributes:
+        link: permalink of the moment that shows the first cause best, or empty.
+    """
+
+    result: Diagnosis | None
+    reason: str = ""
+    link: str = ""
+
+
+def diagnose_traces(
+    traces: Sequence[Trace],
+    checkpoint: Checkpoint | None,
+    link: Callable[[int, int], str],
+    progress: Callable[[float], None],
+) -> ReportedDiagnosis:
+    """Diagnose the runs of the traces, which must have the healthy profile of their filter.
+
+    Args:
+        link: (index of a trace, step) -> permalink.
+    """
+    if checkpoint is None:
+        return ReportedDiagnosis(None, "the filter's checkpoint is not available")
+    episodes = {trace.episode_index: trace.episode for trace in traces}
+    if len(episodes) < len(traces):
+        return ReportedDiagnosis(None, "an episode has several traces")
+    if any(trace.settings.get("edits") or trace.settings.get("standalone") for trace in traces):
+        return ReportedDiagnosis(None, "interventions changed the run")
+    first = traces[0]
+    try:
+        particles = int(first.settings.get("particles", 300))
+        result = diagnose(checkpoint, episodes, seed=first.seed, particles=particles, progress=progress)
+    except BadInput as error:
+        return ReportedDiagnosis(None, str(error))
+    evidence = result.causes[0].evidence if result.causes else ()
+    moments = [(list(episodes).index(e.episode), e.step or 0) for e in evidence if e.episode is not None]
+    return ReportedDiagnosis(result, link=link(*moments[0]) if moments else "")
