@@ -1,4 +1,7 @@
-"""Routes under ``/api/diagnosis``: the probable cause of a fault, preliminary from a trace and confirmed by a job."""
+"""Routes under ``/api/diagnosis`` and ``/api/repair``.
+
+The probable cause of a fault is preliminary from a trace and confirmed by a job; a job searches the smallest repair.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,9 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Query
 from fastapi.responses import FileResponse, JSONResponse, Response
 
+from beliefscope.app.api.jobs import result_or_job
 from beliefscope.app.api.models.catalog import JobReply, Progress
-from beliefscope.app.api.models.diagnosis import Diagnosis, DiagnosisJob
+from beliefscope.app.api.models.diagnosis import Diagnosis, DiagnosisJob, SmallestRepair
 from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.selection import Selection
@@ -53,11 +57,34 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         episodes, faults = arguments["episodes"], arguments["faults"]
         scope = f"episode {selection.episode}" if over == "episode" else f"{len(episodes)} held-out episodes"
         title = ", ".join(filter(None, [f"Diagnosis of {selection.filter}", f"{selection.task} {scope}", faults]))
-        query = {name: arguments[name] for name in ("task", "filter", "data", "faults") if arguments[name]}
-        link = "?" + urlencode(query | {"episode": selection.episode, "over": over, "tab": "diagnosis"})
+        link = _link(selection, arguments["data"], over)
         return JobReply(job=jobs.submit("diagnosis", title, arguments, _key(store, arguments), link))
 
+    @router.get(
+        "/api/repair/{task}/{filter}/{episode}", response_model=SmallestRepair, responses={202: {"model": JobReply}}
+    )
+    def get_repair(selection: RequestedRun) -> Response:
+        return result_or_job(jobs, "repair", store.key(selection))
+
+    @router.post("/api/repair/{task}/{filter}/{episode}", status_code=202)
+    def search_repair(selection: RequestedRun) -> JobReply:
+        data = store.dataset(selection.task, selection.data)[0]
+        run = f"{selection.task} episode {selection.episode}"
+        parts = [f"Smallest repair of {selection.filter}", run, str(selection.faults)]
+        arguments = {"settings": store.settings.to_json(), "selection": selection.to_json()}
+        link = _link(selection, data, "episode")
+        return JobReply(
+            job=jobs.submit("repair", ", ".join(filter(None, parts)), arguments, store.key(selection), link)
+        )
+
     return router
+
+
+def _link(selection: Selection, data: str, over: str) -> str:
+    """The page's address that shows the result."""
+    query = {"task": selection.task, "filter": selection.filter, "data": data, "faults": str(selection.faults)}
+    shown = {"episode": selection.episode, "over": over, "tab": "diagnosis"}
+    return "?" + urlencode({name: value for name, value in query.items() if value} | shown)
 
 
 def _preliminary(run: TracedRun, particles: int) -> Any:

@@ -1,4 +1,4 @@
-"""Job that diagnoses a filter over episodes of a data set."""
+"""Jobs that diagnose a filter over episodes of a data set, and search the smallest repair of a run."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
+from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.worker import Report
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
+from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.views import as_json
 
 
@@ -28,3 +30,21 @@ def run(arguments: Mapping[str, Any], report: Report) -> Any:
             progress=lambda share: report(share, "comparing with the healthy record"),
         )
     return as_json(result.to_json())
+
+
+def search_repair(arguments: Mapping[str, Any], report: Report) -> Any:
+    """Search the smallest repair of the largest failure of a run; its stored trace is reused."""
+    selection = Selection.from_json(arguments["selection"])
+    with closing(TraceStore(Settings.from_json(arguments["settings"]))) as store:
+        report(0.0, "running the filter")
+        run = store.request(selection)
+        bound = healthy_bound(required_profile(run.checkpoint).statistics)
+        data = store.dataset(selection.task, selection.data)[1]
+        clean = data[selection.episode] if selection.faults else None
+        report(0.5, "replaying repairs")
+        repair = smallest_repair(run.checkpoint, run.trace, bound, clean)
+    if repair is None:
+        text = f"Episode {selection.episode} has no failure: its errors are within twice the healthy ones"
+        none = dict.fromkeys(("failure", "error", "repaired", "repair"))
+        return {"sentence": f"{text}, {100 * bound:.2f} cm.", "bound": bound, "replays": 0, **none}
+    return as_json({"sentence": repair.sentence, **repair.to_json()})

@@ -40,6 +40,7 @@ KINDS: dict[str, str] = {
     "finetune": "beliefscope.app.jobs.finetune:run",
     "reading": "beliefscope.app.jobs.recording:open_run",
     "recording": "beliefscope.app.jobs.recording:record",
+    "repair": "beliefscope.app.jobs.diagnosis:search_repair",
     "report": "beliefscope.app.jobs.report:run",
     "study": "beliefscope.app.jobs.study:run",
 }

@@ -109,7 +109,7 @@ def diagnose(
     report = progress or (lambda fraction: None)
     if not episodes:
         raise BadInput("no episodes to diagnose")
-    profile = profile or _profile(checkpoint)
+    profile = profile or required_profile(checkpoint)
     traces = []
     for trace in trace_all(checkpoint, episodes, episodes, seed, particles):
         traces.append(trace)
@@ -129,11 +129,12 @@ def preliminary(checkpoint: Checkpoint, trace: Trace, particles: int = 300, alar
     Raises BadInput without a healthy profile.
     """
     setting = Setting(checkpoint, {trace.episode_index: trace.episode}, particles, frozenset({trace.episode_index}))
-    case = examine(setting, [trace], _profile(checkpoint), alarm_rate)
+    case = examine(setting, [trace], required_profile(checkpoint), alarm_rate)
     return _conclude(case, signature_scores(case), {})
 
 
-def _profile(checkpoint: Checkpoint) -> HealthyProfile:
+def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
+    """The healthy profile of a filter. Raises BadInput without one."""
     profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
     if profile is None:
         raise BadInput(

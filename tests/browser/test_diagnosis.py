@@ -30,3 +30,20 @@ def test_diagnosis_names_causes_and_opens_their_moments(open_page: Any) -> None:
     again = open_page("?" + page.page.url.partition("?")[2])  # the result is stored
     again.until(READY)
     assert again.page.locator("#diagnosis .headline").text_content() == headline
+
+
+def test_the_smallest_repair_is_drawn_in_the_timeline(open_page: Any) -> None:
+    faults = "image_occluded%3D14%3Afrom%3D40%3Ato%3D60"
+    page = open_page(f"?task=push&filter=crossmodal-ekf&episode=9&faults={faults}&tab=diagnosis", size=(1280, 720))
+    key = page.page.locator("#repair-key")
+    assert key.is_hidden()
+    pixels = "() => [...document.querySelectorAll('#tracks canvas')].map((c) => c.toDataURL()).join()"
+    before = page.page.evaluate(pixels)
+    page.page.get_by_role("button", name="Search the smallest repair").click()
+    page.until("() => document.querySelector('#diagnosis .repair .verdict').textContent.includes('restoring')")
+    assert key.is_visible()
+    assert page.page.evaluate(pixels) != before
+    assert not page.violations()
+    page.screenshot("repair")
+    page.page.locator("#faults").select_option(index=0)
+    page.until("() => document.querySelector('#repair-key').hidden")

@@ -59,3 +59,26 @@ class DiagnosisJob(JobReply):
     """Body of a 202 response: the job, and the diagnosis of the selected run before any cause is undone."""
 
     preliminary: Diagnosis
+
+
+class RepairedInterval(Reply):
+    """The sensors to drop or restore, over the steps from the first to the last."""
+
+    sensors: list[str]
+    restored: bool
+    steps: list[int]
+
+
+class SmallestRepair(Reply):
+    """The smallest repair of the largest failure of a run. failure: first and last step, None if there is none.
+
+    error, repaired: RMS position error over the failure without and with the repair, m. bound: which it keeps, m.
+    """
+
+    sentence: str
+    failure: list[int] | None
+    bound: float
+    error: Number
+    repaired: Number
+    repair: RepairedInterval | None
+    replays: int

@@ -105,7 +105,7 @@ export class Page {
     this.rerun = new Rerun(html('#rerun'), this.jobs, (/** @type {number} */ step) =>
       store.set({ step, playing: false }, { origin: 'rerun' }),
     );
-    this.diagnosis = new Diagnosis(html('#diagnosis'), catalog, store, this.jobs);
+    this.diagnosis = new Diagnosis(html('#diagnosis'), catalog, store, this.jobs, this.timeline);
     this.diagnostics = new Diagnostics(html('#diagnostics'), store, this.jobs);
     this.failures = new Failures(html('#failures'), store, this.jobs, this.timeline, catalog);
     this.compare = new ComparisonTab(

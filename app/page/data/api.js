@@ -239,6 +239,25 @@ export const diagnosis = (selection, over, signal) => poll(diagnosisUrl(selectio
  */
 export const startDiagnosis = (selection, over) => send(diagnosisUrl(selection, over));
 
+/** @param {Selection} selection */
+const repairUrl = ({ task, filter, episode, data, faults }) =>
+  path(['repair', task, filter, episode], { data, faults });
+
+/**
+ * Gets the smallest repair of a run, or the job of its search.
+ * @param {Selection} selection
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<import('../types/server.js').SmallestRepair | JobReply>}
+ */
+export const repair = (selection, signal) => get(repairUrl(selection), signal);
+
+/**
+ * Starts the search for the smallest repair of a run.
+ * @param {Selection} selection
+ * @returns {Promise<StartedJob>}
+ */
+export const startRepair = (selection) => send(repairUrl(selection));
+
 /** @typedef {Pick<State, 'task' | 'filter' | 'data' | 'faults' | 'among'>} FailureQuery */
 
 /** @param {FailureQuery} query */

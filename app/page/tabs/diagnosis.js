@@ -2,6 +2,7 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
+/** @import { Timeline } from '../timeline/timeline.js' */
 /** @import { Catalog, Diagnosis as Result, DiagnosisCause, DiagnosisEvidence } from '../types/server.js' */
 /** @import { JobResult } from '../widgets/job_results.js' */
 /** @import { Jobs } from '../widgets/jobs.js' */
@@ -13,6 +14,7 @@ import { copyButton } from '../widgets/copy_button.js';
 import { JobResults, showJobButton } from '../widgets/job_results.js';
 import { jobSummary } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
+import { Repair } from './repair.js';
 
 /** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */
 
@@ -30,6 +32,7 @@ export class Diagnosis {
   #host;
   #store;
   #starts;
+  #repair;
   /** @type {Trace | null} */
   #trace = null;
   /** @type {JobResults<Result>} */
@@ -44,11 +47,13 @@ export class Diagnosis {
    * @param {Catalog} catalog
    * @param {Store} store
    * @param {Jobs} jobs
+   * @param {Timeline} timeline displays the smallest repair
    */
-  constructor(host, catalog, store, jobs) {
+  constructor(host, catalog, store, jobs, timeline) {
     this.#host = host;
     this.#store = store;
     this.#starts = !catalog.read_only;
+    this.#repair = new Repair(html('.repair', host), jobs, timeline);
     this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
       finished.includes(this.#key) ? this.load() : this.#draw(),
     );
@@ -63,6 +68,7 @@ export class Diagnosis {
   /** @param {Trace} trace */
   show(trace) {
     this.#trace = trace;
+    this.#repair.clear();
     this.load();
   }
 
@@ -72,6 +78,7 @@ export class Diagnosis {
     if (!this.#open || !trace) return;
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
+    this.#repair.show(trace);
     if (trace.live) return this.#draw();
     const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
     await this.#results.load(this.#key, get, signal);

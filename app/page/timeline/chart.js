@@ -24,7 +24,7 @@ import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
  * @property {string} [note] text in place of a chart
  *
  * @typedef {[first: number, last: number]} Interval of steps
- * @typedef {{contact: Interval[], blackout: Interval[], edits: Interval[]}} Shading
+ * @typedef {{contact: Interval[], blackout: Interval[], edits: Interval[], failure?: Interval[], repair?: Interval[]}} Shading
  *
  * @typedef {object} Frame
  * @property {number} width px
@@ -44,6 +44,7 @@ export const FONT = `${scaled(10)}px system-ui, sans-serif`;
 /** Style of axis labels. */
 export const LABEL = { labelSize: scaled(14), labelGap: 0, labelFont: FONT };
 const BLACKOUT_HEIGHT = scaled(8); // px
+const LINE_HEIGHT = 4; // px, of a failure and its repair
 const LOG_MARGIN = 0.1; // share of the lower bound at which a logarithmic axis starts at the latest
 const STEP_INCREMENTS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
 const INTEGER_TOLERANCE = 1e-9;
@@ -243,25 +244,28 @@ function extremesOf({ name, values, sigma }, first, last) {
 }
 
 /**
- * Shades contact and interventions, and hatches blackouts along the top edge.
+ * Shades contact and interventions, hatches blackouts along the top edge, and underlines a failure and its repair.
  * @param {uPlot} plot
  * @param {Shading} shading
  */
-export function shadeIntervals(plot, { contact, blackout, edits }) {
+export function shadeIntervals(plot, { contact, blackout, edits, failure = [], repair = [] }) {
   const { ctx, bbox } = plot;
-  /** @param {Interval[]} intervals @param {string | CanvasPattern | null} fill @param {number} [height] */
-  const shade = (intervals, fill, height = bbox.height) => {
+  /** @param {Interval[]} intervals @param {string | CanvasPattern | null} fill @param {number} [height] @param {number} [top] */
+  const shade = (intervals, fill, height = bbox.height, top = bbox.top) => {
     ctx.fillStyle = fill ?? 'transparent';
     for (const [first, last] of intervals) {
       const left = Math.max(bbox.left, plot.valToPos(first - 0.5, 'x', true));
       const right = Math.min(bbox.left + bbox.width, plot.valToPos(last + 0.5, 'x', true));
-      if (right > left) ctx.fillRect(left, bbox.top, Math.max(right - left, 1), height);
+      if (right > left) ctx.fillRect(left, top, Math.max(right - left, 1), height);
     }
   };
   ctx.save();
   shade(contact, colour('contact-band'));
   shade(edits, translucent(colour('accent'), 0.12));
   shade(blackout, hatching(ctx), BLACKOUT_HEIGHT * devicePixelRatio);
+  const line = LINE_HEIGHT * devicePixelRatio;
+  shade(failure, colour('bad'), line, bbox.top + bbox.height - line);
+  shade(repair, colour('accent'), line, bbox.top + bbox.height - 2 * line);
   ctx.restore();
 }
 

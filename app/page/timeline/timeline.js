@@ -2,6 +2,7 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
+/** @import { SmallestRepair } from '../types/server.js' */
 /** @import { Shading, Track } from './chart.js' */
 /** @import { EventMark } from './event_marks.js' */
 /** @import { ValueCell } from './legend.js' */
@@ -110,6 +111,7 @@ export class Timeline {
     const all = this.#allSteps;
     this.#window = fitWindow(sameLength ? parseWindow(window, all) : all, all);
     this.#marks.set([]);
+    this.showRepair(null);
     this.#standalone.show(trace);
     this.redraw();
     this.#setWindow(this.#window);
@@ -174,6 +176,19 @@ export class Timeline {
     this.#marks.set(events);
     this.#placeMarks();
     if (this.#trace) this.#marks.move(this.#store.state.step);
+  }
+
+  /**
+   * Underlines a failure of the trace and its repair until the next call or the next trace.
+   * @param {Pick<SmallestRepair, 'failure' | 'repair'> | null} result
+   */
+  showRepair(result) {
+    /** @param {number[] | null | undefined} steps @returns {[number, number][]} */
+    const asIntervals = (steps) => (steps ? [[steps[0], steps[1]]] : []);
+    this.#shading.failure = asIntervals(result?.failure);
+    this.#shading.repair = asIntervals(result?.repair?.steps);
+    html('#repair-key').hidden = !result?.failure;
+    for (const { plot } of this.#charts) plot.redraw();
   }
 
   /**

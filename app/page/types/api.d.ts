@@ -1180,6 +1180,18 @@ export interface components {
             after: number | null;
         };
         /**
+         * RepairedInterval
+         * @description The sensors to drop or restore, over the steps from the first to the last.
+         */
+        RepairedInterval: {
+            /** Sensors */
+            sensors: string[];
+            /** Restored */
+            restored: boolean;
+            /** Steps */
+            steps: number[];
+        };
+        /**
          * ReportEntry
          * @description A report. created: ISO 8601. pdf: address of its PDF, or None.
          */
@@ -1377,6 +1389,27 @@ export interface components {
             only: string[];
             /** Text */
             text: string;
+        };
+        /**
+         * SmallestRepair
+         * @description The smallest repair of the largest failure of a run. failure: first and last step, None if there is none.
+         *
+         *     error, repaired: RMS position error over the failure without and with the repair, m. bound: which it keeps, m.
+         */
+        SmallestRepair: {
+            /** Sentence */
+            sentence: string;
+            /** Failure */
+            failure: number[] | null;
+            /** Bound */
+            bound: number;
+            /** Error */
+            error: number | null;
+            /** Repaired */
+            repaired: number | null;
+            repair: components["schemas"]["RepairedInterval"] | null;
+            /** Replays */
+            replays: number;
         };
         /**
          * StudyFilter
@@ -1687,6 +1720,7 @@ export type RecordingEntry = components['schemas']['RecordingEntry'];
 export type RecordingList = components['schemas']['RecordingList'];
 export type RecordingRequest = components['schemas']['RecordingRequest'];
 export type RegressionEvent = components['schemas']['RegressionEvent'];
+export type RepairedInterval = components['schemas']['RepairedInterval'];
 export type ReportEntry = components['schemas']['ReportEntry'];
 export type ReportList = components['schemas']['ReportList'];
 export type ReportRequest = components['schemas']['ReportRequest'];
@@ -1694,6 +1728,7 @@ export type ResultViews = components['schemas']['ResultViews'];
 export type Row = components['schemas']['Row'];
 export type RunNames = components['schemas']['RunNames'];
 export type SliceInfo = components['schemas']['SliceInfo'];
+export type SmallestRepair = components['schemas']['SmallestRepair'];
 export type StudyFilter = components['schemas']['StudyFilter'];
 export type StudyInfo = components['schemas']['StudyInfo'];
 export type StudyList = components['schemas']['StudyList'];

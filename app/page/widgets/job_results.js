@@ -146,7 +146,7 @@ function jobState(job) {
  * @param {HTMLElement} [button.next] gets the focus when the button disappears
  */
 export function showJobButton(host, { state, job }, { action, label, progress, press, next }) {
-  const key = `${state} ${label ?? action}`;
+  const key = `${state} ${label || action}`;
   if (host.dataset.key !== key) {
     const hadFocus = host.contains(document.activeElement);
     host.dataset.key = key;

@@ -12,10 +12,12 @@ from urllib.parse import parse_qsl
 import pytest
 from starlette.testclient import TestClient
 
+from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.faults.injection import Faults
-from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.diagnose import diagnose, required_profile
+from beliefscope.inspect.diagnosis.repair import healthy_bound, smallest_repair
 from beliefscope.inspect.diagnostics.views import as_json
 
 pytestmark = pytest.mark.slow
@@ -77,6 +79,28 @@ def wait_for_trace(client: TestClient, query: dict[str, str]) -> Any:
     while "progress" in (reply := client.get(URL, params=query).json()):
         time.sleep(0.05)
     return reply
+
+
+def test_the_smallest_repair_is_that_of_the_command(tmp_path: Path, open_client: Callable[..., TestClient]) -> None:
+    url, faults = "/api/repair/push/crossmodal-ekf/9", "image_occluded=14:from=40:to=60"
+    settings = Settings(workspace=tmp_path)
+    with open_client(settings) as client:
+        assert client.get(url, params={"faults": faults}).json() == {"job": None}
+        job = client.post(url, params={"faults": faults}).json()["job"]
+        assert job["title"] == f"Smallest repair of crossmodal-ekf, push episode 9, {faults}"
+        end = time.monotonic() + TIMEOUT
+        while (answer := client.get(url, params={"faults": faults})).status_code == 202:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        result = answer.json()
+    store = TraceStore(settings)
+    run = store.request(Selection("push", "crossmodal-ekf", 9, Faults.parse(faults)))
+    bound = healthy_bound(required_profile(run.checkpoint).statistics)
+    expected = smallest_repair(run.checkpoint, run.trace, bound, store.dataset("push", "")[1][9])
+    store.close()
+    assert expected is not None
+    assert expected.candidate is not None
+    assert result == as_json({"sentence": expected.sentence, **expected.to_json()})
 
 
 def test_unknown_names_are_reported(client: TestClient) -> None:

@@ -1,0 +1,89 @@
+/** The smallest repair of a run's largest failure, searched by a job: a sentence, and intervals in the timeline. */
+
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Timeline } from '../timeline/timeline.js' */
+/** @import { SmallestRepair } from '../types/server.js' */
+/** @import { Jobs } from '../widgets/jobs.js' */
+
+import { html } from '../core/dom.js';
+import { sentence } from '../core/units.js';
+import * as api from '../data/api.js';
+import { JobResults, showJobButton } from '../widgets/job_results.js';
+import { jobSummary } from '../widgets/jobs.js';
+
+const MAX_RESULTS = 24; // in the cache
+/** Label of the button by state. @type {Record<string, string>} */
+const ACTIONS = { absent: 'Search', ended: 'Try again', error: 'Try again', active: 'Cancel' };
+const ABOUT =
+  'The fewest sensors and the shortest interval to drop or restore so that the largest failure disappears.';
+
+export class Repair {
+  #host;
+  #timeline;
+  /** @type {JobResults<SmallestRepair>} */
+  #results;
+  /** @type {Trace | null} */
+  #trace = null;
+  #loading = new AbortController();
+  /** @type {SmallestRepair | null} */
+  #drawn = null; // in the timeline
+
+  /**
+   * @param {HTMLElement} host
+   * @param {Jobs} jobs
+   * @param {Timeline} timeline displays the failure and the repair
+   */
+  constructor(host, jobs, timeline) {
+    this.#host = host;
+    this.#timeline = timeline;
+    this.#results = new JobResults(jobs, MAX_RESULTS, (finished) =>
+      this.#trace && finished.includes(this.#key) ? this.show(this.#trace) : this.#draw(),
+    );
+  }
+
+  /** Forgets the run, after the timeline has got another one. */
+  clear() {
+    [this.#trace, this.#drawn] = [null, null];
+  }
+
+  /**
+   * Shows the repair of a run, or the state of its search.
+   * @param {Trace} trace
+   */
+  show(trace) {
+    this.#trace = trace;
+    this.#loading.abort();
+    const { signal } = (this.#loading = new AbortController());
+    this.#host.hidden = Boolean(trace.live);
+    if (trace.live) return;
+    this.#results.load(this.#key, () => api.repair(trace.selection, signal), signal);
+  }
+
+  get #key() {
+    return JSON.stringify(this.#trace?.selection);
+  }
+
+  #draw() {
+    const trace = this.#trace;
+    if (!trace || trace.live) return;
+    const entry = this.#results.get(this.#key);
+    html('.verdict', this.#host).textContent = textOf(entry);
+    showJobButton(html('.doing', this.#host), entry, {
+      action: ACTIONS[entry.state] ?? '',
+      label: entry.state === 'absent' ? 'Search the smallest repair' : '',
+      progress: 'Progress of the search for the smallest repair',
+      press: () => this.#results.startOrCancel(this.#key, () => api.startRepair(trace.selection)),
+    });
+    const result = entry.state === 'ready' ? entry.result : null;
+    if (result !== this.#drawn) this.#timeline.showRepair(result);
+    this.#drawn = result;
+  }
+}
+
+/** @param {import('../widgets/job_results.js').JobResult<SmallestRepair>} entry */
+function textOf(entry) {
+  if (entry.state === 'ready') return entry.result.sentence;
+  if (entry.state === 'error') return sentence(entry.error);
+  if (entry.state === 'active' || entry.state === 'ended') return jobSummary(entry.job);
+  return ABOUT;
+}
