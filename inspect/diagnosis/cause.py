@@ -112,7 +112,7 @@ class Candidate:
 
     Attributes:
         cause: catalog entry.
-        probability: that it is the cause; those of all causes, and of an unknown one, sum to one.
+        probability: that it is present, alone or together with another cause.
         episodes: indices of the affected episodes.
         steps: first affected step and first step after it; None for complete episodes.
         evidence: deviations that support it, largest first.

@@ -18,8 +18,8 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence, Recovery
-from beliefscope.inspect.diagnosis.interventions import recovery, replay_without
-from beliefscope.inspect.diagnosis.scoring import applicable, burden, probabilities, score
+from beliefscope.inspect.diagnosis.interventions import ratios, recovery, replay_without
+from beliefscope.inspect.diagnosis.scoring import Explanation, applicable, burden, explain, probabilities
 from beliefscope.inspect.diagnosis.sensor_checks import localise
 from beliefscope.inspect.diagnosis.setting import Setting
 from beliefscope.inspect.diagnosis.statistics import episode_statistics, with_scatter
@@ -49,10 +49,28 @@ WORTH_UNDOING = 0.02
 RESTORED = 0.3
 """Weight of the restored share of all deviations in the score of a cause that was undone."""
 
-VISIBLE = {"error//all": 1.2, "nees/fused/all": 2.0}
-"""Statistic -> ratio to its healthy value, or inverse ratio, from which a fault affects the filter."""
+VISIBLE = {"error//all": 1.2, "angle error//all": 1.2, "nees/fused/all": 2.0}
+"""Statistic -> ratio to its healthy value, or inverse ratio of the NEES, from which a fault affects the filter."""
+
+UNDONE_SHARE = 0.5
+"""Smallest share of all deviations that disappears if the right cause was undone completely."""
 
 Rows = Sequence[Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Effect of undoing a cause.
+
+    Attributes:
+        restored: share of all deviations that disappears.
+        ratios: statistic of ``VISIBLE`` -> value with the fault relative to that without it; empty if the cause cannot
+            be undone completely.
+    """
+
+    recovery: Recovery
+    restored: float
+    ratios: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -117,10 +135,14 @@ def diagnose(
     setting = Setting(checkpoint, episodes, particles, frozenset(episodes))
     case = examine(setting, traces, profile, alarm_rate)
     report(0.5)
-    scores = signature_scores(case)
-    recovered = confirm(case, scores, seed, base, lambda share: report(0.5 + 0.5 * share)) if case.alarms else {}
+    if not case.alarms:
+        report(1.0)
+        return _healthy(case)
+    affected = focus(case)
+    explanations = explain_all(affected)
+    effects = confirm(affected, explanations, seed, base, lambda share: report(0.5 + 0.5 * share))
     report(1.0)
-    return _conclude(case, scores, recovered)
+    return _conclude(case, affected, explanations, effects)
 
 
 def preliminary(checkpoint: Checkpoint, trace: Trace, particles: int = 300, alarm_rate: float = 0.05) -> Diagnosis:
@@ -130,7 +152,7 @@ def preliminary(checkpoint: Checkpoint, trace: Trace, particles: int = 300, alar
     """
     setting = Setting(checkpoint, {trace.episode_index: trace.episode}, particles, frozenset({trace.episode_index}))
     case = examine(setting, [trace], required_profile(checkpoint), alarm_rate)
-    return _conclude(case, signature_scores(case), {})
+    return _conclude(case, case, explain_all(case), {}) if case.alarms else _healthy(case)
 
 
 def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
@@ -146,26 +168,50 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
 def examine(setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, alarm_rate: float) -> Case:
     """Compare all statistics of traces with the healthy profile."""
     rows = [episode_statistics(trace, setting.checkpoint, profile.reference) for trace in traces]
-    profile, rows = with_scatter(profile, rows)
-    comparison = compare(profile, rows)
-    deviations = with_critical_values(profile, comparison, alarm_rate)
-    return Case(setting, traces, rows, profile, deviations, comparison.p_value, alarm_rate)
+    return _compared(setting, traces, rows, profile, alarm_rate)
 
 
-def signature_scores(case: Case) -> dict[str, float]:
-    """Score by name of the causes that can be observed."""
-    causes = applicable(CAUSES, case.by_statistic)
-    return {cause.name: score(cause, case.deviations) for cause in causes}
+def _compared(
+    setting: Setting, traces: Sequence[Trace], rows: Rows, profile: HealthyProfile, alarm_rate: float
+) -> Case:
+    scattered, all_rows = with_scatter(profile, rows)
+    comparison = compare(scattered, all_rows)
+    deviations = with_critical_values(scattered, comparison, alarm_rate)
+    return Case(setting, traces, all_rows, profile, deviations, comparison.p_value, alarm_rate)
+
+
+def focus(case: Case) -> Case:
+    """The episodes with the largest alarm, if it does not concern the others; otherwise all of them."""
+    alarm = case.alarms[0]
+    hit = _affected(case, case.alarms)
+    others = [row.get(alarm.statistic, np.nan) for row, chosen in zip(case.rows, hit, strict=True) if not chosen]
+    if not others or not alarm.low <= np.nanmean(others) <= alarm.high:
+        return case
+    traces = [trace for trace, chosen in zip(case.traces, hit, strict=True) if chosen]
+    rows = [row for row, chosen in zip(case.rows, hit, strict=True) if chosen]
+    episodes = {trace.episode_index: case.setting.episodes[trace.episode_index] for trace in traces}
+    setting = replace(case.setting, episodes=episodes, affected=frozenset(episodes))
+    part = replace(_compared(setting, traces, rows, case.profile, case.alarm_rate), p_value=case.p_value)
+    return part if part.alarms else case
+
+
+def explain_all(case: Case) -> dict[str, Explanation]:
+    """How well each cause that can be observed explains all deviations, by name."""
+    return {c.name: explain(c, case.deviations) for c in applicable(CAUSES, case.by_statistic)}
 
 
 def confirm(
-    case: Case, scores: dict[str, float], seed: int, base: Checkpoint | None, progress: Callable[[float], None]
-) -> dict[str, Recovery]:
-    """Undo the most probable causes; updates their scores by the share of all deviations that disappears."""
+    case: Case,
+    explanations: dict[str, Explanation],
+    seed: int,
+    base: Checkpoint | None,
+    progress: Callable[[float], None],
+) -> dict[str, Effect]:
+    """Undo the most probable causes; adds the share of all deviations that disappears to their support."""
     by_name = {cause.name: cause for cause in CAUSES}
-    likely = sorted(((p, name) for name, p in probabilities(scores).items() if p >= WORTH_UNDOING), reverse=True)
+    likely = sorted(((p, name) for name, p in probabilities(explanations).items() if p >= WORTH_UNDOING), reverse=True)
     before = burden(case.deviations)
-    recovered: dict[str, Recovery] = {}
+    effects: dict[str, Effect] = {}
     for number, (_, name) in enumerate(likely[:UNDONE], 1):
         alarms = _evidence_alarms(case, by_name[name])
         affected = _affected(case, alarms)
@@ -173,37 +219,55 @@ def confirm(
         indices = [trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit]
         setting = replace(case.setting, affected=frozenset(indices), steps=steps)
         if (replay := replay_without(by_name[name], setting, case.by_statistic, seed, base)) is not None:
-            recovered[name] = recovery(case.traces, replay)
             after = examine(setting, replay, case.profile, case.alarm_rate)
-            left = burden(after.deviations)
-            scores[name] += RESTORED * max(0.0, 1.0 - left / before)
+            restored = max(0.0, 1.0 - burden(after.deviations) / before)
+            complete = restored > UNDONE_SHARE and not by_name[name].undo.startswith("drop")
+            changes = ratios(VISIBLE, case.rows, after.rows) if complete else {}
+            effects[name] = Effect(recovery(case.traces, replay), restored, changes)
+            old = explanations[name]
+            explanations[name] = replace(old, support=old.support + RESTORED * restored)
         progress(number / min(UNDONE, len(likely)))
-    return recovered
+    return effects
 
 
-def _conclude(case: Case, scores: Mapping[str, float], recovered: Mapping[str, Recovery]) -> Diagnosis:
-    provenance = _provenance(case)
-    if not case.alarms:
-        text = f"Healthy: all statistics are within the record of {case.profile.episodes} healthy episodes."
-        return Diagnosis("healthy", False, text, (), provenance)
+def _healthy(case: Case) -> Diagnosis:
+    text = f"Healthy: all statistics are within the record of {case.profile.episodes} healthy episodes."
+    return Diagnosis("healthy", False, text, (), _provenance(case))
+
+
+def _conclude(
+    case: Case, affected: Case, explanations: Mapping[str, Explanation], effects: Mapping[str, Effect]
+) -> Diagnosis:
     by_name = {cause.name: cause for cause in CAUSES}
-    ranked = sorted(probabilities(scores).items(), key=lambda item: -item[1])[:LISTED]
-    candidates = tuple(_candidate(case, by_name[name], p, recovered.get(name)) for name, p in ranked)
+    ranked = sorted(probabilities(explanations).items(), key=lambda item: -item[1])[:LISTED]
+    candidates = tuple(_candidate(affected, by_name[name], p, effects.get(name)) for name, p in ranked)
     sure = bool(candidates) and candidates[0].probability >= SURE
     state: Literal["fault", "unsure"] = "fault" if sure else "unsure"
-    masked = not _visible(case, candidates[0].recovered if candidates else None)
-    return Diagnosis(state, masked, _headline(case, candidates, masked), candidates, provenance)
+    masked = not _visible(case, effects.get(candidates[0].cause.name) if sure else None)
+    headline = _headline(affected, candidates, masked, len(case.rows))
+    return Diagnosis(state, masked, headline, candidates, _provenance(case))
 
 
-def _visible(case: Case, recovered: Recovery | None) -> bool:
-    """Whether a fault affects the filter: its error or calibration differ, or undoing the fault reduces the error."""
-    if recovered is not None and recovered.error > 1.0 - 1.0 / VISIBLE["error//all"]:
-        return True
-    found = ((case.by_statistic.get(name), limit) for name, limit in VISIBLE.items())
-    return any(d is not None and not d.healthy / limit < d.value < d.healthy * limit for d, limit in found)
+def _visible(case: Case, effect: Effect | None) -> bool:
+    """Whether a fault affects the filter: its error or calibration differ from those without the fault.
+
+    If it was undone, these are known for the same episodes; otherwise they must also be outside of the healthy range.
+    """
+    if effect is not None and effect.ratios:
+        return any(_large(name, ratio) for name, ratio in effect.ratios.items())
+    found = (case.by_statistic.get(name) for name in VISIBLE)
+    return any(
+        _large(d.statistic, d.value / d.healthy) and not d.low <= d.value <= d.high for d in found if d is not None
+    )
 
 
-def _candidate(case: Case, cause: Cause, probability: float, recovered: Recovery | None) -> Candidate:
+def _large(statistic: str, ratio: float) -> bool:
+    """Whether a statistic of ``VISIBLE`` changes by its limit; errors that decrease do not count."""
+    limit = VISIBLE[statistic]
+    return ratio > limit or (statistic.startswith("nees") and ratio < 1.0 / limit)
+
+
+def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:
     alarms = _evidence_alarms(case, cause)
     affected = _affected(case, alarms)
     task, name = case.setting.checkpoint.task.name, case.setting.checkpoint.name
@@ -213,7 +277,7 @@ def _candidate(case: Case, cause: Cause, probability: float, recovered: Recovery
         episodes=tuple(trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit),
         steps=_steps(case, alarms[0], affected) if alarms else None,
         evidence=tuple(_evidence(case, alarm) for alarm in alarms[:EVIDENCE]),
-        recovered=recovered,
+        recovered=None if effect is None else effect.recovery,
         next=cause.next.format(task=task, filter=name),
     )
 
@@ -250,11 +314,14 @@ def _affected(case: Case, alarms: Sequence[Deviation]) -> np.ndarray:
     return np.asarray(distance >= 0.5 * np.nanmax(distance))
 
 
-def _headline(case: Case, candidates: Sequence[Candidate], masked: bool) -> str:
-    """The first cause with its probability; two causes that cannot be separated; or the largest deviation."""
+def _headline(case: Case, candidates: Sequence[Candidate], masked: bool, count: int) -> str:
+    """The first cause, or two, with their probability; two that cannot be separated; or the largest deviation.
+
+    count: number of all episodes.
+    """
     if not candidates or not candidates[0].evidence:
         return f"Fault of unknown cause: {case.alarms[0].text}."
-    first, count = candidates[0], len(case.rows)
+    first = candidates[0]
     if first.probability < SURE and len(candidates) > 1 and candidates[1].probability > COMPARABLE * first.probability:
         return f"Cannot separate {first.cause.name} from {candidates[1].cause.name}; try: {first.next}"
     since = f" from step {first.steps[0]}" if first.steps is not None and first.steps[0] > 0 else ""
@@ -262,6 +329,8 @@ def _headline(case: Case, candidates: Sequence[Candidate], masked: bool) -> str:
     where = f" in episode {first.episodes[0]}" if len(first.episodes) == 1 < count else where
     title = first.cause.title if first.probability >= SURE else f"Possibly: {first.cause.title}"
     text = f"{title}{since}{where}, probability {first.probability:.2f}"
+    if len(candidates) > 1 and (second := candidates[1]).probability >= SURE:
+        text += f"; and {second.cause.title[0].lower()}{second.cause.title[1:]}, probability {second.probability:.2f}"
     return f"{text}; the filter is unaffected" if masked else text
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -43,6 +43,16 @@ def recovery(before: Sequence[Trace], after: Sequence[Trace]) -> Recovery:
         return Recovery(np.nan, np.nan, np.nan, nll)
     share, low, high = jackknife(sums, _removed)
     return Recovery(float(share), float(low), float(high), nll)
+
+
+def ratios(
+    statistics: Iterable[str], before: Sequence[Mapping[str, float]], after: Sequence[Mapping[str, float]]
+) -> dict[str, float]:
+    """Statistic -> its mean over the episodes before relative to after the undo; absent where it is unknown."""
+    means = {
+        name: [np.mean([row.get(name, np.nan) for row in rows]) for rows in (before, after)] for name in statistics
+    }
+    return {name: float(a / b) for name, (a, b) in means.items() if np.isfinite(a / b)}
 
 
 def negative_log_likelihood(trace: Trace) -> float:

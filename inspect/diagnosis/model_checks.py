@@ -22,6 +22,7 @@ from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.diagnosis.equation_checks import equation_statistics
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array
+from beliefscope.inspect.statistics.signals import lag
 from beliefscope.inspect.trace import Trace
 
 EVERY = 4
@@ -52,18 +53,26 @@ MIN_STEPS = 10
 def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
     """``KIND/SUBJECT/PHASE`` -> value, SI units, of all modules.
 
-    ``error``: root mean square position error of the estimate. Statistics that do not apply are absent.
+    Statistics that do not apply are absent.
     """
     if isinstance(checkpoint, ExternalFilter):
         return {}
     values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
     if np.isfinite(trace.episode.states).all():
-        values["error//all"] = float(
-            np.sqrt(np.square(measures.position_error(trace)[measures.counted(trace), -1]).mean())
-        )
+        values |= error_statistics(trace)
         values |= measurement_statistics(trace, checkpoint)
         values |= dynamics_statistics(trace.episode, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def error_statistics(trace: Trace) -> dict[str, float]:
+    """Root mean square errors of the estimate: ``error`` of the position in m, ``angle error`` of the angles in rad."""
+    at = measures.counted(trace)
+    values = {"error//all": float(np.sqrt(np.square(measures.position_error(trace)[at, -1]).mean()))}
+    angles = [i for i, c in enumerate(measures.task_of(trace).components) if c.unit == "rad"]
+    if angles:
+        values["angle error//all"] = float(np.sqrt(np.square(measures.errors(trace)[at, -1][:, angles]).mean()))
+    return values
 
 
 def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
@@ -115,7 +124,8 @@ def likelihood_moments(
     """Means (S, K, n) and variances (S, K, n) of the likelihoods at some steps, as densities of the state; SI units.
 
     The means are those of likelihoods raised to a power, so that they have the same variance ``POWER^2`` of their
-    logarithm over fixed states; also returns this variance (S, K, 1) of the likelihoods themselves.
+    logarithm over fixed states. Also returns this variance (S, K, 1) around the mean of the likelihood itself, where
+    it does not depend on the true state.
 
     Self-normalised importance sampling from a mixture of Gaussians around the true state with the standard deviations
     ``SCALES``: wide enough for a biased likelihood and dense enough for a narrow one. All steps share the offsets.
@@ -137,11 +147,13 @@ def likelihood_moments(
     spread = log_likelihood[..., REFERENCE].std(-1, keepdim=True).clamp_min(1e-6)
     mean, _ = _moments(POWER / spread * log_likelihood - log_density, offsets)
     _, variance = _moments(log_likelihood - log_density, offsets)
+    around = truth[:, None, None] + mean.unsqueeze(2) + offsets[REFERENCE]  # (S, K, G', n)
+    own = torch.stack([filter_.log_likelihood(by_step, around[:, k])[:, k] for k in range(around.shape[1])], dim=1)
     si, std = filter_.statistics, filter_.statistics.mean_std("state")[1]
     # One sample may have all the weight: the likelihood is then narrower than the spacing of the samples.
     variance = variance.clamp_min((0.1 * SCALES[0]) ** 2) * std.square()
     mean = si.state_to_si(truth.unsqueeze(1) + mean)
-    return mean.double().numpy(), variance.double().numpy(), spread.square().double().numpy()
+    return mean.double().numpy(), variance.double().numpy(), own.var(-1, keepdim=True).double().numpy()
 
 
 def _moments(log_weights: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -164,9 +176,10 @@ def proposal(n: int) -> tuple[Tensor, Tensor]:
 def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, float]:
     """Of the dynamics model from the true previous state, by component, with residual r and process noise q.
 
-    ``dynamics bias``: mean of r. ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2.
-    ``dynamics slope``: slope of the predicted on the true change, for components that move enough. ``dynamics spread``:
-    standard deviation of r that neither bias nor slope explains. ``process noise``: q.
+    ``dynamics error``: root mean square of r. ``dynamics nis``: mean of (r / q)^2. ``dynamics slope``: slope of the
+    predicted on the true change, for components that move enough. ``dynamics bias`` and ``dynamics spread``: mean and
+    standard deviation of r that the slope does not explain. ``process noise``: q. ``lag/dynamics``: steps by which the
+    true changes follow the predicted ones.
     """
     filter_ = checkpoint.filter
     if not isinstance(getattr(filter_, "dynamics", None), Dynamics) or len(episode) < MIN_STEPS:
@@ -185,7 +198,7 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     centred, around = residual - residual.mean(0), change - change.mean(0)
     excess = np.where(moved, (centred * around).sum(0) / np.maximum(np.square(around).sum(0), 1e-12), 0.0)
     columns = {
-        "dynamics bias": residual.mean(0),
+        "dynamics bias": residual.mean(0) - excess * change.mean(0),
         "dynamics error": np.sqrt(np.square(residual).mean(0)),
         "dynamics nis": (np.square(residual) / noise**2).mean(0),
         "dynamics slope": np.where(moved, 1.0 + excess, np.nan),
@@ -195,6 +208,9 @@ def dynamics_statistics(episode: Episode, checkpoint: Checkpoint) -> dict[str, f
     for kind, column in columns.items():
         for component, value in zip(filter_.task.components, column, strict=True):
             values[f"{kind}/{component.name}/all"] = float(value)
+    if moved.any():
+        scaled = (change + residual)[:, moved] / std[moved], change[:, moved] / std[moved]
+        values["lag/dynamics/all"] = lag(scaled[1], scaled[0])[0]
     return values
 
 

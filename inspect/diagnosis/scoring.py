@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,6 +29,9 @@ TEMPERATURE = 0.15
 
 UNKNOWN = -0.3
 """Score of a cause outside of the catalog, which explains nothing."""
+
+PAIR = 0.3
+"""Penalty of two causes at a time."""
 
 
 def strength(ratio: float) -> float:
@@ -71,8 +75,28 @@ def _agreement(target: str, deviations: Sequence[Deviation]) -> float:
     return math.tanh(ratio if target == "common" else -ratio)
 
 
-def score(cause: Cause, deviations: Iterable[Deviation]) -> float:
-    """How well a cause explains all deviations, -2 to 1: support of its symptoms minus unexplained deviations.
+@dataclass(frozen=True)
+class Explanation:
+    """How well a cause explains all deviations.
+
+    Attributes:
+        component: of the cause.
+        support: of its symptoms, -1 to 1, and of its prior and the effect of undoing it.
+        unexplained: kind and subject of deviations that it does not explain -> strength of the largest.
+    """
+
+    component: str
+    support: float
+    unexplained: Mapping[str, float]
+
+    @property
+    def score(self) -> float:
+        """Support minus the probability that an unexplained deviation is real, if they are independent."""
+        return self.support - (1.0 - math.prod(1.0 - size for size in self.unexplained.values()))
+
+
+def explain(cause: Cause, deviations: Iterable[Deviation]) -> Explanation:
+    """Support of the symptoms of a cause, and the deviations that it leaves unexplained.
 
     Statistics of one kind and subject in several phases count once, by their largest deviation.
     """
@@ -94,8 +118,28 @@ def score(cause: Cause, deviations: Iterable[Deviation]) -> float:
     weights = [symptom.weight for symptom in cause.symptoms]
     supports = [support(s, found) for s, found in zip(cause.symptoms, members, strict=True)]
     total = sum(w * s for w, s in zip(weights, supports, strict=True)) / sum(weights)
-    # Probability that at least one unexplained deviation is real, if they are independent.
-    return cause.prior + total - (1.0 - math.prod(1.0 - size for size in unexplained.values()))
+    return Explanation(cause.component, cause.prior + total, unexplained)
+
+
+def probabilities(explanations: Mapping[str, Explanation]) -> dict[str, float]:
+    """Probability that each cause is present: alone, together with another one, or neither of an unknown cause.
+
+    A hypothesis is one cause, or two of different components, which have the mean of their supports and leave
+    unexplained what neither explains. The probabilities are a softmax of the scores.
+    """
+    groups = sorted({group for explanation in explanations.values() for group in explanation.unexplained})
+    left = np.array([[e.unexplained.get(group, 0.0) for group in groups] for e in explanations.values()])
+    supports = np.array([e.support for e in explanations.values()])
+    left = left.reshape(len(supports), len(groups))
+    components = np.array([e.component for e in explanations.values()])
+    excluded = (components[:, None] == components) | (components == "data") | (components == "data")[:, None]
+    pairs = np.where(excluded, -np.inf, (supports[:, None] + supports) / 2.0 - PAIR)
+    np.fill_diagonal(pairs, supports)
+    scores = pairs - (1.0 - np.prod(1.0 - np.minimum(left[:, None], left), axis=-1))
+    shares = np.exp((np.triu(scores) + np.tril(np.full_like(scores, -np.inf), -1)) / TEMPERATURE)
+    shares /= shares.sum() + math.exp(UNKNOWN / TEMPERATURE)
+    present = shares.sum(0) + shares.sum(1) - np.diagonal(shares)
+    return dict(zip(explanations, present.tolist(), strict=True))
 
 
 def burden(deviations: Iterable[Deviation]) -> float:
@@ -106,14 +150,6 @@ def burden(deviations: Iterable[Deviation]) -> float:
         weight = OF_FILTER if matches(FILTER, deviation.statistic) else 1.0
         largest[group] = max(largest.get(group, 0.0), weight * strength(abs(deviation.t)))
     return sum(largest.values())
-
-
-def probabilities(scores: Mapping[str, float], temperature: float = TEMPERATURE) -> dict[str, float]:
-    """Softmax of scores, with an unknown cause in the denominator."""
-    values = np.array([*scores.values(), UNKNOWN]) / temperature
-    shares = np.exp(values - values.max())
-    shares /= shares.sum()
-    return dict(zip(scores, shares[:-1].tolist(), strict=True))
 
 
 def applicable(causes: Sequence[Cause], statistics: Iterable[str]) -> list[Cause]:

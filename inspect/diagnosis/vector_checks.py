@@ -22,9 +22,15 @@ MIN_MOTION = 1e-3
 
 
 def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
-    """Level, drift, noise, repeated and saturated readings of each axis of a vector sensor (T, d)."""
+    """Level, drift, changes, noise, repeated and saturated readings of each axis of a vector sensor (T, d).
+
+    Changes are the 90 % quantile of second differences in free motion: neither a bias nor a drift matters, wherever
+    it begins, but contact without its flag does.
+    """
     readings = episode.observations[key].astype(np.float64)
-    level, slope = robust_line(readings, free_motion(episode))
+    calm = free_motion(episode)
+    level, slope = robust_line(readings, calm)
+    change = np.abs(np.diff(readings, n=2, axis=0))[calm[2:] & calm[1:-1] & calm[:-2]]
     noise = noise_level(readings)
     values: dict[str, float] = {}
     for i in range(readings.shape[1]):
@@ -32,6 +38,7 @@ def axis_statistics(episode: Episode, key: str) -> dict[str, float]:
         values |= {
             f"level/{axis}/free motion": float(level[i]),
             f"drift/{axis}/free motion": float(slope[i] / episode.dt),
+            f"change/{axis}/free motion": float(np.quantile(change[:, i], 0.9)) if len(change) else np.nan,
             f"noise/{axis}/all": float(noise[i]),
             f"stuck/{axis}/all": float(stuck(episode, key, i).mean()),
             f"saturation/{axis}/all": float(saturated(readings[:, i]).mean()),

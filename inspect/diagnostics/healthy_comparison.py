@@ -45,6 +45,7 @@ KINDS = {
     "regret": ("error relative to the oracle's weights", True, 0.02),
     "ess": ("effective sample size", True, 0.05),
     "error": ("RMS position error", True, 0.02),
+    "angle error": ("RMS error of angles in rad", True, 0.02),
     "module bias": ("bias of the measurement model", False, 5e-4),
     "module error": ("error of the measurement model", True, 0.02),
     "module std": ("predicted standard deviation of the measurement model", True, 0.02),
@@ -79,6 +80,7 @@ KINDS = {
     "offset": ("offset from the measured hand or the estimates (m, rad)", False, 0.002),
     "level": ("reading (N, N m) at the start", False, 0.15),
     "drift": ("drift (N/s, N m/s)", False, 0.01),
+    "change": ("second difference (N, N m)", False, 0.05),
     "noise": ("noise (gray levels, N, N m)", False, 0.02),
     "position noise": ("noise in m", False, 5e-4),
     "stuck": ("share of repeated readings", False, 0.02),
@@ -94,6 +96,12 @@ KINDS = {
 }
 """Kind of statistic -> display name, whether it is compared on a logarithmic scale, and on this scale the smallest
 standard deviation between trajectories, below which differences are irrelevant."""
+
+RISING = frozenset(
+    {"error", "angle error", "regret", "outside", "black", "frozen", "occlusion", "change"}
+    | {"module error", "module scatter", "dynamics error"}
+)
+"""Kinds of statistics whose decrease is no sign of a fault."""
 
 
 @dataclass(frozen=True)
@@ -200,9 +208,9 @@ def compare(profile: HealthyProfile, trajectories: Sequence[Mapping[str, float]]
     names, values = [name for name, kept in zip(names, keep, strict=True) if kept], values[:, keep]
     if not names:
         return Comparison(count, profile.episodes, profile.data, ())
-    scaled, floor = _scaled(names, values)
+    scaled, floor, rising = _scaled(names, values)
     divisions = np.concatenate([np.arange(len(values))[None] < count, _divisions(len(values), count, seed)])
-    t, effect = _t_values(scaled, divisions, floor)
+    t, effect = _t_values(scaled, divisions, floor, rising)
     # Rounding must not distinguish a division from itself.
     largest = np.abs(t).max(1) * (1.0 + 1e-9)
     at_least = (largest[1:, None] >= np.abs(t[0])).sum(0)
@@ -241,9 +249,9 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, signif
     statistic is proportional to its own high quantile, so that a share of healthy samples has an alarm.
     """
     names = [deviation.statistic for deviation in comparison.deviations]
-    values, floor = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
+    values, floor, rising = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
     count = min(comparison.trajectories, profile.episodes // 2)
-    t = np.abs(_t_values(values, _divisions(profile.episodes, count, 0), floor)[0])
+    t = np.abs(_t_values(values, _divisions(profile.episodes, count, 0), floor, rising)[0])
     own = _own_scale(t, t, count == 1)
     limit = np.quantile((t / own).max(1), 1.0 - significance)
     critical = limit * (own if own.ndim == 1 else np.maximum(t.max(0), SMALLEST_T))
@@ -255,11 +263,12 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, signif
     return tuple(sorted(result, key=lambda deviation: -abs(deviation.t)))
 
 
-def _scaled(names: Sequence[str], values: Array) -> tuple[Array, Array]:
-    """Values (N, S) on the scale of their kind, and the smallest standard deviations (S,)."""
+def _scaled(names: Sequence[str], values: Array) -> tuple[Array, Array, np.ndarray]:
+    """Values (N, S) on the scale of their kind, smallest standard deviations (S,), and whether ``RISING`` (S,)."""
     settings = [KINDS.get(name.split("/")[0], ("", False, 1e-9)) for name in names]
     logarithmic, floor = np.array([s[1] for s in settings]), np.array([s[2] for s in settings])
-    return np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values), floor
+    rising = np.array([name.split("/")[0] in RISING for name in names])
+    return np.where(logarithmic, np.log(np.maximum(values, 1e-12)), values), floor, rising
 
 
 @lru_cache(maxsize=16)
@@ -271,8 +280,11 @@ def _divisions(total: int, count: int, seed: int) -> np.ndarray:
     return order < count
 
 
-def _t_values(values: Array, divisions: np.ndarray, floor: Array) -> tuple[Array, Array]:
-    """(B, S) t-values and effects in standard deviations of values (N, S) for divisions (B, N). NaN is missing."""
+def _t_values(values: Array, divisions: np.ndarray, floor: Array, rising: np.ndarray) -> tuple[Array, Array]:
+    """(B, S) t-values and effects in standard deviations of values (N, S) for divisions (B, N). NaN is missing.
+
+    Both are zero for a decrease of a ``rising`` statistic (S,).
+    """
     known = np.isfinite(values)
     present = known.astype(np.float64)
     centred = np.where(known, values - np.nanmean(values, axis=0), 0.0)
@@ -285,7 +297,7 @@ def _t_values(values: Array, divisions: np.ndarray, floor: Array) -> tuple[Array
     variance = np.maximum(squares - others * rest**2, 0.0) / np.maximum(others - 1.0, 1.0)
     effect = (mean - rest) / np.maximum(np.sqrt(variance), floor)
     valid = (count >= 1.0) & (others >= 2.0)
-    effect = np.where(valid, effect, 0.0)
+    effect = np.where(valid & ~(rising & (effect < 0.0)), effect, 0.0)
     return effect / np.sqrt(1.0 / np.maximum(count, 1.0) + 1.0 / np.maximum(others, 1.0)), effect
 
 

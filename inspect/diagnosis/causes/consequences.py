@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-FILTER = "error/*|nees/*|nis/*|autocorrelation/*|weight/*|beta/*|regret/*|ess/*|outside/*|ancestors/*|offspring/*"
+FILTER = (
+    "error/*|angle error/*|nees/*|nis/*|autocorrelation/*|weight/*|beta/*|regret/*|ess/*|outside/*|ancestors/*"
+    "|offspring/*"
+)
 """Belief of the filter, and the use of its modules."""
 
 WEIGHTS = f"beta logit/*|beta spread/*|beta contact/*|{FILTER}"

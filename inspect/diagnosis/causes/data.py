@@ -3,32 +3,37 @@
 from __future__ import annotations
 
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, LABELS, WEIGHTS
+from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, FILTER, LABELS, WEIGHTS
 
 MODULES = f"module */*|{WEIGHTS}|{DYNAMICS}"
+
+BY_LABELS = "|".join(f"module {kind}/*" for kind in ("bias", "error", "nis", "spread", "scatter"))
+"""Statistics of modules that compare them with the labels."""
 
 CAUSES = (
     Cause(
         "labels.delay",
         "Labels delayed",
-        (Symptom("lag/labels*", 1), Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0)),
-        f"{LABELS}|{MODULES}",
+        (
+            Symptom("lag/labels*|lag/dynamics/*", 1, 2.0),
+            Symptom("dynamics error/*|dynamics spread/*|dynamics slope/*", 0),
+        ),
+        f"{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
         "Synchronise the clock of the motion capture with the sensors.",
     ),
     Cause(
         "labels.offset",
         "Labels offset",
         (Symptom("module bias/*image*", 0), Symptom("module bias/*", 0, 0.3, "common")),
-        f"{LABELS}|{MODULES}",
+        f"{LABELS}|{BY_LABELS}|{FILTER}|{DYNAMICS}",
         "Register the frame of the motion capture with the robot's.",
     ),
     Cause(
         "data.shift",
         "Data differ from the training data as a whole",
         (
-            Symptom("sharpness/image/*|occlusion/image/*|shift/image*", 0),
-            Symptom("lever/force*|size/force/*|size/torque/*|axes/force/*", 0),
             Symptom("module error/*", 1),
+            Symptom("module power/*|sharpness/image/*|occlusion/image/*|shift/image*|lever/force*|size/*", 0),
         ),
         f"sharpness/*|occlusion/*|shift/*|brightness/*|offset/*|*/force*|*/torque*|*/contact/*|{LABELS}|{MODULES}",
         "Collect data of these conditions and fine-tune: `beliefscope finetune {task} --filter {filter} --data NEW.h5 "

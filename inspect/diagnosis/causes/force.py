@@ -53,7 +53,8 @@ CAUSES = (
         "force.noise",
         "Force noisy",
         (Symptom("noise/force*"),),
-        f"level/force*|drift/force*|direction/force/*|lever/force*|size/force/*|axes/force/*|{CONTACT}|{HAPTICS}",
+        f"level/force*|drift/force*|change/force*|direction/force/*|lever/force*|size/force/*|axes/force/*|{CONTACT}"
+        f"|{HAPTICS}",
         "Check the cable and the filter of the force sensor.",
         "drop haptics",
     ),

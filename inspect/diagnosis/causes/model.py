@@ -18,7 +18,7 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
             f"{name}.bias",
             f"{title} biased",
             (Symptom(f"module bias/{module}", 0), Symptom("module bias/*", 0, 0.3, "alone")),
-            "|".join(f"module {kind}/{module}" for kind in ("error", "nis", "std", "power")) + f"|{LABELS}|{FILTER}",
+            "|".join(f"module {kind}/{module}" for kind in ("error", "nis")) + f"|{LABELS}|{FILTER}",
             retrain,
             f"shift {modality}",
             lowers=f"module spread/{module}|module scatter/{module}",
@@ -44,7 +44,7 @@ def causes_of(modality: str) -> tuple[Cause, ...]:
             f"{title} broken",
             (
                 Symptom(f"module error/{module}|module spread/{module}|module scatter/{module}", 0),
-                Symptom(f"module power/{module}", -1, 0.5),
+                Symptom(f"module power/{module}", 0, 0.5),
             ),
             f"module */{module}|{LABELS}|{FILTER}",
             retrain,

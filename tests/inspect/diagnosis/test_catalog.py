@@ -9,7 +9,15 @@ import pytest
 
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
-from beliefscope.inspect.diagnosis.scoring import applicable, burden, probabilities, score, strength, support
+from beliefscope.inspect.diagnosis.scoring import (
+    Explanation,
+    applicable,
+    burden,
+    explain,
+    probabilities,
+    strength,
+    support,
+)
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
 PAGE = Path(__file__).parents[3] / "docs" / "diagnose.md"
@@ -78,7 +86,7 @@ def ideal(cause: Cause) -> list[Deviation]:
 @pytest.mark.parametrize("cause", CAUSES, ids=lambda cause: cause.name)
 def test_a_cause_explains_its_own_symptoms_best(cause: Cause) -> None:
     deviations = ideal(cause)
-    scores = {other.name: score(other, deviations) for other in CAUSES}
+    scores = {other.name: explain(other, deviations).score for other in CAUSES}
     assert scores[cause.name] == max(scores.values())
     assert scores[cause.name] > 0.5
 
@@ -88,7 +96,7 @@ def test_an_unexplained_deviation_upstream_excludes_a_cause() -> None:
     module, camera = deviation("module power/image/all", 10.0), deviation("shift/image x/all", 10.0)
     belief = deviation("nees/fused/all", 10.0)
     alone, with_belief, with_camera = (
-        score(overconfident, deviations) for deviations in ([module], [module, belief], [module, camera])
+        explain(overconfident, deviations).score for deviations in ([module], [module, belief], [module, camera])
     )
     assert alone == with_belief > 0.9  # the filter follows from its modules
     assert with_camera < 0.1
@@ -123,10 +131,24 @@ def test_strength_grows_from_insignificance_to_one() -> None:
 
 
 def test_probabilities_include_an_unknown_cause() -> None:
-    assert probabilities({"a": -2.0})["a"] < 0.01
-    assert probabilities({"a": 1.0})["a"] > 0.99
-    both = probabilities({"a": 0.5, "b": 0.5})
-    assert both["a"] == both["b"] == pytest.approx(0.5, abs=0.01)
+    def alone(**supports: float) -> dict[str, float]:
+        return probabilities({name: Explanation(name, support, {}) for name, support in supports.items()})
+
+    assert alone(a=-2.0)["a"] < 0.01
+    assert alone(a=1.0)["a"] > 0.99
+    both = alone(a=0.5, b=0.5)
+    assert both["a"] == both["b"] == pytest.approx(0.5, abs=0.1)
+
+
+def test_two_causes_are_probable_if_each_explains_what_the_other_does_not() -> None:
+    first, second = Explanation("b", 1.0, {"noise/force x": 1.0}), Explanation("c", 1.0, {"black/image": 1.0})
+    other = Explanation("d", 1.0, {"black/image": 1.0, "noise/force x": 1.0})
+    result = probabilities({"first": first, "second": second, "other": other})
+    assert min(result["first"], result["second"]) > 0.9
+    assert result["other"] < 0.1
+    one = probabilities({"first": Explanation("b", 1.0, {}), "second": second, "other": other})
+    assert one["first"] > 0.99
+    assert max(one["second"], one["other"]) < 0.2
 
 
 def test_causes_that_cannot_be_observed_are_left_out() -> None:
@@ -154,6 +176,6 @@ def test_a_shift_of_all_modalities_is_common(haptics: float, shared: bool) -> No
 def test_a_cause_may_lower_statistics_without_raising_them() -> None:
     bias = next(cause for cause in CAUSES if cause.name == "model.image.bias")
     module = deviation("module bias/image x/all", 10.0)
-    lower, higher = (score(bias, [module, deviation("module spread/image x/all", t)]) for t in (-10.0, 10.0))
-    assert lower == score(bias, [module])
+    lower, higher = (explain(bias, [module, deviation("module spread/image x/all", t)]).score for t in (-10.0, 10.0))
+    assert lower == explain(bias, [module]).score
     assert higher < lower - 0.9

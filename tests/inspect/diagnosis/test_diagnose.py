@@ -6,14 +6,17 @@ import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import pytest
+import torch
 
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.belief import Belief, Evidence
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.diagnosis.diagnose import diagnose
@@ -65,6 +68,29 @@ def test_a_planted_sensor_fault_is_named(faults: str, cause: str) -> None:
         assert 28 <= first.steps[0] <= 32
 
 
+def test_a_fault_in_some_episodes_is_examined_in_these() -> None:
+    episodes = dict(simulated(100, 6)) | {i: faulty("image_frozen=5")[i] for i in (1, 4)}
+    first = diagnose(checkpoint(), episodes, profile=profile()).causes[0]
+    assert (first.cause.name, first.episodes) == ("image.frozen", (1, 4))
+    assert first.evidence[0].value > 0.8  # share of repeated images in these episodes, not in all
+
+
+@pytest.mark.parametrize(("scale", "masked"), [(0.7, True), (0.3, False)])
+def test_a_fault_is_masked_if_undoing_it_changes_little(scale: float, masked: bool) -> None:
+    """The NEES is inversely proportional to the scale of the reported covariance; its limit is 2."""
+    filter_ = copy.deepcopy(checkpoint().filter)
+    step = filter_.step
+
+    def step_with_other_report(belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, Any]:
+        belief, trace = step(belief, evidence, generator)
+        estimate = replace(trace.estimate, covariance=scale * trace.estimate.covariance)
+        return belief, replace(trace, estimate=estimate)
+
+    object.__setattr__(filter_, "step", step_with_other_report)
+    result = diagnose(replace(checkpoint(), filter=filter_), simulated(100, 6), profile=profile())
+    assert (result.causes[0].cause.name, result.masked) == ("covariance.small", masked)
+
+
 def test_a_biased_module_is_named_and_its_error_recovered() -> None:
     filter_ = copy.deepcopy(checkpoint().filter)
     filter_.get_submodule("virtual_sensors.image.state").bias += 0.7
@@ -78,7 +104,9 @@ def test_a_biased_module_is_named_and_its_error_recovered() -> None:
     assert set(document["causes"][0]) == {
         *("cause", "component", "probability", "episodes", "steps", "evidence", "recovered", "next")
     }
-    assert sum(cause["probability"] for cause in document["causes"]) <= 1.0
+    listed = [cause["probability"] for cause in document["causes"]]
+    assert listed == sorted(listed, reverse=True)
+    assert 0.0 <= listed[-1] <= listed[0] <= 1.0
     assert result.tables()
 
 

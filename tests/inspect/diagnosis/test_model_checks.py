@@ -84,8 +84,17 @@ def test_frozen_dynamics_have_slope_zero_and_process_noise_is_reported() -> None
     values = dynamics_statistics(episode(), replace(checkpoint, filter=frozen))
     assert values["dynamics slope/angle/all"] == pytest.approx(0.0, abs=1e-4)
     assert values["dynamics spread/angle/all"] == pytest.approx(0.0, abs=1e-6)
+    assert values["dynamics bias/angle/all"] == pytest.approx(0.0, abs=1e-6)  # the slope explains the missing change
     noise = checkpoint.filter.dynamics.noise[2] * checkpoint.filter.statistics.mean_std("state")[1][2]
     assert values["process noise/angle/all"] == pytest.approx(float(noise))
+
+
+def test_delayed_states_follow_the_predicted_changes() -> None:
+    checkpoint, _ = run("crossmodal-ekf")
+    for steps in (0, 3):
+        states = np.concatenate([np.repeat(episode().states[:1], steps, axis=0), episode().states[: 100 - steps]])
+        late = replace(episode(), states=states)
+        assert dynamics_statistics(late, checkpoint)["lag/dynamics/all"] == steps
 
 
 def test_moments_of_a_gaussian_likelihood(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,7 +84,7 @@ def test_the_statistic_changes_by_the_planted_amount(
         ("force_drift=0.4", "drift/force stuck noise unflagged agreement lag/contact axes lever size direction"),
         ("delay=image:steps=4", "lag/image shift offset sharpness occlusion"),
         ("image_underexposed=0.5", "brightness occlusion sharpness shift offset frozen lag/image"),
-        ("contact_delayed=3", "lag/contact agreement unflagged share level drift size lever axes direction"),
+        ("contact_delayed=3", "lag/contact agreement unflagged share level drift change size lever axes direction"),
     ],
 )
 def test_other_statistics_do_not_change(task: str, faults: str, own: str) -> None:
