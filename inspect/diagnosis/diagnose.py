@@ -52,9 +52,6 @@ RESTORED = 0.3
 VISIBLE = {"error//all": 1.2, "angle error//all": 1.2, "nees/fused/all": 2.0}
 """Statistic -> ratio to its healthy value, or inverse ratio of the NEES, from which a fault affects the filter."""
 
-UNDONE_SHARE = 0.5
-"""Smallest share of all deviations that disappears if the right cause was undone completely."""
-
 Rows = Sequence[Mapping[str, float]]
 
 
@@ -221,8 +218,10 @@ def confirm(
         if (replay := replay_without(by_name[name], setting, case.by_statistic, seed, base)) is not None:
             after = examine(setting, replay, case.profile, case.alarm_rate)
             restored = max(0.0, 1.0 - burden(after.deviations) / before)
-            complete = restored > UNDONE_SHARE and not by_name[name].undo.startswith("drop")
-            changes = ratios(VISIBLE, case.rows, after.rows) if complete else {}
+            left = [
+                d for d in after.deviations if d.alarm and any(s.matches(d.statistic) for s in by_name[name].symptoms)
+            ]
+            changes = {} if left or by_name[name].undo.startswith("drop") else ratios(VISIBLE, case.rows, after.rows)
             effects[name] = Effect(recovery(case.traces, replay), restored, changes)
             old = explanations[name]
             explanations[name] = replace(old, support=old.support + RESTORED * restored)
@@ -251,13 +250,17 @@ def _conclude(
 def _visible(case: Case, effect: Effect | None) -> bool:
     """Whether a fault affects the filter: its error or calibration differ from those without the fault.
 
-    If it was undone, these are known for the same episodes; otherwise they must also be outside of the healthy range.
+    If it was undone, these are known for the same episodes, and other faults must show as alarms; otherwise errors and
+    calibration must be outside of the healthy range.
     """
-    if effect is not None and effect.ratios:
-        return any(_large(name, ratio) for name, ratio in effect.ratios.items())
+    undone = effect is not None and bool(effect.ratios)
+    if effect is not None and any(_large(name, ratio) for name, ratio in effect.ratios.items()):
+        return True
     found = (case.by_statistic.get(name) for name in VISIBLE)
     return any(
-        _large(d.statistic, d.value / d.healthy) and not d.low <= d.value <= d.high for d in found if d is not None
+        _large(d.statistic, d.value / d.healthy) and (d.alarm if undone else not d.low <= d.value <= d.high)
+        for d in found
+        if d is not None
     )
 
 

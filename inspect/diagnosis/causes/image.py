@@ -64,7 +64,7 @@ CAUSES = (
         "image.occlusion",
         "Camera occluded",
         (Symptom("occlusion/image/*"),),
-        f"sharpness/image/*|shift/image*|brightness/image/*|noise/image/*|{HAND}|{IMAGE}",
+        f"sharpness/image/*|shift/image*|brightness/image/*|noise/image/*|lag/image/*|{HAND}|{IMAGE}",
         "Clear the camera's view.",
         "drop image",
     ),

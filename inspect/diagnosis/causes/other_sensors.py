@@ -5,6 +5,9 @@ from __future__ import annotations
 from beliefscope.inspect.diagnosis.cause import Cause, Symptom
 from beliefscope.inspect.diagnosis.causes.consequences import DYNAMICS, HAPTICS
 
+IN_PHASES = "|".join(f"{kind}/*" for kind in ("level", "drift", "change", "size", "lever", "axes", "direction"))
+"""Statistics of force and torque in free motion or in contact."""
+
 CAUSES = (
     Cause(
         "effector.offset",
@@ -21,7 +24,7 @@ CAUSES = (
             Symptom("agreement/contact/*|unflagged force/contact/*|share/contact/*", 0),
             Symptom("share/contact/*|change/force*", 0, 0.5),
         ),
-        f"*/force*|*/torque*|lag/contact/*|lag/image/*|lag/dynamics/*|{HAPTICS}|{DYNAMICS}",
+        f"{IN_PHASES}|lag/contact/*|lag/image/*|lag/dynamics/*|{HAPTICS}|{DYNAMICS}",
         "Check the contact sensor or its threshold.",
         "drop haptics",
     ),
