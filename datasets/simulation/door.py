@@ -26,7 +26,7 @@ from beliefscope.datasets.simulation.door_policies import POLICIES
 from beliefscope.datasets.simulation.panda import ROBOT_BIT, STIFF, WORLD_BIT, Sleeve, add_panda, new_spec
 from beliefscope.datasets.simulation.panda_meshes import add_visual_meshes
 from beliefscope.datasets.simulation.sensors import add_touch
-from beliefscope.datasets.simulation.simulate import DT, POSITION_BITS, Scene, episode_rng, quantise, simulate
+from beliefscope.datasets.simulation.simulate import DT, POSITION_BITS, Scene, first_free_start, quantise, simulate
 from beliefscope.datasets.task import Array, Component, Outline, Task
 
 PANEL_SIZE = (0.04, PANEL_WIDTH, 0.86)  # thickness, width, height; m
@@ -179,7 +179,11 @@ def draw_door(rng: Generator, policy: str) -> DoorPhysics:
 
 def simulate_door(seed: int, index: int, steps: int) -> Episode:
     """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
-    rng, name = episode_rng(seed, index), policy_name(index)
+    return first_free_start(lambda rng: _simulate(rng, seed, index, steps), seed, index)
+
+
+def _simulate(rng: Generator, seed: int, index: int, steps: int) -> Episode:
+    name = policy_name(index)
     door = draw_door(rng, name)
     hinge = np.array(door.hinge, np.float32)
     return simulate(

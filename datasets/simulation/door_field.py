@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
+from numpy.random import Generator
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
@@ -25,7 +26,7 @@ from beliefscope.datasets.simulation.ingredients import (
     start_ingredient,
     wrist,
 )
-from beliefscope.datasets.simulation.simulate import DT, Scene, episode_rng, simulate
+from beliefscope.datasets.simulation.simulate import DT, Scene, first_free_start, simulate
 from beliefscope.datasets.task import Ingredient
 
 NUDGE_STEPS = 5  # duration of a nudge
@@ -53,7 +54,11 @@ def simulate_door_field(seed: int, index: int, steps: int, without: Collection[s
     Args:
         without: names of ingredients to switch off. The draws of the others do not change.
     """
-    draws, rng, name = draw(DOOR_FIELD, seed, index, without), episode_rng(seed, index), policy_name(index)
+    return first_free_start(lambda rng: _simulate(rng, seed, index, steps, without), seed, index)
+
+
+def _simulate(rng: Generator, seed: int, index: int, steps: int, without: Collection[str]) -> Episode:
+    draws, name = draw(DOOR_FIELD, seed, index, without), policy_name(index)
     door = draw_door(rng, name)
     door = replace(door, **draws["panel"].values) if "panel" in draws else door
     aim = AimError()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, Protocol
 
 import mujoco
@@ -23,6 +25,7 @@ Vector = NDArray[np.float64]
 
 DT = 0.1  # s per step
 SETTLING_STEPS = 5  # before recording starts, to close the grasp
+JAMMED = 1000.0  # N at the start; the largest force of a free start is about 100 N
 MAX_TURN = 0.05  # largest rotation of the hand per step, rad
 CHANGE = slice(3, 6)  # channels of the controls with the change of the position, which is in the channels before
 ROBOT_JOINTS = len(ARM_JOINTS) + len(FINGERS)  # first in qpos, followed by those of the object
@@ -94,9 +97,21 @@ class Scene:
     disturb: Callable[[int, mujoco.MjData], None] | None = None
 
 
-def episode_rng(seed: int, index: int) -> Generator:
-    """Random number generator of trajectory ``index`` of the collection with ``seed``."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+class JammedStart(Exception):
+    """The hand starts inside of the object."""
+
+
+def first_free_start(simulate_with: Callable[[Generator], Episode], seed: int, index: int) -> Episode:
+    """The episode of the first draw whose hand starts outside of the object: nearly always draw 0."""
+    for draw in count():
+        with suppress(JammedStart):
+            return simulate_with(episode_rng(seed, index, draw))
+    raise AssertionError("count() does not end")
+
+
+def episode_rng(seed: int, index: int, draw: int = 0) -> Generator:
+    """Random numbers of trajectory ``index`` of the collection with ``seed``; ``draw``: number of jammed starts."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index, draw) if draw else (index,)))
 
 
 def simulate(
@@ -114,6 +129,8 @@ def simulate(
     Args:
         states: (T, nq) joint positions -> (T, n) true states.
         provenance: replay parameters and other metadata, JSON values.
+
+    Raises JammedStart.
     """
     log = _run(scene, policy, steps)
     effector = quantise(np.stack(log.effector), POSITION_BITS)
@@ -211,6 +228,9 @@ def _run(scene: Scene, policy: Policy, steps: int) -> _Log:
     for _ in range(SETTLING_STEPS):
         controller.command(set_point, yaw)
         mujoco.mj_step(model, data, substeps)
+
+    if np.linalg.norm(sensors.wrench()[:3]) > JAMMED:
+        raise JammedStart
 
     waypoint, remaining = Waypoint(set_point, 0.0, 0), 0
     for step in range(steps):

@@ -10,6 +10,7 @@ import pytest
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation import door
 from beliefscope.datasets.simulation.controller import HandController
 from beliefscope.datasets.simulation.door import (
     DOOR,
@@ -22,7 +23,7 @@ from beliefscope.datasets.simulation.door import (
 from beliefscope.datasets.simulation.door_physics import MAX_ANGLE, DoorPhysics
 from beliefscope.datasets.simulation.replay import replay
 from beliefscope.datasets.simulation.sensors import HandSensors
-from beliefscope.datasets.simulation.simulate import hand_controls, quantise, split_of
+from beliefscope.datasets.simulation.simulate import JammedStart, episode_rng, hand_controls, quantise, split_of
 
 STEPS = 60
 PHYSICS = DoorPhysics((0.8, -0.3), 0.6)
@@ -227,3 +228,13 @@ def test_replay_rejects_mismatched_joints(pull: Episode) -> None:
 
 def test_no_replay_without_joints(pull: Episode) -> None:
     assert replay(DOOR, dataclasses.replace(pull, qpos=pull.qpos[:, :0])) is None
+
+
+def test_a_start_inside_of_the_panel_is_drawn_again() -> None:
+    """The first draw of trajectory 1 of seed 1470 starts with 30 kN."""
+    with pytest.raises(JammedStart):
+        door._simulate(episode_rng(1470, 1), 1470, 1, 3)
+    redrawn = door._simulate(episode_rng(1470, 1, 1), 1470, 1, 3)
+    episode = door.simulate_door(1470, 1, 3)
+    assert np.abs(episode.observations["force"]).max() < 200.0
+    assert np.array_equal(episode.qpos, redrawn.qpos)
