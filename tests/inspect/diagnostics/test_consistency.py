@@ -239,7 +239,7 @@ def test_a_shipped_filter_is_compared_with_its_healthy_record() -> None:
     assert result.healthy is not None
     assert {d.statistic for d in result.healthy.deviations} >= {"nees/fused/all", "nis/image/all"}
     # A single trace may raise an alarm; bench/false_alarms.py measures how often five episodes do.
-    assert "the healthy record of 60 trajectories" in result.verdict
+    assert f"the healthy record of {result.healthy.healthy_trajectories} trajectories" in result.verdict
     assert not any(alarm.startswith("NEES/n") for alarm in result.alarms)
     # An overconfident copy: the same errors, standard deviations a fifth.
     planted = replace(
