@@ -51,7 +51,7 @@ def main(names: list[str]) -> None:
             first = blackout == EVALUATED_BLACKOUTS[0]  # a blackout does not change the baselines
             result = evaluate(filter_, episodes, faults=faults, start_offset=STUDY_OFFSET.of(task), baselines=first)
             baselines = result.baselines or baselines
-            for key in headline_keys(task.name):
+            for key in headline_keys(result.rmse):
                 values = [interval(result, key), f"{result.rmse_from_step_0[key]:.2f}"]
                 values += [f"{m.rmse[key]:.2f}" if (m := baselines[b]) else "" for b in ("dynamics", "stay")]
                 condition = f"{task.name} | {checkpoint.name} | {blackout:.0%} | {label(key)}"

@@ -14,8 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from beliefscope.app.workspace.studies import FILE, SHIPPED, Results, Study
+from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
 from beliefscope.filters.training.study import offset_metrics
 from beliefscope.filters.training.study_table import (
@@ -43,6 +45,10 @@ class ShippedCell:
     task: str
     filter: str
     seed: int
+
+    @property
+    def definition(self) -> Task:
+        return find_task(self.task)
 
 
 def offset_rows(results: Results) -> tuple[list[Row], dict[str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,44 +20,51 @@ TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, DOOR_FIELD, P
 """Shipped tasks by name."""
 
 
-def find_task(name: str) -> Task:
-    """Return a shipped task. Runs no user code, so names read from files are safe.
+def find_task(task: str | Task) -> Task:
+    """Return the shipped task with the name, or the given one. Runs no user code, so names read from files are safe.
 
     Raises:
         BadInput: for an unknown name.
     """
-    if name in TASKS:
-        return TASKS[name]
-    unknown = unknown_name("task", name, TASKS)
+    if isinstance(task, Task):
+        return task
+    if task in TASKS:
+        return TASKS[task]
+    unknown = unknown_name("task", task, TASKS)
     raise BadInput(f"{unknown} Give a task of your own as path/to/file.py:NAME.")
 
 
-def stored_task(stored: Any, given: Task | None = None) -> Task:
+def stored_task(stored: Any, given: Iterable[Task] = ()) -> Task:
     """Task of a file: its definition, or the name that earlier versions stored. Runs no code.
 
     Args:
-        stored: JSON value of the file. given: task that the user has loaded for the file. Functions of the task are
-            those of the given task, else of the shipped one, if it has the same name and layout.
+        stored: JSON value of the file. given: tasks that the user has loaded. The functions of a task are those of a
+            given or shipped one with the same name and layout; without one, the task has none.
 
     Raises:
-        BadInput: for an invalid definition, and for a name that is not given nor shipped.
+        BadInput: for an invalid definition, and for the name of a task that is neither given nor shipped.
     """
+    known = [*given, *TASKS.values()]
     if isinstance(stored, str):
-        return given if given is not None and given.name == stored else find_task(stored)
+        return next((task for task in known if task.name == stored), None) or find_task(stored)
     task = task_from_json(stored)
-    source = TASKS.get(task.name) if given is None or difference(given, task) else given
-    return task if source is None or difference(source, task) else with_functions(task, source)
+    source = next((other for other in known if not difference(task, other)), None)
+    return task if source is None else with_functions(task, source)
 
 
-def load_task(name: str) -> Task:
-    """Return a registered task or load a user-defined one. Runs user code: not for names read from files.
+def load_task(task: str | Task) -> Task:
+    """Return a shipped task by name, or a user-defined one. Runs user code: not for names read from files.
 
-    ``path/to/file.py:NAME`` or ``package.module:NAME`` runs the file and registers its task in ``TASKS``.
+    Args:
+        task: name, definition, or ``path/to/file.py:NAME`` or ``package.module:NAME``, which runs the file once.
 
     Raises:
         BadInput: for an unknown name, a file that cannot be run, or a missing or inconsistent task.
     """
-    return _load_user_task(name) if ":" in name and name not in TASKS else find_task(name)
+    if isinstance(task, Task):
+        check_definition(task)
+        return task
+    return _load_user_task(task) if ":" in task and task not in TASKS else find_task(task)
 
 
 _user_tasks: dict[tuple[str, str], Task] = {}
@@ -73,7 +81,5 @@ def _load_user_task(name: str) -> Task:
             available = ", ".join(n for n, value in vars(module).items() if isinstance(value, Task)) or "none"
             raise BadInput(f"{place} has no task {attribute!r}. Available: {available}.")
         check_definition(task, name)
-        if task.name in TASKS:
-            raise BadInput(f"{name} is named {task.name!r}, which is already used. Existing tasks: {', '.join(TASKS)}.")
-        _user_tasks[key] = TASKS[task.name] = task
+        _user_tasks[key] = task
     return _user_tasks[key]

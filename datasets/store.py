@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.catalog import find_task, stored_task
+from beliefscope.datasets.catalog import TASKS, find_task, stored_task
 from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
@@ -34,7 +34,7 @@ from beliefscope.datasets.readers.mit_push import MitPushDataset, is_mit_push
 from beliefscope.datasets.readers.paper_authors import PaperDataset, is_paper_file
 from beliefscope.datasets.readers.push_real_task import PUSH_REAL, PUSH_REAL_TASKS
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.task_json import task_to_json
+from beliefscope.datasets.task_json import difference, task_to_json
 
 FORMAT = "beliefscope-episodes"
 VERSION = 1
@@ -42,31 +42,39 @@ VERSION = 1
 T = TypeVar("T")
 
 
-def sample_path(task_name: str) -> Path:
+def sample_path(task: str | Task) -> Path:
     """Path of a task's sample dataset. Raises BadInput for an unknown task or one without samples."""
-    path = SAMPLES / f"{find_task(task_name).name}.h5"
-    if not path.exists():
-        can_simulate = find_task(task_name).simulate is not None
+    task = find_task(task)
+    if not has_sample(task):
+        can_simulate = task.simulate is not None
         raise BadInput(
-            f"Task {task_name!r} has no sample dataset. Give its data with --data"
-            + (f": beliefscope collect {task_name} simulates some." if can_simulate else ".")
+            f"Task {task.name!r} has no sample dataset. Give its data with --data"
+            + (f": beliefscope collect {task.name} simulates some." if can_simulate else ".")
         )
-    return path
+    return _sample_file(task.name)
 
 
-def has_sample(task_name: str) -> bool:
-    """Whether the task has a sample dataset."""
-    return (SAMPLES / f"{find_task(task_name).name}.h5").exists()
+def has_sample(task: str | Task) -> bool:
+    """Whether the task is a shipped one with a sample dataset."""
+    task = find_task(task)
+    return task.name in TASKS and not difference(TASKS[task.name], task) and _sample_file(task.name).exists()
 
 
-def open_dataset(path: str | Path, task: Task | None = None, skip_bad: bool = False) -> Dataset:
+def _sample_file(name: str) -> Path:
+    return SAMPLES / f"{name}.h5"
+
+
+def open_dataset(
+    path: str | Path, task: Task | None = None, skip_bad: bool = False, given: Sequence[Task] = ()
+) -> Dataset:
     """Open a dataset for reading; the format is detected.
 
     Args:
         path: HDF5 file written by ``write_dataset``; file or folder (searched recursively) of the MIT Push dataset;
             file or folder of the HDF5 files of the paper's authors.
-        task: which of the ``push-real`` tasks to use for MIT Push files; provides the functions of a custom task.
+        task: which of the ``push-real`` tasks to use for MIT Push files.
         skip_bad: skip unusable trajectories and list them in ``Dataset.skipped``.
+        given: user-defined tasks, as for ``stored_task``; ``task`` is one of them.
 
     Raises:
         BadInput: if the data are missing, damaged, of an unknown format or unusable.
@@ -80,7 +88,7 @@ def open_dataset(path: str | Path, task: Task | None = None, skip_bad: bool = Fa
         return PaperDataset(path, files, skip_bad)
     if path.is_dir():
         raise BadInput(f"{path} contains datasets, such as {files[0].name}: give one of the files.")
-    return EpisodeFile(path, task, skip_bad)
+    return EpisodeFile(path, skip_bad, given if task is None else (task, *given))
 
 
 def data_files(path: Path) -> list[Path]:
@@ -101,7 +109,7 @@ class EpisodeFile(Dataset):
     Its arrays must have the task's shapes and types, be finite and match their digest.
     """
 
-    def __init__(self, path: Path, given: Task | None = None, skip_bad: bool = False) -> None:
+    def __init__(self, path: Path, skip_bad: bool = False, given: Sequence[Task] = ()) -> None:
         self.path = path
         self._file = open_hdf5(path)
         try:
@@ -135,7 +143,7 @@ class EpisodeFile(Dataset):
     def close(self) -> None:
         self._file.close()
 
-    def _read_task(self, given: Task | None) -> Task:
+    def _read_task(self, given: Sequence[Task]) -> Task:
         format_ = self._file.attrs.get("format")
         if format_ != FORMAT:
             raise BadInput(

@@ -65,9 +65,9 @@ class Outline:
     shape: Literal["box", "cylinder"] = "box"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Task:
-    """A state-estimation task.
+    """A state-estimation task. Tasks with the same definition and functions are equal.
 
     Attributes:
         name: without spaces, colons and slashes.
@@ -111,6 +111,9 @@ class Task:
     ingredients: Mapping[str, Ingredient] = field(default_factory=dict)
     start_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warmup: int = 30
+
+    def __hash__(self) -> int:
+        return hash(self.name)
 
     def index(self, component: str) -> int:
         """Index of a component in the state vector. Raises BadInput for an unknown name."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -30,26 +32,24 @@ KINDS: dict[Kind, type[Filter]] = {
 INFORMATION: dict[Kind, type[Filter]] = {"ekf": InformationFilter, "pf": InformationParticleFilter}
 """Filters with fusion ``information``."""
 
-ANY = ""
-"""Placeholder for the task in ``FILTERS``; the models follow from the task's modalities."""
-
-FILTERS: dict[str, tuple[Literal["each", "all", "one"], Architecture]] = {
-    "crossmodal-ekf": ("each", Architecture(ANY, "ekf", "crossmodal", feedback=True)),
-    "crossmodal-pf": ("each", Architecture(ANY, "pf", "crossmodal")),
-    "crossmodal-ukf": ("each", Architecture(ANY, "ukf", "crossmodal", feedback=True)),
-    "information-ekf": ("each", Architecture(ANY, "ekf", "information", feedback=True)),
-    "information-pf": ("each", Architecture(ANY, "pf", "information")),
-    "unimodal-ekf": ("each", Architecture(ANY, "ekf", "unimodal")),
-    "unimodal-pf": ("each", Architecture(ANY, "pf", "unimodal", likelihoods="raw")),
-    "feature-ekf": ("all", Architecture(ANY, "ekf", "none")),
-    "feature-pf": ("all", Architecture(ANY, "pf", "none")),
-    "{modality}-ekf": ("one", Architecture(ANY, "ekf", "none")),
-    "{modality}-pf": ("one", Architecture(ANY, "pf", "none")),
-    "lstm": ("all", Architecture(ANY, "lstm", "none")),
-    "transformer": ("all", Architecture(ANY, "transformer", "none")),
+FILTERS: dict[str, tuple[Literal["each", "all", "one"], Callable[..., Architecture]]] = {
+    "crossmodal-ekf": ("each", partial(Architecture, kind="ekf", fusion="crossmodal", feedback=True)),
+    "crossmodal-pf": ("each", partial(Architecture, kind="pf", fusion="crossmodal")),
+    "crossmodal-ukf": ("each", partial(Architecture, kind="ukf", fusion="crossmodal", feedback=True)),
+    "information-ekf": ("each", partial(Architecture, kind="ekf", fusion="information", feedback=True)),
+    "information-pf": ("each", partial(Architecture, kind="pf", fusion="information")),
+    "unimodal-ekf": ("each", partial(Architecture, kind="ekf", fusion="unimodal")),
+    "unimodal-pf": ("each", partial(Architecture, kind="pf", fusion="unimodal", likelihoods="raw")),
+    "feature-ekf": ("all", partial(Architecture, kind="ekf", fusion="none")),
+    "feature-pf": ("all", partial(Architecture, kind="pf", fusion="none")),
+    "{modality}-ekf": ("one", partial(Architecture, kind="ekf", fusion="none")),
+    "{modality}-pf": ("one", partial(Architecture, kind="pf", fusion="none")),
+    "lstm": ("all", partial(Architecture, kind="lstm", fusion="none")),
+    "transformer": ("all", partial(Architecture, kind="transformer", fusion="none")),
 }
 """Name -> measurement models and architecture. ``each``: one model per modality. ``all``: one model of all modalities.
-``one``: a filter per modality, with that modality only (``image-pf``, ``haptics-pf``)."""
+``one``: a filter per modality, with that modality only (``image-pf``, ``haptics-pf``). The task is added by
+``filters_of``."""
 
 
 def filters_of(task: Task) -> dict[str, Architecture]:
@@ -61,7 +61,7 @@ def filters_of(task: Task) -> dict[str, Architecture]:
         "one": [(modality,) for modality in each],
     }
     return {
-        name.format(modality=names[0]): replace(template, task=task.name, models=names)
+        name.format(modality=names[0]): template(task=task, models=names)
         for name, (inputs, template) in FILTERS.items()
         for names in models[inputs]
     }
@@ -72,7 +72,7 @@ NETWORKS: dict[str, dict[str, Any]] = {"default": {}, "authors": {"networks": "a
 paper's published networks for the door task."""
 
 
-def architecture(task: str, name: str, networks: str = "default") -> Architecture:
+def architecture(task: str | Task, name: str, networks: str = "default") -> Architecture:
     """The named filter's architecture for a task. Raises BadInput for an unknown name."""
     filters = filters_of(find_task(task))
     check_name("filter", name, filters)

@@ -1,15 +1,16 @@
 """Checkpoints: safetensors files with one JSON document in the header. Pickle is never used.
 
-The header's key ``beliefscope`` holds ``{"format", "name", "architecture", "record"}`` and, if it was measured,
-``"healthy_profile"``; the tensors are the
-filter's state dictionary, including the statistics of the training set. A checkpoint's hash is the SHA-256 of its file.
+The header's key ``beliefscope`` holds ``{"format", "name", "task", "architecture", "record"}`` and, if it was measured,
+``"healthy_profile"``; the tensors are the filter's state dictionary, including the statistics of the training set.
+``task`` is the definition; earlier versions stored only its name, in the architecture. A checkpoint's hash is the
+SHA-256 of its file.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch.overrides import TorchFunctionMode
 
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.catalog import TASKS, find_task, stored_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.task_json import difference
+from beliefscope.datasets.task_json import difference, task_to_json
 from beliefscope.filters.catalog import build, filters_of
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.legacy_names import training_record
@@ -76,6 +77,7 @@ def save_checkpoint(
     header = {
         "format": FORMAT,
         "name": name,
+        "task": task_to_json(filter_.task),
         "architecture": filter_.architecture.to_json(),
         "record": dict(record),
     }
@@ -87,8 +89,12 @@ def save_checkpoint(
     return hashlib.sha256(data).hexdigest()
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
-    """Reads a checkpoint. Raises BadInput if it is missing, damaged, or not a checkpoint of this package."""
+def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
+    """Reads a checkpoint. Raises BadInput if it is missing, damaged, or not a checkpoint of this package.
+
+    Args:
+        given: user-defined tasks, as for ``stored_task``.
+    """
     path = Path(path)
     if not path.is_file():
         raise BadInput(f"checkpoint {str(path)!r} does not exist")
@@ -99,7 +105,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise BadInput(f"{str(path)!r} is not a readable safetensors file: {error}") from None
     header = _header(path, metadata)
-    architecture = Architecture.from_json(header["architecture"])
+    task = stored_task(header.get("task", header["architecture"].get("task")), given)
+    architecture = Architecture.from_json(header["architecture"], task)
     with torch.device("meta"), _Uninitialised():  # allocates no memory, whatever the header's sizes
         expected = {key: tuple(value.shape) for key, value in build(architecture).state_dict().items()}
     shapes = {key: tuple(value.shape) for key, value in tensors.items()}
@@ -157,11 +164,13 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return header
 
 
-def shipped(task: str, name: str) -> Path:
+def shipped(task: str | Task, name: str) -> Path:
     """Path of the pretrained checkpoint of a task and filter. Raises BadInput if there is none."""
-    filters = filters_of(find_task(task))
+    definition = find_task(task)
+    filters, task = filters_of(definition), definition.name
     paths = {known: PRETRAINED / f"{task}-{known}.safetensors" for known in filters}
-    available = [known for known, path in paths.items() if path.is_file()]
+    is_shipped = task in TASKS and not difference(TASKS[task], definition)
+    available = [known for known, path in paths.items() if is_shipped and path.is_file()]
     if name not in filters:
         raise unknown_name("filter", name, available)
     if name not in available:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor, nn
 
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Statistics
@@ -35,7 +35,7 @@ class Architecture:
     """Everything that determines a filter's modules and equations; stored as JSON in the checkpoint.
 
     Attributes:
-        task: name in ``TASKS``.
+        task: of the filter.
         kind: ``ekf``, ``ukf``, ``pf``, ``lstm`` or ``transformer``.
         fusion: rule that fuses the measurement models' results: ``crossmodal`` (learned weights beta), ``unimodal``
             (product of experts for an EKF, sum of likelihoods for a PF), ``information`` (one prior; precisions add, or
@@ -52,7 +52,7 @@ class Architecture:
             rest is uniform; in (0, 1].
     """
 
-    task: str
+    task: Task
     kind: Kind
     fusion: Fusion = "crossmodal"
     models: tuple[str, ...] = ("image", "haptics")
@@ -86,13 +86,22 @@ class Architecture:
             raise BadInput(f"soft_share must be above 0 and at most 1, not {self.soft_share}")
 
     def to_json(self) -> dict[str, Any]:
-        return asdict(self) | {"models": list(self.models)}
+        """JSON values; only the name of the task."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return values | {"task": self.task.name, "models": list(self.models)}
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Architecture:
-        """Missing values take their default. Raises BadInput for unknown keys, and without task, kind or models."""
+    def from_json(cls, values: Mapping[str, Any], task: Task | None = None) -> Architecture:
+        """Inverse of ``to_json``. Missing values take their default.
+
+        Args:
+            task: definition; by default the shipped task with the name in the values.
+
+        Raises BadInput for unknown keys, and without task, kind or models.
+        """
         try:
-            return cls(**{**values, "models": tuple(values["models"])})
+            task = stored_task(values["task"]) if task is None else task
+            return cls(**{**values, "task": task, "models": tuple(values["models"])})
         except (KeyError, TypeError) as error:
             raise BadInput(f"not an architecture of this version: {error}") from None
 
@@ -112,7 +121,7 @@ class Filter(nn.Module, ABC):
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
-        task = find_task(architecture.task)
+        task = architecture.task
         self.architecture = architecture
         self.task = task
         self.n = len(task.components)

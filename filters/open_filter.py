@@ -7,6 +7,8 @@ from pathlib import Path
 
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.external.load import load_external
 
@@ -21,25 +23,32 @@ def is_code(text: str) -> bool:
     return ":" in text and not text.endswith(".safetensors")
 
 
-def open_filter(task: str, text: str) -> Checkpoint:
+def open_filter(task: str | Task, text: str) -> Checkpoint:
     """Load a built-in filter by name, a checkpoint by path, or an external filter by its build function.
+
+    Args:
+        task: definition, name or ``path/to/file.py:NAME``. A checkpoint file needs only the name.
 
     Raises BadInput if there is none, or if it is for another task.
     """
-    name = load_task(task).name
-    if is_code(text):
-        return load_external(text, name)
-    checkpoint = load_checkpoint(Path(text) if is_path(text) else shipped(name, text))
-    if checkpoint.task.name != name:
-        raise BadInput(f"filter {text!r} is for task {checkpoint.task.name!r}, not for {name!r}")
+    if not is_path(text) or is_code(text):
+        task = load_task(task)
+        return load_external(text, task) if is_code(text) else load_checkpoint(shipped(task, text))
+    given = () if isinstance(task, str) and ":" not in task else (load_task(task),)
+    checkpoint = load_checkpoint(Path(text), given)
+    name = given[0].name if given else task
+    other = difference(given[0], checkpoint.task) if given else ""
+    if other or checkpoint.task.name != name:
+        raise BadInput(f"filter {text!r} is for {other or f'task {checkpoint.task.name!r}'}, not for {name!r}")
     return checkpoint
 
 
 def open_filters(task: str | None, first: str, second: str) -> tuple[Checkpoint, Checkpoint]:
     """Two filters of one task. task: required for two names. Raises BadInput as ``open_filter``."""
-    files = {text: load_checkpoint(Path(text)) for text in (first, second) if is_path(text)}
+    given = [load_task(task)] if task is not None and ":" in task else []
+    files = {text: load_checkpoint(Path(text), given) for text in (first, second) if is_path(text)}
     if task is None and not files:
         raise BadInput(f"{first!r} and {second!r} are filter names and need a task, such as --task door")
-    name = task or next(iter(files.values())).task.name
-    before, after = (files.get(text) or open_filter(name, text) for text in (first, second))
+    target = task or next(iter(files.values())).task
+    before, after = (files.get(text) or open_filter(target, text) for text in (first, second))
     return before, after

@@ -22,9 +22,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
@@ -86,7 +87,7 @@ class LiveRecorder:
         name: str,
         checkpoint: Checkpoint | None = None,
         *,
-        task: str = "",
+        task: str | Task = "",
         modalities: Sequence[str] = (),
         folder: str | Path = FOLDER,
         start: Gaussian | None = None,
@@ -99,7 +100,7 @@ class LiveRecorder:
 
         Args:
             checkpoint: of a Beliefscope filter.
-            task: name or ``path/to/file.py:NAME`` of the task, for any other filter.
+            task: of any other filter: name, ``path/to/file.py:NAME`` or definition.
             modalities: names of the K measurement models (docs/own_filter.md).
             folder: created if missing. ``beliefscope serve --workspace W`` shows runs in ``W/live``.
             start: belief before step 0, N = 1; standardised for a checkpoint, else in SI units. Default: NaN.
@@ -115,7 +116,7 @@ class LiveRecorder:
             raise BadInput("a live run needs the filter's checkpoint or the name of its task")
         if Path(name).name != name or name.startswith("."):
             raise BadInput(f"live run {name!r}: the name must not contain a folder; use folder=")
-        self._task = find_task(task) if checkpoint is None else checkpoint.task
+        self._task = load_task(task) if checkpoint is None else checkpoint.task
         self._checkpoint, self._modalities, self._start, self._expected = checkpoint, modalities, start, expected
         self._fields = {"settings": {"torch": torch.__version__}} | fields
         self._origin: dict[str, Any] = (

@@ -52,7 +52,7 @@ def record_steps(
         faulty = faults.apply(episode, seed)
         outputs = checkpoint.live(faulty, seed)
         first = next(outputs)  # has the names of the measurement models
-        options |= {"task": checkpoint.task.name, "modalities": first[1], "start": checkpoint.start([faulty])}
+        options |= {"task": checkpoint.task, "modalities": first[1], "start": checkpoint.start([faulty])}
         recorder = LiveRecorder(name, **options)
 
         def external_steps() -> Iterator[None]:

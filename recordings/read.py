@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.file import current_array, current_kind, stored_faults
 from beliefscope.inspect.traces.validate import validate_trace
@@ -38,11 +39,14 @@ Rows = dict[str, list[tuple[NDArray[np.int64] | None, NDArray[Any]]]]
 """Stored path -> its chunks: steps (R,), None if static, and flattened values."""
 
 
-def read_recording(path: str | Path) -> Trace:
+def read_recording(path: str | Path, given: Iterable[Task] = ()) -> Trace:
     """Read the trace in a recording, equal to the recorded one in values and types.
 
     Of a live run that is in progress or was killed, reads the complete steps. Rerun cannot read a file with an
     incomplete last message; in that case, read the ``.live`` file.
+
+    Args:
+        given: user-defined tasks, as for ``stored_task``.
 
     Raises:
         BadInput: the file does not exist, is not a Beliefscope recording, has a newer format version, or is truncated.
@@ -50,7 +54,7 @@ def read_recording(path: str | Path) -> Trace:
     path = Path(path)
     header, rows = _load(path)
     try:
-        trace = _trace(path, header, rows)
+        trace = _trace(path, header, rows, given)
         validate_trace(trace)
     except BadInput as error:
         raise error if str(path) in str(error) else BadInput(f"{path}: {error}") from None
@@ -59,7 +63,7 @@ def read_recording(path: str | Path) -> Trace:
     return trace
 
 
-def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
+def _trace(path: Path, header: dict[str, Any], rows: Rows, given: Iterable[Task]) -> Trace:
     steps, shapes = int(header["steps"]), json.loads(header["shapes"])
     if steps == GROWING:
         steps = _complete(path, shapes, rows)
@@ -71,7 +75,7 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows) -> Trace:
     stored = {current_array(name.removeprefix("trace/")): a for name, a in arrays.items() if name.startswith("trace/")}
     episode_fields = {field.name for field in fields(Episode)} & stored.keys()
     episode = Episode(
-        task=stored_task(_parsed(header, "definition").get("definition", header["task"])),
+        task=stored_task(_parsed(header, "definition").get("definition", header["task"]), given),
         observations=observations,
         dt=float(header["dt"]),
         seed=origin["seed"],

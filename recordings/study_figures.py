@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import STAY
@@ -49,15 +49,15 @@ LINE_LIMIT = 2.0
 def write_study(folder: Path, cells: Sequence[Cell], preset: str) -> tuple[list[Row], Document]:
     """Writes the tables and figures of the finished cells; returns the rows and the content of ``study.json``."""
     rows, overview = write_tables(folder, cells, preset)
-    write_results(rows, folder)
+    write_results(rows, folder, {cell.task: cell.definition for cell in cells})
     return rows, overview
 
 
-def write_results(rows: Sequence[Row], folder: Path) -> list[Path]:
+def write_results(rows: Sequence[Row], folder: Path, tasks: Mapping[str, Task] = TASKS) -> list[Path]:
     """Write ``results.svg`` and ``results.png`` (300 dpi); see ``results``."""
     paths = []
     with rc_context(STYLE):
-        figure = results(rows)
+        figure = results(rows, tasks)
         for suffix, options in (("svg", {"metadata": {"Date": None}}), ("png", {"dpi": 300})):
             data = io.BytesIO()
             figure.savefig(data, format=suffix, **options)
@@ -66,7 +66,7 @@ def write_results(rows: Sequence[Row], folder: Path) -> list[Path]:
     return paths
 
 
-def results(rows: Sequence[Row]) -> Figure:
+def results(rows: Sequence[Row], tasks: Mapping[str, Task] = TASKS) -> Figure:
     """RMSE by probability of image blackout: one panel per task, start and quantity, one bar with spread per filter.
 
     The dashed line is the error of a predictor without observations (``reference``); if far above all bars, it is given
@@ -74,7 +74,7 @@ def results(rows: Sequence[Row]) -> Figure:
     """
     filters = list(dict.fromkeys(row.filter for row in rows if row.filter != TRIVIAL))
     conditions = dict.fromkeys((r.task, r.start) for r in rows if r.filter != TRIVIAL)
-    panels = [(task, start, key, title) for task, start in conditions for key, title in panels_of(task)]
+    panels = [(task, start, key, title) for task, start in conditions for key, title in panels_of(tasks[task])]
     columns = min(2, len(panels))
     lines = -(-len(panels) // columns)
     legend_lines = -(-(len(filters) + 2) // 5)
@@ -110,9 +110,8 @@ def reference(rows: Sequence[Row], key: str) -> tuple[str, float | None]:
     return TRIVIAL, next((row.mean[key] for row in rows if row.filter == TRIVIAL), None)
 
 
-def panels_of(task_name: str) -> list[tuple[str, str]]:
+def panels_of(task: Task) -> list[tuple[str, str]]:
     """Keys and titles of the panels of a task: the position on the map, and each other component."""
-    task: Task = find_task(task_name)
     position = task.map_components[0].rpartition("_")[0] or "position"
     others = [c for c in task.components if c.name not in task.map_components]
     keys = {"m": "cm", "rad": "deg"}

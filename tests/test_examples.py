@@ -8,7 +8,6 @@ import json
 import re
 import runpy
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from beliefscope.app.cli.main import main
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.datasets import catalog
 from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
@@ -34,20 +32,10 @@ EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_task.py"
 SPEC = f"{EXAMPLE}:TASK"
 
 
-@contextlib.contextmanager
-def clean_tasks() -> Iterator[None]:
-    """Remove user-defined tasks at the end, as in a new process."""
-    tasks = dict(TASKS)
-    yield
-    TASKS.clear()
-    TASKS.update(tasks)
-    catalog._user_tasks.clear()
-
-
 def run(*arguments: object) -> tuple[int, str, str]:
     """Run a command line; return exit code, standard output and standard error."""
     out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, clean_tasks():
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["beliefscope", *map(str, arguments)])
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.raises(SystemExit) as end:
             main()
@@ -119,33 +107,29 @@ def test_example_is_short() -> None:
 def test_user_task_on_the_command_line(folder: Path) -> None:
     measured = result("evaluate", SPEC, "--filter", folder / "own.safetensors", "--data", folder / "own.h5")
     assert set(measured["rmse"]) == {"x_cm", "y_cm", "position_cm"}
-    with clean_tasks():
-        load_task(SPEC)
-        with open_dataset(folder / "own.h5") as data:
-            assert measured["data_hash"] == data.hash
-            traced = load_trace(folder / "own.trace")
-            assert traced.data_hash == data[data.held_out()[0]].digest()
+    with open_dataset(folder / "own.h5") as data:
+        assert measured["data_hash"] == data.hash
+        traced = load_trace(folder / "own.trace")
+        assert traced.data_hash == data[data.held_out()[0]].digest()
     assert traced.modalities == ("image", "sound")
     assert (folder / "own.rrd").stat().st_size > 10_000
 
 
 def test_user_task_in_the_server(folder: Path, tmp_path: Path) -> None:
-    with clean_tasks():
-        load_task(SPEC)
-        store = TraceStore(Settings(tmp_path, {"own": folder / "own.h5"}, {"own": folder / "own.safetensors"}))
-        try:
-            catalog = store.catalog()
-            assert catalog["problems"] == []
-            task = catalog["tasks"][0]
-            assert (task["name"], len(task["data"][0]["episodes"])) == ("ball", 100)
-            assert [filter_["name"] for filter_ in task["filters"]] == ["own"]
-            assert store.default_selection() == Selection("ball", "own", 9, data="own")
-            run_ = store.request(store.default_selection())
-            assert run_.trace.modalities == ("image", "sound")
-            assert len(run_.columns[1]) > 0
-            assert run_.map(3, None, 41).layers == ("image", "sound", "fused")
-        finally:
-            store.close()
+    store = TraceStore(Settings(tmp_path, {"own": folder / "own.h5"}, {"own": folder / "own.safetensors"}))
+    try:
+        catalog = store.catalog()
+        assert catalog["problems"] == []
+        task = catalog["tasks"][0]
+        assert (task["name"], len(task["data"][0]["episodes"])) == ("ball", 100)
+        assert [filter_["name"] for filter_ in task["filters"]] == ["own"]
+        assert store.default_selection() == Selection("ball", "own", 9, data="own")
+        run_ = store.request(store.default_selection())
+        assert run_.trace.modalities == ("image", "sound")
+        assert len(run_.columns[1]) > 0
+        assert run_.map(3, None, 41).layers == ("image", "sound", "fused")
+    finally:
+        store.close()
 
 
 def test_filters_of_unknown_tasks_are_rejected(folder: Path) -> None:

@@ -26,6 +26,8 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference
 from beliefscope.filters.external.load import UnavailableFilter
 from beliefscope.inspect.traces.live_run import LiveRun
 
@@ -75,17 +77,19 @@ def routes(store: TraceStore) -> APIRouter:
     @router.get("/api/live", response_model=LiveList)
     def list_runs() -> dict[str, Any]:
         entries: list[dict[str, Any]] = []
+        tasks: dict[str, Task] = {}
         for name in runs.newest():
             try:
                 run = runs[name]
-                filter_name, checkpoint = resolve_filter(run, store.filters(run.task.name))
+                filter_name, checkpoint = resolve_filter(run, store.filters_of(run))
                 unavailable = isinstance(checkpoint, UnavailableFilter) and bool(run.template.checkpoint_hash)
                 entry = {"filter": filter_name, "available": not unavailable, "kind": run.template.kind}
+                if other := difference(tasks.setdefault(run.task.name, run.task), run.task):
+                    raise BadInput(f"live run {name!r} is of {other}, unlike a newer run")
                 entries.append(describe(run) | entry)
             except BadInput as error:
                 entries.append({"name": name, "state": "damaged", "message": str(error)})
-        tasks = {entry["task"] for entry in entries if "task" in entry}
-        return {"runs": entries, "tasks": [store.describe_task(task) for task in sorted(tasks)]}
+        return {"runs": entries, "tasks": [store.describe_task(tasks[name]) for name in sorted(tasks)]}
 
     @router.websocket("/api/live/{name}")
     async def follow(websocket: WebSocket, name: str) -> None:

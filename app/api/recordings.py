@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
@@ -25,12 +25,10 @@ from beliefscope.app.jobs.queue import Job, Jobs
 from beliefscope.app.jobs.recording import write
 from beliefscope.app.protocol.etag import tagged_json
 from beliefscope.app.protocol.messages import READ_ONLY
-from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, display_name
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.recordings import ENDING, Recording, RecordingFolder, free_space
-from beliefscope.datasets.catalog import find_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.filters.checkpoint import Checkpoint
@@ -135,10 +133,12 @@ def _open_run(store: TraceStore, files: RecordingFolder, jobs: Jobs, name: str) 
     assert info.filter is not None
     key = repr((recording.name, recording.bytes, recording.modified))
     run = f"{recording.name.removesuffix(ENDING)} {hashlib.sha256(key.encode()).hexdigest()[:8]}"
-    task = str(info.task)
-    filter_name = display_name(info.filter, info.checkpoint_hash, store.filters(task))
-    link = permalink(find_task(task), filter_name, LIVE_PREFIX + run, info.episode or 0, 0)
-    output = store.live.folder / f"{run}{SUFFIX}"
+    filters: Mapping[str, Checkpoint] = {}
+    with suppress(BadInput):  # a task that this server does not have
+        filters = store.filters(str(info.task))
+    query: dict[str, Any] = {"task": info.task, "filter": display_name(info.filter, info.checkpoint_hash, filters)}
+    query |= {"data": LIVE_PREFIX + run, "episode": info.episode or 0, "tab": "scene"}
+    link, output = f"?{urlencode(query)}", store.live.folder / f"{run}{SUFFIX}"
     arguments = {"recording": str(files.path(name)), "run": str(output)}
     return jobs.submit("reading", f"The run in {recording.name}", arguments, key, link, output.is_file())
 

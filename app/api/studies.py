@@ -23,7 +23,6 @@ from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.catalog import short_names
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.workspace.studies import FILE, SHIPPED, Results, Study
-from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint
@@ -143,7 +142,7 @@ def _job_arguments(study: Study, results: Results, store: TraceStore) -> dict[st
         raise BadInput("the built-in study cannot be continued; create one with beliefscope study")
     check_name("preset", results.preset, PLANS)
     settings = store.settings
-    sources = {load_task(source).name: source for source in settings.tasks}
+    sources = {task.name: source for task, source in zip(settings.definitions, settings.tasks, strict=True)}
     files: dict[str, tuple[str, str]] = {}
     for task, info in results.tasks.items():
         data_hash = info.get("data_hash", "")

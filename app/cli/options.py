@@ -97,9 +97,18 @@ TRACE_FILTER = option(
     "Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",
 )
 
+TASK_OF_FILES = option(
+    "NAME|FILE.py:NAME",
+    "Task of the files. They contain its definition; needed for files of earlier versions that only name a task of "
+    "your own, and for its functions (replay, outline).",
+    "--task",
+)
+
 OPTIONS: dict[str, Any] = {
     "task": argument(
-        "TASK", "Task: door, push, door-field, push-field, push-real, a variant, or your own (docs/data.md)."
+        "TASK",
+        "Task: door, push, door-field, push-field, push-real, a variant, or path/to/file.py:NAME (docs/data.md). Where "
+        "--data or a checkpoint contains the definition of your own task, its name is enough.",
     ),
     "filter": option(
         "NAME|CHECKPOINT|MODULE:BUILD",
@@ -204,8 +213,18 @@ class Runs:
         from beliefscope.datasets.faults.injection import read_faults
         from beliefscope.filters.open_filter import open_filter
 
-        checkpoint = open_filter(self.task, self.filter)
+        checkpoint = open_filter(self._definition(), self.filter)
         return checkpoint, read_faults(self.faults, checkpoint.task)
+
+    def _definition(self) -> Task | str:
+        """The task of the data if it is named and not shipped, so that the file that defines it is not needed."""
+        from beliefscope.datasets.catalog import TASKS
+        from beliefscope.datasets.store import open_dataset
+
+        if self.data is None or self.task in TASKS or ":" in self.task:
+            return self.task
+        with open_dataset(self.data) as data:
+            return data.task if data.task.name == self.task else self.task
 
     def episodes(self, task: Task) -> Dataset:
         """The dataset."""
@@ -277,43 +296,65 @@ def check_workspace(workspace: Path) -> None:
 def open_episodes(task: Task, path: Path | None, skip_bad: bool = False) -> Dataset:
     """Open a dataset (default: the sample dataset) and print skipped trajectories. Raises BadInput for another task."""
     from beliefscope.datasets.store import open_dataset, sample_path
+    from beliefscope.datasets.task_json import difference
 
-    data = open_dataset(sample_path(task.name) if path is None else path, task, skip_bad)
-    if data.task.name != task.name:
+    data = open_dataset(sample_path(task) if path is None else path, task, skip_bad)
+    if other := difference(task, data.task):
         data.close()
-        raise BadInput(f"{str(path)!r} contains episodes of task {data.task.name!r}, not of {task.name!r}")
+        raise BadInput(f"{str(path)!r} contains episodes of {other}, not of {task.name!r}")
     for line in data.skipped:
         console.note(f"skipped: {line}")
     return data
 
 
-def open_recording(path: Path) -> Trace:
-    """Read the trace in a recording or a live file. A separate process checks the recording first (it may crash)."""
+def open_trace(path: Path, task: str = "") -> Trace:
+    """Read a trace from a trace file, a recording or a live file. Raises BadInput if it is not of the task.
+
+    Args:
+        task: name or ``path/to/file.py:NAME``, with its functions; by default the definition in the file, without.
+    """
+    from beliefscope.inspect.trace import load_trace
+
+    return _open(_read_recording if path.suffix in (".rrd", ".live") else load_trace, path, task)
+
+
+def open_recording(path: Path, task: str = "") -> Trace:
+    """As ``open_trace``, only from a recording or a live file."""
+    return _open(_read_recording, path, task)
+
+
+def _open(read: Callable[[Path, Sequence[Task]], Trace], path: Path, name: str) -> Trace:
+    from beliefscope.datasets.catalog import load_task
+    from beliefscope.datasets.task_json import difference
+
+    given = [load_task(name)] if name else []
+    trace = read(path, given)
+    for task in given:
+        if other := difference(task, trace.task):
+            raise BadInput(f"{path} is of {other}, not of task {task.name!r}")
+    return trace
+
+
+def _read_recording(path: Path, given: Sequence[Task]) -> Trace:
+    """A separate process checks recordings first (Rerun may crash)."""
     from beliefscope.inspect.traces.live_file import SUFFIX, load_live
     from beliefscope.recordings.probe import RecordingProbe
     from beliefscope.recordings.read import read_recording
 
     if path.suffix == SUFFIX:
-        return load_live(path)
+        return load_live(path, given)
     if path.is_file():
         metadata = RecordingProbe()(path)
         if metadata.problem and not metadata.application:
             raise BadInput(f"{path}: {metadata.problem}")
-    return read_recording(path)
+    return read_recording(path, given)
 
 
-def open_trace(path: Path) -> Trace:
-    """Read a trace from a trace file, a recording or a live file."""
-    from beliefscope.inspect.trace import load_trace
-
-    return open_recording(path) if path.suffix in (".rrd", ".live") else load_trace(path)
-
-
-def open_traces(paths: Sequence[Path], filter_: str) -> tuple[list[Trace], Checkpoint | None]:
-    """Read traces of one filter, and its checkpoint if available; see ``checkpoint_of``."""
+def open_traces(paths: Sequence[Path], filter_: str, task: str = "") -> tuple[list[Trace], Checkpoint | None]:
+    """Read traces of one filter, and its checkpoint if available; see ``open_trace`` and ``checkpoint_of``."""
     from beliefscope.inspect.traces.provenance import checkpoint_of
 
-    traces = [open_trace(path) for path in paths]
+    traces = [open_trace(path, task) for path in paths]
     return traces, checkpoint_of(traces, paths, filter_)
 
 

@@ -18,6 +18,7 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import available_presets
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.open_filter import is_path
@@ -51,7 +52,7 @@ class TaskCatalog:
         for name in sorted(filters_of(self.task), key=lambda name: name != DEFAULT_FILTER):
             if name not in filters:
                 with suppress(BadInput):  # no pretrained checkpoint ships
-                    self.paths[name] = shipped(self.task.name, name)
+                    self.paths[name] = shipped(self.task, name)
                     filters[name] = load_checkpoint(self.paths[name])
         return filters
 
@@ -60,7 +61,7 @@ class TaskCatalog:
         data = dict(self.user_data)
         if SAMPLE not in data:
             with suppress(BadInput):  # no sample set ships
-                data[SAMPLE] = open_dataset(sample_path(self.task.name), self.task)
+                data[SAMPLE] = open_dataset(sample_path(self.task), self.task)
         return data
 
     def add_filter(self, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
@@ -124,33 +125,34 @@ class TaskCatalog:
 
 
 def task_catalogs(
-    checkpoints: Mapping[str, Path | Checkpoint], data: Mapping[str, Path]
+    checkpoints: Mapping[str, Path | Checkpoint], data: Mapping[str, Path], tasks: Sequence[Task] = ()
 ) -> tuple[dict[str, TaskCatalog], list[str]]:
     """Catalogs of all tasks, those with filters or data of the user first; and one line for each unusable input.
 
     Args:
         checkpoints: displayed name -> checkpoint file, or a loaded filter.
         data: displayed name -> file or folder of episodes.
+        tasks: user-defined tasks, as for ``stored_task``.
     """
     catalogs: dict[str, TaskCatalog] = {}
     problems: list[str] = []
     for name, source in checkpoints.items():
         with _collect_error(problems):
-            checkpoint = source if isinstance(source, Checkpoint) else load_checkpoint(source)
-            catalog = catalogs.setdefault(checkpoint.task.name, TaskCatalog(checkpoint.task))
+            checkpoint = source if isinstance(source, Checkpoint) else load_checkpoint(source, tasks)
+            catalog = _catalog_of(catalogs, checkpoint.task, name)
             catalog.user_filters[name] = checkpoint
             if isinstance(source, Path):
                 catalog.paths[name] = source
     tasks_with_filters = [catalog.task for catalog in catalogs.values()]
     for name, path in data.items():
         with _collect_error(problems):
-            episodes = open_dataset(path)
-            catalogs.setdefault(episodes.task.name, TaskCatalog(episodes.task)).user_data[name] = episodes
+            episodes = open_dataset(path, given=tasks)
+            _catalog_of(catalogs, episodes.task, name).user_data[name] = episodes
             # A file of the MIT Push data set fits several tasks: offer it for each one that the user has filters for.
             for task in tasks_with_filters:
-                if task is not episodes.task:
+                if task != episodes.task:
                     other = open_dataset(path, task)
-                    if other.task is task:
+                    if other.task == task:
                         catalogs[task.name].user_data[name] = other
                     else:
                         other.close()
@@ -159,6 +161,14 @@ def task_catalogs(
         if catalog.problem and (catalog.user_filters or catalog.user_data.keys() - displayed):
             problems.append(catalog.problem)
     return catalogs | {name: TaskCatalog(task) for name, task in TASKS.items() if name not in catalogs}, problems
+
+
+def _catalog_of(catalogs: dict[str, TaskCatalog], task: Task, source: str) -> TaskCatalog:
+    """The catalog of a task, added if missing. Raises BadInput if another task has the same name."""
+    catalog = catalogs.setdefault(task.name, TaskCatalog(task))
+    if other := difference(catalog.task, task):
+        raise BadInput(f"{source} is of {other}; a server has one task of each name")
+    return catalog
 
 
 def short_names(paths: Iterable[Path], reserved: Collection[str] = ()) -> dict[str, Path]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -24,6 +24,7 @@ from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS
+from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import UnavailableFilter
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
@@ -86,8 +87,9 @@ class GrowingRun(TracedRun):
 class LiveRuns:
     """The live files of a folder. Methods may be called from any thread."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, tasks: Sequence[Task] = ()) -> None:
+        """tasks: user-defined tasks, as for ``stored_task``."""
+        self.folder, self._tasks = folder, tasks
         self._runs: dict[str, LiveRun] = {}
         self._growing: dict[str, GrowingRun] = {}  # the newest state of each running run
         self._complete: OrderedDict[str, TracedRun] = OrderedDict()
@@ -104,7 +106,7 @@ class LiveRuns:
                 if run is not None:
                     run.close()
                     del self._runs[name]
-                run = self._runs[name] = LiveRun(path)
+                run = self._runs[name] = LiveRun(path, self._tasks)
         run.poll()
         return run
 

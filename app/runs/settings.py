@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from beliefscope.datasets.catalog import load_task
+from beliefscope.datasets.catalog import load_task, stored_task
+from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import task_to_json
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter, load_external
 
@@ -39,13 +41,18 @@ class Settings:
     tasks: tuple[str, ...] = ()
     studies: Mapping[str, Path] = field(default_factory=dict)
 
+    @property
+    def definitions(self) -> list[Task]:
+        """The user-defined tasks. Runs their files once."""
+        return [load_task(task) for task in self.tasks]
+
     def to_json(self) -> dict[str, Any]:
         """Everything a job needs, as JSON values. External filters are represented by their source."""
         return {
             "workspace": str(self.workspace),
             "data": {name: str(path) for name, path in self.data.items()},
             "checkpoints": {
-                name: {"source": filter_.source, "task": filter_.task.name}
+                name: {"source": filter_.source, "task": task_to_json(filter_.task)}
                 if isinstance(filter_, ExternalFilter)
                 else str(filter_)
                 for name, filter_ in self.checkpoints.items()
@@ -57,14 +64,17 @@ class Settings:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Settings:
-        """Inverse of ``to_json``. Registers the user-defined tasks and loads the external filters."""
-        for task in values["tasks"]:
-            load_task(task)
+        """Inverse of ``to_json``. Loads the user-defined tasks and the external filters."""
+        given = [load_task(task) for task in values["tasks"]]
+
+        def external(filter_: Mapping[str, Any]) -> ExternalFilter:
+            return load_external(filter_["source"], stored_task(filter_["task"], given))
+
         return cls(
             Path(values["workspace"]),
             {name: Path(path) for name, path in values["data"].items()},
             {
-                name: Path(filter_) if isinstance(filter_, str) else load_external(filter_["source"], filter_["task"])
+                name: Path(filter_) if isinstance(filter_, str) else external(filter_)
                 for name, filter_ in values["checkpoints"].items()
             },
             particles=values["particles"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -24,11 +25,14 @@ from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference, task_to_json
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.standalone import check_standalone
 from beliefscope.inspect.stored_runs import StoredRuns
 from beliefscope.inspect.trace import Trace, load_trace
+from beliefscope.inspect.traces.live_run import LiveRun
 
 TRACES_IN_MEMORY = 8  # most recent traces, in addition to those in use
 BYTES_IN_MEMORY = 256 << 20  # of the most recent traces; one is kept whatever its size
@@ -42,7 +46,7 @@ class TraceStore:
     def __init__(self, settings: Settings, worker: TraceWorker | None = None) -> None:
         """worker: process that runs the filters; without one, they run in a thread."""
         self.settings = settings
-        self.live = LiveRuns(settings.workspace / "live")
+        self.live = LiveRuns(settings.workspace / "live", settings.definitions)
         self._worker = worker
         self._lock = threading.RLock()
         self._key = lru_cache(MAX_KEYS)(self._compute_key)
@@ -55,7 +59,7 @@ class TraceStore:
 
     @cached_property
     def _catalogs(self) -> tuple[dict[str, TaskCatalog], list[str]]:
-        return task_catalogs(self.settings.checkpoints, self.settings.data)
+        return task_catalogs(self.settings.checkpoints, self.settings.data, self.settings.definitions)
 
     def problems(self) -> list[str]:
         """One line for each filter or data set of the settings that cannot be used."""
@@ -74,10 +78,21 @@ class TraceStore:
         with self._lock:
             return [name for name, catalog in self._catalogs[0].items() if not catalog.problem]
 
-    def describe_task(self, task: str) -> dict[str, Any]:
-        """The catalog entry of a task, whether or not it has filters and data."""
+    def describe_task(self, task: Task) -> dict[str, Any]:
+        """The catalog entry of a task, whether or not this server has filters and data of it."""
         with self._lock:
-            return self._catalog(task).to_json()
+            catalog = self._catalogs[0].get(task.name)
+            return (TaskCatalog(task) if catalog is None else catalog).to_json()
+
+    def filters_of(self, run: LiveRun) -> dict[str, Checkpoint]:
+        """The filters of a live run's task by name. Raises BadInput if another task here has the same name."""
+        with self._lock:
+            catalog = self._catalogs[0].get(run.task.name)
+            if catalog is None:
+                return {}
+            if other := difference(catalog.task, run.task):
+                raise BadInput(f"live run {run.name!r} is of {other}; this server has its own task {run.task.name!r}")
+            return catalog.filters
 
     def default_selection(self) -> Selection:
         """First task, filter, data set and held-out episode. Raises BadInput if no task can be displayed."""
@@ -191,7 +206,8 @@ class TraceStore:
         """The recorded live run, if the selection is exactly that run."""
         if not selection.data.startswith(LIVE_PREFIX):
             return None
-        return self.live.traced_run(selection, self.filters(selection.task))
+        run = self.live[selection.data.removeprefix(LIVE_PREFIX)]
+        return self.live.traced_run(selection, self.filters_of(run))
 
     def _resolve(self, selection: Selection) -> tuple[Checkpoint, Episode]:
         catalog = self._catalog(selection.task)
@@ -250,21 +266,21 @@ class TraceStore:
             catalog = self._catalog(selection.task)
             live = selection.data.startswith(LIVE_PREFIX)
             data = self.live.path(selection.data) if live else catalog.dataset(selection.data).path
-            if isinstance(checkpoint, ExternalFilter):
-                source, external_task = checkpoint.source, checkpoint.task.name
+            if external := isinstance(checkpoint, ExternalFilter):
+                source = checkpoint.source
             else:
-                source, external_task = str(catalog.paths[selection.filter]), ""
+                source = str(catalog.paths[selection.filter])
             original = str(self._trace_file(replace(selection, edit=None, only="")))
             return RunRequest(
                 selection,
+                task=json.dumps(task_to_json(checkpoint.task), sort_keys=True),
                 checkpoint=source,
-                external_task=external_task,
+                external=external,
                 data=str(data),
                 original=original,
                 output=str(self._trace_file(selection)),
                 seed=self.settings.seed,
                 particles=self.settings.particles,
-                user_tasks=self.settings.tasks,
             )
 
     def _trace_file(self, selection: Selection) -> Path:

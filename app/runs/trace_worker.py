@@ -6,16 +6,17 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.worker import WorkerDied, WorkerProcess
-from beliefscope.datasets.catalog import find_task, load_task
+from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.store import open_dataset
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
 from beliefscope.filters.external.load import load_external
@@ -30,24 +31,23 @@ class RunRequest:
 
     Attributes:
         selection: the run.
-        checkpoint: checkpoint file, or the source of an external filter.
-        external_task: task of an external filter; empty for a checkpoint file.
+        task: definition, as JSON text.
+        checkpoint: checkpoint file, or the source of an external filter. external: whether it is the latter.
         data: file or folder of episodes, or the file of a live run.
         original: trace file of the run without intervention.
         output: trace file of the run.
         seed, particles: settings of the filter.
-        user_tasks: user-defined tasks to register first.
     """
 
     selection: Selection
+    task: str
     checkpoint: str
-    external_task: str
+    external: bool
     data: str
     original: str
     output: str
     seed: int
     particles: int
-    user_tasks: tuple[str, ...] = ()
 
     def settings(self) -> dict[str, Any]:
         """Arguments of ``StoredRuns.run``."""
@@ -114,16 +114,14 @@ class TraceWorker:
 
 
 @lru_cache(maxsize=8)
-def _checkpoint(source: str, external_task: str) -> Checkpoint:
-    return load_external(source, external_task) if external_task else load_checkpoint(Path(source))
+def _checkpoint(source: str, external: bool, task: str) -> Checkpoint:
+    definition = stored_task(read_json(task))
+    return load_external(source, definition) if external else load_checkpoint(Path(source), (definition,))
 
 
 @lru_cache(maxsize=8)
 def _dataset(path: str, task: str) -> Dataset:
-    return open_dataset(path, find_task(task))
-
-
-_load_user_task = cache(load_task)
+    return open_dataset(path, stored_task(read_json(task)))
 
 
 def _episode(request: RunRequest) -> Episode:
@@ -132,7 +130,7 @@ def _episode(request: RunRequest) -> Episode:
             with suppress(BadInput):  # of a damaged file, the steps before the damage are used
                 reader.poll()
             return reader.part().episode
-    return _dataset(request.data, request.selection.task)[request.selection.episode]
+    return _dataset(request.data, request.task)[request.selection.episode]
 
 
 _runs = StoredRuns()
@@ -141,9 +139,7 @@ _runs = StoredRuns()
 def run_filter(arguments: Mapping[str, Any], report: Callable[[float], None]) -> None:
     """Carry out a ``RunRequest`` in the worker process."""
     request = RunRequest.from_json(arguments)
-    for task in request.user_tasks:
-        _load_user_task(task)
-    checkpoint = _checkpoint(request.checkpoint, request.external_task)
+    checkpoint = _checkpoint(request.checkpoint, request.external, request.task)
     trace = _runs.run(checkpoint, _episode(request), progress=report, **request.settings())
     if request.output != request.original:
         save_trace(trace, Path(request.output))

@@ -56,7 +56,7 @@ class Adapter:
         mean, std: (n,) m and rad, in its order: its states are ``(state - mean) / std``.
         inputs: observations by key and controls, SI units -> arguments of the module.
         modalities: names of its K measurement models, in order.
-        task: name of its task; needed by a server if not given elsewhere.
+        task: its task, by name, ``path/to/file.py:NAME`` or definition; needed by a server if not given elsewhere.
     """
 
     module: nn.Module
@@ -65,7 +65,7 @@ class Adapter:
     std: Sequence[float] = ()
     inputs: Callable[[dict[str, Tensor], Tensor], tuple[Any, Any]] = unchanged
     modalities: Sequence[str] = ()
-    task: str = ""
+    task: str | Task = ""
 
 
 class Units:

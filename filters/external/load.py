@@ -27,6 +27,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io import user_code
 from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference
 from beliefscope.filters.batch import check_shapes, start_offset
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import filters_of
@@ -232,12 +233,12 @@ def model_names(
     return ("+".join(modalities),) if count == 1 else tuple(f"model-{k + 1}" for k in range(count))
 
 
-def load_external(source: str, task: str = "", default_task: str = "") -> ExternalFilter:
+def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()) -> ExternalFilter:
     """The filter that ``path/to/file.py:NAME`` or ``package.module:NAME`` returns when called without arguments.
 
     Args:
-        task: name of the task; by default that of the filter, ``Adapter.task`` or an attribute ``task``.
-        default_task: name of the task if neither is given.
+        task: of the filter. Default: ``Adapter.task`` or an attribute ``task``, else the only given task.
+        given: user-defined tasks that the filter may name.
 
     Raises:
         BadInput: the name does not exist, the call fails or does not return a torch module, or the task differs.
@@ -260,14 +261,17 @@ def load_external(source: str, task: str = "", default_task: str = "") -> Extern
     if not isinstance(adapter, Adapter) or not isinstance(adapter.module, nn.Module):
         value = adapter.module if isinstance(adapter, Adapter) else adapter
         raise BadInput(f"{source} returns a {type(value).__name__}, expected a torch.nn.Module, or an Adapter of one")
-    own_task = adapter.task or getattr(adapter.module, "task", "")
-    own_task = own_task if isinstance(own_task, str) else ""
-    task = task or own_task or default_task
-    if not task:
+    loaded = load_task(task) if task else None
+    own = adapter.task or getattr(adapter.module, "task", "")
+    if isinstance(own, str | Task) and own:
+        own_task = next((t for t in (loaded, *given) if t is not None and t.name == own), None) or load_task(own)
+        if loaded is not None and (other := difference(loaded, own_task)):
+            raise BadInput(f"filter {source!r} is for {other}, not for {loaded.name!r}")
+        loaded = loaded or own_task
+    if loaded is None and len(given) == 1:
+        loaded = given[0]
+    if loaded is None:
         raise BadInput(f"{source} does not name its task: give it an attribute task, or use --task")
-    loaded = load_task(task)
-    if own_task and own_task != loaded.name:
-        raise BadInput(f"filter {source!r} is for task {own_task!r}, not for {loaded.name!r}")
     name = f"{Path(place).stem}-{attribute}" if place.endswith(".py") else source.replace(":", "-")
     return ExternalFilter(adapter, loaded, name, source)
 
@@ -288,7 +292,7 @@ def _state_std(task: Task) -> Tensor:
     """(n,) m and rad: standard deviations of the pretrained filters' training states; NaN if there are none."""
     for name in filters_of(task):
         with suppress(BadInput):  # not every filter is pretrained
-            return load_checkpoint(shipped(task.name, name)).filter.statistics.mean_std("state")[1]
+            return load_checkpoint(shipped(task, name)).filter.statistics.mean_std("state")[1]
     return torch.full((len(task.components),), torch.nan)
 
 

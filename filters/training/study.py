@@ -17,12 +17,14 @@ from typing import Any
 
 import torch
 
-from beliefscope.datasets.catalog import TASKS, find_task, load_task
+from beliefscope.datasets.catalog import TASKS, load_task
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.store import has_sample, open_dataset, sample_path
+from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference
 from beliefscope.filters import legacy_names
 from beliefscope.filters.catalog import architecture, filters_of
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
@@ -56,16 +58,20 @@ class Cell:
     def __str__(self) -> str:
         return f"{self.task}/{self.filter}/seed{self.seed}"
 
+    @property
+    def definition(self) -> Task:
+        """The task."""
+        return load_task(self.source)
+
     def path(self, folder: Path, suffix: str = ".json") -> Path:
         return folder / "cells" / f"{self}{suffix}"
 
     def inputs(self) -> Document:
         """The part of the cell's document that identifies it, as read from JSON."""
-        load_task(self.source)
         return {
             "task": self.task,
             "filter": self.filter,
-            "architecture": architecture(self.task, self.filter).to_json(),
+            "architecture": architecture(self.definition, self.filter).to_json(),
             "seed": self.seed,
             "plan": json.loads(json.dumps(asdict(PLANS[self.preset]))),
             "blackouts": list(BLACKOUTS),
@@ -77,7 +83,7 @@ class Cell:
         """The document of the finished or failed cell; None if it is missing, incomplete or of other inputs."""
         try:
             document = read_json(self.path(folder).read_bytes())
-            document["architecture"] = Architecture.from_json(document["architecture"]).to_json()
+            document["architecture"] = Architecture.from_json(document["architecture"], self.definition).to_json()
             document["plan"] = legacy_names.rename_keys(document["plan"], legacy_names.PLAN)
             if any(document.get(key) != value for key, value in self.inputs().items()):
                 return None
@@ -131,10 +137,10 @@ def study_cells(
     cells = []
     for source in sources:
         task = load_task(source)
-        path = (files[source] if source in files else sample_path(task.name)).resolve()
+        path = (files[source] if source in files else sample_path(task)).resolve()
         with open_dataset(path, task, skip_bad) as episodes:
-            if episodes.task.name != task.name:
-                raise BadInput(f"{str(path)!r} contains episodes of task {episodes.task.name!r}, not of {task.name!r}")
+            if other := difference(task, episodes.task):
+                raise BadInput(f"{str(path)!r} contains episodes of {other}, not of {task.name!r}")
             data_hash, splits = episodes.hash, {summary.split for summary in episodes.summaries}
             for line in episodes.skipped:
                 note(f"skipped: {line}")
@@ -191,7 +197,7 @@ def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:
     episodes = _episodes(cell.source, cell.data, cell.skip_bad, cell.data_hash)
     checkpoint = cell.path(folder, ".safetensors")
     trained = train(
-        architecture(cell.task, cell.filter),
+        architecture(cell.definition, cell.filter),
         episodes,
         data_hash=cell.data_hash,
         plan=PLANS[cell.preset],
@@ -203,7 +209,7 @@ def _train_cell(cell: Cell, folder: Path, report: Report | None) -> Document:
         shared=folder / "shared",
     )
     checkpoint_hash = save_checkpoint(trained.filter, cell.filter, trained.record, checkpoint)
-    results = {"checkpoint_hash": checkpoint_hash, "trivial": trivial(cell.task, episodes)}
+    results = {"checkpoint_hash": checkpoint_hash, "trivial": trivial(cell.definition, episodes)}
     return trained.record | cell.inputs() | results | {OFFSET: offset_metrics(trained.filter, episodes)}
 
 
@@ -233,13 +239,13 @@ def _episodes(source: str, data: Path, skip_bad: bool, data_hash: str) -> tuple[
         return tuple(dataset)
 
 
-def trivial(task: str, episodes: Sequence[Episode]) -> dict[str, float]:
+def trivial(task: Task, episodes: Sequence[Episode]) -> dict[str, float]:
     """RMSE of always predicting the mean training state, on held-out episodes without their first steps."""
     mean = torch.cat([torch.from_numpy(e.states).double() for e in episodes if e.split == "train"]).mean(0)
     states = [torch.from_numpy(e.states).double() for e in held_out(episodes)]
-    evaluated = [truth[find_task(task).first_counted(len(truth)) :] for truth in states]
+    evaluated = [truth[task.first_counted(len(truth)) :] for truth in states]
     error = mean - torch.cat(evaluated)
-    return metrics(find_task(task), error, torch.full((*error.shape, error.shape[-1]), math.nan)).rmse
+    return metrics(task, error, torch.full((*error.shape, error.shape[-1]), math.nan)).rmse
 
 
 def _finite(value: Any) -> Any:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from beliefscope.datasets.catalog import find_task
+from beliefscope.datasets.task import Task
 from beliefscope.filters.evaluate import BASELINES, nees_bounds
 from beliefscope.filters.start_offset import STUDY_OFFSET
 from beliefscope.filters.training.plan import EVALUATED_BLACKOUTS
@@ -34,6 +34,9 @@ class Condition(Protocol):
 
     @property
     def task(self) -> str: ...
+
+    @property
+    def definition(self) -> Task: ...
 
     @property
     def filter(self) -> str: ...
@@ -83,7 +86,7 @@ def rows_of(documents: Mapping[Any, Document | None]) -> list[Row]:
     """
     rows = []
     cells: Sequence[Condition] = list(documents)
-    for task in dict.fromkeys(cell.task for cell in cells):
+    for task, definition in {cell.task: cell.definition for cell in cells}.items():
         requested: dict[str, list[Document | None]] = {}
         for cell in cells:
             if cell.task == task:
@@ -94,13 +97,13 @@ def rows_of(documents: Mapping[Any, Document | None]) -> list[Row]:
                 b for b in EVALUATED_BLACKOUTS if not finished or any(f"{b:g}" in d.get(key, {}) for d in finished)
             ]
             for name, members in requested.items():
-                rows += [_row(task, name, key, blackout, members) for blackout in blackouts]
+                rows += [_row(definition, name, key, blackout, members) for blackout in blackouts]
         if finished:
             rows.append(Row(task, TRIVIAL, None, 0, 0, 0, finished[0]["trivial"], {}))
     return rows
 
 
-def _row(task: str, name: str, key: str, blackout: float, requested: Sequence[Document | None]) -> Row:
+def _row(task: Task, name: str, key: str, blackout: float, requested: Sequence[Document | None]) -> Row:
     """The row of one condition: the seeds with metrics ``key`` at this probability of an image blackout."""
     failed = sum(d is not None and "error" in d for d in requested)
     finished = [d for d in requested if d is not None and f"{blackout:g}" in d.get(key, {})]
@@ -111,9 +114,9 @@ def _row(task: str, name: str, key: str, blackout: float, requested: Sequence[Do
     bounds = None
     if mean.get("nees") is not None:
         trajectories = finished[0]["episodes"]["test"] or finished[0]["episodes"]["val"]
-        bounds = nees_bounds(len(find_task(task).components), trajectories)
+        bounds = nees_bounds(len(task.components), trajectories)
     return Row(
-        task,
+        task.name,
         name,
         blackout,
         *(len(finished), len(requested), failed),
@@ -123,7 +126,7 @@ def _row(task: str, name: str, key: str, blackout: float, requested: Sequence[Do
         standalone=_rmse_by_name([{k: m for k, m in by_name.items() if k != "fused"} for by_name in metrics]),
         updates=_rmse_by_name([m.get("updates", {}) for m in fused]),
         by_seed=by_seed,
-        start=str(STUDY_OFFSET.of(find_task(task))) if key == OFFSET else "",
+        start=str(STUDY_OFFSET.of(task)) if key == OFFSET else "",
         from_step_0=_over_seeds([m.get("rmse_from_step_0", {}) for m in fused])[0],
         baselines=_rmse_by_name([{k: m for k, m in f.get("baselines", {}).items() if m} for f in fused]),
     )
@@ -221,9 +224,9 @@ def start_label(start: str) -> str:
     return f"start offset {start}" if start else "start at the truth"
 
 
-def headline_keys(task: str) -> list[str]:
-    """Keys of the RMSE of the position and of each angle."""
-    return ["position_cm", *(f"{c.name}_deg" for c in find_task(task).components if c.unit == "rad")]
+def headline_keys(rmse: Iterable[str]) -> list[str]:
+    """Keys of the RMSE of the position and of each angle, of all keys."""
+    return ["position_cm", *(key for key in rmse if key.endswith("_deg"))]
 
 
 def _baseline_table(rows: Sequence[Row]) -> str:
@@ -231,7 +234,7 @@ def _baseline_table(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
         parts = [row.mean, row.from_step_0, *(row.baselines.get(name, {}) for name in BASELINES)]
-        for key in headline_keys(row.task) if row.baselines else ():
+        for key in headline_keys(row.mean) if row.baselines else ():
             values = ["" if (value := part.get(key)) is None else f"{value:.2f}" for part in parts]
             lines.append(f"| {row.filter} | {row.blackout:.0%} | {label(key)} | {' | '.join(values)} |")
     if not lines:

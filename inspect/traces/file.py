@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import task_to_json
 from beliefscope.inspect.traces.data import ARRAYS, Trace, arrays_of
 from beliefscope.inspect.traces.validate import validate_trace
@@ -55,8 +56,12 @@ def header_of(trace: Trace) -> dict[str, Any]:
     }
 
 
-def load_trace(path: Path) -> Trace:
-    """Read a trace. Raises BadInput if the file is missing, truncated or not a trace."""
+def load_trace(path: Path, given: Iterable[Task] = ()) -> Trace:
+    """Read a trace. Raises BadInput if the file is missing, truncated or not a trace.
+
+    Args:
+        given: user-defined tasks, as for ``stored_task``.
+    """
     path = Path(path)
     if not path.is_file():
         raise BadInput(f"trace {str(path)!r} does not exist")
@@ -72,12 +77,12 @@ def load_trace(path: Path) -> Trace:
     if (version := header.pop("format", None)) != FORMAT:
         raise BadInput(f"{str(path)!r} has trace format {version!r}; this version reads format {FORMAT}")
     try:
-        return trace_from_arrays(header, arrays)
+        return trace_from_arrays(header, arrays, given)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise BadInput(f"{str(path)!r} is not a complete trace: {error}") from None
 
 
-def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> Trace:
+def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any], given: Iterable[Task] = ()) -> Trace:
     """Inverse of ``header_of`` and ``arrays_of``.
 
     Raises AttributeError, KeyError, TypeError or ValueError (including BadInput) for inconsistent content.
@@ -88,7 +93,7 @@ def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> T
     prefix = "observations/"
     origin = header["episode"]
     episode = Episode(
-        **origin | {"task": stored_task(origin["task"])},
+        **origin | {"task": stored_task(origin["task"], given)},
         **{name: episode_arrays[name] for name in ("states", "controls", "contact", "qpos")},
         observations={n.removeprefix(prefix): a for n, a in episode_arrays.items() if n.startswith(prefix)},
     )

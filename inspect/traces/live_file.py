@@ -20,7 +20,7 @@ import struct
 import threading
 from array import array as packed
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.traces.data import Trace, arrays_of
 from beliefscope.inspect.traces.file import header_of, trace_from_arrays
 
@@ -146,9 +147,13 @@ class LiveFileReader:
         bytes_per_step: size of a step in the file.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Raises BadInput if the file is missing, truncated within the header, or not a live file."""
-        self.path = Path(path)
+    def __init__(self, path: Path, given: Iterable[Task] = ()) -> None:
+        """Raises BadInput if the file is missing, truncated within the header, or not a live file.
+
+        Args:
+            given: user-defined tasks, as for ``stored_task``.
+        """
+        self.path, self._given = Path(path), tuple(given)
         self.steps, self.finished = 0, False
         if not self.path.is_file():
             raise BadInput(f"live run {self._name} does not exist")
@@ -291,7 +296,7 @@ class LiveFileReader:
             at, number = to, number + 1
 
     def _trace(self, arrays: Arrays) -> Trace:
-        return trace_from_arrays(self._header, arrays | self._static)
+        return trace_from_arrays(self._header, arrays | self._static, self._given)
 
     def _bytes_at(self, offset: int, length: int) -> bytes:
         parts = []
@@ -301,9 +306,9 @@ class LiveFileReader:
         return b"".join(parts)
 
 
-def load_live(path: Path) -> Trace:
+def load_live(path: Path, given: Iterable[Task] = ()) -> Trace:
     """Read all complete steps. Raises BadInput as ``LiveFileReader``, and if the file is damaged or has no step."""
-    reader = LiveFileReader(path)
+    reader = LiveFileReader(path, given)
     try:
         if not reader.poll():
             raise BadInput(f"{str(path)!r} has no step yet")

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import threading
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
 from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileReader
 
 LIVENESS_INTERVAL = 0.25  # s between checks of a writer that adds no steps
@@ -24,11 +26,15 @@ class LiveRun:
         inode: distinguishes the file from a later one with the same name.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Raises BadInput if the file is not a live run or its task is unknown."""
+    def __init__(self, path: Path, given: Iterable[Task] = ()) -> None:
+        """Raises BadInput if the file is not a live run.
+
+        Args:
+            given: user-defined tasks, as for ``stored_task``.
+        """
         self.name = path.name.removesuffix(SUFFIX)
         self.inode = path.stat().st_ino
-        self.reader = LiveFileReader(path)
+        self.reader = LiveFileReader(path, given)
         try:
             self.template = self.reader.part(0, 0)
             self.task = self.template.task

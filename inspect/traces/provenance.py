@@ -42,12 +42,12 @@ def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str =
         if trace.checkpoint_hash != first.checkpoint_hash:
             raise BadInput(f"{file} and {files[0]} are from different checkpoints; give traces of one filter")
     if filter_:
-        checkpoint = open_filter(first.task.name, filter_)
+        checkpoint = open_filter(first.task, filter_)
         if checkpoint.hash != first.checkpoint_hash:
             raise BadInput(f"{files[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}")
         return checkpoint
     try:
-        checkpoint = load_checkpoint(shipped(first.task.name, first.filter))
+        checkpoint = load_checkpoint(shipped(first.task, first.filter))
     except BadInput:
         return None
     return checkpoint if checkpoint.hash == first.checkpoint_hash else None
@@ -61,7 +61,7 @@ def reproducible(traces: Sequence[Trace], data: Path | None) -> set[int]:
     """
     task = traces[0].task
     try:
-        with open_dataset(sample_path(task.name) if data is None else data, task) as episodes:
+        with open_dataset(sample_path(task) if data is None else data, task) as episodes:
             return {
                 i
                 for i, trace in enumerate(traces)

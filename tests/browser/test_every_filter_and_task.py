@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from beliefscope.datasets import catalog
-from beliefscope.datasets.catalog import TASKS, find_task, load_task
+from beliefscope.datasets.catalog import find_task, load_task
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
@@ -69,15 +68,9 @@ def test_missing_outputs_are_explained_per_filter(open_page: Any, start_server: 
 def test_user_defined_task(open_page: Any, start_server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, checkpoint = tmp_path / "ball.h5", tmp_path / "checkpoint.safetensors"
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), str(data)])
-    before = dict(TASKS)
     runpy.run_path(str(EXAMPLE), run_name="__main__")
-    name = load_task(f"{EXAMPLE}:TASK").name
-    try:
-        untrained(name, "crossmodal-pf", data, checkpoint)
-    finally:
-        for other in TASKS.keys() - before.keys():
-            del TASKS[other]  # other tests must not see it
-        catalog._user_tasks.clear()
+    name = "ball"
+    untrained(load_task(f"{EXAMPLE}:TASK"), "crossmodal-pf", data, checkpoint)
     page = open_page(
         url=start_server("--task", f"{EXAMPLE}:TASK", "--data", str(data), "--filter", str(checkpoint)).url
     )

@@ -49,7 +49,7 @@ def diagnose(
     if not 0.0 < alarm_rate < 1.0:
         raise BadInput(f"--alarm-rate is {alarm_rate:g}, not a probability between 0 and 1")
     checkpoint, faults = runs.open()
-    other = None if base is None else open_filter(checkpoint.task.name, str(base))
+    other = None if base is None else open_filter(checkpoint.task, str(base))
     with runs.episodes(checkpoint.task) as data:
         indices = data.held_out() if episode is None else [episode]
         episodes = {index: faults.apply(data[index], runs.seed) for index in indices}

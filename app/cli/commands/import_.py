@@ -9,8 +9,9 @@ from beliefscope.app.cli import options as opt
 @opt.with_options(
     recording=opt.argument("RUN.rrd|RUN.live", "Recording, or file of a live run."),
     output=opt.TRACE,
+    task=opt.TASK_OF_FILES,
 )
-def import_(recording: Path, output: Path) -> console.Result:
+def import_(recording: Path, output: Path, task: str = "") -> console.Result:
     """Extract the trace from a recording.
 
     The arrays equal those of the recorded trace, including their types, so all diagnostics give the same results. Of
@@ -23,6 +24,6 @@ def import_(recording: Path, output: Path) -> console.Result:
     """
     from beliefscope.inspect.trace import save_trace
 
-    trace = opt.open_recording(recording)
+    trace = opt.open_recording(recording, task)
     save_trace(trace, output)
     return opt.trace_result(trace, output)

@@ -11,6 +11,7 @@ from beliefscope.datasets.errors import BadInput, check_name
 @opt.with_options(
     paths=opt.argument("TRACE...", "Traces of one filter."),
     filter=opt.TRACE_FILTER,
+    task=opt.TASK_OF_FILES,
     only=opt.option("NAME", "Run only this diagnostic. Repeatable."),
     options=opt.option("NAME=VALUE", "Option of a diagnostic, such as step=68. Repeatable.", "--option"),
     every=opt.flag("Include slow diagnostics.", "--all"),
@@ -20,6 +21,7 @@ from beliefscope.datasets.errors import BadInput, check_name
 def inspect(
     paths: list[Path],
     filter: str = "",
+    task: str = "",
     only: list[str] | None = None,
     options: list[str] | None = None,
     every: bool = False,
@@ -55,7 +57,7 @@ def inspect(
         for name, entry in entries.items()
     }
     opt.check_folder(figures, "--figures")
-    traces, checkpoint = opt.open_traces(paths, filter)
+    traces, checkpoint = opt.open_traces(paths, filter, task)
     with console.progress("Inspecting") as advance:
         results, reasons = run_diagnostics(traces, checkpoint, parsed, bool(every or only), advance)
     if not results:

@@ -27,6 +27,7 @@ URL = "http://127.0.0.1:8000"
         "--event",
     ),
     filter=opt.TRACE_FILTER,
+    task=opt.TASK_OF_FILES,
     every=opt.flag("Include slow diagnostics.", "--all"),
     url=opt.option("ADDRESS", "Address of the dashboard, for permalinks."),
     pdf=opt.flag("Also print report.pdf; requires Chromium.", "--pdf"),
@@ -37,6 +38,7 @@ def report(
     title: str = "",
     events: list[str] | None = None,
     filter: str = "",
+    task: str = "",
     data: Path | None = None,
     quantity: opt.Quantity | None = None,
     every: bool = False,
@@ -67,7 +69,7 @@ def report(
     files = [file for path in paths for file in (sorted(path.glob("*.trace")) if path.is_dir() else [path])]
     if not files:
         raise BadInput(f"folder {str(paths[0])!r} contains no .trace file")
-    traces, checkpoint = opt.open_traces(files, filter)
+    traces, checkpoint = opt.open_traces(files, filter, task)
     if quantity and checkpoint is not None and (reason := no_maps(checkpoint, traces[0], quantity)):
         raise BadInput(reason)
     steps = [parse_event(text, traces) for text in events or ()]

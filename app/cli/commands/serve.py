@@ -111,9 +111,8 @@ def _checkpoints(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path
     from beliefscope.filters.external.load import load_external
     from beliefscope.filters.open_filter import is_code
 
-    names = [load_task(name).name for name in tasks]
-    default_task = names[0] if len(names) == 1 else ""
-    external = [load_external(name, default_task=default_task) for name in filters if is_code(name)]
+    given = [load_task(name) for name in tasks]
+    external = [load_external(name, given=given) for name in filters if is_code(name)]
     paths = [Path(name) for name in filters if not is_code(name)]
     return {**short_names(paths, PRETRAINED), **{checkpoint.name: checkpoint for checkpoint in external}}
 

@@ -59,7 +59,7 @@ def train(
 
     opt.check_folder(log, "--log")
     target = load_task(task)
-    settings = architecture(target.name, filter, networks)
+    settings = architecture(target, filter, networks)
     probabilities = parse_blackouts(blackouts)
     check_name("preset", preset, PLANS)
     injected = read_faults(faults, target)

@@ -13,7 +13,6 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
-from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.datasets.store import write_dataset
@@ -39,7 +38,7 @@ def serve(tmp_path: Path, open_client: Callable[..., TestClient]) -> Iterator[Se
         observations = {key: episode.observations[key] for key in task.observations}
         episode = replace(episode, task=task, observations=observations)
         write_dataset(tmp_path / "episode.h5", task, [episode])
-        filter_ = build(architecture(task.name, name))
+        filter_ = build(architecture(task, name))
         filter_.statistics.fit(Steps.from_episodes(task, [episode]))
         save_checkpoint(filter_, name, {}, tmp_path / name)
         data, checkpoints = {"data": tmp_path / "episode.h5"}, {"own": tmp_path / name}
@@ -116,8 +115,7 @@ def test_columns_and_maps_of_a_filter(
 PLAIN = replace(PUSH, name="plain", replay=None, outline=None)
 
 
-def test_task_without_replay(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(TASKS, PLAIN.name, PLAIN)
+def test_task_without_replay(serve: Serve) -> None:
     client = serve(PLAIN, "crossmodal-pf")
     assert [c["name"] for c in header(client, PLAIN)["components"]] == ["x", "y"]
     assert header(client, PLAIN)["image_size"] == [32, 32]
@@ -127,14 +125,13 @@ def test_task_without_replay(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> N
     assert np.frombuffer(images, np.uint8).any()
 
 
-def test_task_without_images(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_task_without_images(serve: Serve) -> None:
     task = replace(
         PUSH,
         name="no-images",
         observations={key: shape for key, shape in PUSH.observations.items() if len(shape) == 1},
         modalities={"haptics": PUSH.modalities["haptics"]},
     )
-    monkeypatch.setitem(TASKS, task.name, task)
     client = serve(task, "haptics-ekf")
     assert header(client, task)["image_size"] is None
     assert map_layers(client, task) == ["haptics", "fused"]

@@ -40,12 +40,12 @@ def test_user_files_precede_the_included_ones(base_settings: Settings) -> None:
     assert door.dataset("") is door.data["mine"]
 
 
-def test_each_unusable_input_is_reported_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bare = task_without_files(monkeypatch)
+def test_each_unusable_input_is_reported_in_one_line(tmp_path: Path) -> None:
+    bare = task_without_files()
     simulate = DOOR.simulate
     assert simulate is not None
     write_dataset(tmp_path / "bare.h5", bare, [replace(simulate(0, 0, 10), task=bare)])
-    save_checkpoint(build(architecture(bare.name, "image-ekf")), "image-ekf", {}, tmp_path / "bare.safetensors")
+    save_checkpoint(build(architecture(bare, "image-ekf")), "image-ekf", {}, tmp_path / "bare.safetensors")
     missing = tmp_path / "missing"
     _, problems = task_catalogs({"a": missing}, {"b": missing, "c": tmp_path / "bare.h5"})
     assert problems == [
@@ -74,8 +74,6 @@ def test_a_file_is_listed_for_each_task_with_user_filters(tmp_path: Path) -> Non
     assert all(catalogs[name].data["pushes"].task is TASKS[name] for name in both)
 
 
-def task_without_files(monkeypatch: pytest.MonkeyPatch) -> Task:
+def task_without_files() -> Task:
     """A task without pretrained filters and sample data."""
-    task = replace(DOOR, name="bare")
-    monkeypatch.setitem(TASKS, task.name, task)
-    return task
+    return replace(DOOR, name="bare")

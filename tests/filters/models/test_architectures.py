@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.task import Component, Task
@@ -54,9 +53,9 @@ def test_catalog_has_the_filters_of_the_paper_and_a_ukf() -> None:
 
 
 @pytest.fixture
-def custom_task(monkeypatch: pytest.MonkeyPatch) -> Task:
+def custom_task() -> Task:
     """A custom task with two state components and three modalities, without images."""
-    task = Task(
+    return Task(
         name="custom",
         components=(Component("x", "m"), Component("y", "m")),
         observations={"depth": (4,), "sound": (2,), "skin": (3,), "heat": (1,)},
@@ -66,8 +65,6 @@ def custom_task(monkeypatch: pytest.MonkeyPatch) -> Task:
         map_components=("x", "y"),
         map_half_width=0.1,
     )
-    monkeypatch.setitem(TASKS, task.name, task)
-    return task
 
 
 def test_custom_task_has_all_filters_over_its_modalities(custom_task: Task) -> None:
@@ -81,7 +78,7 @@ def test_custom_task_has_all_filters_over_its_modalities(custom_task: Task) -> N
     states = torch.randn(5, 2, 2)
     batch = Batch(observations, torch.randn(5, 2, 2), states, torch.zeros(5, 2, dtype=torch.bool), states[0])
     for name in filters:
-        result = run(build(architecture("custom", name)), batch, keep=True)
+        result = run(build(architecture(custom_task, name)), batch, keep=True)
         assert torch.isfinite(result.estimate.mean).all(), name
         if name.startswith("crossmodal"):
             modality = result.steps[0].modality
@@ -90,7 +87,7 @@ def test_custom_task_has_all_filters_over_its_modalities(custom_task: Task) -> N
 
 def test_unknown_names_are_rejected_with_the_available_ones(custom_task: Task) -> None:
     with pytest.raises(BadInput, match=r"filter 'image-ekf' does not exist\. Available: .*sight-ekf.*lstm"):
-        architecture("custom", "image-ekf")
+        architecture(custom_task, "image-ekf")
     with pytest.raises(BadInput, match=r"task 'dor' does not exist\. Available: door"):
         architecture("dor", "lstm")
 
@@ -100,7 +97,7 @@ def test_unknown_names_are_rejected_with_the_available_ones(custom_task: Task) -
 
 def test_architectures_survive_json() -> None:
     unusual = Architecture(
-        "door", "pf", "unimodal", ("image",), 32, 1, "authors", "mean", "moments", True, "raw", "soft", soft_share=0.25
+        DOOR, "pf", "unimodal", ("image",), 32, 1, "authors", "mean", "moments", True, "raw", "soft", soft_share=0.25
     )
     for each in (*filters_of(DOOR).values(), unusual):
         assert Architecture.from_json(each.to_json()) == each
@@ -108,7 +105,7 @@ def test_architectures_survive_json() -> None:
 
 def test_missing_keys_of_older_checkpoints_take_their_default() -> None:
     older = {"task": "door", "kind": "pf", "fusion": "crossmodal", "models": ["image", "haptics"], "units": 64}
-    assert Architecture.from_json(older) == Architecture("door", "pf")
+    assert Architecture.from_json(older) == Architecture(DOOR, "pf")
 
 
 @pytest.mark.parametrize(
@@ -119,13 +116,14 @@ def test_missing_keys_of_older_checkpoints_take_their_default() -> None:
         ({"resampling": "none"}, "resampling of a filter 'none' does not exist. Available: systematic, hard, soft."),
         ({"soft_share": 0.0}, "soft_share must be above 0 and at most 1, not 0.0"),
         ({"colour": "red"}, "not an architecture of this version: .*'colour'"),
-        ({"task": ["door"]}, r"task of a filter is \['door'\], not a name"),
+        ({"task": ["door"]}, "incomplete definition of a task"),
+        ({"task": "dor"}, "task 'dor' does not exist"),
         ({"models": ["smell"]}, r"Modality 'smell' is not in task 'door'\. Available: image, haptics\."),
     ],
 )
 def test_invalid_architectures_are_rejected(change: dict, message: str) -> None:
     with pytest.raises(BadInput, match=message):
-        build(Architecture.from_json(Architecture("door", "ekf").to_json() | change))
+        build(Architecture.from_json(Architecture(DOOR, "ekf").to_json() | change))
 
 
 # Properties of all filters.

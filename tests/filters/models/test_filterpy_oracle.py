@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import KINDS
 from beliefscope.filters.filter import Architecture
@@ -73,7 +74,7 @@ def test_nonlinear_kalman_filters(kind: str, oracle: object, dynamics: Dynamics)
     controls, observations = linear.simulate(STEPS, seed=5)
     evidence = linear.evidence(controls, observations)
     parts = dynamics.control_part(evidence.control)
-    filter_ = KINDS[kind](Architecture("door", kind, "none", ("haptics",)))  # type: ignore[index, arg-type]
+    filter_ = KINDS[kind](Architecture(DOOR, kind, "none", ("haptics",)))  # type: ignore[index, arg-type]
     filter_.dynamics = dynamics
     start = Gaussian(torch.zeros(1, 3, dtype=torch.float64), torch.from_numpy(linear.START)[None])
     from_parts = type(evidence)(parts, evidence.observation, evidence.noise, None)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import KINDS
 from beliefscope.filters.filter import Architecture
@@ -22,7 +23,7 @@ START = Gaussian(torch.zeros(1, 3, dtype=torch.float64), torch.from_numpy(linear
 
 
 def single(kind: str, **options: object) -> Architecture:
-    return Architecture(task="door", kind=kind, fusion="none", models=("haptics",), **options)  # type: ignore[arg-type]
+    return Architecture(task=DOOR, kind=kind, fusion="none", models=("haptics",), **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["ekf", "ukf"])

@@ -111,7 +111,7 @@ def document(folder: Path, name: str) -> dict[str, Any]:
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skips drawing the figures in this process."""
-    monkeypatch.setattr("beliefscope.recordings.study_figures.write_results", lambda rows, folder: [])
+    monkeypatch.setattr("beliefscope.recordings.study_figures.write_results", lambda rows, folder, tasks: [])
 
 
 @pytest.mark.long

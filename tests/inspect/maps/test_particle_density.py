@@ -63,7 +63,7 @@ def divergence(particles: int, seed: int) -> float:
     """nats, KL from the Kalman posterior to prior density times likelihood of a PF, over a grid at the true angle."""
     controls, observations = linear.simulate(10, 3)
     means, covariances = linear.kalman(controls, observations)
-    filter_ = linear.GaussianLikelihood(Architecture(task="door", kind="pf", fusion="none", models=("image",)))
+    filter_ = linear.GaussianLikelihood(Architecture(task=DOOR, kind="pf", fusion="none", models=("image",)))
     filter_.dynamics = linear.LinearDynamics()  # type: ignore[assignment]
     start = Gaussian(torch.zeros(1, 3), torch.from_numpy(linear.START)[None])
     evidence = linear.evidence(controls, observations)
