@@ -46,6 +46,7 @@ OPTIONS = {
     "counterfactual": "--filter --data --episode --faults --weights --from --to --particles --seed --trace -o --json",
     "figure": "--filter --data --skip-bad --episode --step --faults --particles --seed -o --json",
     "failures": "--filter --data --skip-bad --faults --by --top --phase --all --url --particles --seed --json",
+    "slices": "--filter --data --skip-bad --faults --by --alpha --all --particles --seed --json",
     "faults": "--json",
     "doctor": "--workspace --host --port --json",
 }
@@ -124,6 +125,8 @@ BAD = [
     f"evaluate {EKF} --data ekf.safetensors",
     f"evaluate {EKF} --particles 0",
     f"evaluate {EKF} --seed -1",
+    f"slices {EKF} --alpha 2",
+    f"slices {EKF} --by speed",
     f"evaluate {EKF} --json out.json",
     f"evaluate {EKF} --faults notes.txt",
     f"evaluate {EKF} --faults missing.json",

@@ -38,29 +38,33 @@ def survey_of(
     Raises BadInput after the first trace if ``by`` does not apply, and as ``trace``.
     """
     indices = list(episodes)
-    settings: dict[str, Any] = {"seed": seed, "particles": particles, "faults": faults}
+    settings: dict[str, Any] = {"faults": faults, "seed": seed, "particles": particles}
+    return Survey.from_traces(traces_of(checkpoint, data, indices, by=by, progress=progress, **settings))
+
+
+def traces_of(
+    checkpoint: Checkpoint,
+    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    indices: Sequence[int],
+    *,
+    by: str | None = None,
+    progress: Callable[[float], None] | None = None,
+    **settings: Any,
+) -> Iterator[Trace]:
+    """The traces of ``survey_of``, with the same arguments and errors."""
 
     def one_by_one() -> Iterator[Trace]:
         for done, index in enumerate(indices):
-            yield trace(
-                checkpoint,
-                data[index],
-                index,
-                **settings,
-                progress=_partial_progress(progress, done, len(indices)),
-            )
+            share = _partial_progress(progress, done, len(indices))
+            yield trace(checkpoint, data[index], index, **settings, progress=share)
 
-    def traces() -> Iterator[Trace]:
-        batched = checkpoint.kind not in ("pf", "external")
-        runs = trace_all(checkpoint, data, indices, **settings) if batched else one_by_one()
-        for done, run in enumerate(runs):
-            if not done and by is not None:
-                check_applies(by, find_score(by, checkpoint.task).why_not(run))
-            if batched and progress is not None:
-                progress((done + 1) / len(indices))
-            yield run
-
-    return Survey.from_traces(traces())
+    batched = checkpoint.kind not in ("pf", "external")
+    for done, run in enumerate(trace_all(checkpoint, data, indices, **settings) if batched else one_by_one()):
+        if not done and by is not None:
+            check_applies(by, find_score(by, checkpoint.task).why_not(run))
+        if batched and progress is not None:
+            progress((done + 1) / len(indices))
+        yield run
 
 
 def find_score(by: str, task: Task) -> Score:

@@ -1,0 +1,121 @@
+"""Covariates of the steps of runs: everything by which errors may differ, from observations, truth and provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.task import Task, display_name
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.measures import Array, Mask
+from beliefscope.inspect.trace import Trace
+
+IGNORED = frozenset({"beliefscope", "mujoco", "spawn_index", "start_offset"})
+"""Keys of the provenance that do not describe the episode, or that another covariate contains."""
+
+MAX_CATEGORIES = 12
+"""Texts with more different values are names rather than categories."""
+
+
+@dataclass(frozen=True)
+class Covariate:
+    """A quantity of each of S steps.
+
+    Attributes:
+        name: display name. unit: SI unit, may be empty.
+        values: (S,) numbers, or indices in ``categories``; NaN where it does not exist.
+        categories: names of the values; empty for a number. A boolean has the categories ``no`` and ``yes``.
+    """
+
+    name: str
+    unit: str
+    values: Array
+    categories: tuple[str, ...] = ()
+
+
+def covariates_of(traces: Sequence[Trace]) -> list[Covariate]:
+    """Covariates of the concatenated counted steps of traces of one task, without constant ones."""
+    columns = [dict(_columns(trace)) for trace in traces]
+    names = dict.fromkeys(name for column in columns for name in column)
+    lengths = [int(measures.counted(trace).sum()) for trace in traces]
+    result = []
+    for name in names:
+        parts = [column.get(name, ("", np.full(n, np.nan))) for column, n in zip(columns, lengths, strict=True)]
+        unit = next(unit for unit, _ in (column[name] for column in columns if name in column))
+        covariate = _covariate(name, unit, np.concatenate([values for _, values in parts]))
+        if covariate is not None:
+            result.append(covariate)
+    return result
+
+
+def _covariate(name: str, unit: str, values: NDArray[Any]) -> Covariate | None:
+    """None if all values are equal or are names. Texts and booleans become categories."""
+    if values.dtype == object or values.dtype.kind in "US":
+        texts = np.array([value if isinstance(value, str) else "" for value in values.tolist()])
+        categories = tuple(sorted(set(texts.tolist()) - {""}))
+        index = np.where(texts == "", np.nan, np.searchsorted(categories, texts)) if categories else np.zeros(0)
+        return Covariate(name, unit, index, categories) if 1 < len(categories) <= MAX_CATEGORIES else None
+    numbers = values.astype(np.float64)
+    known = numbers[np.isfinite(numbers)]
+    if not len(known) or (known.min() == known.max() and len(known) == len(numbers)):
+        return None
+    return Covariate(name, unit, numbers, ("no", "yes") if values.dtype == bool else ())
+
+
+def _columns(trace: Trace) -> Iterator[tuple[str, tuple[str, NDArray[Any]]]]:
+    """Name, unit and values (T',) of each covariate at the counted steps of a trace."""
+    counted, task = measures.counted(trace), measures.task_of(trace)
+    for name, unit, values in _step_columns(trace, task):
+        yield name, (unit, values[counted])
+    for name, value in _provenance(trace.episode.provenance):
+        yield name, ("", np.full(int(counted.sum()), value))
+
+
+def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[Any]]]:
+    """Name, unit and values (T,) of the covariates that vary within an episode, and of the truth."""
+    episode, dt, steps = trace.episode, trace.episode.dt, np.arange(len(trace))
+    contact, outage = episode.contact.astype(bool), measures.blackout(trace)
+    yield "time since start", "s", steps * dt
+    yield "contact", "", contact
+    yield "contact duration", "s", _duration(contact) * dt
+    yield "blackout", "", outage
+    yield "outage length", "s", _duration(outage) * dt
+    change = measures.wrapped(task, np.diff(episode.states, axis=0, prepend=episode.states[:1]))
+    yield "object speed", "m/s", np.linalg.norm(change[:, list(task.map_indices)], axis=1) / dt
+    for i, component in enumerate(task.components):
+        yield f"true {component.label}", component.unit, episode.states[:, i]
+        if component.unit == "rad":
+            yield f"{component.label} speed", "rad/s", np.abs(change[:, i]) / dt
+    for key, array in episode.observations.items():
+        if array.ndim == 3 and array.dtype == np.uint8:
+            yield f"{display_name(key)} brightness", "", array.mean((1, 2))
+            yield f"{display_name(key)} contrast", "", array.std((1, 2))
+        elif array.ndim == 2 and array.shape[1] > 1:
+            yield f"{display_name(key)} magnitude", "", np.linalg.norm(array, axis=1)
+            motion = np.diff(array, axis=0, prepend=array[:1])
+            yield f"{display_name(key)} change", "", np.linalg.norm(motion, axis=1)
+    yield "control magnitude", "", np.linalg.norm(episode.controls, axis=1)
+
+
+def _duration(mask: Mask) -> Array:
+    """(T,) steps since the mask (T,) was last False; NaN where it is False."""
+    steps = np.arange(1, len(mask) + 1)
+    return np.where(mask, steps - np.maximum.accumulate(np.where(mask, 0, steps)), np.nan)
+
+
+def _provenance(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Display name and value of each number, boolean and text of the provenance, nested ones included."""
+    for key, value in values.items():
+        name = f"{prefix} {display_name(key)}".strip().replace("ingredients ", "").replace("-", " ")
+        if key in IGNORED:
+            continue
+        if isinstance(value, Mapping):
+            yield from _provenance(value, name)
+        elif isinstance(value, list | tuple):
+            yield f"number of {name}", float(len(value))
+        elif isinstance(value, bool | int | float | str):
+            yield name, value if isinstance(value, bool | str) else float(value)

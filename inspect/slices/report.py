@@ -1,0 +1,231 @@
+"""Data slices in which a filter is worse than elsewhere, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from beliefscope.datasets.dataset import Dataset
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.evaluate import UNITS
+from beliefscope.inspect.diagnostics.base import Diagnostic
+from beliefscope.inspect.diagnostics.views import Array, Table, as_json
+from beliefscope.inspect.failures.survey import check_applies, find_score, traces_of
+from beliefscope.inspect.slices.covariates import covariates_of
+from beliefscope.inspect.slices.search import ALPHA, Candidate, Condition, Index, find_candidates
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.statistics.intervals import jackknife
+from beliefscope.inspect.trace import Trace
+
+
+@dataclass(frozen=True)
+class ErrorSlice:
+    """A data slice with a larger score than the other steps.
+
+    Attributes:
+        conditions: one, or two that both hold.
+        inside, outside: mean score of its steps, and of all others; SI units.
+        ratio, low, high: inside / outside with its 95 % interval over episodes; NaN below five episodes.
+        episodes: indices in the data set of the episodes with steps in the slice.
+        steps, share: number of its steps, and their share of all.
+        p_value: of the search, see ``inspect/slices/search.py``.
+    """
+
+    conditions: tuple[Condition, ...]
+    inside: float
+    outside: float
+    ratio: float
+    low: float
+    high: float
+    episodes: tuple[int, ...]
+    steps: int
+    share: float
+    p_value: float
+
+    @property
+    def where(self) -> str:
+        """``panel friction > 2.1``, or two conditions joined by ``and``."""
+        return " and ".join(map(str, self.conditions))
+
+
+@dataclass(frozen=True)
+class ErrorSlices(Diagnostic):
+    """The slices of a data set in which a score is larger.
+
+    Attributes:
+        task, filter, checkpoint_hash, faults, seed, particles: of the runs.
+        by, title, unit: name of the score, its display name and SI unit.
+        alpha: probability of any slice if no covariate is related to the score.
+        episodes, steps: numbers of episodes, and of steps with a score.
+        covariates: names of the covariates that were searched.
+        slices: in the order of their discovery.
+    """
+
+    task: str
+    filter: str
+    checkpoint_hash: str
+    faults: str
+    seed: int
+    particles: int | None
+    by: str
+    title: str
+    unit: str
+    alpha: float
+    episodes: int
+    steps: int
+    covariates: tuple[str, ...]
+    slices: tuple[ErrorSlice, ...]
+
+    @property
+    def verdict(self) -> str:
+        """One sentence for each slice."""
+        scope = f"{self.episodes} episodes, {self.steps} steps and {len(self.covariates)} covariates"
+        if not self.slices:
+            return f"No slice with a larger {self.title} in {scope}."
+        count = f"{len(self.slices)} slice{'s' * (len(self.slices) != 1)} with a larger {self.title} in {scope}."
+        return " ".join([count, *map(self.sentence, self.slices)])
+
+    def sentence(self, slice_: ErrorSlice) -> str:
+        """``Position error is 2.3 x larger (1.8 to 2.9) where friction > 2.1: 14 of 60 episodes, 23 % of steps.``"""
+        interval = f" ({slice_.low:.2g} to {slice_.high:.2g})" if np.isfinite(slice_.low) else ""
+        size = f"{len(slice_.episodes)} of {self.episodes} episodes, {100 * slice_.share:.0f} % of steps"
+        title = self.title[0].upper() + self.title[1:]
+        return f"{title} is {slice_.ratio:.2g} x larger{interval} where {slice_.where}: {size}."
+
+    def to_dict(self) -> dict[str, Any]:
+        sentences = [{"where": s.where, "sentence": self.sentence(s)} for s in self.slices]
+        slices = [as_json(s) | words for s, words in zip(self.slices, sentences, strict=True)]
+        return super().to_dict() | {"slices": slices}
+
+    def tables(self) -> list[Table]:
+        """One row per slice; scores in display units."""
+        unit, factor = UNITS.get(self.unit, (self.unit, 1.0))
+        label = f" {unit}".rstrip()
+        columns: tuple[str, ...] = ("slice", "ratio x", "from", "to", f"inside{label}", f"outside{label}")
+        columns += ("episodes", "steps", "steps %", "p-value")
+        rows = [
+            (
+                s.where,
+                s.ratio,
+                s.low if np.isfinite(s.low) else None,
+                s.high if np.isfinite(s.high) else None,
+                factor * s.inside,
+                factor * s.outside,
+                len(s.episodes),
+                s.steps,
+                100 * s.share,
+                s.p_value,
+            )
+            for s in self.slices
+        ]
+        return [Table(f"Slices with a larger {self.title}", columns, tuple(rows))]
+
+
+def find_slices(
+    checkpoint: Checkpoint,
+    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    episodes: Iterable[int],
+    *,
+    by: str = "error",
+    alpha: float = ALPHA,
+    faults: Faults = NO_FAULTS,
+    seed: int = 0,
+    particles: int = 300,
+    progress: Callable[[float], None] = lambda share: None,
+) -> ErrorSlices:
+    """Run a filter over episodes of a data set and search slices in which a score is larger.
+
+    Args:
+        by: one of ``scores_of(checkpoint.task)``. alpha: see ``ErrorSlices``.
+        progress: called with the completed fraction, 0..1.
+
+    Raises BadInput for an unknown score, one that does not apply, and as ``trace``.
+    """
+    find_score(by, checkpoint.task)
+    runs = traces_of(
+        checkpoint,
+        data,
+        list(episodes),
+        by=by,
+        faults=faults,
+        seed=seed,
+        particles=particles,
+        progress=lambda share: progress(0.8 * share),
+    )
+    return slices_of(list(runs), by, alpha=alpha, progress=lambda share: progress(0.8 + 0.2 * share))
+
+
+def slices_of(
+    traces: Sequence[Trace],
+    by: str = "error",
+    *,
+    alpha: float = ALPHA,
+    progress: Callable[[float], None] = lambda share: None,
+) -> ErrorSlices:
+    """Search slices of the counted steps of the traces of one filter.
+
+    The search compares ranks. Slices whose ratio of means has an interval that contains 1 are omitted.
+    """
+    if not traces:
+        raise BadInput("the search for slices needs at least one trace")
+    first = traces[0]
+    definition = find_score(by, measures.task_of(first))
+    check_applies(by, definition.why_not(first))
+    keep = [measures.counted(trace) for trace in traces]
+    score = np.concatenate([definition.values(trace)[mask] for trace, mask in zip(traces, keep, strict=True)])
+    number = np.repeat(np.arange(len(traces)), [mask.sum() for mask in keep])
+    covariates = covariates_of(traces)
+    if not np.isfinite(score).all():
+        raise BadInput(f"no slices by {by}: the score is not finite at {np.sum(~np.isfinite(score))} steps")
+    candidates = find_candidates(score, number, covariates, alpha=alpha, seed=first.seed, progress=progress)
+    indices = np.array([trace.episode_index for trace in traces])
+    slices = [_error_slice(candidate, score, number, indices) for candidate in candidates]
+    return ErrorSlices(
+        task=measures.task_of(first).name,
+        filter=first.filter,
+        checkpoint_hash=first.checkpoint_hash,
+        faults=str(first.faults),
+        seed=first.seed,
+        particles=None if first.particles is None else first.particles.shape[1],
+        by=by,
+        title=definition.title,
+        unit=definition.unit,
+        alpha=alpha,
+        episodes=len(traces),
+        steps=len(score),
+        covariates=tuple(covariate.name for covariate in covariates),
+        slices=tuple(slice_ for slice_ in slices if not slice_.low <= 1.0),
+    )
+
+
+def _error_slice(candidate: Candidate, score: Array, number: Index, indices: Index) -> ErrorSlice:
+    """Effect of a slice with its interval over episodes."""
+    inside = candidate.steps
+    columns = np.stack([inside, ~inside, inside * score, ~inside * score], axis=1)
+    sums = np.zeros((len(indices), 4))
+    np.add.at(sums, number, columns)
+
+    def log_ratio(total: Array) -> Array:
+        mean = total[..., 2:] / np.maximum(total[..., :2], 1.0)
+        result: Array = np.diff(np.log(np.maximum(mean[..., ::-1], 1e-12)), axis=-1)[..., 0]
+        return result
+
+    ratio, low, high = (float(np.exp(value)) for value in jackknife(sums, log_ratio))
+    return ErrorSlice(
+        conditions=candidate.conditions,
+        inside=float(score[inside].mean()),
+        outside=float(score[~inside].mean()),
+        ratio=ratio,
+        low=low,
+        high=high,
+        episodes=tuple(indices[np.unique(number[inside])].tolist()),
+        steps=int(inside.sum()),
+        share=float(inside.mean()),
+        p_value=candidate.p_value,
+    )
