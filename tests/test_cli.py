@@ -33,6 +33,7 @@ OPTIONS = {
     "change": "--task --data --skip-bad --all --slice --particles --seed -o --json",
     "lineage": "--export -o --json",
     "evaluate": "--filter --data --skip-bad --faults --only --particles --seed --json",
+    "calibrate": "--filter --data --skip-bad --faults --level --particles --seed -o --json",
     "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
     "trace": "--filter --data --skip-bad --episode --faults --seed -o --json",
     "record": "--filter --data --skip-bad --episode --maps --map-size --diagnostics --no-diagnostics --faults --seed "
@@ -126,6 +127,8 @@ BAD = [
     f"evaluate {EKF} --particles 0",
     f"evaluate {EKF} --seed -1",
     f"slices {EKF} --alpha 2",
+    f"calibrate {EKF} --level 1 -o calibration.json",
+    f"calibrate {EKF} -o calibration.pkl",
     f"slices {EKF} --by speed",
     f"evaluate {EKF} --json out.json",
     f"evaluate {EKF} --faults notes.txt",
