@@ -39,7 +39,7 @@ OPTIONS = {
     "record": "--filter --data --skip-bad --episode --maps --map-size --diagnostics --no-diagnostics --faults --seed "
     "-o --json",
     "live": "--filter --data --skip-bad --episode --faults --particles --seed --rate --workspace --name --json",
-    "import": "-o --json",
+    "import": "--map --guess --episode -o --json",
     "export": "-o --json",
     "inspect": "--filter --only --option --all --figures --format --json",
     "diagnose": "--filter --data --skip-bad --episode --base --alarm-rate --faults --particles --seed --json",

@@ -4,26 +4,68 @@ from pathlib import Path
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
+from beliefscope.datasets.errors import BadInput
+
+RECORDINGS = (".rrd", ".live")
 
 
 @opt.with_options(
-    recording=opt.argument("RUN.rrd|RUN.live", "Recording, or file of a live run."),
-    output=opt.TRACE,
+    source=opt.argument("FILE", "Recording (.rrd), file of a live run (.live), or log (.npz, .csv, .parquet)."),
+    map=opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", "--map"),
+    guess=opt.flag("Print a first map of a log instead of importing it.", "--guess"),
+    output=opt.output_file("RUN.trace|DATA.h5", "Output: a trace, or a data set.", ".trace", ".h5"),
     task=opt.TASK_OF_FILES,
 )
-def import_(recording: Path, output: Path, task: str = "") -> console.Result:
-    """Extract the trace from a recording.
+def import_(
+    source: Path,
+    output: Path | None = None,
+    map: Path | None = None,
+    guess: bool = False,
+    episode: int = 0,
+    task: str = "",
+) -> console.Result:
+    """Import a recording or a log as a trace or data set.
 
-    The arrays equal those of the recorded trace, including their types, so all diagnostics give the same results. Of
-    a live run that is in progress or was killed, the complete steps are extracted.
+    The trace of a recording has the recorded arrays, including their types, so all diagnostics give the same results.
+    Of a live run that is in progress or was killed, the complete steps are extracted.
+
+    Of a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
+    become a data set; an estimate of one episode becomes a trace, which every command reads without the filter.
 
     \b
     Examples:
       beliefscope import run.rrd -o run.trace
-      beliefscope import workspace/live/run.live -o run.trace
+      beliefscope import log.csv --guess
+      beliefscope import log.csv --map map.toml -o log.h5
+      beliefscope import log.csv --map map.toml --episode 2 -o run.trace
     """
+    from beliefscope.datasets.store import write_dataset
     from beliefscope.inspect.trace import save_trace
+    from beliefscope.recordings.logs.column_map import guess_map, read_map
+    from beliefscope.recordings.logs.columns import read_columns
+    from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
-    trace = opt.open_recording(recording, task)
-    save_trace(trace, output)
-    return opt.trace_result(trace, output)
+    if guess:
+        text = guess_map(read_columns(source), source.stem)
+        return console.Result({"map": text}, text.rstrip())
+    if output is None:
+        raise BadInput("give the output: -o RUN.trace or -o DATA.h5")
+    if source.suffix.lower() in RECORDINGS:
+        opt.check_output(output, ".trace")
+        trace = opt.open_recording(source, task)
+        save_trace(trace, output)
+        return opt.trace_result(trace, output)
+    if map is None:
+        raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
+    columns, mapping = read_columns(source), read_map(map)
+    episodes = read_log(columns, mapping, source.name)
+    if output.suffix == ".trace":
+        if not 0 <= episode < len(episodes):
+            raise BadInput(f"episode {episode} does not exist: {source.name} has {len(episodes)}")
+        trace = recorded_trace(columns, mapping, episodes, episode, source.name)
+        save_trace(trace, output)
+        return opt.trace_result(trace, output)
+    write_dataset(output, episodes[0].task, episodes)
+    steps = sum(len(e) for e in episodes)
+    document = {"task": mapping.task, "episodes": len(episodes), "steps": steps}
+    return console.Result(document, f"{len(episodes)} episodes of {mapping.task}, {steps} steps", output)

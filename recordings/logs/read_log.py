@@ -1,0 +1,184 @@
+"""Episodes and traces from the columns of a log."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task_json import check_definition
+from beliefscope.filters.external.adapter import check_values, derived
+from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.external import fill_missing
+from beliefscope.recordings.logs.column_map import UNITS, ColumnMap
+from beliefscope.recordings.logs.columns import Columns, column, joined
+
+Array = NDArray[np.float64]
+
+IRREGULAR = 0.1
+"""Largest deviation of a time step from their median, relative to it."""
+
+MARGIN = 1.2
+"""Half width of maps relative to the largest half range of the map components."""
+
+
+def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]:
+    """The episodes of a log, in the order of their first rows.
+
+    Raises BadInput for missing columns, columns of different lengths and irregular time.
+    """
+    states = _states(columns, mapping)
+    sensors = {name: _sensor(columns, name, refs) for name, refs in mapping.sensors.items()}
+    controls = joined(columns, mapping.control, "control") if mapping.control else np.zeros((len(states), 0))
+    contact = column(columns, mapping.contact, "contact") if mapping.contact else np.zeros(len(states))
+    arrays = {"state": states, "control": controls, "contact": contact, **sensors}
+    for name, array in arrays.items():
+        if len(array) != len(states):
+            raise BadInput(f"{name} has {len(array)} rows and the state {len(states)}")
+    rows = _episodes(columns, mapping, len(states))
+    dt = _time_step(columns, mapping, rows)
+    task = _task(mapping, states, sensors, controls.shape[1], dt)
+    return [
+        Episode(
+            task=task,
+            states=states[at].astype(np.float32),
+            controls=controls[at].astype(np.float32),
+            observations={name: array[at] for name, array in sensors.items()},
+            contact=contact[at] != 0.0,
+            qpos=np.zeros((len(at), 0), np.float32),
+            dt=dt,
+            seed=-1,
+            split="test",
+            provenance={"source": source, "episode": name},
+        )
+        for name, at in rows.items()
+    ]
+
+
+def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode], index: int, source: str) -> Trace:
+    """The recorded estimate of an episode as a trace, float32.
+
+    Raises BadInput for a map without an estimate, and for values of the wrong shape or that are not finite.
+    """
+    if not {"mean", "particles"} & set(mapping.estimate):
+        raise BadInput("the map has no estimate: add [estimate] with mean or particles, or write a data set (.h5)")
+    at = list(_episodes(columns, mapping, sum(map(len, episodes))).values())[index]
+    n, episode = len(mapping.state), episodes[index]
+    values = {name: torch.from_numpy(array[at]) for name, array in _estimate(columns, mapping).items()}
+    weights = mapping.estimate.get("weights", {})
+    check_values(values, (len(at),), {"n": n}, source)
+    arrays: dict[str, Any] = {name: value.float().numpy() for name, value in derived(values).items()}
+    settings = {"source": source} | ({"particles": arrays["particles"].shape[1]} if "particles" in arrays else {})
+    return Trace(
+        episode=episode,
+        modalities=tuple(weights),
+        kind="external",
+        filter=str(mapping.estimate.get("filter", "recorded")),
+        start_mean=np.full(n, np.nan, np.float32),
+        start_covariance=np.full((n, n), np.nan, np.float32),
+        data_hash=episode.digest(),
+        episode_index=index,
+        settings=settings,
+        **dict[str, Any](fill_missing(arrays, len(weights))),
+    )
+
+
+def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
+    """(T, ...) values of the recorded estimate by the names of a trace, SI units."""
+    estimate, factors, n = mapping.estimate, mapping.factors, len(mapping.state)
+    values: dict[str, Array] = {}
+    if "mean" in estimate:
+        mean = joined(columns, estimate["mean"], "estimate")
+        if mean.shape[1] != n:
+            raise BadInput(f"mean of [estimate] has {mean.shape[1]} columns, expected {n}: {', '.join(mapping.state)}")
+        values["estimate_mean"] = mean * factors
+    if "covariance" in estimate:
+        covariance = joined(columns, estimate["covariance"], "estimate")
+        if covariance.shape[1] != n * n:
+            raise BadInput(f"covariance of [estimate] has {covariance.shape[1]} numbers per row, expected {n * n}")
+        values["estimate_covariance"] = covariance.reshape(-1, n, n) * factors * factors[:, None]
+    elif "std" in estimate:
+        std = joined(columns, estimate["std"], "estimate") * factors
+        values["estimate_covariance"] = np.square(std)[:, :, None] * np.eye(n)
+    if "particles" in estimate:
+        particles = joined(columns, estimate["particles"], "estimate")
+        if particles.shape[1] % n:
+            raise BadInput(f"particles of [estimate] have {particles.shape[1]} numbers per row, not a multiple of {n}")
+        values["particles"] = particles.reshape(len(particles), -1, n) * factors
+        values["log_weights"] = np.full(values["particles"].shape[:2], -np.log(values["particles"].shape[1]))
+        values.setdefault("estimate_mean", values["particles"].mean(axis=1))
+    if weights := estimate.get("weights"):
+        values["weights"] = joined(columns, list(weights.values()), "weights")[:, :, None]
+    return values
+
+
+def _states(columns: Columns, mapping: ColumnMap) -> Array:
+    """(T, n) true states, SI units; NaN where they are unknown."""
+    known = {name: s for name, s in mapping.state.items() if s.column}
+    count = (
+        len(column(columns, next(iter(known.values())).column, "state")) if known else len(next(iter(columns.values())))
+    )
+    parts = [column(columns, s.column, f"state {name}") if s.column else np.full(count, np.nan)
+             for name, s in mapping.state.items()]  # fmt: skip
+    for (name, s), part in zip(mapping.state.items(), parts, strict=True):
+        if part.shape != (count,):
+            raise BadInput(f"state {name!r} has column {s.column!r} of shape {part.shape}, expected ({count},)")
+    return np.stack(parts, axis=1) * mapping.factors
+
+
+def _sensor(columns: Columns, name: str, references: str | list[str]) -> NDArray[Any]:
+    """(T, H, W) bytes of an image column, or (T, d) float32."""
+    if isinstance(references, str) and references in columns and columns[references].ndim == 3:
+        images = columns[references]
+        if images.dtype == np.uint8:
+            return images
+    return joined(columns, references, f"sensor {name}").astype(np.float32)
+
+
+def _episodes(columns: Columns, mapping: ColumnMap, count: int) -> dict[str, NDArray[np.intp]]:
+    """Name of each episode -> its rows."""
+    if not mapping.episode:
+        return {"0": np.arange(count)}
+    if mapping.episode not in columns:
+        column(columns, mapping.episode, "episode")  # raises the error with similar names
+    names, first, inverse = np.unique(columns[mapping.episode], return_index=True, return_inverse=True)
+    return {str(names[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
+
+
+def _time_step(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.intp]]) -> float:
+    """s per row. Raises BadInput if it varies by more than ``IRREGULAR``."""
+    if mapping.dt is not None:
+        return float(mapping.dt)
+    time = column(columns, mapping.time, "time")
+    steps = np.concatenate([np.diff(time[at]) for at in rows.values()])
+    dt = float(np.median(steps)) if len(steps) else 0.0
+    worst = float(np.abs(steps - dt).max()) if len(steps) else 0.0
+    if not dt > 0.0 or worst > IRREGULAR * dt:
+        raise BadInput(
+            f"time {mapping.time!r} has steps of {steps.min() if len(steps) else 0.0:.4g} to "
+            f"{steps.max() if len(steps) else 0.0:.4g} s, expected a constant one: resample the log"
+        )
+    return dt
+
+
+def _task(mapping: ColumnMap, states: Array, sensors: dict[str, NDArray[Any]], controls: int, dt: float) -> Task:
+    names = list(mapping.state)
+    extent = np.ptp(np.nan_to_num(states[:, :2]), axis=0).max() / 2.0
+    task = Task(
+        name=mapping.task,
+        components=tuple(Component(name, UNITS[s.unit][0]) for name, s in mapping.state.items()),  # type: ignore[arg-type]
+        observations={name: array.shape[1:] for name, array in sensors.items()},
+        modalities={name: (name,) for name in sensors},
+        control_size=controls,
+        dt=dt,
+        map_components=(names[0], names[1]),
+        map_half_width=float(MARGIN * max(extent, 0.01)),
+        warmup=0,
+    )
+    check_definition(task, f"task {mapping.task!r}")
+    return task

@@ -1,0 +1,166 @@
+"""Logs of other programs: every format gives the same episodes and traces; wrong input gives one line."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import csv, parquet
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.trace import load_trace, save_trace
+from beliefscope.recordings.logs.column_map import guess_map, read_map
+from beliefscope.recordings.logs.columns import column, joined, read_columns
+from beliefscope.recordings.logs.read_log import read_log, recorded_trace
+
+MAP = """
+task = "vehicle"
+time = "t"
+episode = "run"
+[state]
+x = {column = "true_x", unit = "cm"}
+y = {column = "true_y", unit = "cm"}
+yaw = {column = "true_yaw", unit = "deg"}
+[sensors]
+gps = ["gps_x", "gps_y"]
+[estimate]
+filter = "mine"
+mean = ["est_x", "est_y", "est_yaw"]
+std = ["sd_x", "sd_y", "sd_yaw"]
+"""
+
+
+def table(steps: int = 20) -> dict[str, np.ndarray]:
+    """Two episodes whose rows alternate, in cm and degrees."""
+    rng = np.random.default_rng(0)
+    names = [f"{kind}_{c}" for kind in ("true", "est", "sd") for c in ("x", "y", "yaw")] + ["gps_x", "gps_y"]
+    columns = {name: rng.uniform(1.0, 9.0, 2 * steps) for name in names}
+    return {"run": np.tile(["b", "a"], steps), "t": np.repeat(np.arange(steps), 2) * 0.05, **columns}
+
+
+@pytest.fixture(params=[".npz", ".csv", ".parquet"])
+def log(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path, columns = tmp_path / f"log{request.param}", table()
+    if request.param == ".npz":
+        np.savez(path, **columns)
+    else:
+        write = csv.write_csv if request.param == ".csv" else parquet.write_table
+        write(pa.table(columns), path)
+    return path
+
+
+def map_file(folder: Path, text: str = MAP) -> Path:
+    path = folder / "map.toml"
+    path.write_text(text)
+    return path
+
+
+def test_every_format_gives_the_same_episodes_and_traces(log: Path, tmp_path: Path) -> None:
+    columns, mapping, expected = read_columns(log), read_map(map_file(tmp_path)), table()
+    episodes = read_log(columns, mapping, log.name)
+    assert [e.provenance["episode"] for e in episodes] == ["b", "a"]
+    first = episodes[0]
+    assert (first.task.name, first.dt, len(first)) == ("vehicle", pytest.approx(0.05), 20)
+    scale = np.array([0.01, 0.01, np.pi / 180.0])
+    truth = np.stack([expected[f"true_{c}"][::2] for c in ("x", "y", "yaw")], axis=1) * scale
+    np.testing.assert_allclose(first.states, truth, rtol=1e-6)
+    np.testing.assert_allclose(first.observations["gps"][:, 1], expected["gps_y"][::2], rtol=1e-6)
+    trace = recorded_trace(columns, mapping, episodes, 1, log.name)
+    np.testing.assert_allclose(trace.estimate_mean[:, 2], np.radians(expected["est_yaw"][1::2]), rtol=1e-6)
+    std = np.sqrt(np.diagonal(trace.estimate_covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose(std[:, 0], 0.01 * expected["sd_x"][1::2], rtol=1e-6)
+    save_trace(trace, tmp_path / "run.trace")
+    stored = load_trace(tmp_path / "run.trace")
+    assert (stored.filter, stored.kind, stored.task.name) == ("mine", "external", "vehicle")
+
+
+def test_arrays_of_an_archive(tmp_path: Path) -> None:
+    """An ensemble gives mean and covariance of its members; unknown states are NaN; images keep their bytes."""
+    rng = np.random.default_rng(1)
+    particles = rng.normal(size=(12, 50, 2))
+    images = rng.integers(0, 256, (12, 8, 8), dtype=np.uint8)
+    np.savez(tmp_path / "log.npz", truth=rng.normal(size=(12, 2)), members=particles, camera=images)
+    text = 'dt = 0.1\n[state]\nx = "truth[1]"\ny = ""\n[sensors]\nimage = "camera"\n[estimate]\nparticles = "members"\n'
+    columns, mapping = read_columns(tmp_path / "log.npz"), read_map(map_file(tmp_path, text))
+    (episode,) = read_log(columns, mapping, "log.npz")
+    assert np.isnan(episode.states[:, 1]).all()
+    assert np.array_equal(episode.observations["image"], images)
+    trace = recorded_trace(columns, mapping, [episode], 0, "log.npz")
+    np.testing.assert_allclose(trace.estimate_mean, particles.mean(1), atol=1e-6)
+    expected = np.stack([np.cov(members.T, bias=True) for members in particles])
+    np.testing.assert_allclose(trace.estimate_covariance, expected, atol=1e-5)
+
+
+def test_a_guessed_map_is_valid(log: Path, tmp_path: Path) -> None:
+    columns = read_columns(log)
+    text = guess_map(columns, "my log")
+    values = tomllib.loads(text)
+    assert (values["task"], values["time"]) == ("my-log", "t")
+    assert values["estimate"] == {"mean": ["est_x", "est_y", "est_yaw"], "std": ["sd_x", "sd_y", "sd_yaw"]}
+    episodes = read_log({n: v[::2] for n, v in columns.items()}, read_map(map_file(tmp_path, text)), "log")
+    assert len(episodes) == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"true_x"', '"truex"', "true_x"),
+        ('unit = "deg"', 'unit = "turns"', "unit of state 'yaw'"),
+        ('time = "t"', "", "needs either dt"),
+        ('time = "t"', 'time = "gps_x"', "constant"),
+        ('time = "t"', 'time = "run"', "has text"),
+        ("[sensors]", "[sensor]", "sensor"),
+        ('["est_x", "est_y", "est_yaw"]', '["est_x", "est_y"]', "2 columns, expected 3"),
+        ('["est_x", "est_y", "est_yaw"]', "5", "is 5"),
+        ('task = "vehicle"', 'task = "a/b"', "without spaces"),
+    ],
+)
+def test_wrong_maps_name_the_value(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in MAP
+    path = map_file(tmp_path, MAP.replace(old, new))
+
+    def read() -> None:
+        mapping = read_map(path)
+        recorded_trace(table(), mapping, read_log(table(), mapping, "log"), 0, "log")
+
+    with pytest.raises(BadInput, match=message):
+        read()
+
+
+def test_elements_and_lengths() -> None:
+    columns = {"a": np.arange(6.0).reshape(3, 2), "b": np.arange(4.0), "name[0]": np.ones(3)}
+    assert column(columns, "a[1]", "x").tolist() == [1.0, 3.0, 5.0]
+    assert column(columns, "name[0]", "x").tolist() == [1.0, 1.0, 1.0]
+    assert joined(columns, ["a", "name[0]"], "x").shape == (3, 3)
+    for references, message in ((["a[2]"], r"no \[2\]"), (["b[0]"], r"no \[0\]"), (["a", "b"], "3, 4 rows")):
+        with pytest.raises(BadInput, match=message):
+            joined(columns, references, "x")
+
+
+@pytest.mark.parametrize("count", [pytest.param(60, id="60"), pytest.param(10_000, marks=pytest.mark.long, id="10000")])
+def test_damaged_logs_give_one_line(log: Path, tmp_path: Path, count: int) -> None:
+    """Bytes are changed, removed and repeated: the columns are read, or BadInput has one line."""
+    data, rng = log.read_bytes(), np.random.default_rng(2)
+    damaged, messages = tmp_path / f"damaged{log.suffix}", []
+    for _ in range(count):
+        changed = bytearray(data)
+        for place in rng.integers(0, len(data), rng.integers(1, 8)):
+            changed[place] = rng.integers(256)
+        if rng.random() < 0.3:
+            changed = changed[: rng.integers(len(changed))]
+        damaged.write_bytes(changed)
+        try:
+            read_columns(damaged)
+        except BadInput as error:
+            messages.append(str(error))
+    assert not any("\n" in message for message in messages)
+    assert messages or log.suffix == ".csv"
+
+
+def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "log.npz", a=np.array([{"x": 1}], dtype=object))
+    with pytest.raises(BadInput, match="cannot be read"):
+        read_columns(tmp_path / "log.npz")
