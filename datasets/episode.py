@@ -24,11 +24,12 @@ class Episode:
         states: (T, n) true state, components as in ``Task.components`` (m, rad), float32.
         controls: (T, c) control applied between steps t-1 and t, float32.
         observations: observation key -> (T, ...) sensor readings (images uint8, others float32).
-        contact: (T,) bool, ground truth of contact between robot and object.
+        contact: (T,) bool, ground truth of contact between robot and object; False if the task has no such covariate.
         qpos: (T, nq) joint positions for replay, float32; nq is 0 without replay.
         dt: seconds per step.
         seed: seed of the simulation, or -1 for recorded data.
         split: ``train``, ``val`` or ``test``.
+        covariates: name -> (T,) float32, values of the task's covariates except contact; NaN where unknown.
         provenance: JSON values: origin and replay parameters (hinge position, policy, versions).
     """
 
@@ -42,6 +43,13 @@ class Episode:
     seed: int
     split: str = "train"
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def covariate(self, name: str) -> FloatArray:
+        """(T,) values of one of the task's covariates; NaN where unknown."""
+        if name == "contact":
+            return self.contact.astype(np.float32)
+        return self.covariates.get(name, np.full(len(self), np.nan, np.float32))
 
     def __len__(self) -> int:
         return len(self.states)
@@ -50,6 +58,7 @@ class Episode:
         """SHA-256 over the names, shapes, types and bytes of the arrays, independent of the file format."""
         arrays = {"states": self.states, "controls": self.controls, "contact": self.contact, "qpos": self.qpos}
         arrays |= {f"observations/{key}": value for key, value in self.observations.items()}
+        arrays |= {f"covariates/{key}": value for key, value in self.covariates.items()}
         digest = hashlib.sha256(f"{self.task.name} {self.dt} {self.seed} {self.split}".encode())
         for name in sorted(arrays):
             array = np.ascontiguousarray(arrays[name])

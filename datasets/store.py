@@ -231,6 +231,11 @@ class EpisodeFile(Dataset):
             seed=summary.seed,
             split=summary.split,
             provenance=provenance,
+            covariates={
+                name: self._array(group, f"covariates/{name}", (steps,), unknown=True)
+                for name in task.covariates
+                if f"covariates/{name}" in group
+            },
         )
         if episode.digest() != self._attribute(group, "digest", str):
             raise BadInput(f"{self.path}: the arrays of {group.name[1:]} do not match its digest: they were modified.")
@@ -267,8 +272,14 @@ class EpisodeFile(Dataset):
         return stored
 
     def _array(
-        self, group: h5py.Group, key: str, shape: tuple[int | None, ...], kind: type = np.float32
+        self,
+        group: h5py.Group,
+        key: str,
+        shape: tuple[int | None, ...],
+        kind: type = np.float32,
+        unknown: bool = False,
     ) -> NDArray[Any]:
+        """A validated array. unknown: whether values may be NaN."""
         array, place = self._stored(group, key)[()], self._place(group, key)
         fits = np.ndim(array) == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         if not fits:
@@ -276,8 +287,9 @@ class EpisodeFile(Dataset):
             raise BadInput(f"{place} has shape {np.shape(array)}, expected {expected}.")
         if array.dtype != kind:
             raise BadInput(f"{place} is {array.dtype}, expected {np.dtype(kind)}.")
-        if not np.isfinite(array).all():
-            at = tuple(np.argwhere(~np.isfinite(array))[0])
+        invalid = np.isinf(array) if unknown else ~np.isfinite(array)
+        if invalid.any():
+            at = tuple(np.argwhere(invalid)[0])
             raise BadInput(f"{place} is {array[at]} at step {at[0]}, expected finite numbers.")
         return np.asarray(array)
 
@@ -322,6 +334,7 @@ def _write_episode(group: h5py.Group, episode: Episode) -> None:
     arrays = {"states": episode.states, "controls": episode.controls, "qpos": episode.qpos}
     arrays["contact"] = episode.contact.astype(np.uint8)
     arrays |= {f"observations/{key}": value for key, value in episode.observations.items()}
+    arrays |= {f"covariates/{key}": value for key, value in episode.covariates.items()}
     for key, array in arrays.items():
         # One HDF5 element per step: the shuffle filter then orders the bytes of each pixel or component by time,
         # which makes the images a fifth smaller.

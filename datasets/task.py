@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.simulation.camera import Camera
 
@@ -91,6 +92,8 @@ class Task:
         ingredients: name -> what varies between simulated episodes; their values are in each episode's provenance.
         start_distance: unit -> range of the distance between the first belief's mean and the true state; units that
             are missing start at the truth. An episode's provenance has the difference, ``start_offset``.
+        covariates: name -> what is known about each step besides state and sensors; metrics are grouped by it. The
+            values of ``contact`` are in ``Episode.contact``, others in ``Episode.covariates``.
         warmup: first steps that are excluded from metrics, because runs start at the truth.
     """
 
@@ -111,6 +114,7 @@ class Task:
     ingredients: Mapping[str, Ingredient] = field(default_factory=dict)
     start_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warmup: int = 30
+    covariates: Mapping[str, Covariate] = field(default_factory=lambda: {"contact": CONTACT})
 
     def __hash__(self) -> int:
         return hash(self.name)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, get_args
 
+from beliefscope.datasets.covariate import Covariate, Kind
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.task import Component, Ingredient, Task, Unit
@@ -47,6 +48,7 @@ def task_from_json(values: Any) -> Task:
             },
             start_distance=_tuples(values["start_distance"]),
             warmup=values["warmup"],
+            **_covariates(values),
         )
         check_definition(task)
     except BadInput:
@@ -54,6 +56,17 @@ def task_from_json(values: Any) -> Task:
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise BadInput(f"incomplete definition of a task: {type(error).__name__}: {error!s:.200}") from None
     return task
+
+
+def _covariates(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The covariates, which definitions of earlier versions lack."""
+    if "covariates" not in values:
+        return {}
+    covariates = {
+        name: Covariate(c["kind"], tuple(c["groups"]), tuple(c["cuts"]), c["unit"])
+        for name, c in values["covariates"].items()
+    }
+    return {"covariates": covariates}
 
 
 def _camera(values: Mapping[str, Any]) -> Camera:
@@ -126,9 +139,28 @@ def check_definition(task: Task, where: str = "") -> None:
     for key, channels in task.positions.items():
         if len(channels) != 2 or not all(_whole(channel, 0) for channel in channels):
             raise BadInput(f"{place}: positions of {key!r} are {channels!r:.200}, expected two channels.")
+    _check_covariates(task, place)
     for unit, ends in task.start_distance.items():
         if unit not in get_args(Unit) or len(ends) != 2 or not all(_number(end) for end in ends):
             raise BadInput(f"{place}: start distance of {unit!r} is {ends!r:.200}, expected two numbers.")
+
+
+def _check_covariates(task: Task, place: str) -> None:
+    groups = ["all", "blackout"]
+    for name, covariate in task.covariates.items():
+        where, cuts = f"{place}: covariate {name!r:.200}", covariate.cuts
+        if not name or "/" in name or covariate.kind not in get_args(Kind) or not isinstance(covariate.unit, str):
+            raise BadInput(f"{where} has kind {covariate.kind!r:.200}, expected one of {', '.join(get_args(Kind))}.")
+        if not all(map(_number, cuts)) or list(cuts) != sorted(set(cuts)) or (cuts and covariate.kind != "continuous"):
+            raise BadInput(f"{where} has cuts {cuts!r:.200}, expected ascending numbers of a continuous covariate.")
+        expected = {"boolean": 2, "continuous": len(cuts) + 1 if cuts else 0}.get(covariate.kind, len(covariate.groups))
+        if not all(isinstance(group, str) and group for group in covariate.groups) or (
+            len(covariate.groups) not in ((0, expected) if covariate.kind != "categorical" else range(1, 1000))
+        ):
+            raise BadInput(f"{where} has groups {covariate.groups!r:.200}, expected {expected or 'one or more'} names.")
+        groups += covariate.group_names(name)
+    if len(set(groups)) < len(groups):
+        raise BadInput(f"{place}: groups of its covariates have the same name: {', '.join(groups):.200}.")
 
 
 def _whole(value: Any, smallest: int) -> bool:

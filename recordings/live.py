@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
@@ -54,6 +54,7 @@ class _Row:
     control: NDArray[Any]
     truth: NDArray[Any]
     contact: bool
+    covariates: dict[str, float]
     qpos: NDArray[Any]
     evidence: Evidence | None
 
@@ -142,6 +143,7 @@ class LiveRecorder:
         *,
         truth: ArrayLike | None = None,
         contact: bool | None = None,
+        covariates: Mapping[str, float | bool | str | None] = MappingProxyType({}),
         qpos: ArrayLike = (),
         evidence: Evidence | None = None,
     ) -> None:
@@ -154,6 +156,8 @@ class LiveRecorder:
             control: (c,).
             truth: (n,) true state, if measured. Default: NaN.
             contact: whether the robot truly touches the object. Default: the observation ``contact``, if any.
+            covariates: values of the task's other covariates: a number, a bool or the name of a group. A missing one is
+                unknown.
             qpos: (nq,) joint positions for the replay of the task's simulation.
             evidence: input of the filter's ``step`` that returned the StepTrace.
 
@@ -166,6 +170,7 @@ class LiveRecorder:
             np.array(np.zeros(self._task.control_size) if control is None else control, np.float32),
             np.array(np.full(self._sizes["n"], np.nan) if truth is None else truth, np.float32),
             bool(np.any(arrays.get("contact", False))) if contact is None else contact,
+            self._covariates(covariates),
             np.array(qpos, np.float32),
             evidence,
         )
@@ -175,6 +180,20 @@ class LiveRecorder:
         else:
             self.waited += int(self._queue.full())
             self._queue.put(row)
+
+    def _covariates(self, values: Mapping[str, float | bool | str | None]) -> dict[str, float]:
+        """Value of each covariate of the task except contact; NaN if unknown. Raises BadInput for another name."""
+        declared = {name: covariate for name, covariate in self._task.covariates.items() if name != "contact"}
+        for name, value in values.items():
+            check_name(f"covariate of task {self._task.name!r}", name, declared)
+            if isinstance(value, str):
+                check_name(f"group of covariate {name!r}", value, declared[name].group_names(name))
+        given = {name: value for name, value in values.items() if value is not None}
+        return {
+            name: float(covariate.group_names(name).index(value) if isinstance(value, str) else value)
+            for name, covariate in declared.items()
+            for value in (given.get(name, np.nan),)
+        }
 
     @property
     def behind(self) -> int:
@@ -266,6 +285,9 @@ class LiveRecorder:
             observations={key: np.stack([row.observations[key] for row in rows]) for key in rows[0].observations},
             contact=np.array([row.contact for row in rows]),
             qpos=np.stack([row.qpos for row in rows]),
+            covariates={
+                name: np.array([row.covariates[name] for row in rows], np.float32) for name in rows[0].covariates
+            },
             **self._origin,
         )
         n = self._sizes["n"]

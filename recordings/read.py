@@ -32,7 +32,7 @@ from beliefscope.recordings.schema import (
 )
 
 VALUES = (TRACE_COMPONENT, "Image:buffer", "Scalars:scalars")
-STORED = ["/trace/**", "/observations/**", f"/{HEADER}"]
+STORED = ["/trace/**", "/observations/**", "/covariates/**", f"/{HEADER}"]
 
 
 Rows = dict[str, list[tuple[NDArray[np.int64] | None, NDArray[Any]]]]
@@ -77,6 +77,7 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows, given: Iterable[Task]
     episode = Episode(
         task=stored_task(_parsed(header, "definition").get("definition", header["task"]), given),
         observations=observations,
+        covariates={n.removeprefix("covariates/"): a for n, a in arrays.items() if n.startswith("covariates/")},
         dt=float(header["dt"]),
         seed=origin["seed"],
         split=origin["split"],

@@ -28,6 +28,8 @@ Needs = Literal[
     "covariance",
     "weights",
     "effective_weights",
+    "covariates",
+    "contact",
     "ekf",
     "sensors",
     "pf",
@@ -103,6 +105,7 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("trace/log_likelihood", "Trace", "(K, M)", "log", "pf", "log-likelihood of each particle, unnormalised"),
     Entity("trace/ancestors", "Trace", "(M,)", "index", "pf", "index of the particle before resampling"),
     Entity("observations/{key}", "Image or Scalars", "task's", "task's", "always", "input of the filter"),
+    Entity("covariates/{name}", "Scalars", "()", "task's", "covariates", "covariate except contact; NaN: unknown"),
     # The scene: metres, z up. The plane shows the belief over the task's two map components.
     Entity("world", "ViewCoordinates", "static", "m", "always", "right-handed, z up"),
     Entity("world/effector", "Points3D", "(3,)", "m", "always", "end effector"),
@@ -145,7 +148,7 @@ SCHEMA: tuple[Entity, ...] = (
         "effective_weights",
         "effective weight, one series per column",
     ),
-    Entity("contact", "StateChange", "()", "text", "always", "`contact` or `free motion`, at changes"),
+    Entity("contact", "StateChange", "()", "text", "contact", "`contact` or `free motion`, at changes"),
     Entity("diagnostics/effective_sample_size", "Scalars", "()", "particles", "pf", "1 / sum of squared weights"),
     # Diagnostics.
     Entity(

@@ -25,7 +25,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
     Returns:
         Descriptions ``{"name", "shape", "offset"}`` (offset in bytes) and the float32 buffer they refer to.
     """
-    innovation = innovations(trace)
+    innovation, groups = innovations(trace), measures.shaded_groups(trace)
     unimodal = bool(trace.modalities_with_posterior)
     arrays: dict[str, NDArray[Any] | None] = {
         "truth": trace.episode.states,
@@ -39,6 +39,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "weights": trace.weights,
         "effective_weights": trace.effective_weights,
         "contact": trace.episode.contact,
+        "groups": np.stack(list(groups.values()), axis=1) if groups else None,
         "effective_sample_size": trace.effective_sample_size,
     }
     arrays |= {key: trace.episode.observations.get(key) for key in SENSORS}
@@ -96,6 +97,7 @@ def header(
         "episode": trace.episode_index,
         "components": components,
         "modalities": list(trace.modalities),
+        "groups": list(measures.shaded_groups(trace)),
         "weight_width": 0 if trace.weights is None else trace.weights.shape[-1],
         "checkpoint_hash": trace.checkpoint_hash,
         "data_hash": trace.data_hash,

@@ -40,7 +40,8 @@ class Capture:
     """Context manager that records a filter's submodule calls; ``step`` returns the values of the last step.
 
     Attributes:
-        models: indices of the measurement models that took part in the last step; empty if none is recognised.
+        models: indices of the measurement models that took part in the last step; empty if none is recognised or the
+            filter has only one, whose sensors are unknown.
     """
 
     def __init__(self, filter_: nn.Module) -> None:
@@ -120,14 +121,14 @@ class Capture:
         }
         models = _modules(model, "measurement_models") or [model]
         outputs = {k: self._calls[part].output for k, part in enumerate(models) if part in self._calls}
-        self.models = tuple(outputs)
+        self.models = tuple(outputs) if len(models) > 1 else ()
         if outputs and all(output.shape == fused.shape for output in outputs.values()):
             values["log_likelihood"] = torch.stack(list(outputs.values()), dim=1)
         after = _copy(self._filter.particle_states)
         if after.shape == states.shape:
-            same = (after.unsqueeze(2) == states.unsqueeze(1)).all(-1)  # (N, M after, M before)
-            if same.any(-1).all():
-                values["ancestors"] = same.int().argmax(-1)
+            ancestors = _first_equal(after, states)
+            if (ancestors < states.shape[1]).all():
+                values["ancestors"] = ancestors
         return values
 
     def _gaussians(self) -> dict[str, Tensor]:
@@ -138,7 +139,9 @@ class Capture:
         covariance = _covariance(self._filter)
         if covariance is not None:
             values["estimate_covariance"] = covariance
+        count = len(filters)
         if filters[0] is self._filter:
+            count = len(_sensors(self._filter))
             sensors = {k: sensor for k, sensor in enumerate(_sensors(self._filter)) if sensor in self._calls}
             beliefs = [_belief(self._filter)] if len(sensors) == 1 else []
         else:
@@ -149,7 +152,7 @@ class Capture:
             beliefs = [(m, c) for m, c in zip(means, covariances, strict=True) if c is not None]
             if len(beliefs) < len(called) or len(sensors) < len(called):
                 return values
-        self.models = tuple(sensors)
+        self.models = tuple(sensors) if count > 1 else ()
         calls = [self._calls[sensor] for sensor in sensors.values() if sensor in self._calls]
         _stack(values, "modality", beliefs)
         if len(calls) == len(sensors):
@@ -239,3 +242,19 @@ def _copy(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(_copy(item) for item in value)
     return value.detach().clone() if isinstance(value, Tensor) else value
+
+
+def _first_equal(after: Tensor, before: Tensor) -> Tensor:
+    """(N, M after): index of the first of the rows ``before`` (N, M, n) that equals each row of ``after``.
+
+    M where there is none. Sorts the rows: O(N M log(N M)) comparisons.
+    """
+    n, count = before.shape[:2]
+    rows = torch.cat([before, after], dim=1)
+    owner = torch.arange(n, dtype=rows.dtype).reshape(n, 1, 1).expand(n, rows.shape[1], 1)
+    _, group = torch.unique(torch.cat([owner, rows], dim=-1).flatten(0, 1), dim=0, return_inverse=True)
+    group = group.reshape(n, -1)
+    first = torch.full((int(group.max()) + 1,), count)
+    index = torch.arange(count).expand(n, count)
+    first.scatter_reduce_(0, group[:, :count].flatten(), index.flatten(), "amin")
+    return first[group[:, count:]]

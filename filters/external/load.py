@@ -216,6 +216,8 @@ def model_names(
 ) -> tuple[str, ...]:
     """Names of the measurement models: as given, or the task's modalities if there are as many, or numbered.
 
+    A single model of a task with several modalities is never named after one that it may not read.
+
     Args:
         axis: of the values that indexes the models. models: indices of the participating models, if not all.
 
@@ -230,7 +232,7 @@ def model_names(
             return candidates
     if names and count:
         raise BadInput(f"{source} names {len(names)} modalities, {', '.join(names)}, but has {count}")
-    return ("+".join(modalities),) if count == 1 else tuple(f"model-{k + 1}" for k in range(count))
+    return tuple(f"model-{k + 1}" for k in range(count))
 
 
 def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()) -> ExternalFilter:

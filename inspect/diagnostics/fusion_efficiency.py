@@ -171,6 +171,7 @@ def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequen
         phases=tuple(
             _phase(name, moments, steps, list(members))
             for name, members in GROUPS.items()
+            if name in measures.phases(first)
             if steps[:, list(members)].any()
         ),
         reasons=reasons_of(traces, checkpoint),

@@ -68,7 +68,7 @@ class MapSurvey(Diagnostic):
             self._shape(layer, phase)
             for layer in self.ridge_layers
             for phase in ("contact", "free motion")
-            if self.phases[phase].any()
+            if phase in self.phases and self.phases[phase].any()
         ]
         if np.isfinite(self.numbers.expected).any():
             sentences.append("A random orientation is 45° off in the median.")

@@ -115,9 +115,26 @@ def counted(trace: Trace) -> Mask:
 
 
 def phases(trace: Trace) -> dict[str, Mask]:
-    """Phase -> mask (T,) without warm-up steps: ``all``, ``contact``, ``free motion``, ``blackout``."""
-    contact, keep = trace.episode.contact.astype(bool), counted(trace)
-    return {"all": keep, "contact": keep & contact, "free motion": keep & ~contact, "blackout": keep & blackout(trace)}
+    """Phase -> mask (T,) without warm-up steps: ``all``, groups of the task's covariates, and ``blackout``.
+
+    The default covariate has the groups ``contact`` and ``free motion``.
+    """
+    keep = counted(trace)
+    groups = {
+        group: keep & mask
+        for name, covariate in trace.task.covariates.items()
+        for group, mask in covariate.masks(name, trace.episode.covariate(name))
+    }
+    return {"all": keep, **groups, "blackout": keep & blackout(trace)}
+
+
+def shaded_groups(trace: Trace) -> dict[str, Mask]:
+    """Group -> mask (T,) of each group of the task's covariates, without those of false values."""
+    return {
+        group: mask
+        for name, covariate in trace.task.covariates.items()
+        for group, mask in list(covariate.masks(name, trace.episode.covariate(name)))[: covariate.shaded]
+    }
 
 
 GROUPS = {"all": (0, 1, 2, 3), "contact": (2, 3), "free motion": (0, 1), "blackout": (1, 3)}

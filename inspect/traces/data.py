@@ -129,4 +129,5 @@ def arrays_of(trace: Trace) -> dict[str, NDArray[Any]]:
         name: getattr(trace, name) for name in ARRAYS if getattr(trace, name) is not None
     }
     arrays |= {f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")}
+    arrays |= {f"episode/covariates/{key}": value for key, value in episode.covariates.items()}
     return arrays | {f"episode/observations/{key}": value for key, value in episode.observations.items()}

@@ -90,12 +90,16 @@ def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any], give
     episode_arrays: dict[str, Any] = {
         name.removeprefix("episode/"): a for name, a in arrays.items() if name.startswith("episode/")
     }
-    prefix = "observations/"
+
+    def group(prefix: str) -> dict[str, Any]:
+        return {name.removeprefix(prefix): a for name, a in episode_arrays.items() if name.startswith(prefix)}
+
     origin = header["episode"]
     episode = Episode(
         **origin | {"task": stored_task(origin["task"], given)},
         **{name: episode_arrays[name] for name in ("states", "controls", "contact", "qpos")},
-        observations={n.removeprefix(prefix): a for n, a in episode_arrays.items() if n.startswith(prefix)},
+        observations=group("observations/"),
+        covariates=group("covariates/"),
     )
     values = {name: value for name, value in header.items() if name not in ("format", "episode", "recipe")}
     values |= {

@@ -40,6 +40,8 @@ def validate_trace(trace: Trace) -> None:
     for name, letters, kinds in (("states", "Tn", "f"), ("controls", "Tc", "f"), ("contact", "T", "b")):
         _check_array(name, getattr(episode, name), letters, sizes, kinds)
     _check_array("qpos", episode.qpos, "Tq", sizes, "f")
+    for name, values in episode.covariates.items():
+        _check_array(f"covariate {name!r}", values, "T", sizes, "f")
     for name, values in episode.observations.items():
         _check_array(f"observation {name!r}", values, "T" + "_" * (np.ndim(values) - 1), sizes, "biuf")
     ancestors, particles = trace.ancestors, sizes.get("M", 0)

@@ -182,9 +182,14 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
 
 
 def event_summary(trace: Trace, step: int) -> str:
-    """Time, contact, image blackout and effective sample size at a step."""
-    contact = "in contact" if trace.episode.contact[step] else "free motion"
-    parts = [f"{step * trace.episode.dt:.1f} s after the start, {contact}"]
+    """Time, groups of the task's covariates, image blackout and effective sample size at a step."""
+    groups = [
+        "in contact" if group == "contact" else group
+        for name, covariate in trace.task.covariates.items()
+        for group, mask in covariate.masks(name, trace.episode.covariate(name))
+        if mask[step]
+    ]
+    parts = [", ".join([f"{step * trace.episode.dt:.1f} s after the start", *groups])]
     if measures.blackout(trace)[step]:
         parts.append("image blacked out")
     if trace.effective_sample_size is not None and trace.particles is not None:

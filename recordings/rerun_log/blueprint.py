@@ -110,8 +110,10 @@ def _map(layer: str, first: LikelihoodMap) -> rrb.Spatial2DView:
 
 def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     rows: list[rrb.View | rrb.Container] = []
-    rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=_linked()))
-    shares = [1.6]
+    shares: list[float] = []
+    if "contact" in task.covariates:
+        rows.append(rrb.StateTimelineView(origin="contact", name="Contact", time_view=_linked()))
+        shares.append(1.6)
     titles = {"weights": "Fusion weights beta", "effective_weights": "Effective weights"}
     fusion = [_plot(name, title, (-0.05, 1.05)) for name, title in titles.items() if getattr(trace, name) is not None]
     if fusion:

@@ -102,12 +102,9 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
         outline = task.outline(positions(trace)[0])
         for name in ("truth", "fused") if has_truth(trace) else ("fused",):
             yield f"world/object/{name}", _object(_hex(name, trace), outline, filled=name == "truth")
-    yield (
-        "contact",
-        rr.StateConfiguration(
-            values=CONTACT_NAMES, colors=np.full(2, rgba(_hex("contact", trace)), np.uint32), visible=[False, True]
-        ),
-    )
+    if "contact" in task.covariates:
+        colours = np.full(2, rgba(_hex("contact", trace)), np.uint32)
+        yield "contact", rr.StateConfiguration(values=CONTACT_NAMES, colors=colours, visible=[False, True])
     for source in sources(trace):
         hue, width, label = _hex(source, trace), 2.5 if source == "fused" else 1.2, layer_label(source)
         yield f"world/plane/{source}/mean", _marker(hue, 3.5 if source == "fused" else 2.5)
@@ -145,8 +142,13 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
 
 
 def contact_changes(trace: Trace, span: slice) -> tuple[NDArray[np.int64], Any]:
-    """Steps at which contact begins or ends, including the trace's first step, and the columns of the states."""
+    """Steps at which contact begins or ends, including the trace's first step, and the columns of the states.
+
+    None for a task without the covariate contact.
+    """
     contact = trace.episode.contact
+    if "contact" not in trace.task.covariates:
+        return np.zeros(0, np.int64), ()
     steps = span.start + np.flatnonzero(np.concatenate([[True], contact[1:] != contact[:-1]])[span])
     return steps, rr.StateChange.columns(state=[CONTACT_NAMES[int(contact[step])] for step in steps])
 

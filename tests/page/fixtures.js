@@ -74,6 +74,7 @@ export function makeTrace(arrays, header = {}, images = null) {
       kind: 'ekf',
       components: TASK.components,
       modalities: TASK.modalities,
+      groups: ['contact'],
       settings: {},
       image_size: null,
       nees_bounds: null,

@@ -57,6 +57,7 @@ class TraceHeader(Reply):
     """Metadata of a trace.
 
     Attributes:
+        groups: names of the groups of covariates, in the order of the column ``groups`` (T, G).
         weight_width: 0 for a filter without weights. settings: of the run.
         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
@@ -72,6 +73,7 @@ class TraceHeader(Reply):
     episode: int
     components: list[Component]
     modalities: list[str]
+    groups: list[str]
     weight_width: int
     checkpoint_hash: str
     data_hash: str

@@ -103,6 +103,21 @@ export class Trace {
     return this.position.every((i) => Number.isFinite(this.truth(i)[step]));
   }
 
+  /** Names of the groups of steps by covariate, such as contact. */
+  get groups() {
+    return this.header.groups;
+  }
+
+  /**
+   * Returns whether each step belongs to a group (0 or 1); empty for an unknown name.
+   * @param {string} name
+   * @returns {Series}
+   */
+  group(name) {
+    const index = this.groups.indexOf(name);
+    return (index < 0 ? undefined : this.#slice('groups', index)) ?? new Float32Array();
+  }
+
   /** Whether the filter fuses several modalities. */
   get fuses() {
     return this.modalities.length > 1;

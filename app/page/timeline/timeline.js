@@ -14,6 +14,7 @@ import { intervals } from '../data/arrays.js';
 import { GUTTER, chart, chartData } from './chart.js';
 import { EventMarks } from './event_marks.js';
 import { Gestures } from './gestures.js';
+import { GroupPicker } from './group_picker.js';
 import { layoutKey, noteElement, trackHeights } from './layout.js';
 import { formatValue, legend, updateLegend } from './legend.js';
 import { StandalonePicker } from './standalone_picker.js';
@@ -59,6 +60,7 @@ export class Timeline {
   #selection = overlayMark('selection');
   #marks;
   #standalone;
+  #group;
   #readout;
   #resetButton = element('#reset-zoom', HTMLButtonElement);
   #legendWidth = 0;
@@ -75,6 +77,7 @@ export class Timeline {
     this.#host.append(this.#cursor, this.#pointer, this.#level, this.#selection);
     this.#marks = new EventMarks(html('#marks', body), store);
     this.#standalone = new StandalonePicker(store);
+    this.#group = new GroupPicker(() => this.redraw());
     this.#trackSelect = element('#track', HTMLSelectElement);
     this.#trackSelect.replaceChildren(
       ...Object.entries(TRACKS).map(([key, label]) => new Option(label, key)),
@@ -113,6 +116,7 @@ export class Timeline {
     this.#marks.set([]);
     this.showRepair(null);
     this.#standalone.show(trace);
+    this.#group.show(trace.groups);
     this.redraw();
     this.#setWindow(this.#window);
   }
@@ -341,7 +345,7 @@ export class Timeline {
   #updateShading() {
     if (!this.#trace) return;
     Object.assign(this.#shading, {
-      contact: intervals(this.#trace.contact),
+      contact: intervals(this.#trace.group(this.#group.value)),
       blackout: intervals(this.#trace.blackout),
       edits: this.#activeComparison?.edits ?? [],
     });
@@ -383,7 +387,8 @@ export class Timeline {
     const parts = [`step ${step}`, `${fixed(step * trace.dt)} s`];
     if (trace.hasTruth(step))
       parts.push(`error ${fixed(trace.error('fused', 'position')?.[step])} cm`);
-    if (trace.contact[step]) parts.push('in contact');
+    const groups = trace.groups.filter((name) => trace.group(name)[step]);
+    parts.push(...groups.map((name) => (name === 'contact' ? 'in contact' : name)));
     if (trace.blackout[step]) parts.push('image blacked out');
     return parts.join(', ');
   }

@@ -1528,6 +1528,7 @@ export interface components {
          * @description Metadata of a trace.
          *
          *     Attributes:
+         *         groups: names of the groups of covariates, in the order of the column ``groups`` (T, G).
          *         weight_width: 0 for a filter without weights. settings: of the run.
          *         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
          *         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
@@ -1550,6 +1551,8 @@ export interface components {
             components: components["schemas"]["Component"][];
             /** Modalities */
             modalities: string[];
+            /** Groups */
+            groups: string[];
             /** Weight Width */
             weight_width: number;
             /** Checkpoint Hash */
