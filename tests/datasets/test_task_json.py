@@ -38,10 +38,10 @@ def test_functions_come_only_from_tasks_of_the_same_layout() -> None:
     assert stored_task(stored(wider)).simulate is DOOR.simulate
     other = replace(DOOR, components=(*DOOR.components, Component("speed", "m")))
     assert stored_task(stored(other)).simulate is None
-    assert stored_task(stored(other), given=other) is other
-    assert stored_task(stored(other), given=DOOR).simulate is None
+    assert stored_task(stored(other), given=[other]) is other
+    assert stored_task(stored(other), given=[DOOR]).simulate is None
     mine = replace(other, name="mine")
-    assert stored_task("mine", given=mine) is mine
+    assert stored_task("mine", given=[mine]) is mine
     with pytest.raises(BadInput, match="task 'mine' does not exist"):
         stored_task("mine")
 
