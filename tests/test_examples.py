@@ -135,6 +135,9 @@ def test_user_task_in_the_server(folder: Path, tmp_path: Path) -> None:
 def test_filters_of_unknown_tasks_are_rejected(folder: Path) -> None:
     code, _, err = run("evaluate", "door", "--filter", folder / "own.safetensors")
     assert code == 2
+    assert "own.safetensors' is for task 'ball', not for 'door'" in err
+    code, _, err = run("trace", "ball", "--filter", "crossmodal-ekf", "-o", folder / "no.trace")
+    assert code == 2
     assert "task 'ball' does not exist. Available: door, " in err
     assert "Give a task of your own as path/to/file.py:NAME." in err
     _, _, err = run("evaluate", SPEC, "--filter", folder / "own.safetensors")
@@ -163,7 +166,6 @@ TASK = Task(
         ("def", "own.py:TASK", r"own\.py cannot be run: SyntaxError"),
         ("", "no.such.module:TASK", r"module 'no\.such\.module' cannot be imported: ModuleNotFoundError: No module"),
         ("", "json:TASK", r"json has no task 'TASK'"),
-        (TASK_FILE, "own.py:TASK|door", r"own\.py:TASK is named 'door', which is already used"),
         (TASK_FILE, "own.py:TASK|a b", r"own\.py:TASK is named 'a b', expected a name without spaces"),
         (TASK_FILE, "own.py:TASK||('touch',)", r"modality 'haptics' has 'touch', which is not an observation"),
         (
