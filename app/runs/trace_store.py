@@ -67,11 +67,12 @@ class TraceStore:
             return self._catalogs[1]
 
     def catalog(self) -> dict[str, Any]:
-        """``tasks`` that can be displayed, and the ``problems``."""
+        """``tasks`` that can be displayed, the ``problems``, and whether the settings name files of the user."""
         with self._lock:
             catalogs, problems = self._catalogs
             tasks = [catalog.to_json() for catalog in catalogs.values() if not catalog.problem]
-            return {"tasks": tasks, "problems": problems}
+            own_files = bool(self.settings.data or self.settings.checkpoints or self.settings.tasks)
+            return {"tasks": tasks, "problems": problems, "own_files": own_files}
 
     def tasks(self) -> list[str]:
         """Names of the tasks that can be displayed."""

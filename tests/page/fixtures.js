@@ -39,7 +39,14 @@ export const TASK = {
 };
 
 /** @type {import('../../app/page/data/api.js').Catalog} */
-export const CATALOG = { version: '0', read_only: false, faults: [], tasks: [TASK], problems: [] };
+export const CATALOG = {
+  version: '0',
+  read_only: false,
+  own_files: false,
+  faults: [],
+  tasks: [TASK],
+  problems: [],
+};
 
 /**
  * Encodes columns end to end, as the server does.

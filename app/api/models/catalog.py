@@ -153,10 +153,14 @@ class FaultInfo(Reply):
 
 
 class Catalog(Reply):
-    """Everything the server can show. problems: one line per file that cannot be used."""
+    """Everything the server can show.
+
+    own_files: whether the server was given filters, data sets or tasks. problems: one line per unusable file.
+    """
 
     version: str
     read_only: bool
+    own_files: bool
     faults: list[FaultInfo]
     tasks: list[TaskInfo]
     problems: list[str]

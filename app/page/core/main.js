@@ -5,6 +5,7 @@ import { addLiveRuns } from '../tabs/live_runs.js';
 import { Messages } from '../widgets/panel_state.js';
 import { showError, showLoading } from './common_panels.js';
 import { html, messageOf } from './dom.js';
+import { examples } from './examples.js';
 import { Page } from './page.js';
 import { disableChanges } from './read_only.js';
 import { Store, parsePermalink } from './state.js';
@@ -28,7 +29,10 @@ async function start() {
     throw new api.ServerError(
       'Nothing to display: no task has both episodes and a trained filter.',
     );
-  const { state, problems } = parsePermalink(location.search, catalog);
+  const { state, problems } = parsePermalink(
+    location.search || examples(catalog)[0]?.link || '',
+    catalog,
+  );
   if (state.faults)
     await api.checkSelection({ ...state, against: '' }).catch((error) => {
       problems.push(

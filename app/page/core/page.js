@@ -26,6 +26,7 @@ import { Rerun } from '../tabs/rerun.js';
 import { Study } from '../tabs/study.js';
 import { Timeline } from '../timeline/timeline.js';
 import { FaultDialog } from '../widgets/fault_dialog.js';
+import { Intro } from '../widgets/intro.js';
 import { Jobs } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice, connectPickers } from '../widgets/pickers.js';
@@ -81,6 +82,7 @@ export class Page {
       catalog.faults,
     );
     const refreshPickers = connectPickers(catalog, store, faultDialog);
+    this.intro = new Intro(html('#intro'), catalog, store);
     this.undo = new Undo(store);
     this.theme = new Theme((dark) => this.#changeTheme(dark));
     this.clock = new Clock(store);
@@ -261,6 +263,7 @@ export class Page {
     const loading = (this.#loading = new AbortController());
     [this.#trace, this.#failed] = [null, false];
     this.clock.show(null);
+    this.diagnosis.show(null);
     const loadingState = startLoading();
     try {
       const selection = { task: name, filter, data, episode, faults };
@@ -295,6 +298,7 @@ export class Page {
     this.diagnostics.show(trace);
     this.failures.show(trace);
     this.report.show(trace);
+    this.intro.show(trace);
     showProperties(trace);
     this.adaptMapMenu(trace);
     this.sceneMenu.show(trace);

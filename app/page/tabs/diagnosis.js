@@ -65,10 +65,11 @@ export class Diagnosis {
     if (open) this.load();
   }
 
-  /** @param {Trace} trace */
+  /** @param {Trace | null} trace null while another one is loading */
   show(trace) {
     this.#trace = trace;
     this.#repair.clear();
+    this.#loading.abort();
     this.load();
   }
 

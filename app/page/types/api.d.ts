@@ -9,13 +9,17 @@ export interface components {
     schemas: {
         /**
          * Catalog
-         * @description Everything the server can show. problems: one line per file that cannot be used.
+         * @description Everything the server can show.
+         *
+         *     own_files: whether the server was given filters, data sets or tasks. problems: one line per unusable file.
          */
         Catalog: {
             /** Version */
             version: string;
             /** Read Only */
             read_only: boolean;
+            /** Own Files */
+            own_files: boolean;
             /** Faults */
             faults: components["schemas"]["FaultInfo"][];
             /** Tasks */
