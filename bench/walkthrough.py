@@ -1,4 +1,4 @@
-"""Take the screenshots of README.md and docs/walkthrough.md, and print the verdicts in them.
+"""Take the screenshots of README.md, docs/diagnose.md and docs/walkthrough.md, and print the verdicts in them.
 
 python bench/walkthrough.py [FOLDER]    # docs/images by default; needs Chromium and the package's [dev] extra
 """
@@ -18,6 +18,7 @@ from playwright.sync_api import Page, sync_playwright
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 SELECTION = {"task": "push", "filter": "crossmodal-ekf", "episode": 79, "step": 68, "component": "x"}
+FROZEN = {"episode": 9, "step": 50, "faults": "image_frozen:from=30", "tab": "diagnosis"}
 SIZE = {"width": 1440, "height": 900}
 SETTLING = 10.0  # s: software rendering of the scene is slow
 TIMEOUT = 300.0  # s: integrated gradients are slow on a busy machine
@@ -38,17 +39,10 @@ class Shot:
 SHOTS = (
     Shot(
         "page",
-        {
-            "task": "door",
-            "filter": "crossmodal-pf",
-            "data": "sample",
-            "episode": 9,
-            "step": 25,
-            "component": "angle",
-            "faults": "blackout=0.4",
-        },
+        {"task": "push-field", "filter": "information-ekf", "episode": 13, "step": 53, "weights": "effective"},
         "#maps-pairs",
     ),
+    Shot("diagnosis", FROZEN, "#diagnosis[data-state=ready] .headline"),
     Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Search for failures"),
     Shot("walkthrough-moment", {"tab": "scene"}, "#maps-pairs"),
     Shot("walkthrough-weights", {"tab": "diagnostics", "diagnostic": "weights"}, READY),

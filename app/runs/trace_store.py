@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,8 @@ from weakref import WeakValueDictionary
 
 from beliefscope.app.protocol.errors import QueueFull
 from beliefscope.app.runs.catalog import TaskCatalog, task_catalogs
+from beliefscope.app.runs.examples import Example, available
+from beliefscope.app.runs.first_moment import first_moment
 from beliefscope.app.runs.live_runs import LIVE_PREFIX, LiveRuns
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.settings import Settings
@@ -67,12 +69,11 @@ class TraceStore:
             return self._catalogs[1]
 
     def catalog(self) -> dict[str, Any]:
-        """``tasks`` that can be displayed, the ``problems``, and whether the settings name files of the user."""
+        """``tasks`` that can be displayed, the ``problems``, and ``examples``."""
         with self._lock:
             catalogs, problems = self._catalogs
             tasks = [catalog.to_json() for catalog in catalogs.values() if not catalog.problem]
-            own_files = bool(self.settings.data or self.settings.checkpoints or self.settings.tasks)
-            return {"tasks": tasks, "problems": problems, "own_files": own_files}
+            return {"tasks": tasks, "problems": problems, "examples": list(map(asdict, self._examples()))}
 
     def tasks(self) -> list[str]:
         """Names of the tasks that can be displayed."""
@@ -96,14 +97,23 @@ class TraceStore:
             return catalog.filters
 
     def default_selection(self) -> Selection:
-        """First task, filter, data set and held-out episode. Raises BadInput if no task can be displayed."""
+        """The first example; without one, the first task and filter. Raises BadInput if no task can be displayed."""
         with self._lock:
             catalogs, problems = self._catalogs
-            catalog = next((catalog for catalog in catalogs.values() if not catalog.problem), None)
-            if catalog is None:
-                raise BadInput("; ".join(problems) or "no trained filter is available; train one first")
+            if examples := self._examples():
+                catalog, filter_ = catalogs[examples[0].task], examples[0].filter
+            else:
+                first = next((catalog for catalog in catalogs.values() if not catalog.problem), None)
+                if first is None:
+                    raise BadInput("; ".join(problems) or "no trained filter is available; train one first")
+                catalog, filter_ = first, next(iter(first.filters))
             data, episodes = next(iter(catalog.data.items()))
-            return Selection(catalog.task.name, next(iter(catalog.filters)), episodes.held_out()[0], data=data)
+            return Selection(catalog.task.name, filter_, first_moment(episodes)[0], data=data)
+
+    def _examples(self) -> list[Example]:
+        """None for a server with filters, data sets or tasks of the user."""
+        settings = self.settings
+        return [] if settings.data or settings.checkpoints or settings.tasks else available(self._catalogs[0])
 
     def request(self, selection: Selection) -> TracedRun:
         """The selected run; its computation is started if necessary.

@@ -2,9 +2,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import './browser.js';
-import { examples } from '../../app/page/core/examples.js';
 import { outageFinding } from '../../app/page/step/finding.js';
-import { CATALOG } from './fixtures.js';
 
 const STEPS = 20;
 
@@ -38,14 +36,4 @@ test('the finding describes the outage in contact, with weights, error and its e
 test('short outages and those in free motion are no finding', () => {
   assert.equal(outageFinding(run(11), 0), '');
   assert.equal(outageFinding(run(14, 9), 0), '');
-});
-
-test('examples need their task and filter, and a server without own files', () => {
-  const links = examples(CATALOG).map(({ link }) => new URLSearchParams(link));
-  assert.ok(links.length > 0);
-  for (const link of links) {
-    assert.equal(link.get('task'), 'door');
-    assert.ok(['crossmodal-pf', 'crossmodal-ekf'].includes(link.get('filter') ?? ''));
-  }
-  assert.deepEqual(examples({ ...CATALOG, own_files: true }), []);
 });

@@ -42,7 +42,7 @@ export const TASK = {
 export const CATALOG = {
   version: '0',
   read_only: false,
-  own_files: false,
+  examples: [],
   faults: [],
   tasks: [TASK],
   problems: [],

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, create_model
 
 from beliefscope.app.jobs.queue import Job
+from beliefscope.app.runs.examples import Example
 from beliefscope.datasets.dataset import EpisodeSummary
 from beliefscope.datasets.task import Component
 
@@ -155,12 +156,12 @@ class FaultInfo(Reply):
 class Catalog(Reply):
     """Everything the server can show.
 
-    own_files: whether the server was given filters, data sets or tasks. problems: one line per unusable file.
+    examples: none on a server with the user's filters, data sets or tasks. problems: one line per unusable file.
     """
 
     version: str
     read_only: bool
-    own_files: bool
+    examples: list[Example]
     faults: list[FaultInfo]
     tasks: list[TaskInfo]
     problems: list[str]

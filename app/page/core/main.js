@@ -5,7 +5,6 @@ import { addLiveRuns } from '../tabs/live_runs.js';
 import { Messages } from '../widgets/panel_state.js';
 import { showError, showLoading } from './common_panels.js';
 import { html, messageOf } from './dom.js';
-import { examples } from './examples.js';
 import { Page } from './page.js';
 import { disableChanges } from './read_only.js';
 import { Store, parsePermalink } from './state.js';
@@ -30,7 +29,7 @@ async function start() {
       'Nothing to display: no task has both episodes and a trained filter.',
     );
   const { state, problems } = parsePermalink(
-    location.search || examples(catalog)[0]?.link || '',
+    location.search || catalog.examples[0]?.link || '',
     catalog,
   );
   if (state.faults)
@@ -42,4 +41,5 @@ async function start() {
     });
   messages.show('link', problems.join('\n'));
   new Page(catalog, new Store(state), live, messages);
+  document.body.classList.remove('starting');
 }

@@ -11,15 +11,15 @@ export interface components {
          * Catalog
          * @description Everything the server can show.
          *
-         *     own_files: whether the server was given filters, data sets or tasks. problems: one line per unusable file.
+         *     examples: none on a server with the user's filters, data sets or tasks. problems: one line per unusable file.
          */
         Catalog: {
             /** Version */
             version: string;
             /** Read Only */
             read_only: boolean;
-            /** Own Files */
-            own_files: boolean;
+            /** Examples */
+            examples: components["schemas"]["Example"][];
             /** Faults */
             faults: components["schemas"]["FaultInfo"][];
             /** Tasks */
@@ -326,6 +326,18 @@ export interface components {
         Error: {
             /** Error */
             error: string;
+        };
+        /**
+         * Example
+         * @description A run on the page. help: what it shows. link: query string of the page's address.
+         */
+        Example: {
+            /** Title */
+            title: string;
+            /** Help */
+            help: string;
+            /** Link */
+            link: string;
         };
         /**
          * FailureEvent
@@ -1688,6 +1700,7 @@ export type DiagnosticResult = components['schemas']['DiagnosticResult'];
 export type EpisodeErrors = components['schemas']['EpisodeErrors'];
 export type EpisodeSummary = components['schemas']['EpisodeSummary'];
 export type Error = components['schemas']['Error'];
+export type Example = components['schemas']['Example'];
 export type FailureEvent = components['schemas']['FailureEvent'];
 export type FailureScore = components['schemas']['FailureScore'];
 export type Failures = components['schemas']['Failures'];

@@ -5,13 +5,13 @@
 /** @import { Catalog } from '../types/server.js' */
 
 import { create, html } from '../core/dom.js';
-import { examples } from '../core/examples.js';
 import { parsePermalink } from '../core/state.js';
 import { outageFinding } from '../step/finding.js';
 
 export class Intro {
   #host;
   #store;
+  #help = ''; // of the example that was opened last
 
   /**
    * @param {HTMLElement} host is shown if the address selects nothing and there are examples
@@ -21,9 +21,12 @@ export class Intro {
   constructor(host, catalog, store) {
     this.#host = host;
     this.#store = store;
-    const chips = examples(catalog).map(({ title, help, link }) => {
+    const chips = catalog.examples.map(({ title, help, link }) => {
       const chip = create('button', { type: 'button', className: 'chip', title: help }, title);
-      chip.addEventListener('click', () => store.set(parsePermalink(link, catalog).state));
+      chip.addEventListener('click', () => {
+        this.#help = help;
+        store.set(parsePermalink(link, catalog).state);
+      });
       return chip;
     });
     host.hidden = Boolean(location.search) || !chips.length;
@@ -36,6 +39,6 @@ export class Intro {
     if (this.#host.hidden) return;
     const { component } = this.#store.state;
     const index = trace.components.findIndex(({ name }) => name === component);
-    html('.finding', this.#host).textContent = outageFinding(trace, index);
+    html('.finding', this.#host).textContent = outageFinding(trace, index) || this.#help;
   }
 }

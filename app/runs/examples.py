@@ -1,0 +1,68 @@
+"""Examples that the page offers: runs that show one thing each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from urllib.parse import parse_qs
+
+from beliefscope.app.runs.catalog import TaskCatalog
+
+
+@dataclass(frozen=True)
+class Example:
+    """A run on the page. help: what it shows. link: query string of the page's address."""
+
+    title: str
+    help: str
+    link: str
+
+    @property
+    def task(self) -> str:
+        return self._value("task")
+
+    @property
+    def filter(self) -> str:
+        return self._value("filter")
+
+    def _value(self, key: str) -> str:
+        return parse_qs(self.link.removeprefix("?"))[key][0]
+
+
+EXAMPLES = (
+    Example(
+        "Camera outage",
+        "The camera goes dark during the first contact with a pushed object.",
+        "?task=push-field&filter=information-ekf&weights=effective",
+    ),
+    Example(
+        "Outage at a door",
+        "The camera goes dark while a hand opens a door.",
+        "?task=door-field&filter=information-ekf&weights=effective",
+    ),
+    Example(
+        "Frozen image",
+        "The camera repeats one image; the diagnosis names the cause.",
+        "?task=push&filter=crossmodal-ekf&step=50&faults=image_frozen%3Afrom%3D30&tab=diagnosis",
+    ),
+    Example(
+        "Biased force sensor",
+        "The measured force has a bias of 8 N; the diagnosis names the cause.",
+        "?task=push&filter=crossmodal-pf&step=40&faults=force_bias%3Ax%3D8&tab=diagnosis",
+    ),
+    Example(
+        "40 % image blackout",
+        "Random single images are black, the fault of the paper.",
+        "?task=door&filter=crossmodal-pf&step=25&faults=blackout%3D0.4&weights=effective",
+    ),
+)
+"""The first is what an address without a selection opens."""
+
+
+def available(catalogs: Mapping[str, TaskCatalog]) -> list[Example]:
+    """The examples whose task and filter can be displayed."""
+    return [
+        example
+        for example in EXAMPLES
+        if (catalog := catalogs.get(example.task)) and not catalog.problem and example.filter in catalog.filters
+    ]
