@@ -112,9 +112,16 @@ def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
         values["particles"] = particles.reshape(len(particles), -1, n) * factors
         values["log_weights"] = np.full(values["particles"].shape[:2], -np.log(values["particles"].shape[1]))
         values.setdefault("estimate_mean", values["particles"].mean(axis=1))
+        values.setdefault("estimate_covariance", _sample_covariance(values["particles"]))
     if weights := estimate.get("weights"):
         values["weights"] = joined(columns, list(weights.values()), "weights")[:, :, None]
     return values
+
+
+def _sample_covariance(ensemble: Array) -> Array:
+    """(T, n, n): unbiased covariance of the members (T, M, n)."""
+    centred = ensemble - ensemble.mean(axis=1, keepdims=True)
+    return np.einsum("tmi,tmj->tij", centred, centred) / max(ensemble.shape[1] - 1, 1)
 
 
 def _states(columns: Columns, mapping: ColumnMap) -> Array:

@@ -1,10 +1,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
 from beliefscope.datasets.errors import BadInput
+
+if TYPE_CHECKING:
+    from beliefscope.inspect.trace import Trace
 
 RECORDINGS = (".rrd", ".live")
 
@@ -13,7 +17,11 @@ RECORDINGS = (".rrd", ".live")
     source=opt.argument("FILE", "Recording (.rrd), file of a live run (.live), or log (.npz, .csv, .parquet)."),
     map=opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", "--map"),
     guess=opt.flag("Print a first map of a log instead of importing it.", "--guess"),
-    output=opt.output_file("RUN.trace|DATA.h5", "Output: a trace, or a data set.", ".trace", ".h5"),
+    output=opt.output_file(
+        "RUN.trace|RUN.live|DATA.h5",
+        "Output: a trace, a run for the folder live of a workspace, or a data set.",
+        *(".trace", ".live", ".h5"),
+    ),
     task=opt.TASK_OF_FILES,
 )
 def import_(
@@ -30,7 +38,8 @@ def import_(
     Of a live run that is in progress or was killed, the complete steps are extracted.
 
     Of a log, a map of a few lines names the columns of true states, sensors and recorded estimates. Sensors and states
-    become a data set; an estimate of one episode becomes a trace, which every command reads without the filter.
+    become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
+    run that the page displays.
 
     \b
     Examples:
@@ -38,9 +47,9 @@ def import_(
       beliefscope import log.csv --guess
       beliefscope import log.csv --map map.toml -o log.h5
       beliefscope import log.csv --map map.toml --episode 2 -o run.trace
+      beliefscope import log.csv --map map.toml -o workspace/live/run.live
     """
     from beliefscope.datasets.store import write_dataset
-    from beliefscope.inspect.trace import save_trace
     from beliefscope.recordings.logs.column_map import guess_map, read_map
     from beliefscope.recordings.logs.columns import read_columns
     from beliefscope.recordings.logs.read_log import read_log, recorded_trace
@@ -49,23 +58,27 @@ def import_(
         text = guess_map(read_columns(source), source.stem)
         return console.Result({"map": text}, text.rstrip())
     if output is None:
-        raise BadInput("give the output: -o RUN.trace or -o DATA.h5")
+        raise BadInput("give the output: -o RUN.trace, -o RUN.live or -o DATA.h5")
     if source.suffix.lower() in RECORDINGS:
-        opt.check_output(output, ".trace")
-        trace = opt.open_recording(source, task)
-        save_trace(trace, output)
-        return opt.trace_result(trace, output)
+        opt.check_output(output, ".trace", ".live")
+        return _written(opt.open_recording(source, task), output)
     if map is None:
         raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
     columns, mapping = read_columns(source), read_map(map)
     episodes = read_log(columns, mapping, source.name)
-    if output.suffix == ".trace":
+    if output.suffix != ".h5":
         if not 0 <= episode < len(episodes):
             raise BadInput(f"episode {episode} does not exist: {source.name} has {len(episodes)}")
-        trace = recorded_trace(columns, mapping, episodes, episode, source.name)
-        save_trace(trace, output)
-        return opt.trace_result(trace, output)
+        return _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
     write_dataset(output, episodes[0].task, episodes)
     steps = sum(len(e) for e in episodes)
     document = {"task": mapping.task, "episodes": len(episodes), "steps": steps}
     return console.Result(document, f"{len(episodes)} episodes of {mapping.task}, {steps} steps", output)
+
+
+def _written(trace: Trace, output: Path) -> console.Result:
+    from beliefscope.inspect.trace import save_trace
+    from beliefscope.inspect.traces.live_file import save_live
+
+    (save_live if output.suffix == ".live" else save_trace)(trace, output)
+    return opt.trace_result(trace, output)

@@ -11,6 +11,7 @@ import pytest
 from pyarrow import csv, parquet
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.inspect.statistics.measures import nees
 from beliefscope.inspect.trace import load_trace, save_trace
 from beliefscope.recordings.logs.column_map import guess_map, read_map
 from beliefscope.recordings.logs.columns import column, joined, read_columns
@@ -78,7 +79,7 @@ def test_every_format_gives_the_same_episodes_and_traces(log: Path, tmp_path: Pa
 
 
 def test_arrays_of_an_archive(tmp_path: Path) -> None:
-    """An ensemble gives mean and covariance of its members; unknown states are NaN; images keep their bytes."""
+    """An ensemble gives mean and sample covariance of its members; unknown states are NaN; images keep their bytes."""
     rng = np.random.default_rng(1)
     particles = rng.normal(size=(12, 50, 2))
     images = rng.integers(0, 256, (12, 8, 8), dtype=np.uint8)
@@ -90,7 +91,7 @@ def test_arrays_of_an_archive(tmp_path: Path) -> None:
     assert np.array_equal(episode.observations["image"], images)
     trace = recorded_trace(columns, mapping, [episode], 0, "log.npz")
     np.testing.assert_allclose(trace.estimate_mean, particles.mean(1), atol=1e-6)
-    expected = np.stack([np.cov(members.T, bias=True) for members in particles])
+    expected = np.stack([np.cov(members.T) for members in particles])
     np.testing.assert_allclose(trace.estimate_covariance, expected, atol=1e-5)
 
 
@@ -164,3 +165,15 @@ def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "log.npz", a=np.array([{"x": 1}], dtype=object))
     with pytest.raises(BadInput, match="cannot be read"):
         read_columns(tmp_path / "log.npz")
+
+
+def test_a_published_ensemble_filter(tmp_path: Path) -> None:
+    """The recorded run of the differentiable ensemble Kalman filter (DEnKF) has NEES/n 0.0747 in NumPy."""
+    path = Path(__file__).parents[4] / "shared" / "data" / "denkf" / "eval-13920.npz"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not here")
+    columns = read_columns(path)
+    text = guess_map(columns, "vehicle")
+    mapping = read_map(map_file(tmp_path, text))
+    trace = recorded_trace(columns, mapping, read_log(columns, mapping, path.name), 0, path.name)
+    assert nees(trace)[:, -1].mean() == pytest.approx(0.0747, rel=0.01)
