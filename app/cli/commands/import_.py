@@ -47,7 +47,7 @@ def import_(
       beliefscope import log.csv --guess
       beliefscope import log.csv --map map.toml -o log.h5
       beliefscope import log.csv --map map.toml --episode 2 -o run.trace
-      beliefscope import log.csv --map map.toml -o workspace/live/run.live
+      beliefscope import log.csv --map map.toml -o run.live
     """
     from beliefscope.datasets.store import write_dataset
     from beliefscope.recordings.logs.column_map import guess_map, read_map
