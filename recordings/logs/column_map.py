@@ -19,7 +19,7 @@ from beliefscope.recordings.logs.columns import Columns
 UNITS = {"m": ("m", 1.0), "cm": ("m", 0.01), "mm": ("m", 0.001), "rad": ("rad", 1.0), "deg": ("rad", math.pi / 180.0)}
 """Unit of a column -> internal unit, and its factor."""
 
-KEYS = ("task", "dt", "time", "episode", "control", "contact", "state", "sensors", "estimate")
+KEYS = ("task", "dt", "time", "episode", "control", "contact", "state", "sensors", "covariates", "estimate")
 ESTIMATE = ("filter", "mean", "std", "covariance", "particles", "weights")
 
 References = str | list[str]
@@ -34,6 +34,15 @@ class StateColumn:
 
 
 @dataclass(frozen=True)
+class CovariateColumn:
+    """Column of a covariate: text is categorical, zeros and ones boolean, other numbers continuous with ``cuts``."""
+
+    column: str
+    cuts: tuple[float, ...] = ()
+    unit: str = ""
+
+
+@dataclass(frozen=True)
 class ColumnMap:
     """What the columns of a log are.
 
@@ -42,7 +51,7 @@ class ColumnMap:
         dt: seconds per row; None if ``time``, a column in s, is given.
         episode: column that numbers or names the episodes; empty for a single one.
         state: component -> its column. control: columns. contact: column that is not zero in contact.
-        sensors: modality -> columns, or one column of images.
+        sensors: modality -> columns, or one column of images. covariates: name -> column.
         estimate: recorded estimate: ``filter``: its name; ``mean``; ``std`` or ``covariance``; or ``particles``
             (rows of M n numbers) in their place; ``weights``: modality -> column. Empty for a log without estimates.
     """
@@ -55,6 +64,7 @@ class ColumnMap:
     control: References = field(default_factory=list)
     contact: str = ""
     sensors: Mapping[str, References] = field(default_factory=dict)
+    covariates: Mapping[str, CovariateColumn] = field(default_factory=dict)
     estimate: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -86,8 +96,11 @@ def read_map(path: Path) -> ColumnMap:
     for key, value in (names | lists).items():
         if not isinstance(value, str) and not (key in lists and _texts(value)):
             raise BadInput(f"{key} in {path.name} is {value!r:.100}, expected the name of a column or a list of names")
+    covariates = {name: _covariate(name, value) for name, value in _table(values, "covariates", path).items()}
     task = values.get("task", path.stem)
-    return ColumnMap(task, state, dt, control=lists["control"], sensors=sensors, estimate=estimate, **names)
+    return ColumnMap(
+        task, state, dt, control=lists["control"], sensors=sensors, covariates=covariates, estimate=estimate, **names
+    )
 
 
 def guess_map(columns: Columns, name: str) -> str:
@@ -148,6 +161,19 @@ def _component(name: str, value: Any) -> StateColumn:
     unit = settings.get("unit", "m")
     check_name(f"unit of state {name!r}", str(unit), UNITS)
     return StateColumn(settings["column"], unit)
+
+
+def _covariate(name: str, value: Any) -> CovariateColumn:
+    settings = {"column": value} if isinstance(value, str) else value
+    valid = isinstance(settings, dict) and {"column"} <= settings.keys() <= {"column", "cuts", "unit"}
+    if valid:
+        cuts, unit = settings.get("cuts", []), settings.get("unit", "")
+        numbers = isinstance(cuts, list) and all(type(cut) in (int, float) for cut in cuts)
+        if numbers and sorted(set(cuts)) == cuts and isinstance(settings["column"], str) and isinstance(unit, str):
+            return CovariateColumn(settings["column"], tuple(map(float, cuts)), unit)
+    raise BadInput(
+        f"covariate {name!r} is {value!r:.100}, expected a column or {{column = NAME, cuts = [ascending], unit = UNIT}}"
+    )
 
 
 def _texts(value: Any) -> bool:

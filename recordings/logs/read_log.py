@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Component, Task
@@ -15,7 +16,7 @@ from beliefscope.datasets.task_json import check_definition
 from beliefscope.filters.external.adapter import check_values, derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
-from beliefscope.recordings.logs.column_map import UNITS, ColumnMap
+from beliefscope.recordings.logs.column_map import UNITS, ColumnMap, CovariateColumn
 from beliefscope.recordings.logs.columns import Columns, column, joined
 
 Array = NDArray[np.float64]
@@ -36,13 +37,16 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
     sensors = {name: _sensor(columns, name, refs) for name, refs in mapping.sensors.items()}
     controls = joined(columns, mapping.control, "control") if mapping.control else np.zeros((len(states), 0))
     contact = column(columns, mapping.contact, "contact") if mapping.contact else np.zeros(len(states))
-    arrays = {"state": states, "control": controls, "contact": contact, **sensors}
+    covariates = {name: _covariate(columns, name, entry) for name, entry in mapping.covariates.items()}
+    values = {name: numbers for name, (_, numbers) in covariates.items()}
+    arrays = {"state": states, "control": controls, "contact": contact, **sensors, **values}
     for name, array in arrays.items():
         if len(array) != len(states):
             raise BadInput(f"{name} has {len(array)} rows and the state {len(states)}")
     rows = _episodes(columns, mapping, len(states))
     dt = _time_step(columns, mapping, rows)
-    task = _task(mapping, states, sensors, controls.shape[1], dt)
+    declared = {name: covariate for name, (covariate, _) in covariates.items()}
+    task = _task(mapping, states, sensors, controls.shape[1], dt, declared)
     return [
         Episode(
             task=task,
@@ -55,6 +59,7 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
             seed=-1,
             split="test",
             provenance={"source": source, "episode": name},
+            covariates={name: numbers[at] for name, numbers in values.items()},
         )
         for name, at in rows.items()
     ]
@@ -173,7 +178,27 @@ def _time_step(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.
     return dt
 
 
-def _task(mapping: ColumnMap, states: Array, sensors: dict[str, NDArray[Any]], controls: int, dt: float) -> Task:
+def _covariate(columns: Columns, name: str, entry: CovariateColumn) -> tuple[Covariate, NDArray[np.float32]]:
+    """A covariate and its values (T,): categories are numbered in alphabetical order."""
+    if entry.column in columns and columns[entry.column].dtype.kind in "US":
+        groups, index = np.unique(columns[entry.column], return_inverse=True)
+        return Covariate("categorical", tuple(map(str, groups))), index.astype(np.float32)
+    numbers = column(columns, entry.column, f"covariate {name}")
+    if numbers.ndim != 1:
+        raise BadInput(f"covariate {name!r} has column {entry.column!r} of shape {numbers.shape}, expected one number")
+    boolean = not entry.cuts and np.isin(numbers[~np.isnan(numbers)], (0.0, 1.0)).all()
+    covariate = Covariate("boolean") if boolean else Covariate("continuous", cuts=entry.cuts, unit=entry.unit)
+    return covariate, numbers.astype(np.float32)
+
+
+def _task(
+    mapping: ColumnMap,
+    states: Array,
+    sensors: dict[str, NDArray[Any]],
+    controls: int,
+    dt: float,
+    covariates: dict[str, Covariate],
+) -> Task:
     names = list(mapping.state)
     extent = np.ptp(np.nan_to_num(states[:, :2]), axis=0).max() / 2.0
     task = Task(
@@ -186,6 +211,7 @@ def _task(mapping: ColumnMap, states: Array, sensors: dict[str, NDArray[Any]], c
         map_components=(names[0], names[1]),
         map_half_width=float(MARGIN * max(extent, 0.01)),
         warmup=0,
+        covariates=({"contact": CONTACT} if mapping.contact else {}) | covariates,
     )
     check_definition(task, f"task {mapping.task!r}")
     return task

@@ -95,6 +95,27 @@ def test_arrays_of_an_archive(tmp_path: Path) -> None:
     np.testing.assert_allclose(trace.estimate_covariance, expected, atol=1e-5)
 
 
+def test_covariates_define_groups(tmp_path: Path) -> None:
+    text = MAP.replace(
+        "[estimate]",
+        """[covariates]
+fix = "fix"
+stage = "stage"
+speed = {column = "gps_x", cuts = [3, 6], unit = "m/s"}
+[estimate]""",
+    )
+    rng = np.random.default_rng(3)
+    columns = table() | {"fix": np.tile([1.0, np.nan, 0.0, 1.0], 10), "stage": rng.choice(["reach", "lift"], 40)}
+    episode = read_log(columns, read_map(map_file(tmp_path, text)), "log")[0]
+    kinds = {name: c.kind for name, c in episode.task.covariates.items()}
+    assert kinds == {"fix": "boolean", "stage": "categorical", "speed": "continuous"}
+    groups = {n: m for name, c in episode.task.covariates.items() for n, m in c.masks(name, episode.covariate(name))}
+    assert [*groups] == ["fix", "no fix", "lift", "reach", *(f"speed {t} m/s" for t in ("below 3", "3 to 6", "from 6"))]
+    assert np.array_equal(groups["lift"], columns["stage"][::2] == "lift")
+    assert np.array_equal(groups["fix"], columns["fix"][::2] == 1.0)
+    assert np.array_equal(groups["speed from 6 m/s"], columns["gps_x"][::2] >= 6.0)
+
+
 def test_a_guessed_map_is_valid(log: Path, tmp_path: Path) -> None:
     columns = read_columns(log)
     text = guess_map(columns, "my log")
@@ -117,6 +138,7 @@ def test_a_guessed_map_is_valid(log: Path, tmp_path: Path) -> None:
         ('["est_x", "est_y", "est_yaw"]', '["est_x", "est_y"]', "2 columns, expected 3"),
         ('["est_x", "est_y", "est_yaw"]', "5", "is 5"),
         ('task = "vehicle"', 'task = "a/b"', "without spaces"),
+        ("[estimate]", '[covariates]\nv = {column = "t", cuts = [2, 1]}\n[estimate]', "covariate 'v'"),
     ],
 )
 def test_wrong_maps_name_the_value(tmp_path: Path, old: str, new: str, message: str) -> None:
