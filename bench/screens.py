@@ -19,7 +19,7 @@ from served import serving
 from beliefscope.datasets.store import sample_path
 from beliefscope.filters.checkpoint import shipped
 
-SIZES = ("1024x768", "1440x900", "3840x2160")
+SIZES = ("1024x768", "1280x720", "1440x900", "3840x2160")
 THEMES = ("light", "dark")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 LONG = "a-filter-trained-on-the-third-floor-with-the-new-camera-v12b"
@@ -53,6 +53,7 @@ def state(panel: str) -> str:
 
 
 VIEWS: dict[str, Callable[[Page], None]] = {
+    "diagnosis": tab("diagnosis", "diagnosis.dataset.state === 'ready'"),
     "failures": tab("failures", state("#failures"), "Search for failures"),
     "compare": tab("compare", state("#compare .result"), "Compare"),
     "study": tab("study", state("#study")),

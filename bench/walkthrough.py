@@ -18,6 +18,8 @@ from playwright.sync_api import Page, sync_playwright
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 SELECTION = {"task": "push", "filter": "crossmodal-ekf", "episode": 79, "step": 68, "component": "x"}
+OUTAGE = {"task": "push-field", "filter": "information-ekf", "episode": 13, "step": 53, "weights": "effective"}
+WITHOUT_HAPTICS = "from=54&to=86&weights=haptics=0"
 FROZEN = {"episode": 9, "step": 50, "faults": "image_frozen:from=30", "tab": "diagnosis"}
 SIZE = {"width": 1440, "height": 900}
 SETTLING = 10.0  # s: software rendering of the scene is slow
@@ -37,11 +39,8 @@ class Shot:
 
 
 SHOTS = (
-    Shot(
-        "page",
-        {"task": "push-field", "filter": "information-ekf", "episode": 13, "step": 53, "weights": "effective"},
-        "#maps-pairs",
-    ),
+    Shot("page", OUTAGE, "#maps-pairs"),
+    Shot("walkthrough-outage", OUTAGE | {"tab": "compare", "against": WITHOUT_HAPTICS}, "#compare .verdict"),
     Shot("diagnosis", FROZEN, "#diagnosis[data-state=ready] .headline"),
     Shot("walkthrough-failures", {"tab": "failures"}, "#failures[data-state=ready] .verdict", "Search for failures"),
     Shot("walkthrough-moment", {"tab": "scene"}, "#maps-pairs"),
