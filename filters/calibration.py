@@ -106,7 +106,7 @@ class Calibrated(nn.Module):
 
     def __init__(self, module: nn.Module, calibration: Calibration) -> None:
         super().__init__()
-        self.module, self.calibration = module, calibration
+        self.module, self.calibration, self.task = module, calibration, calibration.task
         if hasattr(module, "initialize_beliefs"):  # a module that runs step by step
             self.initialize_beliefs = module.initialize_beliefs
 
