@@ -20,7 +20,7 @@ def calibrate(runs: opt.Runs, output: Path, level: float = 0.95) -> console.Resu
     \b
     Examples:
       beliefscope calibrate door --filter crossmodal-ekf -o calibration.json
-      beliefscope calibrate door --filter lstm --data door.h5 --level 0.9 -o calibration.json
+      beliefscope calibrate door --filter lstm.safetensors --data door.h5 --level 0.9 -o calibration.json
       beliefscope calibrate push --filter my_filter.py:build -o calibration.json --json -
     """
     from beliefscope.filters.calibration import save_calibration
