@@ -2,7 +2,7 @@
 
 python bench/false_alarms.py DIR [TASK-FILTER ...]
 
-Clean episodes of a new seed are simulated into DIR once (door, push: 50 of 100 steps, seed 202).
+Clean episodes of a new seed are simulated into DIR once (50 per task, seed 202), as long as those of the profiles.
 
 false alarms: share of 200 samples of five episodes, drawn without replacement, for which any of the diagnostics
 weights, consistency and particles raises an alarm.
@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from healthy_profiles import SIZES
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.collect import collect
@@ -38,7 +39,7 @@ from beliefscope.inspect.diagnostics.healthy_profile import HealthyProfile, find
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.batch import trace_all
 
-EPISODES, STEPS, SEED = 50, 100, 202
+EPISODES, SEED = 50, 202
 SAMPLES, PLANTED_EPISODES, PLANTED_SAMPLES, SIZE = 200, 10, 50, 5
 FAULTS = ("overconfident", "constant weights")
 
@@ -49,7 +50,7 @@ Rows = dict[str, list[dict[str, float]]]
 def episodes_of(task: str, folder: Path) -> list[Episode]:
     path = folder / f"{task}.h5"
     if not path.exists():
-        collect(task, EPISODES, STEPS, SEED, None, path)
+        collect(task, EPISODES, SIZES[task][1], SEED, None, path)
     with open_dataset(path) as data:
         return list(data)
 
