@@ -26,7 +26,7 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import PRETRAINED, load_checkpoint, shipped
-from beliefscope.filters.evaluate import UNITS, Metrics, evaluate
+from beliefscope.filters.evaluate import Metrics, evaluate
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.defaults import default_settings
 from beliefscope.filters.finetuning.finetune import finetune
@@ -41,7 +41,7 @@ Result = dict[str, Any]
 def squares(filter_: Filter, result: Metrics) -> np.ndarray:
     """(R,) sums of squared standardised errors of each episode."""
     _, std = filter_.statistics.mean_std("state")
-    factors = np.array([UNITS[c.unit][1] for c in filter_.task.components])
+    factors = np.array([c.shown[1] for c in filter_.task.components])
     components = result.squares[:, 1 : 1 + len(factors)]
     return np.asarray((components / np.square(factors * std.numpy())).sum(1))
 

@@ -105,7 +105,7 @@ def statistics(task: Task, episodes: Iterable[Episode]) -> Statistics:
     joined = {key: np.concatenate(values).astype(np.float64) for key, values in columns.items()}
     result: dict[str, float | list[float]] = {"contact_fraction": float(joined["contact"].mean())}
     for component, spread in zip(task.components, joined["states"].std(axis=0), strict=True):
-        unit, factor = ("cm", 100.0) if component.unit == "m" else ("deg", np.degrees(1.0))
+        unit, factor = component.shown
         result[f"{component.name}_std_{unit}"] = float(factor * spread)
     if "displacement" in joined:
         position = joined["effector_position"]

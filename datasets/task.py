@@ -13,7 +13,9 @@ from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.simulation.camera import Camera
 
-Unit = Literal["m", "rad"]
+DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
+"""SI unit -> unit for display, and the factor."""
+
 Array = NDArray[np.float64]
 
 
@@ -24,11 +26,28 @@ def display_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class Component:
-    """A state component. Components in rad are angles; static ones are constant in every episode."""
+    """A state component.
+
+    Attributes:
+        unit: of its values: ``rad`` for an angle, ``m``, or any other text, such as ``m/s``.
+        static: whether it is constant in every episode.
+        display: unit for display and its factor, such as ``("km/h", 3.6)``. Default: cm, degrees, else the unit.
+    """
 
     name: str
-    unit: Unit
+    unit: str
     static: bool = False
+    display: tuple[str, float] | None = None
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """Unit for display, and the factor from ``unit``."""
+        return self.display or DISPLAY_UNITS.get(self.unit, (self.unit, 1.0))
+
+    @property
+    def key(self) -> str:
+        """Name with the unit for display, such as ``hinge_x_cm``."""
+        return f"{self.name}_{self.shown[0]}".rstrip("_")
 
     @property
     def label(self) -> str:

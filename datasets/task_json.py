@@ -13,7 +13,7 @@ from typing import Any, get_args
 from beliefscope.datasets.covariate import Covariate, Kind
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.camera import Camera
-from beliefscope.datasets.task import Component, Ingredient, Task, Unit
+from beliefscope.datasets.task import Component, Ingredient, Task
 
 FUNCTIONS = ("replay", "outline", "ridge_direction", "simulate")
 """Fields of a task that are code."""
@@ -34,7 +34,7 @@ def task_from_json(values: Any) -> Task:
     try:
         task = Task(
             name=values["name"],
-            components=tuple(Component(c["name"], c["unit"], c["static"]) for c in values["components"]),
+            components=tuple(_component(c) for c in values["components"]),
             observations=_tuples(values["observations"]),
             modalities=_tuples(values["modalities"]),
             control_size=values["control_size"],
@@ -56,6 +56,13 @@ def task_from_json(values: Any) -> Task:
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise BadInput(f"incomplete definition of a task: {type(error).__name__}: {error!s:.200}") from None
     return task
+
+
+def _component(values: Mapping[str, Any]) -> Component:
+    display = values.get("display")
+    return Component(
+        values["name"], values["unit"], values["static"], None if display is None else (display[0], display[1])
+    )
 
 
 def _covariates(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -110,15 +117,17 @@ def check_definition(task: Task, where: str = "") -> None:
     if not names or len(set(map(repr, names))) < len(names):
         raise BadInput(f"{place} has the components {names!r:.200}, expected one or more with different names.")
     for component in task.components:
-        if (
-            not isinstance(component.name, str)
-            or component.unit not in get_args(Unit)
-            or component.static not in (0, 1)
-        ):
-            raise BadInput(f"{place}: component {component.name!r:.200} has unit {component.unit!r:.200}, "
-                           f"expected one of {', '.join(get_args(Unit))}.")  # fmt: skip
+        about = f"{place}: component {component.name!r:.200}"
+        if not isinstance(component.name, str) or component.static not in (0, 1):
+            raise BadInput(f"{about} is static {component.static!r:.200}, expected a name, and true or false.")
+        if not isinstance(component.unit, str) or len(component.unit) > 40:
+            raise BadInput(f"{about} has unit {component.unit!r:.200}, expected a text.")
+        unit, factor = component.shown
+        if not isinstance(unit, str) or not _positive(factor) or (component.display and component.unit == "rad"):
+            raise BadInput(f"{about} has display {component.display!r:.200}, expected a unit and a factor above 0.")
     for name in task.map_components:
-        task.index(name)
+        if (unit := task.components[task.index(name)].unit) != "m":
+            raise BadInput(f"{place}: map component {name!r} has unit {unit!r}, expected m.")
     for key, shape in task.observations.items():
         if not all(_whole(size, 1) for size in shape):
             raise BadInput(f"{place}: observation {key!r} has shape {shape!r:.200}, expected whole numbers above 0.")
@@ -141,7 +150,7 @@ def check_definition(task: Task, where: str = "") -> None:
             raise BadInput(f"{place}: positions of {key!r} are {channels!r:.200}, expected two channels.")
     _check_covariates(task, place)
     for unit, ends in task.start_distance.items():
-        if unit not in get_args(Unit) or len(ends) != 2 or not all(_number(end) for end in ends):
+        if unit not in {c.unit for c in task.components} or len(ends) != 2 or not all(_number(end) for end in ends):
             raise BadInput(f"{place}: start distance of {unit!r} is {ends!r:.200}, expected two numbers.")
 
 

@@ -24,7 +24,6 @@ from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.sequence import SequenceModel
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start, shifted, without_start_offset
-from beliefscope.filters.start_offset import UNITS as UNITS
 from beliefscope.filters.subsets import input_modalities, standalone_evidence
 
 FILTER, STAY, DYNAMICS = "filter", "stay", "dynamics"
@@ -239,8 +238,7 @@ def _squares(task: Task, error: Tensor) -> dict[str, Tensor]:
     error = error.double()
     squares = {}
     for i, component in enumerate(task.components):
-        unit, factor = UNITS[component.unit]
-        squares[f"{component.name}_{unit}"] = (factor * error[:, i]).square()
+        squares[component.key] = (component.shown[1] * error[:, i]).square()
     return squares | {"position_cm": (100.0 * error[:, list(task.map_indices)]).square().sum(-1)}
 
 

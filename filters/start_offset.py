@@ -12,13 +12,12 @@ from torch import Tensor
 
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import DISPLAY_UNITS, Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import first_belief
 
-UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / math.pi)}
 """Internal unit -> unit of reported values, and the conversion factor."""
 
 
@@ -37,7 +36,7 @@ class StartOffset:
     @classmethod
     def parse(cls, text: str, task: Task) -> StartOffset:
         """From text such as ``3cm,20deg``. Raises BadInput for other text and for units that the task does not have."""
-        units = {UNITS[c.unit][0]: c.unit for c in task.components if c.unit in UNITS}
+        units = {DISPLAY_UNITS[c.unit][0]: c.unit for c in task.components if c.unit in DISPLAY_UNITS}
         lengths: dict[str, float] = {}
         for part in filter(None, (part.strip() for part in text.split(","))):
             number = part.rstrip("abcdefghijklmnopqrstuvwxyz ")
@@ -50,7 +49,7 @@ class StartOffset:
                 value = math.nan
             if not 0.0 < value < 1e6 or units[shown] in lengths:
                 raise BadInput(f"start offset {part!r} of {text!r} is not one positive length, such as 3{shown}")
-            lengths[units[shown]] = value / UNITS[units[shown]][1]
+            lengths[units[shown]] = value / DISPLAY_UNITS[units[shown]][1]
         return cls(lengths)
 
     def of(self, task: Task) -> StartOffset:
@@ -63,7 +62,8 @@ class StartOffset:
         return bool(self.lengths)
 
     def __str__(self) -> str:
-        return ",".join(f"{UNITS[unit][1] * length:g}{UNITS[unit][0]}" for unit, length in self.lengths.items())
+        shown = {unit: DISPLAY_UNITS[unit] for unit in self.lengths}
+        return ",".join(f"{factor * self.lengths[unit]:g}{name}" for unit, (name, factor) in shown.items())
 
     def vectors(self, task: Task, episodes: Sequence[Episode], seed: int) -> FloatArray:
         """(N, n) offsets in SI units. Directions depend only on the seed and on each episode's digest."""

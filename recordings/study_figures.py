@@ -114,8 +114,7 @@ def panels_of(task: Task) -> list[tuple[str, str]]:
     """Keys and titles of the panels of a task: the position on the map, and each other component."""
     position = task.map_components[0].rpartition("_")[0] or "position"
     others = [c for c in task.components if c.name not in task.map_components]
-    keys = {"m": "cm", "rad": "deg"}
-    return [("position_cm", position), *((f"{c.name}_{keys[c.unit]}", c.name) for c in others)]
+    return [("position_cm", position), *((c.key, c.name) for c in others)]
 
 
 def bar_styles(filters: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from beliefscope.app.protocol.trace_format import component_json
 from beliefscope.app.runs.first_moment import first_moment
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.dataset import Dataset
@@ -109,7 +110,7 @@ class TaskCatalog:
         task, (x, y) = self.task, self.task.map_components
         return {
             "name": task.name,
-            "components": [{"name": c.name, "unit": c.unit} for c in task.components],
+            "components": [component_json(c) for c in task.components],
             "modalities": list(task.modalities),
             "dt": task.dt,
             "map": {"x": x, "y": y, "half_width": task.map_half_width},

@@ -10,12 +10,11 @@ from functools import partial
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.task import Task
-from beliefscope.filters.evaluate import UNITS
+from beliefscope.datasets.task import DISPLAY_UNITS, Task
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.inspect.failures.events import event_spans
 from beliefscope.inspect.failures.step_scores import RECENT
-from beliefscope.inspect.statistics.episode_sums import EpisodeSums, Measure, condition
+from beliefscope.inspect.statistics.episode_sums import BELIEF_MEASURES, EpisodeSums, Measure, condition
 from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.statistics.measures import Array
 
@@ -38,7 +37,7 @@ class Difference:
 
     Attributes:
         slice, measure: names.
-        unit: unit of before and after: m, rad, nats or none.
+        unit: unit of before and after: of the component, nats or none.
         before, after: values.
         effect: natural logarithm of the factor of deterioration; negative is better. Errors: log ratio. NLL: increase
             over n, equivalent to scaling all errors and standard deviations. NEES: factor by which standard deviations
@@ -67,12 +66,12 @@ class Difference:
 
     @property
     def is_error(self) -> bool:
-        return self.unit in UNITS
+        return self.measure not in BELIEF_MEASURES
 
     @property
     def display(self) -> tuple[float, float, str]:
         """Before and after in display units, and the unit."""
-        unit, factor = UNITS.get(self.unit, (self.unit, 1.0))
+        unit, factor = DISPLAY_UNITS.get(self.unit, (self.unit, 1.0))
         return factor * self.before, factor * self.after, unit
 
 

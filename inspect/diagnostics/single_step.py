@@ -14,7 +14,6 @@ from beliefscope.datasets.errors import check_name
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence, Gaussian, Particles, StepTrace
-from beliefscope.filters.evaluate import UNITS
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.models.pf import ParticleFilter
 from beliefscope.filters.models.sequence import SequenceModel
@@ -143,7 +142,7 @@ class SingleStep:
 
     def _targets(self) -> Iterable[Target]:
         for i, component in enumerate(self.filter.task.components):
-            yield Target(component.name, *UNITS[component.unit], self._component(i), self)
+            yield Target(component.name, *component.shown, self._component(i), self)
         if isinstance(self.filter, SequenceModel):
             return
         for k, name in enumerate(self.filter.names):

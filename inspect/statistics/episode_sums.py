@@ -26,13 +26,17 @@ Condition = tuple[str, tuple[str, ...]]
 """Faults as text, and ``only``; slices with equal conditions are evaluated in one run."""
 
 
+BELIEF_MEASURES = ("nll", "nees", "coverage95", "miscalibration")
+"""Names of the measures of beliefs; the others are errors."""
+
+
 @dataclass(frozen=True)
 class Measure:
     """A measure of errors or beliefs.
 
     Attributes:
         name: ``position``, a component, ``nll``, ``nees``, ``coverage95`` or ``miscalibration``.
-        unit: SI unit.
+        unit: of the state component, else nats or none.
         value: sums (..., Q) -> values (...).
         loss: values -> loss on a natural logarithmic scale, on which differences are relative changes.
     """
@@ -45,7 +49,7 @@ class Measure:
     @property
     def is_error(self) -> bool:
         """Whether the measure is a root mean square error rather than a measure of the belief."""
-        return self.unit in ("m", "rad")
+        return self.name not in BELIEF_MEASURES
 
 
 @dataclass(frozen=True)

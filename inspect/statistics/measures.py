@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task
-from beliefscope.filters.evaluate import UNITS
 from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
@@ -191,5 +190,5 @@ def intervals(mask: Mask) -> NDArray[np.int64]:
 
 def display_units(task: Task) -> tuple[tuple[str, ...], Array]:
     """Display units (``cm``, ``deg``) of the n components, and the conversion factors (n,) from SI."""
-    pairs = [UNITS[component.unit] for component in task.components]
+    pairs = [component.shown for component in task.components]
     return tuple(unit for unit, _ in pairs), np.array([factor for _, factor in pairs])

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.evaluate import UNITS, metrics
+from beliefscope.filters.evaluate import metrics
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.inspect.likelihood import LikelihoodMap, Quantity
@@ -141,7 +141,7 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
         if layer != "fused" and layer not in first.modalities_with_posterior:
             continue
         result = metrics(task, error[:, i], covariance[:, i])
-        names = [*(f"{c.label} ({UNITS[c.unit][0]})" for c in task.components), "position (cm)"]
+        names = [*(f"{c.label} ({c.shown[0]})" for c in task.components), "position (cm)"]
         values: dict[str, Value] = dict(zip(names, result.rmse.values(), strict=True))
         if first.has_covariance:
             values |= {"NEES/n": result.nees, "95 % coverage": result.coverage95, "NLL (nats)": result.nll}

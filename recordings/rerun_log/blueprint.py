@@ -15,7 +15,7 @@ from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.rerun_log.diagnostics import diagnostic_tab
-from beliefscope.recordings.rerun_log.entities import SHOWN_SCALE, SHOWN_UNIT, SIGMAS, angles, plane_height, positions
+from beliefscope.recordings.rerun_log.entities import SIGMAS, angles, plane_height, positions
 from beliefscope.recordings.schema import STEP
 
 TRAIL_STEPS = 100
@@ -133,7 +133,7 @@ def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
 
 
 def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> rrb.TimeSeriesView:
-    i, scale = task.index(component.name), SHOWN_SCALE[component.unit]
+    i, scale = task.index(component.name), component.shown[1]
     limits = None
     if not growing:
         # Limits fit the true state and the fused 2 sigma band; diverging modalities may exceed them.
@@ -143,7 +143,7 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
         low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
         margin = 0.1 * (high - low) or 1.0
         limits = (low - margin, high + margin)
-    name = f"{component.label} ({SHOWN_UNIT[component.unit]}): truth green, fused red"
+    name = f"{component.label} ({component.shown[0]}): truth green, fused red"
     name += ", thin lines 2 sigma" if trace.has_covariance else ""
     return _plot(f"states/{component.name}", name, limits, legend=False)
 

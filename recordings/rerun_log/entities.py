@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Component, Outline, Task, display_name
+from beliefscope.datasets.task import DISPLAY_UNITS, Component, Outline, Task, display_name
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours, layer_label
 from beliefscope.inspect.trace import Trace
@@ -17,8 +17,6 @@ from beliefscope.recordings.schema import STEP, TIME
 
 Array = NDArray[Any]
 
-SHOWN_UNIT = {"m": "cm", "rad": "deg"}
-SHOWN_SCALE = {"m": 100.0, "rad": 180.0 / np.pi}
 CONTACT_NAMES = ("free motion", "contact")
 SIGMAS = 2.0
 PARTICLE_GRID, SHADES = 2.0**-13, 32
@@ -187,7 +185,7 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
 
 def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
     for i, component in enumerate(task.components):
-        scale = SHOWN_SCALE[component.unit]
+        scale = component.shown[1]
         yield f"states/{component.name}/truth", series(trace.episode.states[steps, i] * scale)
         for source, mean, covariance in _estimates(trace, steps):
             yield f"states/{component.name}/{source}", series(mean[:, i] * scale)
@@ -202,11 +200,11 @@ def _errors(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
     for source, mean, _ in _estimates(trace, steps):
         error = mean - trace.episode.states[steps]
         distance = np.linalg.norm(error[:, plane], axis=1)
-        yield f"errors/position/{source}", series(distance * SHOWN_SCALE["m"])
+        yield f"errors/position/{source}", series(distance * DISPLAY_UNITS["m"][1])
         for component in angles(task):
             angle = error[:, task.index(component.name)]
             shortest = np.abs(np.arctan2(np.sin(angle), np.cos(angle)))
-            yield f"errors/{component.name}/{source}", series(shortest * SHOWN_SCALE["rad"])
+            yield f"errors/{component.name}/{source}", series(shortest * DISPLAY_UNITS["rad"][1])
 
 
 def _estimates(trace: Trace, steps: slice) -> Iterator[tuple[str, Array, Array]]:

@@ -17,7 +17,6 @@ from pydantic import BaseModel, ConfigDict, create_model
 from beliefscope.app.jobs.queue import Job
 from beliefscope.app.runs.examples import Example
 from beliefscope.datasets.dataset import EpisodeSummary
-from beliefscope.datasets.task import Component
 
 Number = float | None
 """None if not finite or not available."""
@@ -121,6 +120,15 @@ class DataInfo(Reply):
     first: int
     first_step: int
     episodes: list[EpisodeSummary]
+
+
+class Component(Reply):
+    """A state component. Values times ``scale`` are in the unit ``shown``."""
+
+    name: str
+    unit: str
+    shown: str
+    scale: float
 
 
 class TaskInfo(Reply):

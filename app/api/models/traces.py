@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from beliefscope.app.api.models.catalog import Reply, TaskInfo
+from beliefscope.app.api.models.catalog import Component, Reply, TaskInfo
 from beliefscope.app.protocol.messages import SceneLayer
-from beliefscope.datasets.task import Component
 from beliefscope.inspect.maps.likelihood_map import Quantity
 
 

@@ -1,6 +1,6 @@
 /** Number formats, and the conversion from the server's m and rad to the page's cm and degrees. */
 
-/** @typedef {{unit: 'cm' | '°', scale: number}} DisplayUnit scale: factor from the server's unit */
+/** @typedef {{unit: string, scale: number}} DisplayUnit scale: factor from the server's unit */
 
 /** @type {Record<'m' | 'rad', DisplayUnit>} */
 export const DISPLAY_UNITS = {

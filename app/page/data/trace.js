@@ -181,7 +181,8 @@ export class Trace {
    * @param {number} component
    */
   unitOf(component) {
-    return DISPLAY_UNITS[this.components[component].unit];
+    const { unit, shown, scale } = this.components[component];
+    return unit === 'rad' ? DISPLAY_UNITS.rad : { unit: shown, scale };
   }
 
   /**

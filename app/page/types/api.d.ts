@@ -68,21 +68,17 @@ export interface components {
         };
         /**
          * Component
-         * @description A state component. Components in rad are angles; static ones are constant in every episode.
+         * @description A state component. Values times ``scale`` are in the unit ``shown``.
          */
         Component: {
             /** Name */
             name: string;
-            /**
-             * Unit
-             * @enum {string}
-             */
-            unit: "m" | "rad";
-            /**
-             * Static
-             * @default false
-             */
-            static: boolean;
+            /** Unit */
+            unit: string;
+            /** Shown */
+            shown: string;
+            /** Scale */
+            scale: number;
         };
         /**
          * Curve
