@@ -82,6 +82,13 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
     yield "time since start", "s", steps * dt
     yield "contact", "", contact
     yield "contact duration", "s", _duration(contact) * dt
+    for name, covariate in task.covariates.items():
+        values = episode.covariate(name)
+        if name != "contact" and covariate.kind == "continuous":
+            yield display_name(name), covariate.unit, values
+        elif name != "contact":
+            groups = np.array([*covariate.group_names(name), ""], dtype=object)  # the last one: unknown
+            yield display_name(name), "", groups[covariate.group_index(values)]
     yield "blackout", "", outage
     yield "outage length", "s", _duration(outage) * dt
     change = measures.wrapped(task, np.diff(episode.states, axis=0, prepend=episode.states[:1]))

@@ -17,6 +17,7 @@ from beliefscope.datasets.task import Component, Task
 from beliefscope.datasets.task_json import task_from_json, task_to_json
 from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.diagnostics.consistency import Consistency
+from beliefscope.inspect.slices.covariates import covariates_of
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, load_trace, save_trace
 from beliefscope.inspect.traces.live_file import load_live
@@ -90,6 +91,15 @@ def test_audits_use_the_groups(tmp_path: Path) -> None:
     assert "Least consistent phase: no fix, overconfident" in result.verdict
     assert set(result.phases) >= {"fix", "no fix", "slide", "lift", "speed below 0.5 m/s"}
     assert "contact" not in " ".join(result.phases)
+
+
+def test_slices_are_searched_over_the_covariates(run: Trace) -> None:
+    found = {covariate.name: covariate for covariate in covariates_of([run])}
+    assert found["stage"].categories == ("lift", "slide")
+    assert found["fix"].categories == ("fix", "no fix")
+    assert int(np.isnan(found["fix"].values).sum()) == 20
+    assert (found["speed"].unit, found["speed"].values.max()) == ("m/s", pytest.approx(0.95))
+    assert "contact" not in found
 
 
 def by_trace(run: Trace, folder: Path) -> Trace:
