@@ -40,9 +40,6 @@ FloatArray64 = NDArray[np.float64]
 Run = tuple[Tensor, Tensor]
 """Errors (T, N, n) and covariances (T, N, n, n) in SI units, on the CPU; of one trajectory without N."""
 
-CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815, 4: 9.488}
-"""95 % quantiles of the chi-square distribution by degrees of freedom."""
-
 
 @dataclass(frozen=True)
 class Metrics:
@@ -261,7 +258,7 @@ def metrics(task: Task, error: Tensor, covariance: Tensor) -> Metrics:
         rmse=rmse,
         nll=float(nll.mean()),
         nees=float(squared.mean() / n),
-        coverage95=float((squared <= CHI2_95[n]).double().mean()),
+        coverage95=float((squared <= chdtri(n, 0.05)).double().mean()),
     )
 
 

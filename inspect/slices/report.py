@@ -12,8 +12,8 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.task import DISPLAY_UNITS
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.evaluate import UNITS
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
 from beliefscope.inspect.failures.survey import check_applies, find_score, traces_of
@@ -105,7 +105,7 @@ class ErrorSlices(Diagnostic):
 
     def tables(self) -> list[Table]:
         """One row per slice; scores in display units."""
-        unit, factor = UNITS.get(self.unit, (self.unit, 1.0))
+        unit, factor = DISPLAY_UNITS.get(self.unit, (self.unit, 1.0))
         label = f" {unit}".rstrip()
         columns: tuple[str, ...] = ("slice", "ratio x", "from", "to", f"inside{label}", f"outside{label}")
         columns += ("episodes", "steps", "steps %", "p-value")

@@ -27,10 +27,15 @@ References = str | list[str]
 
 @dataclass(frozen=True)
 class StateColumn:
-    """Column of a component's true value, empty if it is unknown, and its unit (``UNITS``)."""
+    """Column of a component's true value, empty if it is unknown, and its unit."""
 
     column: str
     unit: str = "m"
+
+    @property
+    def internal(self) -> tuple[str, float]:
+        """Unit of the state component, and its factor; the same unit if it is not in ``UNITS``."""
+        return UNITS.get(self.unit, (self.unit, 1.0))
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class ColumnMap:
     @property
     def factors(self) -> np.ndarray:
         """(n,) internal units per unit of each component's column."""
-        return np.array([UNITS[component.unit][1] for component in self.state.values()])
+        return np.array([component.internal[1] for component in self.state.values()])
 
 
 def read_map(path: Path) -> ColumnMap:
@@ -159,7 +164,8 @@ def _component(name: str, value: Any) -> StateColumn:
     if not isinstance(settings, dict) or not isinstance(settings.get("column"), str) or len(settings) > 2:
         raise BadInput(f"state {name!r} is {value!r:.100}, expected a column or {{column = NAME, unit = UNIT}}")
     unit = settings.get("unit", "m")
-    check_name(f"unit of state {name!r}", str(unit), UNITS)
+    if not isinstance(unit, str):
+        raise BadInput(f"unit of state {name!r} is {unit!r:.100}, expected a text such as m, cm, rad, deg or m/s")
     return StateColumn(settings["column"], unit)
 
 

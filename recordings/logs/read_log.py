@@ -16,7 +16,7 @@ from beliefscope.datasets.task_json import check_definition
 from beliefscope.filters.external.adapter import check_values, derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
-from beliefscope.recordings.logs.column_map import UNITS, ColumnMap, CovariateColumn
+from beliefscope.recordings.logs.column_map import ColumnMap, CovariateColumn
 from beliefscope.recordings.logs.columns import Columns, column, joined
 
 Array = NDArray[np.float64]
@@ -203,7 +203,7 @@ def _task(
     extent = np.ptp(np.nan_to_num(states[:, :2]), axis=0).max() / 2.0
     task = Task(
         name=mapping.task,
-        components=tuple(Component(name, UNITS[s.unit][0]) for name, s in mapping.state.items()),  # type: ignore[arg-type]
+        components=tuple(Component(name, s.internal[0]) for name, s in mapping.state.items()),
         observations={name: array.shape[1:] for name, array in sensors.items()},
         modalities={name: (name,) for name in sensors},
         control_size=controls,

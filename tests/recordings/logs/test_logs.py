@@ -130,7 +130,7 @@ def test_a_guessed_map_is_valid(log: Path, tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ('"true_x"', '"truex"', "true_x"),
-        ('unit = "deg"', 'unit = "turns"', "unit of state 'yaw'"),
+        ('unit = "deg"', "unit = 3", "unit of state 'yaw' is 3"),
         ('time = "t"', "", "needs either dt"),
         ('time = "t"', 'time = "gps_x"', "constant"),
         ('time = "t"', 'time = "run"', "has text"),
