@@ -60,7 +60,7 @@ def test_differences_are_named() -> None:
         ({"name": 3}, "is named 3, expected a name"),
         ({"components": []}, r"has the components \[\], expected one or more"),
         ({"components": [{"name": "x", "unit": "mile", "static": False}] * 2}, "expected one or more with different"),
-        ({"components": [{"name": "x", "unit": "mile", "static": False}]}, "component 'x' has unit 'mile'"),
+        ({"components": [{"name": "x", "unit": 3, "static": False}]}, "component 'x' has unit 3, expected a text"),
         ({"observations": {"image": [0, 4]}}, r"observation 'image' has shape \(0, 4\)"),
         ({"observations": {"image": [1e30]}}, "observation 'image' has shape"),
         ({"modalities": {"image": ["touch"]}}, "'touch', which is not an observation"),
