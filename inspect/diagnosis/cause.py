@@ -71,6 +71,10 @@ class Cause:
         return self.name.rpartition(".")[0]
 
 
+SHOWN = 0.005
+"""Smallest probability of a cause in tables and on the page; it is 0.01 when rounded."""
+
+
 @dataclass(frozen=True)
 class Evidence:
     """A deviation that supports a cause.
@@ -167,14 +171,15 @@ class Diagnosis:
 
     def tables(self) -> list[Table]:
         """The ranked causes, and the evidence and next action of each."""
-        if not self.causes:
+        causes = [cause for cause in self.causes if cause.probability >= SHOWN]
+        if not causes:
             return []
         rows = tuple(
-            (c.cause.name, c.probability, _share(c.recovered), ", ".join(map(str, c.episodes))) for c in self.causes
+            (c.cause.name, c.probability, _share(c.recovered), ", ".join(map(str, c.episodes))) for c in causes
         )
         tables = [Table("Causes", ("cause", "probability", "error recovered by undoing it", "episodes"), rows)]
-        evidence = tuple((c.cause.name, e.text, e.episode, e.step) for c in self.causes for e in c.evidence)
-        actions = tuple((c.cause.name, c.next) for c in self.causes)
+        evidence = tuple((c.cause.name, e.text, e.episode, e.step) for c in causes for e in c.evidence)
+        actions = tuple((c.cause.name, c.next) for c in causes)
         return [
             *tables,
             Table("Evidence", ("cause", "deviation", "episode", "step"), evidence),

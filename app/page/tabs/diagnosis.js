@@ -26,6 +26,7 @@ const OVER = [
 /** Label of the button by state. @type {Partial<Record<Entry['state'], string>>} */
 const ACTIONS = { absent: 'Diagnose', ended: 'Try again', error: 'Try again', active: 'Cancel' };
 const MAX_RESULTS = 24; // in the cache
+const SHOWN = 0.005; // smallest probability of a listed cause
 const SETTLING = 500; // ms until the job of a selection starts
 
 export class Diagnosis {
@@ -134,7 +135,9 @@ export class Diagnosis {
     if (result === this.#listed) return;
     this.#listed = result;
     html('.causes', this.#host).replaceChildren(
-      ...(result?.causes ?? []).map((cause) => this.#row(cause)),
+      ...(result?.causes ?? [])
+        .filter((cause) => cause.probability >= SHOWN)
+        .map((cause) => this.#row(cause)),
     );
     html('.about', this.#host).textContent = result ? aboutOf(result) : '';
   }
