@@ -19,7 +19,6 @@ from beliefscope.inspect.statistics.measures import (
     layer_label,
     means,
     position_error,
-    task_of,
     wrapped,
 )
 from beliefscope.inspect.trace import Trace
@@ -206,7 +205,7 @@ def compare(original: Trace, edited: Trace, edit: Edit) -> Counterfactual:
     """Compare the traces of an original and an edited run. Raises BadInput for traces of different length."""
     if len(original) != len(edited):
         raise BadInput(f"traces of {len(original)} and {len(edited)} steps are not from one episode")
-    task = task_of(original)
+    task = original.task
     difference = wrapped(task, means(edited) - means(original))
     on_map = np.linalg.norm(difference[..., list(task.map_indices)], axis=-1)
     fused = difference[:, -1]

@@ -28,7 +28,6 @@ from beliefscope.inspect.statistics.measures import (
     nees,
     phases,
     position_error,
-    task_of,
     wrapped,
 )
 from beliefscope.inspect.trace import Trace
@@ -215,7 +214,7 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
             f"the runs are over different episodes: {this.data_hash[:12]} with {len(this)} steps, "
             f"{other.data_hash[:12]} with {len(other)}"
         )
-    task = task_of(this)
+    task = this.task
     either_blackout = blackout(this) | blackout(other)
     masks = phases(this)
     masks["blackout"] = masks["all"] & either_blackout

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beliefscope.inspect.statistics.measures import counted, task_of, wrapped
+from beliefscope.inspect.statistics.measures import counted, wrapped
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag
 from beliefscope.inspect.trace import Trace
 
@@ -26,7 +26,7 @@ def label_statistics(trace: Trace) -> dict[str, float]:
     modalities, zero if the signs differ. NaN if no component moves.
     """
     measured = trace.observation_mean if trace.observation_mean is not None else trace.modality_mean
-    labels, task = trace.episode.states.astype(np.float64), task_of(trace)
+    labels, task = trace.episode.states.astype(np.float64), trace.task
     keep = counted(trace)
     if not trace.modalities or keep.sum() < MIN_STEPS or not np.isfinite(labels).all():
         return {}

@@ -69,7 +69,7 @@ def error_statistics(trace: Trace) -> dict[str, float]:
     """Root mean square errors of the estimate: ``error`` of the position in m, ``angle error`` of the angles in rad."""
     at = measures.counted(trace)
     values = {"error//all": float(np.sqrt(np.square(measures.position_error(trace)[at, -1]).mean()))}
-    angles = [i for i, c in enumerate(measures.task_of(trace).components) if c.unit == "rad"]
+    angles = [i for i, c in enumerate(trace.task.components) if c.unit == "rad"]
     if angles:
         values["angle error//all"] = float(np.sqrt(np.square(measures.errors(trace)[at, -1][:, angles]).mean()))
     return values
@@ -93,7 +93,7 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
         observed, variance, power = likelihood_moments(checkpoint.filter, trace.episode, steps)
     else:
         return {}
-    task = measures.task_of(trace)
+    task = trace.task
     truth = trace.episode.states[steps].astype(np.float64)
     residual = measures.wrapped(task, observed - truth[:, None])
     black = measures.blackout(trace)[steps]
@@ -222,7 +222,7 @@ def weight_statistics(trace: Trace) -> dict[str, float]:
     """
     if trace.weights is None or len(trace) < MIN_STEPS or trace.weights.shape[1] < 2:
         return {}
-    names = [c.name for c in measures.task_of(trace).components] if trace.weights.shape[-1] > 1 else [""]
+    names = [c.name for c in trace.task.components] if trace.weights.shape[-1] > 1 else [""]
     weights = np.clip(trace.weights.astype(np.float64), 1e-9, 1.0 - 1e-9)
     odds = np.log(weights / (1.0 - weights))
     logits = 2.0 * MAX_LOGIT * np.arctanh(np.clip(odds / (2.0 * MAX_LOGIT), -LARGEST, LARGEST))

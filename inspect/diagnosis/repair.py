@@ -22,7 +22,7 @@ from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.subsets import input_modalities
-from beliefscope.inspect.statistics.measures import Array, position_error, task_of
+from beliefscope.inspect.statistics.measures import Array, position_error
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.replay import Replay, repeat_belief
 
@@ -132,7 +132,7 @@ class Candidates:
         evidence, generator = self._evidence(candidates)[start:end], self.replay.generator(start, Common)
         means = [step.estimate.mean for step in self.filter.steps(belief, evidence, generator)]
         estimates = self.filter.statistics.state_to_si(torch.stack(means)).numpy()  # (t, N, n)
-        where = list(task_of(self.trace).map_indices)
+        where = list(self.trace.task.map_indices)
         difference = (estimates - self.trace.episode.states[start:end, None])[..., where]
         squared = np.square(np.linalg.norm(difference, axis=-1))
         unchanged = position_error(self.trace)[self.failure[0] : max(start, self.failure[0]), -1]
@@ -212,7 +212,7 @@ def smallest_repair(
 def largest_failure(trace: Trace, bound: float) -> tuple[int, int] | None:
     """First and last step of the stretch with errors above the bound (m) around the largest one of a counted step."""
     error = position_error(trace)[:, -1]
-    first = task_of(trace).first_counted(len(trace))
+    first = trace.task.first_counted(len(trace))
     peak = first + int(np.argmax(error[first:]))
     if not error[peak] > bound:
         return None

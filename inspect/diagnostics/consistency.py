@@ -266,7 +266,7 @@ def trajectory_statistics(trace: Trace) -> dict[str, float]:
 
 def _step_measures(trace: Trace) -> dict[str, Array]:
     """Measures by step and layer, (T, L, ...)."""
-    task = measures.task_of(trace)
+    task = trace.task
     error, covariance = measures.errors(trace), measures.covariances(trace)
     n = error.shape[-1]
     nees = measures.nees(trace)

@@ -152,7 +152,7 @@ def fusion_efficiency(
 
 def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequence[Array]) -> FusionEfficiency:
     """The result, given the errors (T, K, n) of the standalone filters by trace."""
-    first, where = traces[0], list(measures.task_of(traces[0]).map_indices)
+    first, where = traces[0], list(traces[0].task.map_indices)
     errors = [
         np.concatenate([measures.errors(trace)[:, -1:], e], axis=1) for trace, e in zip(traces, alone, strict=True)
     ]

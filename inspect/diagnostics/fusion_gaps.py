@@ -81,7 +81,7 @@ def _sensor_errors(trace: Trace) -> tuple[Array, Array]:
     """Errors (T, K, n) of the virtual sensors, and the inverses of R (T, K, n, n), at counted steps."""
     assert trace.observation_mean is not None
     assert trace.observation_covariance is not None
-    error = measures.wrapped(measures.task_of(trace), trace.observation_mean - trace.episode.states[:, None])
+    error = measures.wrapped(trace.task, trace.observation_mean - trace.episode.states[:, None])
     keep = measures.counted(trace)
     return error[keep], np.linalg.inv(trace.observation_covariance[keep].astype(np.float64))
 
@@ -96,7 +96,7 @@ def _sensor_reasons(traces: Sequence[Trace], spread: Array) -> list[Reason]:
     Args:
         spread: (n,) variance of the states in the training data.
     """
-    task = measures.task_of(traces[0])
+    task = traces[0].task
     units, scale = measures.display_units(task)
     sensors = [_sensor_errors(trace) for trace in traces]
     weighted = []
@@ -226,7 +226,7 @@ def _weighted_sums(trace: Trace, of_sensors: bool) -> tuple[Array, Array]:
     A scalar weight serves both coordinates of the position, d = 1; else d = 2.
     """
     assert trace.effective_weights is not None
-    task = measures.task_of(trace)
+    task = trace.task
     where = list(task.map_indices)
     estimates = trace.observation_mean if of_sensors else trace.modality_mean
     assert estimates is not None

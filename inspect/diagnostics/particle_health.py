@@ -252,7 +252,7 @@ def measure_steps(trace: Trace) -> ParticleSteps:
     """Compute the measures of all steps of a trace."""
     assert trace.particles is not None
     assert trace.log_weights is not None
-    task = measures.task_of(trace)
+    task = trace.task
     steps, count, _ = trace.particles.shape
     weights = np.exp(trace.log_weights.astype(np.float64))
     prior = trace.prior_log_weights
@@ -314,7 +314,7 @@ def _regions(density: Array, height: float) -> NDArray[np.int64]:
 def _farther(trace: Trace, weights: Array) -> Array:
     """(T,) share of the predicted weight (T, M) that is farther from the mean than the true state."""
     assert trace.particles is not None
-    task = measures.task_of(trace)
+    task = trace.task
     deviation = measures.wrapped(task, trace.particles - trace.episode.states[:, None])
     error = (weights[..., None] * deviation).sum(1)
     from_mean = measures.wrapped(task, deviation - error[:, None])

@@ -250,7 +250,7 @@ def shapley(
     """
     if not 0.0 <= offset < math.inf:
         raise BadInput(f"offset must be a finite number of standard deviations, at least 0, not {offset:g}")
-    first, task = traces[0], measures.task_of(traces[0])
+    first, task = traces[0], traces[0].task
     modalities = input_modalities(checkpoint.filter)
     weights = shapley_weights(len(modalities))
     errors = []

@@ -184,7 +184,7 @@ def _with_position(trace: Trace, modalities: Sequence[str], alone: Array) -> Arr
         if modality in trace.modalities_with_posterior:
             updates[:, k] = error[:, trace.modalities.index(modality)]
     both = np.concatenate([error[:, -1:], updates, alone], axis=1)
-    where = list(measures.task_of(trace).map_indices)
+    where = list(trace.task.map_indices)
     return np.concatenate([np.linalg.norm(both[..., where], axis=-1, keepdims=True), np.abs(both)], axis=-1)
 
 

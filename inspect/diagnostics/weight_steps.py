@@ -44,7 +44,7 @@ class Correlation:
 def trajectory_statistics(trace: Trace) -> dict[str, float]:
     """Statistics of a healthy profile: mean weights by phase, and the error relative to that with the oracle's."""
     steps = weight_steps(trace)
-    task, count = measures.task_of(trace), len(trace.modalities)
+    task, count = trace.task, len(trace.modalities)
     columns = [c.name for c in task.components] if steps["oracle"].shape[-1] == len(task.components) else [""]
     sources = {"weight": "effective_weights"}
     if "beta" in steps and not np.allclose(steps["beta"], steps["effective_weights"], atol=1e-3):
@@ -74,7 +74,7 @@ def weight_steps(trace: Trace) -> dict[str, Array]:
     """By step: weights (T, K, W), regret (T, W), position and component errors (T, 1 + n), unimodal (T, K, 1 + n)."""
     assert trace.effective_weights is not None
     effective_weights = trace.effective_weights.astype(np.float64)
-    error, where = measures.errors(trace), list(measures.task_of(trace).map_indices)
+    error, where = measures.errors(trace), list(trace.task.map_indices)
     unimodal, fused = error[:, :-1], error[:, -1]
     per_component = effective_weights.shape[-1] == error.shape[-1]
     if per_component:
@@ -102,7 +102,7 @@ def add_constant(step_values: list[dict[str, Array]], traces: Sequence[Trace]) -
     """Add ``constant``, errors (T, 1 + n) with the best constant weights by phase; NaN for one trajectory."""
     if len(traces) == 1:
         return [steps | {"constant": np.full_like(steps["fused"], np.nan)} for steps in step_values]
-    where = list(measures.task_of(traces[0]).map_indices)
+    where = list(traces[0].task.map_indices)
     errors = [np.swapaxes(measures.errors(trace)[:, :-1], 1, 2) for trace in traces]  # (T, n, K)
     scalar = step_values[0]["oracle"].shape[-1] == 1
     # Blackout, contact, free motion; the warm-up is not used.
@@ -140,7 +140,7 @@ def _with_position(error: Array, where: list[int]) -> Array:
 
 def weight_correlations(traces: Sequence[Trace], step_values: Sequence[dict[str, Array]]) -> list[Correlation]:
     names = [name for name in ("beta", "effective_weights", "oracle") if name in step_values[0]]
-    task, modalities = measures.task_of(traces[0]), traces[0].modalities
+    task, modalities = traces[0].task, traces[0].modalities
     width = step_values[0]["oracle"].shape[-1]
     columns = [c.name for c in task.components] if width == len(task.components) else [None]
     labels: list[tuple[str, str, str | None, str]] = []

@@ -101,7 +101,7 @@ class Survey:
             raise BadInput("the failure search needs at least one trace")
         episodes = [by_index[index] for index in sorted(by_index)]
         columns = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
-        task = measures.task_of(first)
+        task = first.task
         available = scores_of(task)
         return cls(
             task=task,
@@ -144,7 +144,7 @@ def disagreement(trace: Trace) -> Array:
     """
     mean, covariance = measures.means(trace)[:, :-1], measures.covariances(trace)[:, :-1]
     i, j = np.array(list(combinations(range(len(trace.modalities)), 2))).T
-    difference = measures.wrapped(measures.task_of(trace), mean[:, i] - mean[:, j])
+    difference = measures.wrapped(trace.task, mean[:, i] - mean[:, j])
     white = np.linalg.solve(covariance[:, i] + covariance[:, j], difference[..., None])[..., 0]
     return np.sqrt((difference * white).sum(-1) / difference.shape[-1]).max(axis=1)
 
@@ -195,7 +195,7 @@ def _check_same_run(first: Trace, other: Trace) -> None:
 
 def _columns(trace: Trace) -> dict[str, NDArray[Any]]:
     """(T, ...) columns of a trace in a survey; speeds in m/s and rad/s."""
-    task, steps = measures.task_of(trace), np.arange(len(trace))
+    task, steps = trace.task, np.arange(len(trace))
     angles = [i for i, c in enumerate(task.components) if c.unit == "rad"]
     scores = {f"score {name}": s.values(trace) for name, s in scores_of(task).items() if s.why_not(trace) is None}
     recent = max(1, round(RECENT / trace.episode.dt))

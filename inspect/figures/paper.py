@@ -204,7 +204,7 @@ def weights_figure(trace: Trace) -> Figure:
     if why := weight_audit.why_not(trace):
         raise BadInput(f"no weights to draw: {why}")
     assert trace.effective_weights is not None
-    task = measures.task_of(trace)
+    task = trace.task
     component_wise = trace.effective_weights.shape[-1] > 1
     columns = task.map_indices if component_wise else (0,)
     with rc_context(STYLE):

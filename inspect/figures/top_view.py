@@ -57,7 +57,7 @@ def draw_step(trace: Trace, step: int, map_: LikelihoodMap | None = None) -> Fig
     Shows robot and object, true and estimated object, estimates with 2 sigma contours, particles by weight, and the
     contact force.
     """
-    task = measures.task_of(trace)
+    task = trace.task
     footprints = scene_footprints(trace, task, step)
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH if footprints else HEIGHT + 0.9, HEIGHT), layout="constrained")

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
 from beliefscope.inspect.maps.shape import classify, fit_rings
-from beliefscope.inspect.statistics.measures import task_of
 from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
@@ -132,7 +131,7 @@ def _principal(share: Array, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _expected(maps: Sequence[LikelihoodMap], trace: Trace) -> Array:
-    direction = task_of(trace).ridge_direction
+    direction = trace.task.ridge_direction
     if direction is None:
         return np.full(len(maps), np.nan)
     return np.asarray(direction(trace.episode.states[[m.step for m in maps]]), dtype=np.float64)

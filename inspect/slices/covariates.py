@@ -68,7 +68,7 @@ def _covariate(name: str, unit: str, values: NDArray[Any]) -> Covariate | None:
 
 def _columns(trace: Trace) -> Iterator[tuple[str, tuple[str, NDArray[Any]]]]:
     """Name, unit and values (T',) of each covariate at the counted steps of a trace."""
-    counted, task = measures.counted(trace), measures.task_of(trace)
+    counted, task = measures.counted(trace), trace.task
     for name, unit, values in _step_columns(trace, task):
         yield name, (unit, values[counted])
     for name, value in _provenance(trace.episode.provenance):

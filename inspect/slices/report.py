@@ -175,7 +175,7 @@ def slices_of(
     if not traces:
         raise BadInput("the search for slices needs at least one trace")
     first = traces[0]
-    definition = find_score(by, measures.task_of(first))
+    definition = find_score(by, first.task)
     check_applies(by, definition.why_not(first))
     keep = [measures.counted(trace) for trace in traces]
     score = np.concatenate([definition.values(trace)[mask] for trace, mask in zip(traces, keep, strict=True)])
@@ -187,7 +187,7 @@ def slices_of(
     indices = np.array([trace.episode_index for trace in traces])
     slices = [_error_slice(candidate, score, number, indices) for candidate in candidates]
     return ErrorSlices(
-        task=measures.task_of(first).name,
+        task=first.task.name,
         filter=first.filter,
         checkpoint_hash=first.checkpoint_hash,
         faults=str(first.faults),

@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
 from beliefscope.inspect.statistics.intervals import jackknife
-from beliefscope.inspect.statistics.measures import Array, counted, task_of, wrapped
+from beliefscope.inspect.statistics.measures import Array, counted, wrapped
 from beliefscope.inspect.traces.data import Trace
 
 
@@ -60,7 +60,7 @@ def innovations(trace: Trace) -> tuple[Array, Array] | None:
     if any(part is None for part in parts):
         return None
     z, predicted, r, p = (np.asarray(part, dtype=np.float64) for part in parts)
-    return wrapped(task_of(trace), z - predicted), p + r
+    return wrapped(trace.task, z - predicted), p + r
 
 
 def nis_of(trace: Trace) -> Array | None:
@@ -94,7 +94,7 @@ def whiteness_of(traces: Sequence[Trace]) -> list[Whiteness]:
 
 
 def _names(trace: Trace) -> list[tuple[str, str]]:
-    return [(modality, c.name) for modality in trace.modalities for c in task_of(trace).components]
+    return [(modality, c.name) for modality in trace.modalities for c in trace.task.components]
 
 
 def _ljung_box(trace: Trace) -> tuple[Array, Array, int] | None:

@@ -21,11 +21,6 @@ MIN_STEPS = 10
 """Minimum number of steps of a phase for a verdict."""
 
 
-def task_of(trace: Trace) -> Task:
-    """The task of a trace's episode."""
-    return trace.task
-
-
 def layers(trace: Trace) -> tuple[str, ...]:
     """Names of the L estimates: the K modalities, for their updates, then ``fused``."""
     return (*trace.modalities, "fused")
@@ -64,12 +59,12 @@ def covariances(trace: Trace) -> Array:
 
 def errors(trace: Trace) -> Array:
     """(T, L, n) m, rad: estimate minus true state, angles wrapped."""
-    return wrapped(task_of(trace), means(trace) - trace.episode.states[:, None])
+    return wrapped(trace.task, means(trace) - trace.episode.states[:, None])
 
 
 def position_error(trace: Trace) -> Array:
     """(T, L) m: distance between estimated and true position."""
-    where = list(task_of(trace).map_indices)
+    where = list(trace.task.map_indices)
     return np.linalg.norm(errors(trace)[..., where], axis=-1)
 
 
@@ -110,7 +105,7 @@ def blackout(trace: Trace) -> Mask:
 
 def counted(trace: Trace) -> Mask:
     """(T,): steps used by metrics; all but those of the task's warm-up."""
-    return np.arange(len(trace)) >= task_of(trace).first_counted(len(trace))
+    return np.arange(len(trace)) >= trace.task.first_counted(len(trace))
 
 
 def phases(trace: Trace) -> dict[str, Mask]:

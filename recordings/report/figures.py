@@ -102,7 +102,7 @@ def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int 
 
 def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None, layer: str, zoom: int) -> None:
     """Draw a layer's map with its estimate, or without a map the estimates of all layers."""
-    task = measures.task_of(trace)
+    task = trace.task
     half = 100.0 * task.map_half_width
     centre = trace.episode.states[step][list(task.map_indices)]
     offsets = 100.0 * (measures.means(trace)[step][:, list(task.map_indices)] - centre)

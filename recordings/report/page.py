@@ -58,7 +58,7 @@ def page(
         provenance=_provenance(report),
         episodes=_episodes(report),
         methods=methods(first, report.checkpoint),
-        definitions=definitions(measures.task_of(first), first),
+        definitions=definitions(first.task, first),
     )
 
 

@@ -127,7 +127,7 @@ def accuracy(traces: Sequence[Trace], standalone: Mapping[str, Sequence[Trace]] 
 
 
 def _accuracy(traces: Sequence[Trace]) -> Table:
-    task, first = measures.task_of(traces[0]), traces[0]
+    task, first = traces[0].task, traces[0]
     counted = [measures.counted(trace) for trace in traces]
     error = torch.from_numpy(np.concatenate([measures.errors(t)[c] for t, c in zip(traces, counted, strict=True)]))
     covariances = [
@@ -152,7 +152,7 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
 
 def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     """Error, weights and map statistics of each layer at one step."""
-    task = measures.task_of(trace)
+    task = trace.task
     units, factors = measures.display_units(task)
     error, nees = measures.errors(trace)[step] * factors, measures.nees(trace)[step]
     distance = 100.0 * measures.position_error(trace)[step]

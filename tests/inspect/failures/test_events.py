@@ -59,7 +59,7 @@ def shifted(run: Trace, first: int, last: int, metres: float) -> Trace:
     """Exact estimates with an error over some steps that is largest in their middle."""
     mean = run.episode.states.copy()
     hump = 1.0 + np.sin(np.linspace(0.0, np.pi, last - first + 1))
-    mean[first : last + 1, measures.task_of(run).map_indices[0]] += metres * hump
+    mean[first : last + 1, run.task.map_indices[0]] += metres * hump
     return replace(run, estimate_mean=mean)
 
 
