@@ -86,13 +86,14 @@ class LiveFileWriter:
             "pid": os.getpid(),
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
         }
+        # Computed first, because a reader may find the file as soon as it exists.
+        content = json.dumps(header).encode() + b"".join(array.tobytes() for array in static.values())
         try:
             self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise write_error(self.path, error) from None
         fcntl.flock(self._file, fcntl.LOCK_EX)
         self._size = 0
-        content = json.dumps(header).encode() + b"".join(array.tobytes() for array in static.values())
         self._write(HEADER, len(content), content)
 
     def append(self, part: Trace) -> None:
