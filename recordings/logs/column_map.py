@@ -20,7 +20,8 @@ UNITS = {"m": ("m", 1.0), "cm": ("m", 0.01), "mm": ("m", 0.001), "rad": ("rad", 
 """Unit of a column -> internal unit, and its factor."""
 
 KEYS = ("task", "dt", "time", "episode", "control", "contact", "state", "sensors", "covariates", "estimate")
-ESTIMATE = ("filter", "mean", "std", "covariance", "particles", "weights")
+VALUES = ("mean", "std", "covariance", "particles")
+ESTIMATE = ("filter", *VALUES, "weights")
 
 References = str | list[str]
 
@@ -96,15 +97,15 @@ def read_map(path: Path) -> ColumnMap:
     if len(state) < 2:
         raise BadInput(f'[state] of {path.name} has {len(state)} components, expected two or more: name = "column"')
     names = {key: values.get(key, "") for key in ("time", "episode", "contact")}
-    lists = {"control": values.get("control", []), **sensors}
-    lists |= {key: estimate[key] for key in ("mean", "std", "covariance", "particles") if key in estimate}
-    for key, value in (names | lists).items():
-        if not isinstance(value, str) and not (key in lists and _texts(value)):
+    control = values.get("control", [])
+    lists = [("control", control), *sensors.items(), *((key, estimate[key]) for key in VALUES if key in estimate)]
+    for key, value in (*names.items(), *lists, *_table(estimate, "weights", path).items()):
+        if not isinstance(value, str) and not (_texts(value) and (key, value) in lists):
             raise BadInput(f"{key} in {path.name} is {value!r:.100}, expected the name of a column or a list of names")
     covariates = {name: _covariate(name, value) for name, value in _table(values, "covariates", path).items()}
     task = values.get("task", path.stem)
     return ColumnMap(
-        task, state, dt, control=lists["control"], sensors=sensors, covariates=covariates, estimate=estimate, **names
+        task, state, dt, control=control, sensors=sensors, covariates=covariates, estimate=estimate, **names
     )
 
 

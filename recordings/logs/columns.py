@@ -37,7 +37,10 @@ def read_columns(path: Path) -> dict[str, NDArray[Any]]:
         raise
     except (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
         raise BadInput(f"{path.name} cannot be read: {(str(error).splitlines() or ['no message'])[0]:.200}") from None
-    return {name: column for name, column in columns.items() if column.ndim and len(column)}
+    columns = {name: column for name, column in columns.items() if column.ndim and len(column)}
+    if not columns:
+        raise BadInput(f"{path.name} has no column with rows")
+    return columns
 
 
 def _read_table(path: Path) -> dict[str, NDArray[Any]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.covariate import CONTACT, Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Component, Task
+from beliefscope.datasets.task import Component, Task, display_name
 from beliefscope.datasets.task_json import check_definition
 from beliefscope.filters.external.adapter import check_values, derived
 from beliefscope.inspect.trace import Trace
@@ -72,9 +72,13 @@ def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode]
     """
     if not {"mean", "particles"} & set(mapping.estimate):
         raise BadInput("the map has no estimate: add [estimate] with mean or particles, or write a data set (.h5)")
-    at = list(_episodes(columns, mapping, sum(map(len, episodes))).values())[index]
-    n, episode = len(mapping.state), episodes[index]
-    values = {name: torch.from_numpy(array[at]) for name, array in _estimate(columns, mapping).items()}
+    rows, n, episode = sum(map(len, episodes)), len(mapping.state), episodes[index]
+    at = list(_episodes(columns, mapping, rows).values())[index]
+    estimate = _estimate(columns, mapping)
+    for name, array in estimate.items():
+        if len(array) != rows:
+            raise BadInput(f"{display_name(name)} has {len(array)} rows and the state {rows}")
+    values = {name: torch.from_numpy(array[at]) for name, array in estimate.items()}
     weights = mapping.estimate.get("weights", {})
     check_values(values, (len(at),), {"n": n}, source)
     arrays: dict[str, Any] = {name: value.float().numpy() for name, value in derived(values).items()}
@@ -108,8 +112,10 @@ def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
             raise BadInput(f"covariance of [estimate] has {covariance.shape[1]} numbers per row, expected {n * n}")
         values["estimate_covariance"] = covariance.reshape(-1, n, n) * factors * factors[:, None]
     elif "std" in estimate:
-        std = joined(columns, estimate["std"], "estimate") * factors
-        values["estimate_covariance"] = np.square(std)[:, :, None] * np.eye(n)
+        std = joined(columns, estimate["std"], "estimate")
+        if std.shape[1] != n:
+            raise BadInput(f"std of [estimate] has {std.shape[1]} columns, expected {n}: {', '.join(mapping.state)}")
+        values["estimate_covariance"] = np.square(std * factors)[:, :, None] * np.eye(n)
     if "particles" in estimate:
         particles = joined(columns, estimate["particles"], "estimate")
         if particles.shape[1] % n:

@@ -138,6 +138,9 @@ def test_a_guessed_map_is_valid(log: Path, tmp_path: Path) -> None:
         ('["est_x", "est_y", "est_yaw"]', '["est_x", "est_y"]', "2 columns, expected 3"),
         ('["est_x", "est_y", "est_yaw"]', "5", "is 5"),
         ('task = "vehicle"', 'task = "a/b"', "without spaces"),
+        ('["sd_x", "sd_y", "sd_yaw"]', '"sd_x"', "std of .estimate. has 1 columns"),
+        ("[estimate]", '[estimate]\nweights = "sd_x"', "expected a table"),
+        ("[estimate]", "[estimate]\nweights = {gps = 1}", "gps in map.toml is 1"),
         ("[estimate]", '[covariates]\nv = {column = "t", cuts = [2, 1]}\n[estimate]', "covariate 'v'"),
     ],
 )
@@ -181,6 +184,31 @@ def test_damaged_logs_give_one_line(log: Path, tmp_path: Path, count: int) -> No
             messages.append(str(error))
     assert not any("\n" in message for message in messages)
     assert messages or log.suffix == ".csv"
+
+
+def test_damaged_maps_give_one_line(tmp_path: Path) -> None:
+    """Words of a map are exchanged, repeated and removed."""
+    rng, words, messages = np.random.default_rng(4), MAP.split(" "), []
+    for _ in range(200):
+        changed = list(words)
+        for place in rng.integers(0, len(words), rng.integers(1, 4)):
+            changed[place] = rng.choice([*words, "", "5", "[]", "{}", '"t"', "true"])
+        try:
+            mapping = read_map(map_file(tmp_path, " ".join(changed)))
+            recorded_trace(table(), mapping, read_log(table(), mapping, "log"), 0, "log")
+        except BadInput as error:
+            messages.append(str(error))
+    assert messages
+    assert not any("\n" in message for message in messages)
+
+
+def test_estimates_need_as_many_rows_as_the_state(tmp_path: Path) -> None:
+    np.savez(tmp_path / "log.npz", truth=np.ones((5, 2)), estimate=np.ones((4, 2)))
+    columns = read_columns(tmp_path / "log.npz")
+    mapping = read_map(map_file(tmp_path, guess_map(columns, "log")))
+    episodes = read_log(columns, mapping, "log")
+    with pytest.raises(BadInput, match="estimate mean has 4 rows and the state 5"):
+        recorded_trace(columns, mapping, episodes, 0, "log")
 
 
 def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
