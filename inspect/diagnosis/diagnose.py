@@ -250,12 +250,14 @@ def _conclude(
 def _visible(case: Case, effect: Effect | None) -> bool:
     """Whether a fault affects the filter: its error or calibration differ from those without the fault.
 
-    If it was undone, these are known for the same episodes, and other faults must show as alarms; otherwise errors and
-    calibration must be outside of the healthy range.
+    If it was undone, these are known for the same episodes, and other faults must show as alarms. Otherwise errors and
+    calibration must be outside of the healthy range, or the error decrease without the faulty sensor.
     """
     undone = effect is not None and bool(effect.ratios)
-    if effect is not None and any(_large(name, ratio) for name, ratio in effect.ratios.items()):
-        return True
+    if effect is not None:
+        changes = effect.ratios or {"error//all": 1.0 / max(1.0 - effect.recovery.error, 1e-9)}
+        if any(_large(name, ratio) for name, ratio in changes.items()):
+            return True
     found = (case.by_statistic.get(name) for name in VISIBLE)
     return any(
         _large(d.statistic, d.value / d.healthy) and (d.alarm if undone else not d.low <= d.value <= d.high)
