@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,12 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput, unknown_name
 
 Columns = Mapping[str, NDArray[Any]]
+
+DAMAGED = (
+    *(OSError, ValueError, KeyError, EOFError, RuntimeError, MemoryError, OverflowError, SyntaxError),
+    *(struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
+"""Errors of the readers for damaged files, and for encrypted archives."""
 
 ELEMENT = re.compile(r"(.*)\[(\d+)\]")
 """``NAME[I]``: element I of the rows of an array."""
@@ -35,7 +44,7 @@ def read_columns(path: Path) -> dict[str, NDArray[Any]]:
                 raise BadInput(f"{path.name} has the format {suffix or 'unknown'!r}; logs are .npz, .csv or .parquet")
     except BadInput:
         raise
-    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         raise BadInput(f"{path.name} cannot be read: {(str(error).splitlines() or ['no message'])[0]:.200}") from None
     columns = {name: column for name, column in columns.items() if column.ndim and len(column)}
     if not columns:
