@@ -135,16 +135,6 @@ class LiveFileWriter:
         self._size = at
 
 
-def save_live(trace: Trace, path: Path) -> None:
-    """Write a trace as the file of a finished live run. Raises BadInput as ``LiveFileWriter``."""
-    writer = LiveFileWriter(path, trace, len(trace))
-    try:
-        writer.append(trace)
-        writer.finish()
-    finally:
-        writer.close()
-
-
 class LiveFileReader:
     """Reader of a live file that may still grow. Methods may be called from any thread.
 

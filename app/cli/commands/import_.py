@@ -78,7 +78,7 @@ def import_(
 
 def _written(trace: Trace, output: Path) -> console.Result:
     from beliefscope.inspect.trace import save_trace
-    from beliefscope.inspect.traces.live_file import save_live
+    from beliefscope.inspect.traces.live_file import write_live
 
-    (save_live if output.suffix == ".live" else save_trace)(trace, output)
+    (write_live if output.suffix == ".live" else save_trace)(trace, output)
     return opt.trace_result(trace, output)
