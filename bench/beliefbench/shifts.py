@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.random import Generator
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.door import CAMERA as DOOR_CAMERA
@@ -12,7 +13,7 @@ from beliefscope.datasets.simulation.door import DOOR, door_model, draw_door, po
 from beliefscope.datasets.simulation.door import IMPEDANCE as DOOR_IMPEDANCE
 from beliefscope.datasets.simulation.door_policies import POLICIES
 from beliefscope.datasets.simulation.push import CAMERA, IMPEDANCE, PUSH, RADIUS, PuckPhysics, PushPuck, push_model
-from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, episode_rng, simulate
+from beliefscope.datasets.simulation.simulate import ROBOT_JOINTS, Scene, first_free_start, simulate
 
 MAGNITUDES = (0.1, 0.15, 0.5, 0.4)
 """Four levels: relative change of the door's width and its bar's distance, or of the puck's radius and mass."""
@@ -20,7 +21,10 @@ MAGNITUDES = (0.1, 0.15, 0.5, 0.4)
 
 def shifted_episode(task: str, seed: int, index: int, steps: int, magnitude: float) -> Episode:
     """Door: a wider panel whose bar is closer. Push: a larger, heavier puck with less friction."""
-    rng = episode_rng(seed, index)
+    return first_free_start(lambda rng: _simulate(rng, task, seed, index, steps, magnitude), seed, index)
+
+
+def _simulate(rng: Generator, task: str, seed: int, index: int, steps: int, magnitude: float) -> Episode:
     if task == "door":
         policy = policy_name(index)
         door = draw_door(rng, policy)

@@ -25,7 +25,7 @@ from beliefscope.datasets.simulation.simulate import (
     Policy,
     Scene,
     Waypoint,
-    episode_rng,
+    first_free_start,
     quantise,
     random_speed,
     random_wait,
@@ -201,10 +201,14 @@ def push_model(
 
 def simulate_push(seed: int, index: int, steps: int) -> Episode:
     """Simulate trajectory ``index`` of the collection with ``seed``: ``steps`` steps of 0.1 s. Deterministic."""
+    return first_free_start(lambda rng: _simulate(rng, seed, index, steps), seed, index)
+
+
+def _simulate(rng: Generator, seed: int, index: int, steps: int) -> Episode:
     return simulate(
         PUSH,
         Scene(push_model(), IMPEDANCE, CAMERA),
-        PushPuck(episode_rng(seed, index)),
+        PushPuck(rng),
         lambda qpos: qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 2],
         seed,
         index,

@@ -25,7 +25,7 @@ from beliefscope.datasets.simulation.ingredients import (
     wrist,
 )
 from beliefscope.datasets.simulation.push import CAMERA, CENTRE, IMPEDANCE, PUSH, PuckPhysics, PushPuck, push_model
-from beliefscope.datasets.simulation.simulate import DT, ROBOT_JOINTS, Scene, Waypoint, episode_rng, simulate
+from beliefscope.datasets.simulation.simulate import DT, ROBOT_JOINTS, Scene, Waypoint, first_free_start, simulate
 from beliefscope.datasets.task import Ingredient
 
 Vector = NDArray[np.float64]
@@ -77,6 +77,10 @@ def simulate_push_field(seed: int, index: int, steps: int, without: Collection[s
     Args:
         without: names of ingredients to switch off. The draws of the others do not change.
     """
+    return first_free_start(lambda rng: _simulate(rng, seed, index, steps, without), seed, index)
+
+
+def _simulate(rng: Generator, seed: int, index: int, steps: int, without: Collection[str]) -> Episode:
     draws = draw(PUSH_FIELD, seed, index, without)
     puck = PuckPhysics(**draws["puck"].values) if "puck" in draws else PuckPhysics()
     aim = draws["aim"].values["std"] if "aim" in draws else 0.0
@@ -91,7 +95,7 @@ def simulate_push_field(seed: int, index: int, steps: int, without: Collection[s
     episode = simulate(
         PUSH_FIELD,
         scene,
-        PushPuckWithAimError(episode_rng(seed, index), puck, aim),
+        PushPuckWithAimError(rng, puck, aim),
         lambda qpos: qpos[:, ROBOT_JOINTS : ROBOT_JOINTS + 2],
         seed,
         index,

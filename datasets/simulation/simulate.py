@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import count
 from typing import Any, Protocol
 
 import mujoco
@@ -103,10 +101,12 @@ class JammedStart(Exception):
 
 def first_free_start(simulate_with: Callable[[Generator], Episode], seed: int, index: int) -> Episode:
     """The episode of the first draw whose hand starts outside of the object: nearly always draw 0."""
-    for draw in count():
-        with suppress(JammedStart):
+    draw = 0
+    while True:
+        try:
             return simulate_with(episode_rng(seed, index, draw))
-    raise AssertionError("count() does not end")
+        except JammedStart:
+            draw += 1
 
 
 def episode_rng(seed: int, index: int, draw: int = 0) -> Generator:
