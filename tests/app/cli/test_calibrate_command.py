@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beliefscope.app.cli.main import main
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.calibration import load_calibration
 from beliefscope.filters.external.load import load_external
@@ -18,17 +16,6 @@ from beliefscope.inspect.trace import trace
 
 Run = Callable[..., tuple[int, str, str]]
 FILTER = f"{Path(__file__).parents[3] / 'examples' / '04_own_filter.py'}:build"
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["beliefscope", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return int(end.value.code or 0), *capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture(scope="module")

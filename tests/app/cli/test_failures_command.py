@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from urllib.parse import parse_qs
 
 import pytest
 
-from beliefscope.app.cli.main import main
 from beliefscope.app.protocol.permalinks import permalink
 from beliefscope.app.runs.settings import Settings
 from beliefscope.datasets.simulation.door import DOOR
@@ -17,17 +15,6 @@ from beliefscope.datasets.simulation.door import DOOR
 pytestmark = pytest.mark.slow
 
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["beliefscope", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return int(end.value.code or 0), *capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture
