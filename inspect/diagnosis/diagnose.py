@@ -7,7 +7,7 @@ with the same random numbers. The right undo restores the healthy statistics.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -129,15 +129,41 @@ def diagnose(
     for trace in trace_all(checkpoint, episodes, episodes, seed, particles):
         traces.append(trace)
         report(0.4 * len(traces) / len(episodes))
+    return diagnose_traces(
+        checkpoint,
+        traces,
+        seed=seed,
+        particles=particles,
+        alarm_rate=alarm_rate,
+        base=base,
+        profile=profile,
+        progress=lambda share: report(0.4 + 0.6 * share),
+    )
+
+
+def diagnose_traces(
+    checkpoint: Checkpoint,
+    traces: Sequence[Trace],
+    *,
+    seed: int = 0,
+    particles: int = 300,
+    alarm_rate: float = 0.05,
+    base: Checkpoint | None = None,
+    profile: HealthyProfile | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Diagnosis:
+    """Diagnose a filter from its runs over different episodes, with the arguments and errors of ``diagnose``."""
+    report = progress or (lambda fraction: None)
+    episodes = {trace.episode_index: trace.episode for trace in traces}
     setting = Setting(checkpoint, episodes, particles, frozenset(episodes))
-    case = examine(setting, traces, profile, alarm_rate)
-    report(0.5)
+    case = examine(setting, traces, profile or required_profile(checkpoint), alarm_rate)
+    report(0.2)
     if not case.alarms:
         report(1.0)
         return _healthy(case)
     affected = focus(case)
     explanations = explain_all(affected)
-    effects = confirm(affected, explanations, seed, base, lambda share: report(0.5 + 0.5 * share))
+    effects = confirm(affected, explanations, seed, base, lambda share: report(0.2 + 0.8 * share))
     report(1.0)
     return _conclude(case, affected, explanations, effects)
 
@@ -210,7 +236,7 @@ def confirm(
     before = burden(case.deviations)
     effects: dict[str, Effect] = {}
     for number, (_, name) in enumerate(likely[:UNDONE], 1):
-        alarms = _evidence_alarms(case, by_name[name])
+        alarms = _symptoms(by_name[name], case.alarms)
         affected = _affected(case, alarms)
         steps = _steps(case, alarms[0], affected) if alarms else None
         indices = [trace.episode_index for trace, hit in zip(case.traces, affected, strict=True) if hit]
@@ -218,9 +244,7 @@ def confirm(
         if (replay := replay_without(by_name[name], setting, case.by_statistic, seed, base)) is not None:
             after = examine(setting, replay, case.profile, case.alarm_rate)
             restored = max(0.0, 1.0 - burden(after.deviations) / before)
-            left = [
-                d for d in after.deviations if d.alarm and any(s.matches(d.statistic) for s in by_name[name].symptoms)
-            ]
+            left = _symptoms(by_name[name], (d for d in after.deviations if d.alarm))
             changes = {} if left or by_name[name].undo.startswith("drop") else ratios(VISIBLE, case.rows, after.rows)
             effects[name] = Effect(recovery(case.traces, replay), restored, changes)
             old = explanations[name]
@@ -273,7 +297,7 @@ def _large(statistic: str, ratio: float) -> bool:
 
 
 def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | None) -> Candidate:
-    alarms = _evidence_alarms(case, cause)
+    alarms = _symptoms(cause, case.alarms)
     affected = _affected(case, alarms)
     task, name = case.setting.checkpoint.task.name, case.setting.checkpoint.name
     return Candidate(
@@ -287,9 +311,9 @@ def _candidate(case: Case, cause: Cause, probability: float, effect: Effect | No
     )
 
 
-def _evidence_alarms(case: Case, cause: Cause) -> list[Deviation]:
-    """The alarms among the symptoms of a cause, largest first."""
-    return [d for d in case.alarms if any(s.matches(d.statistic) for s in cause.symptoms)]
+def _symptoms(cause: Cause, deviations: Iterable[Deviation]) -> list[Deviation]:
+    """The deviations of statistics that are symptoms of a cause, in their order."""
+    return [d for d in deviations if any(s.matches(d.statistic) for s in cause.symptoms)]
 
 
 def _evidence(case: Case, deviation: Deviation) -> Evidence:

@@ -37,7 +37,7 @@ from beliefscope.inspect.likelihood import FINE, MapEngine, Quantity, no_maps
 from beliefscope.inspect.standalone import standalone_runs
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
-from beliefscope.recordings.report.diagnosis import diagnose_traces
+from beliefscope.recordings.report.diagnosis import report_diagnosis
 from beliefscope.recordings.report.figures import error_figure, event_figure, zoom_of
 from beliefscope.recordings.report.folder import FORMAT, new_folder
 from beliefscope.recordings.report.page import page
@@ -93,7 +93,7 @@ def compose(
     """
     first = traces[0]
     options = {name: {"quantity": quantity} if "quantity" in e.options else {} for name, e in DIAGNOSTICS.items()}
-    diagnosis = diagnose_traces(traces, checkpoint, link, lambda share: progress(0.5 * share))
+    diagnosis = report_diagnosis(traces, checkpoint, link, lambda share: progress(0.5 * share))
     results, reasons = run_diagnostics(traces, checkpoint, options, slow, lambda share: progress(0.5 + 0.5 * share))
     events = [Event(index, step) for index, step in steps] or worst_events(traces)
     return Report(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnosis.cause import Diagnosis
-from beliefscope.inspect.diagnosis.diagnose import diagnose
+from beliefscope.inspect.diagnosis.diagnose import diagnose_traces
 from beliefscope.inspect.trace import Trace
 
 
@@ -25,7 +25,7 @@ class ReportedDiagnosis:
     link: str = ""
 
 
-def diagnose_traces(
+def report_diagnosis(
     traces: Sequence[Trace],
     checkpoint: Checkpoint | None,
     link: Callable[[int, int], str],
@@ -38,17 +38,17 @@ def diagnose_traces(
     """
     if checkpoint is None:
         return ReportedDiagnosis(None, "the filter's checkpoint is not available")
-    episodes = {trace.episode_index: trace.episode for trace in traces}
-    if len(episodes) < len(traces):
+    indices = [trace.episode_index for trace in traces]
+    if len(set(indices)) < len(indices):
         return ReportedDiagnosis(None, "an episode has several traces")
     if any(trace.settings.get("edits") or trace.settings.get("standalone") for trace in traces):
         return ReportedDiagnosis(None, "interventions changed the run")
     first = traces[0]
     try:
         particles = int(first.settings.get("particles", 300))
-        result = diagnose(checkpoint, episodes, seed=first.seed, particles=particles, progress=progress)
+        result = diagnose_traces(checkpoint, traces, seed=first.seed, particles=particles, progress=progress)
     except BadInput as error:
         return ReportedDiagnosis(None, str(error))
     evidence = result.causes[0].evidence if result.causes else ()
-    moments = [(list(episodes).index(e.episode), e.step or 0) for e in evidence if e.episode is not None]
+    moments = [(indices.index(e.episode), e.step or 0) for e in evidence if e.episode is not None]
     return ReportedDiagnosis(result, link=link(*moments[0]) if moments else "")
