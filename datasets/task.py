@@ -19,6 +19,11 @@ DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
 Array = NDArray[np.float64]
 
 
+def display_unit(unit: str) -> tuple[str, float]:
+    """Unit for display, and the factor from the SI unit: cm, degrees, else the unit itself."""
+    return DISPLAY_UNITS.get(unit, (unit, 1.0))
+
+
 def display_name(name: str) -> str:
     """A name with spaces instead of underscores: ``hinge x``."""
     return name.replace("_", " ")
@@ -42,7 +47,7 @@ class Component:
     @property
     def shown(self) -> tuple[str, float]:
         """Unit for display, and the factor from ``unit``."""
-        return self.display or DISPLAY_UNITS.get(self.unit, (self.unit, 1.0))
+        return self.display or display_unit(self.unit)
 
     @property
     def key(self) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import display_name
+from beliefscope.datasets.task import display_name, display_unit
 from beliefscope.filters.calibration import Calibration, Layer, conformal_radius
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table
@@ -68,7 +68,7 @@ class CalibrationReport(Diagnostic):
     def tables(self) -> list[Table]:
         """Factors and radii of each layer; and coverage, one row per layer and phase."""
         names = tuple(self.calibration.layers["fused"].distances)
-        units = {name: ("cm", 100.0) if name == "position" else ("deg", 180.0 / math.pi) for name in names}
+        units = {name: display_unit("m" if name == "position" else "rad") for name in names}
         rows = [
             (layer, c.scale, c.ellipsoid, *(units[name][1] * c.distances[name] for name in names))
             for layer, c in self.calibration.layers.items()

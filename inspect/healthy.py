@@ -34,7 +34,7 @@ def profile_of(checkpoint: Checkpoint, episodes: Sequence[Episode], data: str) -
     references = [measure_reference(group) for group in groups]
     for trace in trace_all(checkpoint, episodes, range(len(episodes))):
         rows.append(episode_statistics(trace, checkpoint, references[trace.episode_index % FOLDS]))
-        particles = None if trace.particles is None else trace.particles.shape[1]
+        particles = trace.particle_count
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
     return HealthyProfile(data, len(rows), particles, columns, measure_reference(episodes))

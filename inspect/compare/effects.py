@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.task import DISPLAY_UNITS, Task
+from beliefscope.datasets.task import Task, display_unit
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.inspect.failures.events import event_spans
 from beliefscope.inspect.failures.step_scores import RECENT
@@ -71,7 +71,7 @@ class Difference:
     @property
     def display(self) -> tuple[float, float, str]:
         """Before and after in display units, and the unit."""
-        unit, factor = DISPLAY_UNITS.get(self.unit, (self.unit, 1.0))
+        unit, factor = display_unit(self.unit)
         return factor * self.before, factor * self.after, unit
 
 

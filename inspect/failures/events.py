@@ -13,7 +13,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.task import DISPLAY_UNITS, display_name
+from beliefscope.datasets.task import display_name, display_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
@@ -206,7 +206,7 @@ class Failures(Diagnostic):
     @property
     def _display(self) -> tuple[str, float]:
         """Display unit of the score and the conversion factor."""
-        return DISPLAY_UNITS.get(self.unit, (self.unit, 1.0))
+        return display_unit(self.unit)
 
     @property
     def _label(self) -> str:

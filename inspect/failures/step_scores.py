@@ -109,7 +109,7 @@ class Survey:
             checkpoint_hash=first.checkpoint_hash,
             faults=str(first.faults),
             seed=first.seed,
-            particles=None if first.particles is None else first.particles.shape[1],
+            particles=first.particle_count,
             layers=measures.layers(first),
             angles=tuple(c.name for c in task.components if c.unit == "rad"),
             scores={name: columns[f"score {name}"] for name in available if f"score {name}" in columns},

@@ -12,7 +12,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.task import DISPLAY_UNITS
+from beliefscope.datasets.task import display_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
@@ -105,7 +105,7 @@ class ErrorSlices(Diagnostic):
 
     def tables(self) -> list[Table]:
         """One row per slice; scores in display units."""
-        unit, factor = DISPLAY_UNITS.get(self.unit, (self.unit, 1.0))
+        unit, factor = display_unit(self.unit)
         label = f" {unit}".rstrip()
         columns: tuple[str, ...] = ("slice", "ratio x", "from", "to", f"inside{label}", f"outside{label}")
         columns += ("episodes", "steps", "steps %", "p-value")
@@ -192,7 +192,7 @@ def slices_of(
         checkpoint_hash=first.checkpoint_hash,
         faults=str(first.faults),
         seed=first.seed,
-        particles=None if first.particles is None else first.particles.shape[1],
+        particles=first.particle_count,
         by=by,
         title=definition.title,
         unit=definition.unit,

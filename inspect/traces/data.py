@@ -97,6 +97,11 @@ class Trace:
         return self.episode.task
 
     @property
+    def particle_count(self) -> int | None:
+        """M; None for a filter without particles."""
+        return None if self.particles is None else self.particles.shape[1]
+
+    @property
     def has_covariance(self) -> bool:
         """Whether the estimates have a covariance; those of an LSTM or transformer do not."""
         return not np.isnan(self.estimate_covariance).all() or not len(self)

@@ -121,7 +121,7 @@ def _kalman(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
 
 
 def _particles(trace: Trace, checkpoint: Checkpoint | None) -> list[Passage]:
-    count = "M" if trace.particles is None else str(trace.particles.shape[1])
+    count = str(trace.particle_count or "M")
     resampling = _setting(checkpoint, "resampling", "")
     resampled = f" Particles are resampled at every step ({resampling})." if resampling else ""
     passages = [
