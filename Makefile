@@ -13,6 +13,8 @@ VENV := .venv
 BIN  := $(VENV)/bin
 # --no-compile: compiling every module of every package adds half a minute; Python compiles modules when they are imported.
 PIP  := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt $(PIP_FLAGS)
+# Otherwise each of the many processes that the tests start would compile PyTorch again: 2 s of CPU time.
+export PYTHONDONTWRITEBYTECODE :=
 
 # loadfile: the tests of a file share a server, a browser or a training. tests/conftest.py orders the files.
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
