@@ -1,4 +1,4 @@
-"""Likelihood maps: likelihood or posterior of every position of the map square, by modality, at one step."""
+"""Likelihood maps: likelihood or posterior over two state components, by modality, at one step."""
 
 from __future__ import annotations
 
@@ -20,16 +20,30 @@ from beliefscope.inspect.maps.fusion_rules import fuse_sensors, fusion_rule
 from beliefscope.inspect.maps.grid import GridEvaluator, one_thread
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, Quantity
 from beliefscope.inspect.maps.particle_density import ParticleDensity
+from beliefscope.inspect.maps.plane import (
+    OTHERS,
+    Others,
+    Plane,
+    check_others,
+    describe_others,
+    other_components,
+    plane_of,
+)
+from beliefscope.inspect.maps.statistics import has_layer_weights, layer_weights
 from beliefscope.inspect.statistics.measures import FLOOR, wrapped
 from beliefscope.inspect.trace import Trace
+
+Doubles = NDArray[np.float64]
 
 __all__ = [
     "COARSE",
     "FINE",
     "LARGEST",
+    "OTHERS",
     "QUANTITIES",
     "LikelihoodMap",
     "MapEngine",
+    "Others",
     "Quantity",
     "missing_quantities",
     "no_maps",
@@ -46,22 +60,22 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quanti
     """One-line reason why a filter has no maps of a quantity, or None.
 
     Args:
-        trace: a trace of the filter; required for an external filter, whose maps are computed from its Gaussians.
+        trace: a trace of the filter; required for an external filter, whose maps are computed from its Gaussians and
+            particles.
         quantity: by default either.
     """
     task, subject = checkpoint.task, "has no likelihood maps" if quantity != "posterior" else "has no posterior maps"
     if trace is not None and (only := trace.settings.get("standalone")):
         return f"a standalone run of {only} {subject}: those of the run with all modalities include {only}"
     if isinstance(checkpoint, ExternalFilter):
-        reasons = [_no_gaussians(trace, each) for each in ((quantity,) if quantity else QUANTITIES)]
+        reasons = [_no_density(trace, each) for each in ((quantity,) if quantity else QUANTITIES)]
         if None not in reasons:
             return f"filter {checkpoint.name!r} {subject}: {reasons[-1]}"
     elif not checkpoint.filter.has_covariance:
         kind = {"lstm": "an LSTM"}.get(checkpoint.kind, f"a {checkpoint.kind}")
         return f"filter {checkpoint.name!r} {subject}: {kind} has no likelihood and no covariance"
-    off_map = [c.name for i, c in enumerate(task.components) if i not in task.map_indices]
-    if len(off_map) > 1:
-        return f"task {task.name!r} {subject}: {', '.join(off_map)} are not on the map; at most one can be held fixed"
+    if len(task.components) < 2:
+        return f"task {task.name!r} {subject}: a map shows two components, and its state has one"
     return None
 
 
@@ -71,16 +85,18 @@ def missing_quantities(checkpoint: Checkpoint, trace: Trace) -> dict[Quantity, s
     return {quantity: reason for quantity, reason in reasons.items() if reason is not None}
 
 
-def _no_gaussians(trace: Trace | None, quantity: Quantity) -> str | None:
-    """Reason why an external filter has no Gaussians of a quantity to draw, or None."""
+def _no_density(trace: Trace | None, quantity: Quantity) -> str | None:
+    """Reason why an external filter has no density of a quantity, from Gaussians or particles; None if it has."""
     if trace is None or not trace.has_covariance:
         return "it reports no covariance"
-    if trace.log_likelihood is not None or trace.particles is not None:
-        return "its measurement model is known only at its particles"
     if quantity == "likelihood":
         if trace.observation_mean is None or trace.observation_covariance is None:
+            if trace.particles is not None:
+                return "its measurement model is known only at its particles"
             return "it reports no virtual observations (observation_mean and observation_covariance)"
         covariances = trace.observation_covariance
+    elif has_layer_weights(trace):
+        return None
     else:
         if trace.modalities and not trace.modalities_with_posterior:
             return "it reports no single-modality updates"
@@ -107,9 +123,8 @@ class MapEngine:
         self.trace = trace
         self.task = checkpoint.task
         self.evidence = self._encode()
-        off_map = [i for i in range(len(self.task.components)) if i not in self.task.map_indices]
-        self.fixed = off_map[0] if off_map else None
         self._grid = self._grid_evaluator()
+        self._planes: dict[tuple[str, ...], Plane] = {}
         self._anchors = trace.anchors
         missing = missing_quantities(checkpoint, trace)
         self.quantities = tuple(quantity for quantity in QUANTITIES if quantity not in missing)
@@ -129,21 +144,42 @@ class MapEngine:
         filter_ = self.checkpoint.filter
         assert isinstance(filter_, MixtureParticleFilter)
         models = [filter_.measurement_model(name) for name in filter_.names]
-        return GridEvaluator(models, self.task.map_indices, filter_.statistics.mean_std("state")[1])
+        return GridEvaluator(models, filter_.statistics.mean_std("state")[1])
+
+    def plane(self, components: tuple[str, ...] = ()) -> Plane:
+        """The plane of two components, by default of the task's map. Raises BadInput (``plane_of``)."""
+        if components not in self._planes:
+            self._planes[components] = plane_of(self.trace, components)
+        return self._planes[components]
+
+    def no_others(self, quantity: Quantity, others: Others) -> str | None:
+        """Reason why components off the map cannot be treated this way for a quantity; None if they can."""
+        if others == "marginal" and quantity == "likelihood" and self.evidence is not None:
+            return "the likelihood of a particle filter cannot be integrated over components: choose the posterior"
+        return None
 
     @torch.no_grad()
     def map(
-        self, step: int, angle: float | None = None, size: int = FINE, quantity: Quantity | None = None
+        self,
+        step: int,
+        angle: float | None = None,
+        size: int = FINE,
+        quantity: Quantity | None = None,
+        components: tuple[str, ...] = (),
+        others: Others | None = None,
     ) -> LikelihoodMap:
         """Compute the maps of one step.
 
         Args:
-            angle: rad, value of the component that is not on the map; by default the true value.
+            angle: SI, value of the component off the map if it is the only one and fixed; by default the true value.
             size: cells per side, S.
             quantity: by default the likelihood, or the posterior for a filter that reports only that (``quantities``).
+            components: names of the x and the y axis; by default those of the task's map.
+            others: treatment of the components off the map. Default: one is fixed; several are integrated out if
+                possible (``no_others``), because a map at fixed values of all of them shows little of the belief.
 
         Raises:
-            BadInput: step, angle or size out of range, or the filter does not have the quantity.
+            BadInput: step, angle, size or components are invalid, or the filter does not have such maps.
         """
         quantity = quantity or self.quantities[0]
         if quantity not in QUANTITIES:
@@ -157,23 +193,33 @@ class MapEngine:
             raise BadInput(f"a map has 2 to {LARGEST} cells per side, not {size}")
         if angle is not None and not math.isfinite(angle):
             raise BadInput(f"angle must be a finite number of rad, not {angle}")
+        plane = self.plane(components)
+        off_map = other_components(trace, plane)
+        if others is None:
+            others = "marginal" if len(off_map) > 1 and self.no_others(quantity, "marginal") is None else "fixed"
+        check_others(others)
+        if reason := self.no_others(quantity, others):
+            raise BadInput(reason)
         anchor = self._anchors[step]
-        middle, centre = anchor.astype(np.float64), anchor[list(self.task.map_indices)]
-        if self.fixed is not None and angle is not None:
-            middle[self.fixed] = angle
+        middle, fixed = anchor.astype(np.float64), off_map[0] if len(off_map) == 1 and others == "fixed" else None
+        if fixed is not None and angle is not None:
+            middle[fixed] = angle
         with one_thread():
-            evaluate = self._particle_filter if self.evidence is not None else self._gaussians
-            values = evaluate(step, size, middle, quantity)
+            values = self._densities(quantity, others)(step, size, middle, plane, quantity, others)
+        x, y = (_offsets(half, size).astype(np.float32) for half in plane.half_widths)
         return LikelihoodMap(
             step=step,
-            angle=math.nan if self.fixed is None else float(middle[self.fixed]),
+            angle=math.nan if fixed is None else float(middle[fixed]),
             layers=(*trace.modalities, "fused"),
-            offsets_x=self._offsets(size),
-            offsets_y=self._offsets(size),
-            centre=centre,
+            offsets_x=x,
+            offsets_y=y,
+            centre=anchor[list(plane.components)],
             log_likelihood=values,
             quantity=quantity,
             rule=fusion_rule(self.checkpoint, trace.modalities, quantity),
+            components=plane.components,
+            others=others,
+            note=describe_others(trace, plane, others),
         )
 
     def maps(
@@ -183,18 +229,23 @@ class MapEngine:
         progress: Callable[[float], None] | None = None,
         quantity: Quantity | None = None,
     ) -> Iterator[LikelihoodMap]:
-        """Maps of several steps, at the true angle. ``progress`` is called with the completed fraction, 0..1."""
+        """Default maps of several steps. ``progress`` is called with the completed fraction, 0..1."""
         for count, step in enumerate(steps, start=1):
             yield self.map(step, size=size, quantity=quantity)
             if progress is not None:
                 progress(count / len(steps))
 
-    def _offsets(self, size: int) -> Array:
-        """(S,) m, cell centres."""
-        offsets = ((np.arange(size) + 0.5) / size * 2.0 - 1.0) * self.task.map_half_width
-        return offsets.astype(np.float32)
+    def _densities(self, quantity: Quantity, others: Others) -> Callable[..., Array]:
+        """The method that evaluates a quantity: networks, kernel densities of particles, or Gaussians."""
+        if self.evidence is not None and others == "fixed":
+            return self._networks
+        if quantity == "posterior" and has_layer_weights(self.trace):
+            return self._kernel_densities
+        return self._gaussians
 
-    def _particle_filter(self, step: int, size: int, middle: NDArray[np.float64], quantity: Quantity) -> Array:
+    def _networks(
+        self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others
+    ) -> Array:
         """(K + 1, S, S) log-likelihoods of the measurement models and of the fused mixture, or log posteriors.
 
         The posterior is ``p(x) p(z | x) / p(z)``: the prior p(x) is the density of the predicted particles, and the
@@ -205,10 +256,13 @@ class MapEngine:
         assert self.evidence is not None
         evidence = self.evidence[step]
         assert self._grid is not None
+        x, y = (_offsets(half, size) for half in plane.half_widths)
         unimodal = self._grid.log_likelihood(
-            torch.from_numpy(self._offsets(size)),
+            plane.components,
+            torch.from_numpy(x.astype(np.float32)),
+            torch.from_numpy(y.astype(np.float32)),
             filter_.statistics.standardise("state", torch.from_numpy(middle)),
-            tuple(middle.tolist()),
+            (*plane.components, *middle.tolist()),
             evidence.observation[0],
         )
         assert trace.prior_log_weights is not None
@@ -224,11 +278,23 @@ class MapEngine:
             at_particles = torch.cat([at_particles, mixture(at_particles - scale, log_weights).unsqueeze(0)])
             evidence_ = torch.logsumexp(torch.from_numpy(prior) + at_particles, dim=1, keepdim=True)
             density = ParticleDensity(self.task, trace.particles[step], prior)
-            log_prior = density.log_density(middle, self._offsets(size).astype(np.float64)).astype(np.float32)
+            log_prior = density.log_density(middle, plane.components, x, y).astype(np.float32)
             values = values - evidence_ + torch.from_numpy(log_prior).flatten()
         return values.unflatten(1, (size, size)).numpy()
 
-    def _moments(self, step: int, quantity: Quantity) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _kernel_densities(
+        self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others
+    ) -> Array:
+        """(K + 1, S, S) log densities of the particles with the weights of each posterior."""
+        particles, weights = self.trace.particles, layer_weights(self.trace, step)
+        assert particles is not None
+        x, y = (_offsets(half, size) for half in plane.half_widths)
+        components = plane.components if others == "marginal" else None
+        with np.errstate(divide="ignore"):
+            densities = [ParticleDensity(self.task, particles[step], np.log(layer), components) for layer in weights]
+        return np.stack([d.log_density(middle, plane.components, x, y) for d in densities]).astype(np.float32)
+
+    def _moments(self, step: int, quantity: Quantity) -> tuple[Doubles, Doubles]:
         """Means (K + 1, n) and covariances (K + 1, n, n) of the sensors or posteriors, the fused one last."""
         trace = self.trace
         if quantity == "posterior":
@@ -243,23 +309,36 @@ class MapEngine:
         fused = fuse_sensors(self.checkpoint, z, r, None if trace.weights is None else trace.weights[step])
         return np.concatenate([z, fused[0][None]]), np.concatenate([r, fused[1][None]])
 
-    def _gaussians(self, step: int, size: int, middle: NDArray[np.float64], quantity: Quantity) -> Array:
+    def _gaussians(
+        self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others
+    ) -> Array:
         """(K + 1, S, S) log densities of the modalities' Gaussians and of the fused Gaussian (``_moments``).
 
-        The squared Mahalanobis distance is a sum of a term by column, a term by row and their product.
+        The squared Mahalanobis distance is a sum of a term by column, a term by row and their product. The marginal of
+        a Gaussian has the mean and the covariance of the remaining components.
         """
-        ix, iy = self.task.map_indices
+        ix, iy = plane.components
         mean, covariance = self._moments(step, quantity)
+        from_mean = wrapped(self.task, middle - mean)
+        if others == "marginal":
+            from_mean, covariance = from_mean[:, [ix, iy]], covariance[:, [ix, iy]][:, :, [ix, iy]]
+            ix, iy = 0, 1
         factor = np.linalg.cholesky(covariance)
         whiten = np.linalg.inv(factor)
         precision = whiten.swapaxes(-1, -2) @ whiten
-        from_mean = wrapped(self.task, middle - mean)
-        offsets = self._offsets(size).astype(np.float64)
+        x, y = (_offsets(half, size) for half in plane.half_widths)
         slope = (precision @ from_mean[..., None])[..., 0]
-        along_x, along_y = (precision[:, i, i, None] * offsets**2 + 2.0 * slope[:, i, None] * offsets for i in (ix, iy))
-        both = 2.0 * precision[:, ix, iy, None, None] * offsets[:, None] * offsets
+        along_x, along_y = (
+            precision[:, i, i, None] * d**2 + 2.0 * slope[:, i, None] * d for i, d in ((ix, x), (iy, y))
+        )
+        both = 2.0 * precision[:, ix, iy, None, None] * y[:, None] * x
         middle_squared = np.einsum("ln,ln->l", from_mean, slope)[:, None, None]
         squared = middle_squared + along_x[:, None, :] + along_y[:, :, None] + both
         log_det = np.log(np.einsum("lnn->ln", factor)).sum(-1)[:, None, None]
-        constant = 0.5 * mean.shape[-1] * math.log(2.0 * math.pi)
+        constant = 0.5 * from_mean.shape[-1] * math.log(2.0 * math.pi)
         return (-0.5 * squared - log_det - constant).astype(np.float32)
+
+
+def _offsets(half_width: float, size: int) -> Doubles:
+    """(S,) SI, cell centres of an axis."""
+    return ((np.arange(size) + 0.5) / size * 2.0 - 1.0) * half_width

@@ -17,8 +17,18 @@ COLOURS: dict[str, str] = {
 }
 """Okabe and Ito's palette, distinguishable with colour vision deficiency. Each colour has one meaning."""
 
-SPARE_COLOURS: tuple[str, ...] = ("#0072B2", "#F0E442", "#999999")
-"""Colours of other modalities, in the order of the trace's modalities."""
+SPARE_COLOURS: tuple[str, ...] = (
+    "#0072B2",
+    "#F0E442",
+    "#999999",
+    "#882255",
+    "#44AA99",
+    "#332288",
+    "#8C6D31",
+    "#A6D854",
+)
+"""Colours of other modalities, in the order of the trace's modalities; with dashes, since eight colours are too many
+for some colour vision deficiencies."""
 
 
 def colour(source: str, modalities: Sequence[str]) -> str:

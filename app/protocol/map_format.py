@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.app.protocol.trace_format import component_json
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.maps.shape import SHAPES
@@ -71,10 +72,17 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
     """
     effector = trace.episode.observations.get("effector_position")
     cells, log_max, log_range = quantise(maps.log_likelihood)
-    cloud = particle_cloud(trace, index, task)
+    cloud = particle_cloud(trace, index, maps.components)
+    axes = [
+        _axis_json(task, k, offsets)
+        for k, offsets in zip(maps.components, (maps.offsets_x, maps.offsets_y), strict=True)
+    ]
+    is_default, same_unit = maps.components == task.map_indices, axes[0]["unit"] == axes[1]["unit"]
     statistics = measure_maps([replace(maps, step=index)], trace)
     # Without a true state the maps are centered on the estimate, whose log-likelihood is not the one at the truth.
     unknown = {"truth": [None] * len(maps.layers)} if np.isnan(trace.episode.states[index]).any() else {}
+    if not same_unit:  # directions and circles have no meaning
+        unknown |= {name: [None] * len(maps.layers) for name in ("axis", "elongation", "deviation", "ring_radius")}
     description = {
         "step": maps.step,
         "size": len(maps.offsets_x),
@@ -82,21 +90,30 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
         "rule": maps.rule,
         "angle": None if math.isnan(maps.angle) else float(maps.angle),
         "layers": list(maps.layers),
-        "half_width": float(-maps.offsets_x[0] + 0.5 * (maps.offsets_x[1] - maps.offsets_x[0])),
+        "axes": axes,
+        "others": maps.others,
+        "note": maps.note,
         "centre": maps.centre.tolist(),
         "truth": _json(trace.episode.states[index]),
         "estimate": _json(trace.estimate_mean[index]),
         "log_max": _json(log_max),
         "log_range": _json(log_range),
         "peak": maps.peaks().tolist(),
-        "effector": None if effector is None else effector[index, :2].tolist(),
+        "effector": effector[index, :2].tolist() if effector is not None and is_default else None,
         "expected": _json(statistics.expected[0]),
-        "shape": [SHAPES[shape] for shape in statistics.shape[0]],
+        "shape": [SHAPES[shape] if same_unit else None for shape in statistics.shape[0]],
         "numbers": {name: _json(getattr(statistics, name)[0]) for name in NUMBERS} | unknown,
         "particles": 0 if cloud is None else len(cloud[0]),
     }
     floats = [] if cloud is None else [np.ascontiguousarray(part, dtype="<f4").tobytes() for part in cloud]
     return EncodedMaps(maps, json.dumps(description), b"".join([*floats, cells.astype("<u2").tobytes()]))
+
+
+def _axis_json(task: Task, index: int, offsets: NDArray[np.float32]) -> dict[str, Any]:
+    """A component that a map shows. half_width: SI. scale: factor to its unit for display."""
+    component = task.components[index]
+    half_width = float(-offsets[0] + 0.5 * (offsets[1] - offsets[0]))
+    return component_json(component) | {"index": index, "half_width": half_width}
 
 
 def quantise(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:

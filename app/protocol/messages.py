@@ -9,7 +9,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeI
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.inspect.maps.likelihood_map import Quantity
+from beliefscope.inspect.maps.likelihood_map import MapOptions, Quantity
+from beliefscope.inspect.maps.plane import Others
 
 MAX_ANGLE = 1e3  # rad: beyond the turns of any door
 READ_ONLY = "This server is read-only."
@@ -43,7 +44,8 @@ class Cursor(_Message):
         faults: injected faults. scene: whether the 3D scene is updated, or only the maps.
         against: differences of the comparison run (``Selection.against``), whose estimate the scene shows; empty
             without one. comparison_maps: whether its maps are sent, too. quantity: of the maps; the other one if the
-            filter does not have it.
+            filter does not have it. components: of the maps' axes; empty for those of the task's map. others: treatment
+            of the components off the maps (``MapEngine.map``).
     """
 
     serial: NonNegativeInt
@@ -59,6 +61,13 @@ class Cursor(_Message):
     against: str = ""
     comparison_maps: bool = False
     quantity: Quantity = "likelihood"
+    components: Annotated[tuple[str, ...], Field(strict=False, max_length=2)] = ()
+    others: Others | None = None
+
+    @property
+    def map_options(self) -> MapOptions:
+        """What the maps show."""
+        return MapOptions(self.angle, self.quantity, self.components, self.others)
 
 
 class SceneLayers(_Message):

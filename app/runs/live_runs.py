@@ -18,7 +18,7 @@ import numpy as np
 
 from beliefscope.app.protocol.trace_format import header
 from beliefscope.app.runs.selection import Selection
-from beliefscope.app.runs.traced_run import TracedRun, compute_map
+from beliefscope.app.runs.traced_run import DEFAULT_MAP, TracedRun, compute_map
 from beliefscope.app.workspace.json_files import is_text
 from beliefscope.app.workspace.paths import file_within
 from beliefscope.datasets.episode import Episode
@@ -27,7 +27,8 @@ from beliefscope.datasets.faults.injection import NO_FAULTS
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import UnavailableFilter
-from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
+from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, missing_quantities, no_maps
+from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.live_file import SUFFIX
 from beliefscope.inspect.traces.live_run import LiveRun
@@ -73,9 +74,9 @@ class GrowingRun(TracedRun):
     def no_maps(self) -> str | None:
         return no_maps(self.checkpoint, self._last)
 
-    def map(self, step: int, angle: float | None, size: int, quantity: Quantity = "likelihood") -> LikelihoodMap:
+    def map(self, step: int, size: int, options: MapOptions = DEFAULT_MAP) -> LikelihoodMap:
         """Compute the map from this step alone, without encoding the images of all earlier steps."""
-        return replace(compute_map(MapEngine(self.checkpoint, self.at(step)[0]), 0, angle, size, quantity), step=step)
+        return replace(compute_map(MapEngine(self.checkpoint, self.at(step)[0]), 0, size, options), step=step)
 
     def header(self) -> dict[str, Any]:
         """Description of the run for the page. Each block of steps describes its own columns."""

@@ -16,10 +16,12 @@ from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.data_check import data_warning
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
+from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.trace import Trace, arrays_of
 
 COARSE, FINE = MAP_SIZES
 MAP_CACHE_BYTES = 12 << 20  # per trace: about 300 coarse maps
+DEFAULT_MAP = MapOptions()
 
 
 class TracedRun:
@@ -46,7 +48,7 @@ class TracedRun:
         self.diagnostics: dict[str, bytes] = {}
         self._engine_lock = threading.Lock()
         self._cache_lock = threading.Lock()
-        self._cache: OrderedDict[tuple[int, float | None, int, Quantity], EncodedMaps] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, int, MapOptions], EncodedMaps] = OrderedDict()
         self._cache_bytes = 0
 
     def result(self, timeout: float | None = None) -> Trace:
@@ -95,23 +97,23 @@ class TracedRun:
         """Time series of the trace for the page: descriptions and one buffer."""
         return columns(self.trace)
 
-    def map(self, step: int, angle: float | None, size: int, quantity: Quantity = "likelihood") -> LikelihoodMap:
+    def map(self, step: int, size: int, options: MapOptions = DEFAULT_MAP) -> LikelihoodMap:
         """Compute one map. The map engine keeps caches, so it computes one map at a time."""
         with self._engine_lock:
-            return compute_map(self._engine, step, angle, size, quantity)
+            return compute_map(self._engine, step, size, options)
 
     def maps(self, steps: Iterable[int], quantity: Quantity = "likelihood") -> Iterator[LikelihoodMap]:
         """Compute fine maps of several steps. Other threads get their maps in between."""
-        return (self.map(step, None, FINE, quantity) for step in steps)
+        return (self.map(step, FINE, MapOptions(quantity=quantity)) for step in steps)
 
-    def encoded_maps(self, step: int, angle: float | None, size: int, quantity: Quantity = "likelihood") -> EncodedMaps:
+    def encoded_maps(self, step: int, size: int, options: MapOptions = DEFAULT_MAP) -> EncodedMaps:
         """One map in its binary encoding. The most recent ones are cached for all views of the run."""
-        key = step, angle, size, quantity
+        key = step, size, options
         with self._cache_lock:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
-        maps = encode_maps(self.checkpoint.task, *self.at(step), self.map(step, angle, size, quantity))
+        maps = encode_maps(self.checkpoint.task, *self.at(step), self.map(step, size, options))
         with self._cache_lock:
             if key not in self._cache:
                 self._cache[key] = maps
@@ -120,12 +122,12 @@ class TracedRun:
                 self._cache_bytes -= self._cache.popitem(last=False)[1].nbytes
         return maps
 
-    def missing_maps(self, step: int, angle: float | None, count: int, quantity: Quantity = "likelihood") -> list[int]:
+    def missing_maps(self, step: int, count: int, options: MapOptions) -> list[int]:
         """Of the ``count`` steps nearest to ``step``, those whose coarse map is not cached; the nearest first."""
         near = range(max(0, step - count), min(len(self), step + count + 1))
         nearest = sorted(near, key=lambda index: abs(index - step))[:count]
         with self._cache_lock:
-            return [index for index in nearest if (index, angle, COARSE, quantity) not in self._cache]
+            return [index for index in nearest if (index, COARSE, options) not in self._cache]
 
     @property
     def nbytes(self) -> int:
@@ -142,6 +144,10 @@ class TracedRun:
         return MapEngine(self.checkpoint, self.trace)
 
 
-def compute_map(engine: MapEngine, step: int, angle: float | None, size: int, quantity: Quantity) -> LikelihoodMap:
-    """Compute one map of a quantity, or of the other one if the filter does not have it."""
-    return engine.map(step, angle=angle, size=size, quantity=quantity if quantity in engine.quantities else None)
+def compute_map(engine: MapEngine, step: int, size: int, options: MapOptions) -> LikelihoodMap:
+    """Compute one map. A quantity or treatment of other components that the filter does not have is replaced."""
+    quantity = options.quantity if options.quantity in engine.quantities else engine.quantities[0]
+    others = options.others
+    if others is not None and engine.no_others(quantity, others) is not None:
+        others = None
+    return engine.map(step, options.angle, size, quantity, options.components, others)

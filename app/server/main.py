@@ -244,7 +244,7 @@ def _warm(store: TraceStore, viewer: WebViewer, stopping: threading.Event) -> No
     for prepare in (
         lambda: store.request(store.default_selection()),  # starts the run in another thread
         store.catalog,
-        lambda: store.request(store.default_selection()).encoded_maps(0, None, MAP_SIZES[0]),
+        lambda: store.request(store.default_selection()).encoded_maps(0, MAP_SIZES[0]),
         lambda: viewer.prepare(stopping.is_set),
         freeze_heap,
     ):

@@ -147,7 +147,8 @@ class View:
                 await websocket.send_bytes(other.message(cursor.serial, other=True))
             encoded = await self._maps(cursor, run)
             await websocket.send_bytes(encoded.message(cursor.serial))
-            maps = encoded.maps
+            # The floor of the scene shows positions only.
+            maps = encoded.maps if encoded.maps.components == run.checkpoint.task.map_indices else None
             if not run.growing:
                 self._prefetch_center = cursor, run
                 self._maps_sent.set()
@@ -186,14 +187,14 @@ class View:
                 continue
             cursor, run = self._prefetch_center
             with contextlib.suppress(Exception):  # reported when the page requests the step
-                for step in run.missing_maps(cursor.step, cursor.angle, PREFETCH_STEPS, cursor.quantity):
-                    compute = partial(run.encoded_maps, step, cursor.angle, COARSE, cursor.quantity)
+                for step in run.missing_maps(cursor.step, PREFETCH_STEPS, cursor.map_options):
+                    compute = partial(run.encoded_maps, step, COARSE, cursor.map_options)
                     await self._executor.run(compute, PREFETCH_DEADLINE, frozenset({run, COARSE}))
                     if self._maps_sent.is_set():
                         break
 
     async def _maps(self, cursor: Cursor, run: TracedRun) -> EncodedMaps:
-        compute = partial(run.encoded_maps, cursor.step, cursor.angle, cursor.size, cursor.quantity)
+        compute = partial(run.encoded_maps, cursor.step, cursor.size, cursor.map_options)
         if cursor.size == FINE:  # one at a time, so that threads remain available for coarse maps
             return await self._executor.run(compute, FINE_DEADLINE, frozenset({run, FINE}))
         return await self._executor.run(compute, COARSE_DEADLINE, frozenset({run}))

@@ -88,7 +88,7 @@ class DrawnBelief:
         weights = trace.log_weights[step]
         strength = np.sqrt(np.exp(weights - weights.max()))[:, None]
         color = np.array(rgb("fused", trace), np.float32)
-        shares = modality_shares(trace, step, self._task) if tint == "share" else None
+        shares = modality_shares(trace, step) if tint == "share" else None
         if shares is not None:
             color = shares.T @ np.array([rgb(name, trace) for name in trace.modalities], np.float32)
             strength = MIN_STRENGTH + (1.0 - MIN_STRENGTH) * strength

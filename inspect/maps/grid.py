@@ -28,60 +28,61 @@ class GridEvaluator:
     fixed cross-section.
     """
 
-    def __init__(self, models: Sequence[MeasurementModel], along: tuple[int, int], scale: Tensor) -> None:
-        """along: state components of the x and y axis. scale: (n,) standard deviations of the state components, SI."""
+    def __init__(self, models: Sequence[MeasurementModel], scale: Tensor) -> None:
+        """scale: (n,) standard deviations of the state components, SI."""
         self._models = models
-        self._along = along
         self._scale = scale
         self._units = models[0].join_state.out_features
         self._buffers = torch.empty(2, CELLS_AT_ONCE, self._units)
-        self._middles: dict[int, tuple[float, ...]] = {}  # size -> centre of the last grid
+        self._grids: dict[int, tuple[float, ...]] = {}  # size -> centre and axes of the last grid
         self._parts: dict[int, Tensor] = {}  # size -> (K, S^2, units), state branch of repeated grids
 
     @torch.inference_mode()
-    def log_likelihood(self, offsets: Tensor, state: Tensor, middle: tuple[float, ...], observation: Tensor) -> Tensor:
+    def log_likelihood(
+        self, along: tuple[int, int], x: Tensor, y: Tensor, state: Tensor, key: tuple[float, ...], observation: Tensor
+    ) -> Tensor:
         """(K, S^2) log-likelihoods in row order, not normalised.
 
         Args:
-            offsets: (S,) SI, offsets of cells from the centre, equal in both directions.
+            along: state components of the axes. x, y: (S,) SI, offsets of columns and rows from the centre.
             state: (n,) centre, standardised.
-            middle: centre in SI units; identifies the grid in the cache.
+            key: identifies centre and axes of the grid in the cache.
             observation: (K, units) observation features of each model.
         """
-        size = len(offsets)
-        cached, part = self._cached_part(size, middle)
+        size = len(x)
+        cached, part = self._cached_part(size, key)
         values = torch.empty(len(self._models), size * size)
         for k, (model, features) in enumerate(zip(self._models, observation, strict=True)):
-            columns, rows = self._first(model, offsets, state)
+            columns, rows = self._first(model, along, x, y, state)
             *inner, last = model.head
             assert isinstance(last, nn.Linear)
             encoder, join, head = layers([*model.state_encoder][1:]), model.join_state.weight.T, layers(inner)
             for begin, end in chunks(size):
-                x, y = self._buffers.narrow(1, 0, (end - begin) * size)
+                activation, scratch = self._buffers.narrow(1, 0, (end - begin) * size)
                 rows_slice = slice(begin * size, end * size)
                 if not cached:
-                    torch.add(columns, rows[begin:end, None], out=x.view(-1, size, self._units))
-                    apply_layers(encoder, x, y)
+                    torch.add(columns, rows[begin:end, None], out=activation.view(-1, size, self._units))
+                    apply_layers(encoder, activation, scratch)
                 if part is None:
-                    torch.addmm(features, x, join, out=y)
+                    torch.addmm(features, activation, join, out=scratch)
                 else:
                     if not cached:
-                        torch.mm(x, join, out=part[k, rows_slice])
-                    torch.add(part[k, rows_slice], features, out=y)
-                apply_layers(head, y, x)
-                torch.addmv(last.bias, y, last.weight[0], out=values[k, rows_slice])
+                        torch.mm(activation, join, out=part[k, rows_slice])
+                    torch.add(part[k, rows_slice], features, out=scratch)
+                apply_layers(head, scratch, activation)
+                torch.addmv(last.bias, scratch, last.weight[0], out=values[k, rows_slice])
         return values
 
-    def _cached_part(self, size: int, middle: tuple[float, ...]) -> tuple[bool, Tensor | None]:
+    def _cached_part(self, size: int, key: tuple[float, ...]) -> tuple[bool, Tensor | None]:
         """Whether the grid's state branch is cached, and its cache entry; None until a grid is requested again."""
-        before = self._middles.pop(size, None)
+        before = self._grids.pop(size, None)
         if size * size > CACHED_CELLS:
             return False, None
-        self._middles[size] = middle
-        if len(self._middles) > CACHED_GRIDS:
-            oldest = next(iter(self._middles))
-            self._middles.pop(oldest), self._parts.pop(oldest, None)
-        if before != middle:
+        self._grids[size] = key
+        if len(self._grids) > CACHED_GRIDS:
+            oldest = next(iter(self._grids))
+            self._grids.pop(oldest), self._parts.pop(oldest, None)
+        if before != key:
             self._parts.pop(size, None)
             return False, None
         cached = size in self._parts
@@ -89,12 +90,14 @@ class GridEvaluator:
             self._parts[size] = torch.empty(len(self._models), size * size, self._units)
         return cached, self._parts[size]
 
-    def _first(self, model: MeasurementModel, offsets: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def _first(
+        self, model: MeasurementModel, along: tuple[int, int], x: Tensor, y: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """(S, units) each: terms of the first layer by column and by row."""
         layer = model.state_encoder[0]
         assert isinstance(layer, nn.Linear)
-        by_x, by_y = ((layer.weight / self._scale)[:, i] for i in self._along)
-        return offsets[:, None] * by_x, offsets[:, None] * by_y + layer(state)
+        by_x, by_y = ((layer.weight / self._scale)[:, i] for i in along)
+        return x[:, None] * by_x, y[:, None] * by_y + layer(state)
 
 
 def chunks(size: int) -> Iterator[tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""Maps of one step: a grid of positions around the true one."""
+"""Maps of one step: a grid of two state components around the true state."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.inspect.maps.plane import Others
+
 Array = NDArray[np.float32]
 
 Quantity = Literal["likelihood", "posterior"]
@@ -16,8 +18,18 @@ QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 
 
 @dataclass(frozen=True)
+class MapOptions:
+    """What a map shows, as for ``MapEngine.map``: quantity, axes and treatment of the other components."""
+
+    angle: float | None = None
+    quantity: Quantity = "likelihood"
+    components: tuple[str, ...] = ()
+    others: Others | None = None
+
+
+@dataclass(frozen=True)
 class LikelihoodMap:
-    """One map per modality and one fused map, over offsets from the true position.
+    """One map per modality and one fused map, over offsets of two state components from the true state.
 
     Likelihood: of the observation given the state. EKF, UKF: ``N(z_k; x, R_k)`` of each virtual sensor; PF: each
     measurement model, up to a factor. Posterior: density of the state. EKF, UKF: posterior of the update with one
@@ -25,14 +37,17 @@ class LikelihoodMap:
 
     Attributes:
         step: step of the trace.
-        angle: fixed value of the state component that is not on the map (rad), NaN if there is none.
+        angle: fixed value of the only state component that is not on the map (SI); NaN if there is none or there are
+            several, or if it is integrated out.
         layers: L names: the trace's modalities, then ``fused``.
-        offsets_x, offsets_y: (S,) m, cell centres relative to ``centre``, increasing.
-        centre: (2,) m, the true position, or the fused estimate where it is unknown.
+        offsets_x, offsets_y: (S,) SI, cell centres relative to ``centre``, increasing.
+        centre: (2,) SI, the true values, or those of the fused estimate where they are unknown.
         log_likelihood: (L, S, S) natural log of the quantity, likelihoods not normalised; [l, iy, ix] is at
             offsets_y[iy], offsets_x[ix].
         quantity: of all layers.
         rule: how the fused layer results from the modalities.
+        components: indices of the state components of the x and the y axis. others: treatment of the others; note: the
+            same in words.
     """
 
     step: int
@@ -44,11 +59,14 @@ class LikelihoodMap:
     log_likelihood: Array
     quantity: Quantity = "likelihood"
     rule: str = ""
+    components: tuple[int, int] = (0, 1)
+    others: Others = "fixed"
+    note: str = ""
 
     @property
     def title(self) -> str:
         """Quantity and fusion rule: ``Posterior. Fused: product of posteriors (unimodal)``."""
-        return f"{self.quantity.capitalize()}. Fused: {self.rule}"
+        return f"{self.quantity.capitalize()}{self.note and f', {self.note}'}. Fused: {self.rule}"
 
     def normalised(self) -> NDArray[np.uint8]:
         """(L, S, S) uint8: value relative to the maximum of its layer, times 255."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.statistics.measures import FLOOR, wrapped
+from beliefscope.inspect.statistics.measures import FLOOR, wrap_angles
 
 Array = NDArray[np.float64]
 
@@ -27,11 +29,18 @@ class ParticleDensity:
     tends to zero and the density to that of the particles' distribution.
     """
 
-    def __init__(self, task: Task, states: NDArray[np.float32], log_weights: NDArray[np.float32]) -> None:
-        """states: (M, n) SI. log_weights: (M,), normalised."""
+    def __init__(
+        self,
+        task: Task,
+        states: NDArray[np.float32],
+        log_weights: NDArray[np.float32],
+        components: Sequence[int] | None = None,
+    ) -> None:
+        """states: (M, n) SI. log_weights: (M,), normalised. components: of the density, the others integrated out."""
         weights = np.exp(log_weights.astype(np.float64))
         weights /= weights.sum()
-        particles, n = states.astype(np.float64), states.shape[1]
+        self._components = list(range(states.shape[1]) if components is None else components)
+        particles, n = states[:, self._components].astype(np.float64), len(self._components)
         mean = weights @ particles
         deviation = particles - mean
         covariance = (deviation * weights[:, None]).T @ deviation + FLOOR * np.eye(n)
@@ -41,25 +50,28 @@ class ParticleDensity:
             quantiles = (np.arange(MAX_KERNELS) + 0.5) / MAX_KERNELS
             deviation = deviation[np.searchsorted(weights.cumsum(), quantiles).clip(max=len(weights) - 1)]
             weights = np.full(MAX_KERNELS, 1.0 / MAX_KERNELS)
-        self._task = task
+        self._angles = [i for i, k in enumerate(self._components) if task.components[k].unit == "rad"]
         self._centres = mean + np.sqrt(1.0 - h**2) * deviation
         self._whiten = np.linalg.inv(np.linalg.cholesky(h**2 * covariance))
         constant = np.log(np.diagonal(self._whiten)).sum() - 0.5 * n * np.log(2.0 * np.pi)
         with np.errstate(divide="ignore"):
             self._log_weights = np.log(weights) + constant
 
-    def log_density(self, middle: Array, offsets: Array) -> Array:
-        """(S, S) log density at the cells [iy, ix] of a grid with the offsets (S,) around a state (n,), SI.
+    def log_density(self, middle: Array, along: tuple[int, int], x: Array, y: Array) -> Array:
+        """(S, S) log density at the cells [iy, ix] of a grid.
 
         The exponent of a kernel is a term by column, a term by row, and their product, which all kernels share.
+
+        Args:
+            middle: (n,) SI, centre of the grid. along: state components of its axes. x, y: (S,) SI, offsets of its
+                columns and rows.
         """
-        ix, iy = self._task.map_indices
-        along_x, along_y = self._whiten[:, ix], self._whiten[:, iy]
-        from_centre = wrapped(self._task, middle - self._centres) @ self._whiten.T
-        columns = self._log_weights - 0.5 * np.square(from_centre + along_x * offsets[:, None, None]).sum(-1)
-        rows = -offsets[:, None] * (from_centre @ along_y) - 0.5 * (along_y @ along_y) * offsets[:, None] ** 2
+        along_x, along_y = (self._whiten[:, self._components.index(k)] for k in along)
+        from_centre = wrap_angles(middle[self._components] - self._centres, self._angles) @ self._whiten.T
+        columns = self._log_weights - 0.5 * np.square(from_centre + along_x * x[:, None, None]).sum(-1)
+        rows = -y[:, None] * (from_centre @ along_y) - 0.5 * (along_y @ along_y) * y[:, None] ** 2
         at_column, at_row = (torch.from_numpy(terms.astype(np.float32)) for terms in (columns, rows))
         size = max(1, PAIRS_AT_ONCE // columns.size)
         sums = [torch.logsumexp(at_column + part[:, None], dim=-1) for part in at_row.split(size)]
-        both = (along_x @ along_y) * offsets[:, None] * offsets
+        both = (along_x @ along_y) * y[:, None] * x
         return np.asarray(torch.cat(sums).numpy() - both, dtype=np.float64)

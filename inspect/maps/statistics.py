@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Task
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
 from beliefscope.inspect.maps.shape import classify, fit_rings
 from beliefscope.inspect.traces.data import Trace
@@ -18,7 +17,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MapStatistics:
-    """Statistics of the maps of B steps with L layers. p is the likelihood normalised to a density over the map square.
+    """Statistics of the maps of B steps with L layers. p is the likelihood normalised to a density over the map.
+
+    Units are those of a map over positions. Axis, elongation, shape and ring are of interest only if both components of
+    the map have the same unit.
 
     Attributes:
         steps: (B,) steps of the trace.
@@ -77,7 +79,7 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
     at_truth = log[:, :, middle][..., middle].mean(axis=(2, 3))
     best = flat.argmax(axis=-1)
     axis, elongation = _principal(share, x, y)
-    expected = _expected(maps, trace)
+    expected = _expected(maps, trace) if maps[0].components == trace.task.map_indices else np.full(len(maps), np.nan)
     deviation = np.abs((axis - expected[:, None] + np.pi / 2.0) % np.pi - np.pi / 2.0)
     plogp = np.einsum("blc,blc->bl", flat, flat_log)
     ordered = -np.sort(-flat, axis=-1)
@@ -137,15 +139,30 @@ def _expected(maps: Sequence[LikelihoodMap], trace: Trace) -> Array:
     return np.asarray(direction(trace.episode.states[[m.step for m in maps]]), dtype=np.float64)
 
 
-def particle_cloud(trace: Trace, step: int, task: Task) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Positions (M, 2) of the predicted particles on the map, m, and their weights (L, M) by layer, which sum to 1.
+def has_layer_weights(trace: Trace) -> bool:
+    """Whether the particle weights of the posterior of each layer are known (``layer_weights``)."""
+    by_modality = trace.log_likelihood is not None and trace.prior_log_weights is not None
+    return trace.log_weights is not None and (by_modality or not trace.modalities)
+
+
+def layer_weights(trace: Trace, step: int) -> NDArray[np.float32]:
+    """(L, M) particle weights of the posterior of each layer, which sum to 1; of the fused one only for K = 0."""
+    assert trace.log_weights is not None
+    log = trace.log_weights[step][None]
+    if trace.modalities:
+        assert trace.log_likelihood is not None
+        assert trace.prior_log_weights is not None
+        log = np.concatenate([trace.prior_log_weights[step] + trace.log_likelihood[step], log])
+    return np.asarray(np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True)), dtype=np.float32)
+
+
+def particle_cloud(
+    trace: Trace, step: int, components: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Components (M, 2) of the predicted particles, SI, and their weights (L, M) by layer (``layer_weights``).
 
     None for a filter without particles or without weights by layer.
     """
-    if trace.particles is None or trace.log_likelihood is None or trace.prior_log_weights is None:
+    if trace.particles is None or not has_layer_weights(trace):
         return None
-    assert trace.log_weights is not None
-    unimodal = trace.prior_log_weights[step] + trace.log_likelihood[step]
-    log = np.concatenate([unimodal, trace.log_weights[step][None]])
-    weights = np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True))
-    return trace.particles[step][:, list(task.map_indices)], weights
+    return trace.particles[step][:, list(components)], layer_weights(trace, step)

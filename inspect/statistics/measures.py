@@ -39,10 +39,14 @@ def layer_label(layer: str) -> str:
 
 def wrapped(task: Task, difference: NDArray[Any]) -> Array:
     """Differences of states (..., n), angles wrapped to -pi..pi."""
+    return wrap_angles(difference, [i for i, component in enumerate(task.components) if component.unit == "rad"])
+
+
+def wrap_angles(difference: NDArray[Any], angles: Sequence[int]) -> Array:
+    """Differences (..., n) with the components of these indices wrapped to -pi..pi."""
     difference = np.array(difference, dtype=np.float64)
-    for i, component in enumerate(task.components):
-        if component.unit == "rad":
-            difference[..., i] = (difference[..., i] + np.pi) % (2.0 * np.pi) - np.pi
+    where = list(angles)
+    difference[..., where] = (difference[..., where] + np.pi) % (2.0 * np.pi) - np.pi
     return difference
 
 

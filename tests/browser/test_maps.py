@@ -55,7 +55,9 @@ def test_values_and_exports_match_the_engine(
         download.value.save_as(files[kind])
     assert files["csv"].name == "door-crossmodal-pf-episode9-step25-maps.csv"
     rows = list(csv.reader(line for line in files["csv"].read_text().splitlines() if not line.startswith("#")))
-    assert rows[0] == ["dx_cm", "dy_cm", "x_cm", "y_cm"] + [f"{m}_ln_likelihood_nats" for m in expected.layers]
+    assert rows[0] == ["hinge_x_offset_cm", "hinge_y_offset_cm", "hinge_x_cm", "hinge_y_cm"] + [
+        f"{m}_ln_likelihood_nats" for m in expected.layers
+    ]
     cells = np.array(rows[1:], dtype=float)
     # Likelihoods have four decimals and 65535 levels over less than 64 nats; positions have three decimals in cm.
     np.testing.assert_allclose(
@@ -69,7 +71,7 @@ def test_values_and_exports_match_the_engine(
     drawing = ElementTree.parse(files["svg"]).getroot()
     assert len(drawing.findall(".//{*}clipPath")) == 3
     texts = [text.text for text in drawing.iter("{http://www.w3.org/2000/svg}text")]
-    assert {*(f"{layer} likelihood" for layer in expected.layers), "Δx (cm)"} <= {*texts}
+    assert {*(f"{layer} likelihood" for layer in expected.layers), "Δ hinge x (cm)"} <= {*texts}
     assert files["png"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 

@@ -142,7 +142,8 @@ def test_posterior_of_a_particle_filter_is_prior_times_likelihood(pf: MapEngine)
     assert trace_.prior_log_weights is not None
     assert trace_.log_likelihood is not None
     density = ParticleDensity(pf.task, trace_.particles[step], trace_.prior_log_weights[step])
-    prior = density.log_density(trace_.episode.states[step].astype(np.float64), likelihood.offsets_x.astype(np.float64))
+    offsets = likelihood.offsets_x.astype(np.float64)
+    prior = density.log_density(trace_.episode.states[step].astype(np.float64), (0, 1), offsets, offsets)
     evidence = [np.logaddexp.reduce(trace_.prior_log_weights[step] + ll) for ll in trace_.log_likelihood[step]]
     # The mixture of normalised likelihoods with weights that sum to one has evidence 1.
     for layer, log in zip(range(3), [*evidence, 0.0], strict=True):

@@ -31,7 +31,12 @@ const HEADER = {
   expected: 1.5,
   shape: ['round', 'ridge', 'ring'],
   layers: ['image', 'haptics', 'fused'],
-  half_width: 0.3,
+  axes: [
+    { name: 'hinge_x', index: 0, unit: 'm', shown: 'cm', scale: 100, half_width: 0.3 },
+    { name: 'hinge_y', index: 1, unit: 'm', shown: 'cm', scale: 100, half_width: 0.3 },
+  ],
+  others: 'fixed',
+  note: '',
   centre: [1, 2],
   truth: [1, 2, 0],
   estimate: [1, 2, 0],

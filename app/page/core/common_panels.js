@@ -76,8 +76,6 @@ export function showProperties(trace) {
   for (const body of bodies.slice(1)) setPanelState(body, 'ready');
   const { no_maps: noMaps, data_warning: warning } = trace.header;
   showDataWarning(warning);
-  const position = displayName(trace.task.map.x).replace(/(^| )x$/, '');
-  html('#maps-quantity').textContent = position || 'position';
   const { classList } = html('#maps');
   classList.toggle('single', !trace.fuses);
   classList.toggle('no-effector', !trace.has('effector_position'));

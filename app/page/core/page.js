@@ -9,6 +9,7 @@
 import * as api from '../data/api.js';
 import { ViewSocket } from '../data/view_socket.js';
 import { AngleSlider } from '../maps/angle_slider.js';
+import { mapChoices } from '../maps/map_choices.js';
 import { mapMenu } from '../maps/map_menu.js';
 import { MapPanel } from '../maps/map_panel.js';
 import { Camera } from '../scene/camera.js';
@@ -251,7 +252,8 @@ export class Page {
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
     if (any('component', 'weights', 'track')) this.#showComponent(this.#trace);
-    if (any('step', 'angle', 'beside', 'map')) this.#move(this.#trace);
+    if (any('plane', 'others')) this.angleSlider.show(this.#trace);
+    if (any('step', 'angle', 'beside', 'map', 'plane', 'others')) this.#move(this.#trace);
   }
 
   /** Loads the trace that the state selects. */
@@ -367,7 +369,7 @@ export class Page {
   /** @param {Trace} trace */
   #move(trace) {
     const { state, origin, inputTime } = this.#store;
-    const { step, angle, against, map: quantity } = state;
+    const { step, angle, against } = state;
     this.timeline.move(step);
     this.camera.move(step);
     this.stepTable.move(step);
@@ -376,7 +378,7 @@ export class Page {
     this.failures.move(step);
     this.compare.move(step);
     this.rerun.move(step, origin === 'rerun');
-    const cursor = { ...trace.selection, step, angle, against, quantity };
+    const cursor = { ...trace.selection, step, angle, against, ...mapChoices(state, trace) };
     this.socket.move({ ...cursor, comparison_maps: state.beside === 'gain' }, inputTime);
     showSummary(trace, step, state.component);
     showCount(trace, step);

@@ -15,7 +15,7 @@ import { displayName } from './units.js';
  * @property {string} faults fault injection as text (docs/data.md), empty for none
  * @property {string} against differences of the comparison run (docs/api.md), empty for none
  * @property {number} step
- * @property {number | null} angle rad, of the cross-section that the maps show; null for the true angle
+ * @property {number | null} angle SI, value of the only component off the maps; null for the true value
  * @property {string} tab one of `TABS`
  * @property {string} component state component of the charts
  * @property {string} weights `raw` for the fusion weights beta, or `effective`
@@ -29,6 +29,8 @@ import { displayName } from './units.js';
  * @property {string} by score that ranks failures
  * @property {string} phase of the failures in the list, empty for all
  * @property {'likelihood' | 'posterior'} map quantity of the maps
+ * @property {string} plane components of the maps' axes, such as x,y; empty for those of the task's map
+ * @property {string} others components off the maps: `auto`, `fixed` at the true values, or `marginal`, integrated out
  * @property {string} scale of the maps: `normalised` or `log`
  * @property {string} range of the maps' colours: `own` of each map, or the `same` for all
  * @property {string} axes of the maps: `offset` from the true position, or `world`
@@ -75,6 +77,7 @@ const CHOICES = {
   list: ['events', 'episodes'],
   among: ['held-out', 'all'],
   map: MAP_QUANTITIES,
+  others: ['auto', 'fixed', 'marginal'],
   axes: ['offset', 'world'],
   regions: ['shown', 'hidden'],
   zoom: ['fit', '1', '4'],
@@ -93,6 +96,7 @@ const TEXTS = {
   study: '',
   quantity: '',
   pin: '',
+  plane: '',
   by: 'error',
   phase: '',
   hide: '',

@@ -3,7 +3,17 @@
 /** @import { State, Store } from './state.js' */
 
 /** @type {(keyof State)[]} */
-const SELECTION = ['task', 'filter', 'data', 'episode', 'faults', 'against', 'map'];
+const SELECTION = [
+  'task',
+  'filter',
+  'data',
+  'episode',
+  'faults',
+  'against',
+  'map',
+  'plane',
+  'others',
+];
 /** Restored together with the selection. @type {(keyof State)[]} */
 const CURSOR = ['step', 'angle', 'component'];
 const MAX_ENTRIES = 100;

@@ -9,6 +9,14 @@ export const DISPLAY_UNITS = {
 };
 
 /**
+ * Returns the display unit of a state component, with the degree sign for angles.
+ * @param {{unit: string, shown: string, scale: number}} component
+ * @returns {DisplayUnit}
+ */
+export const displayUnit = ({ unit, shown, scale }) =>
+  unit === 'rad' ? DISPLAY_UNITS.rad : { unit: shown, scale };
+
+/**
  * Replaces the underscores of a name such as hinge_x by spaces.
  * @param {string} name
  */

@@ -4,7 +4,7 @@
 /** @import { Column, Series } from './arrays.js' */
 /** @import { Block, LiveStream } from './live_stream.js' */
 
-import { DISPLAY_UNITS, wrapDegrees } from '../core/units.js';
+import { displayUnit, wrapDegrees } from '../core/units.js';
 import { append, norm, slice, stride } from './arrays.js';
 
 const FUSED = 'fused';
@@ -181,8 +181,7 @@ export class Trace {
    * @param {number} component
    */
   unitOf(component) {
-    const { unit, shown, scale } = this.components[component];
-    return unit === 'rad' ? DISPLAY_UNITS.rad : { unit: shown, scale };
+    return displayUnit(this.components[component]);
   }
 
   /**

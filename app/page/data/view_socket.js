@@ -1,5 +1,6 @@
 /** The socket of a view: sends the cursor and receives maps (docs/api.md). At most one cursor is in flight. */
 
+/** @import { MapChoices } from '../maps/map_choices.js' */
 /** @import { Maps } from '../maps/map_values.js' */
 /** @import { Selection } from './api.js' */
 
@@ -9,7 +10,7 @@ import { readMaps } from '../maps/map_values.js';
 import { openView } from './api.js';
 
 /**
- * @typedef {Selection & {step: number, angle: number | null, quantity: string, comparison_maps?: boolean}} Cursor
+ * @typedef {Selection & MapChoices & {step: number, angle: number | null, comparison_maps?: boolean}} Cursor
  * @typedef {Cursor & {size: number, scene: boolean}} Message
  * @typedef {{size?: number, inputTime?: number | null}} Cause of an answer: the cursor's map size and input
  * @typedef {object} Handlers

@@ -1,12 +1,13 @@
-/** The slider for the angle of the cross-section that the maps show. */
+/** The slider for the cross-section that the maps show: the value of the only component that is not on the maps. */
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
 
 import { element, html } from '../core/dom.js';
 import { displayName, fixed, signed, wrapDegrees } from '../core/units.js';
+import { mapPlane } from './map_choices.js';
 
-const MARGIN = 60; // degrees beyond the angles of the episode
+const MARGIN = { angle: 60, part: 0.5 }; // beyond the values of the episode: degrees, or a part of their range
 
 export class AngleSlider {
   #label;
@@ -15,11 +16,11 @@ export class AngleSlider {
   #store;
   /** @type {Trace | null} */
   #trace = null;
-  #component = -1; // index of the angle in the state
+  #component = -1; // index in the state
 
   /**
    * @param {HTMLElement} label with the slider inside
-   * @param {HTMLButtonElement} reset button that returns to the true angle
+   * @param {HTMLButtonElement} reset button that returns to the true value
    * @param {Store} store
    */
   constructor(label, reset, store) {
@@ -42,7 +43,11 @@ export class AngleSlider {
   /** @param {Trace} trace */
   show(trace) {
     this.#trace = trace;
-    this.#component = trace.components.findIndex((_, i) => !trace.position.includes(i));
+    const { state } = this.#store;
+    const plane = mapPlane(state, trace);
+    const others = trace.components.filter(({ name }) => !plane.includes(name));
+    const fixes = others.length === 1 && state.others !== 'marginal';
+    this.#component = fixes ? trace.components.indexOf(others[0]) : -1;
     this.#label.hidden = this.#reset.hidden = this.#component < 0;
     if (this.#component < 0) return;
     const angles = defaultAngles(trace, this.#component).filter(Number.isFinite);
@@ -50,8 +55,10 @@ export class AngleSlider {
       ([min, max], v) => [Math.min(min, v), Math.max(max, v)],
       [Infinity, -Infinity],
     );
-    this.#input.min = String(Math.floor(low - MARGIN));
-    this.#input.max = String(Math.ceil(high + MARGIN));
+    const isAngle = trace.angles.includes(this.#component);
+    const margin = isAngle ? MARGIN.angle : MARGIN.part * Math.max(high - low, 1);
+    this.#input.min = String(Math.floor(low - margin));
+    this.#input.max = String(Math.ceil(high + margin));
     this.#input.disabled = false;
     html('#angle-name', this.#label).textContent = displayName(
       trace.components[this.#component].name,
@@ -68,9 +75,11 @@ export class AngleSlider {
     const { unit, scale } = trace.unitOf(this.#component);
     const value = angle === null ? reference : angle * scale;
     if (document.activeElement !== this.#input || angle === null) this.#input.value = String(value);
+    const difference = value - reference;
     const text = `${fixed(value)}${unit}`;
     const name = isTrue ? 'true' : 'estimated';
-    const offset = `${signed(wrapDegrees(value - reference))}${unit}`;
+    const isAngle = trace.angles.includes(this.#component);
+    const offset = `${signed(isAngle ? wrapDegrees(difference) : difference)}${unit}`;
     html('output', this.#label).textContent =
       angle === null ? `${text} ${isTrue ? 'true' : 'est.'}` : text;
     this.#label.title =

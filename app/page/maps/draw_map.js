@@ -7,7 +7,8 @@
 
 import { COLOUR_TABLES, lineStyle, scaled } from '../core/palette.js';
 import { context2d } from '../core/dom.js';
-import { fixed } from '../core/units.js';
+import { displayName, displayUnit, fixed } from '../core/units.js';
+import { offsetOf } from './map_values.js';
 
 /**
  * @typedef {CanvasRenderingContext2D | SvgContext} Context
@@ -27,21 +28,25 @@ import { fixed } from '../core/units.js';
  * @property {boolean} cloud whether particles are drawn
  * @property {string} textColour
  * @property {boolean} withY whether the y axis has labels
- * @property {number[] | null} hover m, offset of the crosshair
+ * @property {number[] | null} hover offset of the crosshair
  *
- * @typedef {(position: number[]) => number[]} Projection from m to px
+ * @typedef {(position: number[]) => number[]} Projection from values of the axes to px
  */
 
 /** px around the square of a map. */
 export const MARGIN = {
-  left: scaled(38),
+  left: scaled(44),
   bottom: scaled(30),
   top: 1,
   right: scaled(5),
   gap: scaled(9),
 };
-const TICK_SPACINGS = [1, 2, 5, 10, 20, 50, 100]; // cm
 const MIN_TICK_DISTANCE = scaled(26); // px
+const LABEL_MARGIN = scaled(8); // px; labels nearer to the ends of their axis lie inside of them
+/** @type {CanvasTextAlign[]} */
+const ALIGN = ['left', 'center', 'right'];
+/** @type {CanvasTextBaseline[]} */
+const BASELINE = ['bottom', 'middle', 'top'];
 const FONT = `${scaled(10)}px system-ui, sans-serif`;
 const PARTICLE_RADIUS = scaled(22) / 10; // px, for the mean weight
 const BORDER_OPACITIES = [0.95, 0.5]; // the smallest region first
@@ -110,56 +115,73 @@ export function drawMap(context, layer, side, options) {
  * @param {MapOptions} options
  */
 function drawAxes(context, maps, side, { axes, zoom, textColour, withY }) {
-  const half = (100 * maps.half_width) / zoom;
-  const spacing =
-    TICK_SPACINGS.find((cm) => (cm / (2 * half)) * side > MIN_TICK_DISTANCE) ?? 2 * half;
   const world = axes === 'world';
-  const middle = world ? maps.centre.map((m) => 100 * m) : [0, 0];
+  const [x, y] = maps.axes.map((axis, i) => {
+    const { unit, scale } = displayUnit(axis);
+    const half = (scale * axis.half_width) / zoom;
+    const name = displayName(axis.name);
+    const label = world ? name : `Δ${name.length > 1 ? ' ' : ''}${name}`;
+    return {
+      label: unit ? `${label} (${unit})` : label,
+      ticks: ticks(world ? scale * maps.centre[i] : 0, half, side),
+    };
+  });
   context.font = FONT;
   context.fillStyle = context.strokeStyle = textColour;
   context.lineWidth = 1;
   context.textBaseline = 'top';
   context.textAlign = 'center';
   context.beginPath();
-  for (const [cm, x] of ticks(middle[0], half, spacing, side)) {
-    context.moveTo(x, side);
-    context.lineTo(x, side + 3);
-    context.fillText(fixed(cm, 0), x, side + scaled(5));
+  for (const [text, place, end] of x.ticks) {
+    context.textAlign = ALIGN[end];
+    context.moveTo(place, side);
+    context.lineTo(place, side + 3);
+    context.fillText(text, place, side + scaled(5));
   }
   if (withY) {
     context.textAlign = 'right';
-    context.textBaseline = 'middle';
-    for (const [cm, y] of ticks(middle[1], half, spacing, side)) {
-      context.moveTo(0, side - y);
-      context.lineTo(-3, side - y);
-      context.fillText(fixed(cm, 0), -5, side - y);
+    for (const [text, place, end] of y.ticks) {
+      context.textBaseline = BASELINE[end];
+      context.moveTo(0, side - place);
+      context.lineTo(-3, side - place);
+      context.fillText(text, -5, side - place);
     }
   }
   context.stroke();
   context.textAlign = 'center';
   context.textBaseline = 'top';
-  context.fillText(world ? 'x (cm)' : 'Δx (cm)', side / 2, side + scaled(18));
+  context.fillText(x.label, side / 2, side + scaled(18));
   if (!withY) return;
   context.save();
   context.translate(-MARGIN.left + 1, side / 2);
   context.rotate(-Math.PI / 2);
-  context.fillText(world ? 'y (cm)' : 'Δy (cm)', 0, 0);
+  context.fillText(y.label, 0, 0);
   context.restore();
 }
 
 /**
- * Returns the values of the ticks of an axis in cm and their positions in px.
- * @param {number} middle cm
- * @param {number} half cm
- * @param {number} spacing cm
+ * Returns the ticks of an axis at multiples of 1, 2 or 5 times a power of ten: labels, places in px, and whether a tick
+ * is at the start of the axis (0), at its end (2) or between them, which decides how its label is aligned.
+ * @param {number} middle
+ * @param {number} half extent
  * @param {number} side px
  */
-function ticks(middle, half, spacing, side) {
-  /** @type {[number, number][]} */
+function ticks(middle, half, side) {
+  const smallest = (2 * half * MIN_TICK_DISTANCE) / side;
+  const power = 10 ** Math.floor(Math.log10(smallest));
+  const spacings = [1, 2, 5, 10].map((factor) => factor * power);
+  const wide = spacings.find((value) => value >= smallest) ?? 10 * power;
+  const spacing = wide > half ? Math.max(...spacings.filter((value) => value <= half)) : wide;
+  const digits = Math.max(0, -Math.floor(Math.log10(spacing * 1.001)));
+  /** @type {[text: string, place: number, end: 0 | 1 | 2][]} */
   const result = [];
-  const first = Math.ceil((middle - half) / spacing) * spacing;
-  for (let cm = first; cm <= middle + half; cm += spacing)
-    result.push([cm, Math.round(((cm - middle + half) / (2 * half)) * side) + 0.5]);
+  const reach = half * (1 + 1e-6); // a tick at the end may lie beyond it after rounding
+  const [first, last] = [(middle - reach) / spacing, (middle + reach) / spacing];
+  for (let count = Math.ceil(first); count <= last; count++) {
+    const place = Math.round(((count * spacing - middle + half) / (2 * half)) * side) + 0.5;
+    const end = place < LABEL_MARGIN ? 0 : place > side - LABEL_MARGIN ? 2 : 1;
+    result.push([fixed(count * spacing, digits), place, end]);
+  }
   return result;
 }
 
@@ -195,23 +217,24 @@ function drawBorder(context, segments, side, zoom, opacity) {
  */
 function drawMarks(context, layer, side, { cloud, zoom, hover }) {
   const { maps, trace, name } = layer;
-  const { centre, estimate, effector, expected, step } = maps;
-  const half = maps.half_width / zoom;
+  const { centre, estimate, effector, expected, step, axes } = maps;
   /** @type {Projection} */
-  const project = ([x, y]) => [
-    ((x - centre[0] + half) / (2 * half)) * side,
-    ((centre[1] - y + half) / (2 * half)) * side,
-  ];
+  const project = (position) => {
+    const [x, y] = offsetOf(maps, position).map((d, i) => (d * zoom) / axes[i].half_width);
+    return [((1 + x) / 2) * side, ((1 - y) / 2) * side];
+  };
   const centrePx = project(centre);
   if (trace.contact[step] && expected !== null)
     drawExpectedRidge(context, centrePx, expected, side);
   if (trace.contact[step] && effector) drawEffector(context, project(effector));
   if (cloud) drawParticles(context, layer, project);
-  if (maps.truth[0] !== null) drawTruth(context, centrePx);
+  if (maps.truth[axes[0].index] !== null) drawTruth(context, centrePx);
   const single = name !== 'fused' && trace.fuses;
-  const mean = single ? trace.position.map((i) => trace.mean(name, i)?.[step] ?? NaN) : [];
-  if (single) drawModalityEstimate(context, project(mean.map((cm) => cm / 100)), lineStyle(name));
-  drawEstimate(context, project(trace.position.map((i) => estimate[i])));
+  if (single) {
+    const mean = axes.map(({ index, scale }) => (trace.mean(name, index)?.[step] ?? NaN) / scale);
+    drawModalityEstimate(context, project(mean), lineStyle(name));
+  }
+  drawEstimate(context, project(axes.map(({ index }) => estimate[index])));
   if (hover) drawCrosshair(context, project(hover.map((d, i) => centre[i] + d)), side);
 }
 

@@ -71,8 +71,10 @@ function fileName({ trace, maps }, layer) {
 /** @param {DisplayedMaps} sheet */
 function caption({ trace, maps }) {
   const { task, filter, data, episode, faults } = trace.selection;
+  const off = trace.components.findIndex((_, i) => maps.axes.every(({ index }) => index !== i));
+  const { unit, scale } = off < 0 ? { unit: '', scale: 1 } : trace.unitOf(off);
   const angle =
-    maps.angle === null ? '' : `, cross-section at ${fixed((maps.angle * 180) / Math.PI, 1)}°`;
+    maps.angle === null ? '' : `, cross-section at ${fixed(maps.angle * scale, 1)}${unit}`;
   return `${task}, ${filter}, ${data} episode ${episode}, ${faults ? `faults ${faults}, ` : ''}step ${maps.step}${angle}`;
 }
 
@@ -83,32 +85,39 @@ function caption({ trace, maps }) {
 export function csv(sheet) {
   const { maps, layers } = sheet;
   const logs = layers.map(({ index }) => logLikelihood(maps, index));
-  const { size, half_width: half, centre } = maps;
-  /** @param {number} index */
-  const offset = (index) => 100 * (((index + 0.5) / size) * 2 - 1) * half;
+  const { size, axes, centre } = maps;
+  /** @param {number} index @param {number} axis */
+  const offset = (index, axis) => (((index + 0.5) / size) * 2 - 1) * axes[axis].half_width;
   const lowest = layers.map(
     ({ name, index }) => `${name} ${fixed(maps.log_max[index] - maps.log_range[index], 3)}`,
   );
   const comments = [
     `# Beliefscope: ${caption(sheet)}: natural logarithm. ${mapTitle(maps)}`,
-    `# dx and dy: offset from the true position; x and y: world position. Values are clipped at: ${lowest.join(' / ')}`,
+    `# offset: from the true value. Values are clipped at: ${lowest.join(' / ')}`,
   ];
   const names = layers.map(({ name }) => `${name}_ln_${maps.quantity}_nats`);
   const rows = [
     ...comments.map((line) => line.replaceAll('−', '-')),
-    ['dx_cm', 'dy_cm', 'x_cm', 'y_cm', ...names].join(','),
+    [
+      ...axes.map(({ name, shown }) => columnName(`${name}_offset`, shown)),
+      ...axes.map(({ name, shown }) => columnName(name, shown)),
+      ...names,
+    ].join(','),
   ];
   for (let i = 0; i < size * size; i++) {
-    const offsets = [offset(i % size), offset(Math.floor(i / size))];
-    const positions = [...offsets, ...offsets.map((d, axis) => d + 100 * centre[axis])];
-    rows.push(
-      [...positions.map((cm) => cm.toFixed(3)), ...logs.map((values) => values[i].toFixed(4))].join(
-        ',',
-      ),
-    );
+    const offsets = [offset(i % size, 0), offset(Math.floor(i / size), 1)];
+    const positions = [...offsets, ...offsets.map((d, axis) => d + centre[axis])];
+    const numbers = positions.map((value, k) => (value * axes[k % 2].scale).toFixed(3));
+    rows.push([...numbers, ...logs.map((values) => values[i].toFixed(4))].join(','));
   }
   return `${rows.join('\n')}\n`;
 }
+
+/**
+ * @param {string} name
+ * @param {string} unit
+ */
+const columnName = (name, unit) => (unit ? `${name}_${unit}` : name);
 
 /** @param {DisplayedMaps} sheet */
 function svg(sheet) {

@@ -5,13 +5,24 @@
 /** @import { MapPanel } from './map_panel.js' */
 
 import { create, element, html } from '../core/dom.js';
+import { displayName } from '../core/units.js';
 import { choice } from '../widgets/pickers.js';
 import { bindExport } from './export_map.js';
+import { mapPlane } from './map_choices.js';
 
 const GAP = 6; // px between the menu and the panel
 
 /** @type {{key: keyof State, label: string, options: [value: string, label: string][]}[]} */
 const OPTIONS = [
+  {
+    key: 'others',
+    label: 'Other components',
+    options: [
+      ['auto', 'automatic'],
+      ['fixed', 'at the truth'],
+      ['marginal', 'integrated out'],
+    ],
+  },
   {
     key: 'scale',
     label: 'Scale',
@@ -81,7 +92,13 @@ const OPTIONS = [
  */
 export function mapMenu(menu, button, store, maps) {
   const rows = OPTIONS.map((option) => optionRow(option, store));
-  html('.map-options', menu).append(...rows);
+  const plane = create('select', { ariaLabel: 'Components of the axes' });
+  const planeRow = create('label', {}, create('span', { textContent: 'Components' }), plane);
+  plane.addEventListener('change', () => store.set({ plane: plane.value, angle: null }));
+  html('.map-options', menu).append(planeRow, ...rows);
+  store.listen(({ plane: names }, changed) => {
+    if (changed.has('plane') && names) plane.value = names;
+  });
   const pin = element('.pin', HTMLButtonElement, menu);
   pin.addEventListener('click', () => maps.togglePin());
   maps.changed = () => {
@@ -98,9 +115,26 @@ export function mapMenu(menu, button, store, maps) {
   });
   return (trace) => {
     OPTIONS.forEach(({ key }, i) => {
-      if (key === 'cloud') rows[i].hidden = trace.header.kind !== 'pf';
+      if (key === 'cloud') rows[i].hidden = !trace.header.scene.includes('particles');
+      if (key === 'others') rows[i].hidden = trace.components.length < 3;
     });
+    planeRow.hidden = trace.components.length < 3;
+    plane.replaceChildren(...planeOptions(trace));
+    plane.value = mapPlane(store.state, trace).join();
   };
+}
+
+/**
+ * Returns an option for each pair of components, the pair of the task's map first.
+ * @param {Trace} trace
+ */
+function planeOptions({ components, task }) {
+  const pairs = components.flatMap(({ name }, i) =>
+    components.slice(i + 1).map((other) => [name, other.name]),
+  );
+  const map = [task.map.x, task.map.y];
+  const others = pairs.filter((pair) => !map.every((name) => pair.includes(name)));
+  return [map, ...others].map((pair) => new Option(pair.map(displayName).join(', '), pair.join()));
 }
 
 /**

@@ -26,6 +26,7 @@ import {
 } from './map_summary.js';
 import { borders, shades } from './map_values.js';
 import { formatPin, parsePin } from './pin.js';
+import { mapChoices } from './map_choices.js';
 
 const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom']; // keys of the state
 const EXPLANATIONS = {
@@ -35,6 +36,7 @@ const EXPLANATIONS = {
 const REGION_SHARES = [0.5, 0.95];
 const CLOSE_UP = 4; // zoom while all maps of the run fit into it
 const MIN_SIDE = 60; // px
+const MAX_COLUMNS = 4;
 /** @type {Record<string, number[]>} */
 const ARROWS = {
   ArrowLeft: [-1, 0],
@@ -66,11 +68,12 @@ export class MapPanel {
   #pinned = null;
   #requestedPin = '';
   #comparisonName = '';
-  /** Offset of the crosshair in m. @type {number[] | null} */
+  /** Offset of the crosshair. @type {number[] | null} */
   #hover = null;
   /** Whether some maps of the run did not fit into the close-up. */
   #wide = false;
   #side = 0; // px
+  #columns = 1; // maps in a row
 
   /**
    * @param {HTMLElement} panel
@@ -107,8 +110,8 @@ export class MapPanel {
     if (rebuild)
       this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
     const pinned = this.#pinned;
-    if (pinned && pinned.maps.quantity !== maps.quantity) {
-      [this.#pinned, this.#requestedPin] = [null, '']; // requested again, in the new quantity
+    if (pinned && content(pinned.maps) !== content(maps)) {
+      [this.#pinned, this.#requestedPin] = [null, '']; // requested again, with the new quantity and axes
     } else if (
       pinned &&
       (pinned.selection.task !== trace.selection.task || !comparable(pinned.maps, maps))
@@ -169,9 +172,10 @@ export class MapPanel {
     if (!pin || !this.#maps || this.#pinned || this.#requestedPin === pin) return;
     this.#requestedPin = pin;
     const { selection, step, angle } = parsePin(pin, task);
-    const quantity = this.#store.state.map;
-    const maps = await this.#requestMaps({ ...selection, step, angle, quantity });
-    if (this.#store.state.pin !== pin || this.#pinned || quantity !== this.#store.state.map) return;
+    const shown = content(this.#maps);
+    const choices = mapChoices(this.#store.state, this.#trace);
+    const maps = await this.#requestMaps({ ...selection, step, angle, ...choices });
+    if (this.#store.state.pin !== pin || this.#pinned || shown !== content(this.#maps)) return;
     if (comparable(maps, this.#maps)) this.#setPinned({ maps, selection });
     else this.#store.set({ pin: '' });
   }
@@ -250,8 +254,18 @@ export class MapPanel {
     html('#maps-rule', this.#panel).textContent = reference
       ? ` · ${title}`
       : title.replace(/^\w+/, '');
-    const quantity = html('#maps-of', this.#panel);
-    quantity.hidden = Boolean(reference);
+    html('#maps-of', this.#panel).hidden = Boolean(reference);
+    html('#maps-quantity', this.#panel).textContent = this.#subject();
+  }
+
+  /** Names the state components of the axes. */
+  #subject() {
+    const { map } = this.#trace?.task ?? {};
+    const axes = this.#maps?.axes ?? [];
+    const isPosition =
+      axes[0]?.name === map?.x && axes[1]?.name === map?.y && axes[0]?.unit === 'm';
+    if (!isPosition) return axes.map(({ name }) => displayName(name)).join(', ');
+    return displayName(axes[0].name).replace(/(^| )x$/, '') || 'position';
   }
 
   /** Describes what the colours show. */
@@ -276,6 +290,7 @@ export class MapPanel {
     for (const { figure } of this.#figures) figure.remove();
     this.#figures = layers.map((name) => createFigure(name, layers.length > 1));
     this.#figures.forEach(({ canvas }, layer) => this.#bindCanvas(canvas, layer));
+    this.#host.classList.toggle('many', layers.length > MAX_COLUMNS);
     this.#host.append(...this.#figures.map(({ figure }) => figure));
   }
 
@@ -297,13 +312,33 @@ export class MapPanel {
     const { clientWidth, clientHeight } = this.#host;
     const { paddingLeft, paddingRight, paddingTop, paddingBottom } = getComputedStyle(this.#host);
     const width = clientWidth - parseFloat(paddingLeft) - parseFloat(paddingRight);
-    const horizontal =
-      (width - MARGIN.left - (count - 1) * MARGIN.gap - count * MARGIN.right) / count;
+    const height = clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom);
+    this.#arrange(count);
     const { caption, head } = this.#figures[0];
-    const texts =
-      caption.offsetHeight + head.offsetHeight + parseFloat(paddingTop) + parseFloat(paddingBottom);
-    const vertical = clientHeight - MARGIN.bottom - MARGIN.top - texts;
-    return Math.max(MIN_SIDE, Math.floor(Math.min(horizontal, vertical)));
+    /** @param {number} rows two have no captions */
+    const side = (rows) => {
+      const columns = Math.ceil(count / rows);
+      const horizontal =
+        (width - MARGIN.left - (columns - 1) * MARGIN.gap - columns * MARGIN.right) / columns;
+      const texts = head.offsetHeight + (rows === 1 ? caption.offsetHeight : 0);
+      return Math.floor(Math.min(horizontal, height / rows - MARGIN.bottom - MARGIN.top - texts));
+    };
+    const [one, two] = [side(1), count > MAX_COLUMNS ? side(2) : 0];
+    if (two > one) this.#arrange(Math.ceil(count / 2));
+    return Math.max(MIN_SIDE, one, two);
+  }
+
+  /**
+   * Arranges the maps in rows.
+   * @param {number} columns
+   */
+  #arrange(columns) {
+    this.#columns = columns;
+    this.#host.style.setProperty('--columns', String(columns));
+    this.#host.classList.toggle('two-rows', columns < this.#figures.length);
+    this.#figures.forEach(({ figure }, layer) => {
+      figure.classList.toggle('row-start', layer % columns === 0);
+    });
   }
 
   get #zoom() {
@@ -317,7 +352,7 @@ export class MapPanel {
 
   /** @param {number} layer */
   #leftMargin(layer) {
-    return layer === 0 ? MARGIN.left : MARGIN.gap;
+    return layer % this.#columns === 0 ? MARGIN.left : MARGIN.gap;
   }
 
   /**
@@ -331,7 +366,7 @@ export class MapPanel {
       zoom: this.#zoom,
       cloud: cloud === 'shown',
       textColour: colour('muted'),
-      withY: layer === 0,
+      withY: layer % this.#columns === 0,
       hover: this.#hover,
     };
   }
@@ -378,11 +413,11 @@ export class MapPanel {
    */
   #point(event, layer) {
     if (!this.#maps) return;
-    const half = this.#maps.half_width / this.#zoom;
+    const [halfX, halfY] = this.#maps.axes.map((axis) => axis.half_width / this.#zoom);
     const x = (event.offsetX - this.#leftMargin(layer)) / this.#side;
     const y = (event.offsetY - MARGIN.top) / this.#side;
     const inside = x >= 0 && x <= 1 && y >= 0 && y <= 1;
-    this.#setHover(inside ? [(2 * x - 1) * half, (1 - 2 * y) * half] : null);
+    this.#setHover(inside ? [(2 * x - 1) * halfX, (1 - 2 * y) * halfY] : null);
   }
 
   /**
@@ -395,30 +430,37 @@ export class MapPanel {
     const maps = this.#maps;
     if (!direction || !maps) return;
     event.preventDefault();
-    const cell = (2 * maps.half_width) / maps.size;
-    const limit = maps.half_width / this.#zoom - cell / 2;
     const from = this.#hover ?? [0, 0];
-    const distance = (event.shiftKey ? 5 : 1) * cell;
-    const offset = direction.map((d, i) =>
-      Math.min(Math.max(from[i] + distance * d, -limit), limit),
-    );
+    const offset = direction.map((d, i) => {
+      const { half_width: half } = maps.axes[i];
+      const cell = (2 * half) / maps.size;
+      const limit = half / this.#zoom - cell / 2;
+      return Math.min(Math.max(from[i] + (event.shiftKey ? 5 : 1) * cell * d, -limit), limit);
+    });
     this.#setHover(offset);
     const values = this.#figures.map(
       ({ name }, layer) => `${displayName(name)} ${this.#values(maps, layer, offset).join(', ')}`,
     );
     html('#maps-announcement', this.#panel).textContent =
-      `${positionText(maps, offset, this.#world)} cm: ${values.join('; ')}`;
+      `${positionText(maps, offset, this.#world)}: ${values.join('; ')}`;
   }
 
-  /** @param {number[] | null} offset m */
+  /** @param {number[] | null} offset */
   #setHover(offset) {
     if (offset === this.#hover) return;
     this.#hover = offset;
     html('#maps-value', this.#panel).textContent =
-      offset && this.#maps ? `at ${positionText(this.#maps, offset, this.#world)} cm` : '';
+      offset && this.#maps ? `at ${positionText(this.#maps, offset, this.#world)}` : '';
     this.redraw();
   }
 }
+
+/**
+ * Identifies the quantity, the axes and the treatment of the other components of maps.
+ * @param {Maps} maps
+ */
+const content = ({ quantity, axes, others }) =>
+  [quantity, others, ...axes.map(({ name }) => name)].join();
 
 /**
  * @param {Maps} a
@@ -426,16 +468,19 @@ export class MapPanel {
  */
 const comparable = (a, b) =>
   a.layers.join() === b.layers.join() &&
-  a.quantity === b.quantity &&
-  Math.abs(a.half_width - b.half_width) < 1e-6;
+  content(a) === content(b) &&
+  a.axes.every(({ half_width: half }, i) => Math.abs(half / b.axes[i].half_width - 1) < 1e-5);
 
 /**
  * Returns whether peaks and 95 % regions, approximated by ellipses, fit into the close-up.
  * @param {Maps} maps
  */
-function fitsCloseUp({ half_width: half, peak, numbers }) {
+function fitsCloseUp({ axes, peak, numbers }) {
+  const [halfX, halfY] = axes.map(({ half_width: half }) => half);
   return peak.every((offset, layer) => {
-    const radius = Math.sqrt((numbers.area95[layer] / Math.PI) * numbers.elongation[layer]);
-    return Math.max(...offset.map(Math.abs)) + radius <= half / CLOSE_UP;
+    const area = numbers.area95[layer] / (halfX * halfY);
+    const radius = Math.sqrt((area / Math.PI) * (numbers.elongation[layer] ?? 1));
+    const farthest = Math.max(Math.abs(offset[0]) / halfX, Math.abs(offset[1]) / halfY);
+    return farthest + radius <= 1 / CLOSE_UP;
   });
 }

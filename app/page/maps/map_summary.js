@@ -2,8 +2,8 @@
 
 /** @import { Maps } from './map_values.js' */
 
-import { fixed, percent, signed } from '../core/units.js';
-import { cellAt, valueAt } from './map_values.js';
+import { displayUnit, fixed, percent, signed } from '../core/units.js';
+import { areaUnit, cellAt, valueAt } from './map_values.js';
 
 export const QUANTITY_NAMES = { likelihood: 'Likelihood', posterior: 'Posterior' };
 
@@ -17,22 +17,27 @@ const degrees = (radians) => (radians === null ? null : (radians * 180) / Math.P
 const short = (value) => fixed(value, value !== null && value < 10 ? 1 : 0);
 
 /**
- * Formats an offset from the truth, in the coordinates of the axes, in cm.
+ * Formats an offset from the truth, in the coordinates and units of the axes.
  * @param {Maps} maps
- * @param {number[]} offset m
+ * @param {number[]} offset
  * @param {boolean} world
  */
-export function positionText(maps, offset, world) {
-  const texts = offset.map((d, i) => (world ? fixed(100 * (d + maps.centre[i])) : signed(100 * d)));
-  return texts.join(', ');
+export function positionText({ axes, centre }, offset, world) {
+  const units = axes.map(displayUnit);
+  const texts = offset.map((d, i) => {
+    const { scale } = units[i];
+    return world ? fixed(scale * (d + centre[i])) : signed(scale * d);
+  });
+  if (units[0].unit === units[1].unit) return `${texts.join(', ')} ${units[0].unit}`.trim();
+  return texts.map((text, i) => `${text} ${units[i].unit}`.trim()).join(', ');
 }
 
 /**
  * Returns the quantity of the maps and the rule of the fused one.
  * @param {Maps} maps
  */
-export const mapTitle = ({ quantity, layers, rule }) =>
-  QUANTITY_NAMES[quantity] + (layers.length > 2 ? `. Fused: ${rule}` : '');
+export const mapTitle = ({ quantity, layers, rule, note }) =>
+  QUANTITY_NAMES[quantity] + (note && `, ${note}`) + (layers.length > 2 ? `. Fused: ${rule}` : '');
 
 /**
  * Returns the measures of a layer as lines below its map, and as one description.
@@ -42,22 +47,23 @@ export const mapTitle = ({ quantity, layers, rule }) =>
  */
 export function layerMeasures(maps, layer, world) {
   const { log_max: logMax, numbers } = maps;
+  const { unit, scale } = areaUnit(maps.axes);
   const peak = positionText(maps, maps.peak[layer], world);
-  const [area50, area95] = [numbers.area50[layer], numbers.area95[layer]].map((m2) =>
-    short(1e4 * m2),
+  const [area50, area95] = [numbers.area50[layer], numbers.area95[layer]].map((area) =>
+    short(scale * area),
   );
-  const entropy = fixed(numbers.entropy[layer] + Math.log(1e4), 2); // of a density per cm²
+  const entropy = fixed(numbers.entropy[layer] + Math.log(scale), 2); // of a density per unit of area
   const shape = shapeText(maps, layer);
   return {
     lines: [
-      `peak ${peak} cm`,
-      `50 % ${area50}, 95 % ${area95} cm²`,
-      `${shape.short} · entropy ${entropy}`,
+      `peak ${peak}`,
+      `50 % ${area50}, 95 % ${area95} ${unit}`,
+      [shape.short, `entropy ${entropy}`].filter(Boolean).join(' · '),
     ],
     description:
-      `peak at ${peak} cm, ln ${maps.quantity} ${fixed(logMax[layer], 2)} at the peak and ${fixed(numbers.truth[layer], 2)} relative to it at the truth; ` +
-      `50 % of the ${maps.quantity} within ${area50} cm², 95 % within ${area95} cm²; entropy ${entropy} nats (density per cm²); ` +
-      `length-to-width ratio ${fixed(numbers.elongation[layer], 1)}; ${shape.long}`,
+      `peak at ${peak}, ln ${maps.quantity} ${fixed(logMax[layer], 2)} at the peak and ${fixed(numbers.truth[layer], 2)} relative to it at the truth; ` +
+      `50 % of the ${maps.quantity} within ${area50} ${unit}, 95 % within ${area95} ${unit}; entropy ${entropy} nats (density per ${unit})` +
+      shape.long,
   };
 }
 
@@ -66,26 +72,29 @@ export function layerMeasures(maps, layer, world) {
  * @param {Maps} maps
  * @param {number} layer
  */
-function shapeText({ numbers, shape }, layer) {
-  const [deviation, axis] = [numbers.deviation[layer], numbers.axis[layer]];
-  if (shape[layer] === 'ring') {
-    const radius = fixed(100 * numbers.ring_radius[layer]);
-    const [x, y] = numbers.ring_centre[layer].map((m) => signed(100 * (m ?? NaN)));
+function shapeText({ numbers, shape: shapes, axes }, layer) {
+  const [deviation, axis, shape] = [numbers.deviation[layer], numbers.axis[layer], shapes[layer]];
+  if (shape === null) return { short: '', long: '' };
+  const ratio = `; length-to-width ratio ${fixed(numbers.elongation[layer], 1)}; `;
+  if (shape === 'ring') {
+    const { unit, scale } = displayUnit(axes[0]);
+    const radius = `${fixed(scale * (numbers.ring_radius[layer] ?? NaN))} ${unit}`;
+    const [x, y] = numbers.ring_centre[layer].map((m) => signed(scale * (m ?? NaN)));
     const part = percent(numbers.ring_coverage[layer]);
     return {
-      short: `ring, radius ${radius} cm`,
-      long: `ring with radius ${radius} cm around ${x}, ${y} cm from the truth, over ${part} of the circle`,
+      short: `ring, radius ${radius}`,
+      long: `${ratio}ring with radius ${radius} around ${x}, ${y} ${unit} from the truth, over ${part} of the circle`,
     };
   }
-  if (shape[layer] !== 'ridge') return { short: shape[layer], long: `shape: ${shape[layer]}` };
+  if (shape !== 'ridge') return { short: shape, long: `${ratio}shape: ${shape}` };
   if (deviation === null) {
     const text = `ridge at ${fixed(degrees(axis), 0)}°`;
-    return { short: text, long: `${text} from the x axis` };
+    return { short: text, long: `${ratio}${text} from the x axis` };
   }
   const off = fixed(degrees(deviation), 0);
   return {
     short: `ridge, ${off}° off`,
-    long: `ridge, ${off}° off the direction that the task expects`,
+    long: `${ratio}ridge, ${off}° off the direction that the task expects`,
   };
 }
 
@@ -109,7 +118,7 @@ export function pairwiseMeasures({ layers, numbers }) {
  * Returns the values at the crosshair as lines below a map.
  * @param {Maps} maps
  * @param {number} layer
- * @param {number[]} offset m
+ * @param {number[]} offset
  * @param {Float32Array | null} ratios log-likelihood ratios, if the maps show them
  */
 export function valuesAt(maps, layer, offset, ratios) {

@@ -1,19 +1,21 @@
 /** Likelihood maps as the server sends them (docs/api.md), and the values that the page displays: colours, regions, differences. */
 
+/** @import { DisplayUnit } from '../core/units.js' */
+
 import { CELL_STEPS, LOG_RANGE } from '../core/constants.js';
-import { fixed, signed } from '../core/units.js';
+import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
 
 /**
  * @typedef {object} MapStatistics measures of each layer; null where a measure does not exist
  * @property {(number | null)[]} truth log-likelihood at the true position, relative to the peak
- * @property {number[]} entropy nats, of a density per m²
- * @property {number[]} area50 m²
- * @property {number[]} area95 m²
+ * @property {number[]} entropy nats, of a density per area in the units of the axes
+ * @property {number[]} area50 in the units of the axes
+ * @property {number[]} area95
  * @property {(number | null)[]} axis rad, direction of the long axis
- * @property {number[]} elongation length of the long axis over the short one
+ * @property {(number | null)[]} elongation length of the long axis over the short one
  * @property {(number | null)[]} deviation rad between the long axis and the direction of the ridge that the task expects
  * @property {(number | null)[][]} ring_centre m, centre of the circle fitted to the 50 % region, as an offset from the truth
- * @property {number[]} ring_radius m
+ * @property {(number | null)[]} ring_radius m
  * @property {number[]} ring_coverage part of the circle in the 50 % region, 0 to 1
  * @property {(number | null)[][]} divergence nats, from layer to layer
  * @property {(number | null)[][]} overlap
@@ -26,23 +28,33 @@ import { fixed, signed } from '../core/units.js';
  * @property {number} size S, cells along a side
  * @property {'likelihood' | 'posterior'} quantity
  * @property {string} rule of the fused layer
- * @property {number | null} angle rad
+ * @property {number | null} angle SI, value of the only component off the map; null if there is none or it is integrated out
  * @property {number | null} expected rad, direction of the ridge that the task expects
- * @property {('flat' | 'round' | 'ridge' | 'ring')[]} shape of each layer
+ * @property {('flat' | 'round' | 'ridge' | 'ring' | null)[]} shape of each layer; null where the axes have different units
  * @property {string[]} layers L names
- * @property {number} half_width m
- * @property {number[]} centre m
+ * @property {MapAxis[]} axes x and y
+ * @property {'fixed' | 'marginal'} others treatment of the components off the map
+ * @property {string} note the same in words, empty if only one component is fixed
+ * @property {number[]} centre
  * @property {(number | null)[]} truth state
  * @property {number[]} estimate state
  * @property {number[]} log_max log-likelihood of the peaks
  * @property {number[]} log_range nats from the peak to the lowest cell
- * @property {number[][]} peak m, offsets from the centre
+ * @property {number[][]} peak offsets from the centre
  * @property {number[] | null} effector m
  * @property {MapStatistics} numbers
  * @property {number} particles M
- * @property {Float32Array} positions M x 2 m, of the particles
+ * @property {Float32Array} positions M x 2, of the particles
  * @property {Float32Array[]} weights L x M
  * @property {Uint16Array[]} cells L x S x S; row 0 has the smallest y offset
+ *
+ * @typedef {object} MapAxis a state component
+ * @property {string} name
+ * @property {number} index in the state
+ * @property {string} unit of values
+ * @property {string} shown unit for display
+ * @property {number} scale factor from `unit` to `shown`
+ * @property {number} half_width half the extent, in `unit`
  *
  * @typedef {'normalised' | 'log'} Scale likelihood relative to the peak, or its logarithm
  * @typedef {'own' | 'same'} Range of the colours: of each layer, or common to all
@@ -161,14 +173,39 @@ function matchingCell(cell, size, otherSize) {
 
 /**
  * Returns the cell at an offset from the truth.
- * @param {Pick<Maps, 'size' | 'half_width'>} maps
- * @param {number[]} offset m
+ * @param {{size: number, axes: Pick<MapAxis, 'half_width'>[]}} maps
+ * @param {number[]} offset
  */
-export function cellAt({ size, half_width: half }, [dx, dy]) {
-  /** @param {number} d */
-  const index = (d) =>
-    Math.min(Math.max(Math.floor(((d + half) / (2 * half)) * size), 0), size - 1);
-  return index(dy) * size + index(dx);
+export function cellAt({ size, axes }, offset) {
+  const [column, row] = offset.map((d, i) => {
+    const { half_width: half } = axes[i];
+    return Math.min(Math.max(Math.floor(((d + half) / (2 * half)) * size), 0), size - 1);
+  });
+  return row * size + column;
+}
+
+/**
+ * Returns a position as offsets from the centre of maps, with angles wrapped.
+ * @param {Pick<Maps, 'axes' | 'centre'>} maps
+ * @param {number[]} position
+ */
+export const offsetOf = ({ axes, centre }, position) =>
+  position.map((value, i) => {
+    const offset = value - centre[i];
+    return axes[i].unit === 'rad'
+      ? wrapDegrees((offset * 180) / Math.PI) * (Math.PI / 180)
+      : offset;
+  });
+
+/**
+ * Returns the unit of an area of the maps, and the factor from its SI unit.
+ * @param {MapAxis[]} axes
+ * @returns {DisplayUnit}
+ */
+export function areaUnit([x, y]) {
+  const [unit, other] = [displayUnit(x), displayUnit(y)];
+  const name = unit.unit === other.unit ? `${unit.unit}²` : `${unit.unit}·${other.unit}`;
+  return { unit: name, scale: unit.scale * other.scale };
 }
 
 /**

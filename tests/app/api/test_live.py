@@ -202,14 +202,14 @@ def test_maps_of_growing_and_ended_runs_are_equal(
     selection = Selection("door", full_trace.filter, 9, data="live:run")
     growing = store.request(selection)
     assert growing.growing
-    maps = [growing.map(step, None, 41) for step in (0, 11)]
+    maps = [growing.map(step, 41) for step in (0, 11)]
     writer.append(part(full_trace, 12, STEPS))
     writer.finish()
     ended = store.request(selection)
     assert not ended.growing
     for likelihood_map in maps:
         np.testing.assert_allclose(
-            likelihood_map.log_likelihood, ended.map(likelihood_map.step, None, 41).log_likelihood, rtol=1e-4, atol=1e-3
+            likelihood_map.log_likelihood, ended.map(likelihood_map.step, 41).log_likelihood, rtol=1e-4, atol=1e-3
         )
 
 

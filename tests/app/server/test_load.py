@@ -32,6 +32,7 @@ from beliefscope.app.views.scheduler import DeadlineExecutor, FairLock
 from beliefscope.app.views.view import PREFETCH_STEPS
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
+from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.recordings.probe import RecordingInfo, RecordingProbe
 
 pytestmark = pytest.mark.slow
@@ -161,13 +162,13 @@ def test_disk_fills_during_upload(client: TestClient, monkeypatch: pytest.Monkey
 def test_maps_are_cached(store: TraceStore, monkeypatch: pytest.MonkeyPatch) -> None:
     run = store.request(faulty_run(1, "crossmodal-pf"))
     run.result(TIMEOUT)
-    maps = run.encoded_maps(3, None, 41)
-    assert run.encoded_maps(3, None, 41) is maps
-    assert run.encoded_maps(3, 0.1, 41) is not maps
+    maps = run.encoded_maps(3, 41)
+    assert run.encoded_maps(3, 41) is maps
+    assert run.encoded_maps(3, 41, MapOptions(0.1)) is not maps
     assert maps.message(5)[4:].startswith(b'{"type": "maps", "serial": 5, "other": false, "step": 3')
     monkeypatch.setattr(traced_run, "MAP_CACHE_BYTES", 3 * maps.nbytes)
     for step in range(10):
-        run.encoded_maps(step, None, 41)
+        run.encoded_maps(step, 41)
     assert len(run._cache) == 3
     assert run._cache_bytes == sum(maps.nbytes for maps in run._cache.values())
 
@@ -180,9 +181,9 @@ def test_neighbouring_maps_are_prefetched(client: TestClient) -> None:
         socket.send_json({"type": "cursor", "serial": 1, "step": 3, "angle": None, "size": 41, **selection})
         assert len(socket.receive_bytes()) > 0
         run = store.request(Selection("door", "crossmodal-ekf", 1))
-        assert run.missing_maps(3, 0.1, 4) == [3, 2, 4, 1]
+        assert run.missing_maps(3, 4, MapOptions(0.1)) == [3, 2, 4, 1]
         deadline = time.monotonic() + TIMEOUT
-        while run.missing_maps(3, None, PREFETCH_STEPS):
+        while run.missing_maps(3, PREFETCH_STEPS, MapOptions()):
             assert time.monotonic() < deadline
             time.sleep(0.01)
 

@@ -99,7 +99,7 @@ def test_mean_particle_shares_equal_the_effective_weights(run: Trace) -> None:
     assert run.effective_weights is not None
     assert run.log_weights is not None
     for step in (0, 25, len(run) - 1):
-        shares = modality_shares(run, step, DOOR)
+        shares = modality_shares(run, step)
         assert shares is not None
         assert (shares >= 0.0).all()
         np.testing.assert_allclose(shares.sum(axis=0), 1.0, atol=1e-5)
@@ -108,8 +108,8 @@ def test_mean_particle_shares_equal_the_effective_weights(run: Trace) -> None:
 
 
 def test_filters_without_separate_modalities_have_no_particle_shares(run: Trace) -> None:
-    assert modality_shares(replace(run, effective_weights=None), 0, DOOR) is None
-    assert modality_shares(replace(run, log_likelihood=None), 0, DOOR) is None
+    assert modality_shares(replace(run, effective_weights=None), 0) is None
+    assert modality_shares(replace(run, log_likelihood=None), 0) is None
 
 
 def test_layers_depend_on_the_trace(run: Trace) -> None:

@@ -77,7 +77,7 @@ def test_a_cursor_is_answered_with_maps_then_the_scene(
         np.testing.assert_allclose(value, getattr(measured, name)[0], rtol=1e-12)
     assert header["layers"] == ["image", "haptics", "fused"]
     assert (header["serial"], header["step"], header["size"], header["angle"]) == (3, 7, size, 0.4)
-    assert header["half_width"] == pytest.approx(0.135)
+    assert [axis["half_width"] for axis in header["axes"]] == pytest.approx([0.135, 0.135])
     np.testing.assert_allclose(header["peak"], expected.peaks(), rtol=1e-6)
     np.testing.assert_allclose(header["truth"], trace.episode.states[7], rtol=1e-6)
     np.testing.assert_allclose(header["effector"], trace.episode.observations["effector_position"][7, :2], rtol=1e-6)

@@ -34,7 +34,7 @@ def test_moments_are_those_of_the_particles(particles: int) -> None:
     weights = rng.dirichlet(np.ones(particles))
     density = ParticleDensity(PUSH, states, np.log(weights))
     offsets = np.linspace(-0.2, 0.2, 161)
-    p = np.exp(density.log_density(np.array([0.4, -0.2]), offsets)) * (offsets[1] - offsets[0]) ** 2
+    p = np.exp(density.log_density(np.array([0.4, -0.2]), (0, 1), offsets, offsets)) * (offsets[1] - offsets[0]) ** 2
     cells = np.stack(np.meshgrid(0.4 + offsets, -0.2 + offsets), axis=-1)
     assert p.sum() == pytest.approx(1.0, abs=1e-3)
     mean = np.einsum("yx,yxi->i", p, cells)
@@ -51,10 +51,10 @@ def test_angles_wrap_and_collapsed_particles_have_a_density() -> None:
     offsets = np.linspace(-0.01, 0.01, 5)
     middle = np.array([0.5, 0.1, np.pi - 0.01])
     density = ParticleDensity(DOOR, states, log_weights)
-    turned = density.log_density(middle - [0.0, 0.0, 2.0 * np.pi], offsets)
-    np.testing.assert_allclose(turned, density.log_density(middle, offsets), atol=1e-3)
+    turned = density.log_density(middle - [0.0, 0.0, 2.0 * np.pi], (0, 1), offsets, offsets)
+    np.testing.assert_allclose(turned, density.log_density(middle, (0, 1), offsets, offsets), atol=1e-3)
     one = ParticleDensity(DOOR, states[:1], np.zeros(1))
-    values = one.log_density(states[0], offsets)
+    values = one.log_density(states[0], (0, 1), offsets, offsets)
     assert np.isfinite(values).all()
     assert values.argmax() == 12
 
@@ -75,7 +75,7 @@ def divergence(particles: int, seed: int) -> float:
     cells = np.stack(np.meshgrid(middle[0] + offsets, middle[1] + offsets), axis=-1)
     cells = np.concatenate([cells, np.full((*cells.shape[:2], 1), middle[2])], axis=-1)
     likelihood = -0.5 * np.square((observations[-1] - cells) / linear.R_STD).sum(-1)
-    posterior = density.log_density(middle, offsets) + likelihood
+    posterior = density.log_density(middle, (0, 1), offsets, offsets) + likelihood
     error = cells - middle
     exact = -0.5 * np.einsum("yxi,ij,yxj->yx", error, np.linalg.inv(covariances[-1]), error)
     exact, posterior = (log - np.logaddexp.reduce(log, axis=None) for log in (exact, posterior))
