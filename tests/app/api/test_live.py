@@ -235,16 +235,18 @@ def test_states_of_runs(client: TestClient, writer: LiveFileWriter, full_trace: 
 
 
 def test_run_of_an_unavailable_filter(client: TestClient, folder: Path, full_trace: Trace) -> None:
-    """Gaussians have maps; a particle filter's maps need its networks."""
+    """Gaussians and particles have posterior maps; a particle filter's likelihood maps need its networks."""
     other = replace(full_trace, checkpoint_hash="f" * 64)
     writer = LiveFileWriter(folder / "run.live", other)
     writer.append(other)
     run = client.get("/api/live").json()["runs"][0]
     assert (run["filter"], run["available"]) == (f"{full_trace.filter} (live)", False)
     header = client.get(TRACE.format(run["filter"])).json()
-    assert (header["no_maps"] is None) == (full_trace.kind == "ekf")
+    assert header["no_maps"] is None
+    assert ("likelihood" in header["missing_quantities"]) == (full_trace.kind == "pf")
     writer.finish()
-    assert client.get(TRACE.format(run["filter"])).json()["no_maps"] == header["no_maps"]
+    missing = client.get(TRACE.format(run["filter"])).json()["missing_quantities"]
+    assert missing == header["missing_quantities"]
     writer.close()
 
 
