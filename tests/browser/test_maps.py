@@ -111,6 +111,27 @@ def check_probe(page: Any, expected: LikelihoodMap) -> None:
     assert page.page.locator("#maps-value").text_content() == ""
 
 
+def test_other_components_are_selected_in_the_menu(open_page: Any, engine: MapEngine) -> None:
+    page = open_page(f"{LINK}&map=posterior")
+    page.page.locator("#maps-view").click()
+    page.page.locator("#maps-options select").first.select_option("hinge_x,angle")
+    title = "Posterior of the hinge x, angle. Fused: prior times beta-weighted sum"
+    page.until(f"() => document.querySelector('#maps h2').textContent.startsWith('{title}')")
+    assert page.page.locator("#angle-label").text_content().startswith("Cross-section at hinge y")
+    page.page.locator("#maps-others label", has=page.page.locator("[value=marginal]")).click()
+    page.until("() => document.querySelector('#maps-rule').textContent.includes('hinge y integrated out')")
+    assert page.page.locator("#angle-label").is_hidden()
+    page.page.keyboard.press("Escape")
+    page.settle(STEP)
+    expected = engine.map(STEP, quantity="posterior", components=("hinge_x", "angle"), others="marginal")
+    degrees = np.array([100.0, 180.0 / np.pi])
+    for layer, line in enumerate(page.page.locator("#heatmaps figcaption p:first-child").all_text_contents()):
+        assert numbers(line) == pytest.approx(expected.peaks()[layer] * degrees, abs=0.051)
+    page.until(
+        "() => location.search.includes('plane=hinge_x%2Cangle&') && location.search.includes('others=marginal')"
+    )
+
+
 def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
     open_page: Any, expected: LikelihoodMap
 ) -> None:
