@@ -94,8 +94,9 @@ def context(browser: Any) -> Iterator[Any]:
 
 
 # Embedded pages of other projects are excluded: viser's scene and Rerun's canvas.
-VIOLATIONS = """async () => {
-  const { violations } = await axe.run({ exclude: ['iframe', '.viewer'] }, { resultTypes: ['violations'] });
+VIOLATIONS = """async (part) => {
+  const checked = { include: [part], exclude: ['iframe', '.viewer'] };
+  const { violations } = await axe.run(checked, { resultTypes: ['violations'] });
   const serious = violations.filter(({ impact }) => impact === 'serious' || impact === 'critical');
   const describe = ({ target, failureSummary }) => `${target} ${failureSummary.split('\\n')[1].trim()}`;
   return serious.flatMap(({ id, nodes }) => nodes.map((node) => `${id}: ${describe(node)}`));
@@ -163,12 +164,12 @@ class MonitoredPage:
         """Data URL of each map's image."""
         return self.page.evaluate("() => [...document.querySelectorAll('#heatmaps canvas')].map((c) => c.toDataURL())")
 
-    def violations(self) -> list[str]:
-        """Serious accessibility violations of the page in its current state, according to axe."""
+    def violations(self, part: str = "html") -> list[str]:
+        """Serious accessibility violations of a part of the page in its current state, according to axe."""
         axe = pytest.importorskip("axe_playwright_python", reason="axe is not installed: pip install -e '.[test]'")
         if not self.page.evaluate("() => Boolean(window.axe)"):
             self.page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text())
-        return self.page.evaluate(VIOLATIONS)
+        return self.page.evaluate(VIOLATIONS, part)
 
     def settle(self, step: int) -> None:
         """Waits until maps in full resolution and the scene, if it is open, show the step."""

@@ -29,20 +29,20 @@ LAYOUT_SHIFT = """() => new Promise((resolve) => {
 @pytest.mark.parametrize("theme", ["light", pytest.param("dark", marks=pytest.mark.long)])
 def test_tabs_and_dialogs_are_accessible(open_page: Any, theme: str) -> None:
     page = open_page(theme=theme)
-    violations: dict[str, list[str]] = {}
+    violations = {"all": page.violations()}
     tabs = page.page.locator("[role=tab]").evaluate_all(TABS)
     for tab in tabs:
         if tab == "rerun":
             continue  # its viewer starts slowly; test_recordings.py checks it
         page.page.evaluate(f"() => document.querySelector('#tab-{tab}').click()")
         page.until(f"() => !document.querySelector('#{tab}').matches('[aria-busy=true], :has([aria-busy=true])')")
-        violations[tab] = page.violations()
-    dialogs = {"keys": "#help", "maps-options": "#maps-view", "jobs": "#jobs-button", "layers": "#scene-layers"}
+        violations[tab] = page.violations(f"#{tab}")
+    dialogs = {"keys": "#help", "maps-options": "#maps-view", "jobs": "#jobs-button", "scene-options": "#scene-layers"}
     for dialog, button in dialogs.items():
-        if dialog == "layers":
+        if dialog == "scene-options":
             page.page.evaluate("() => document.querySelector('#tab-scene').click()")
         page.page.evaluate(f"() => document.querySelector('{button}').click()")
-        violations[dialog] = page.violations()
+        violations[dialog] = page.violations(f"#{dialog}")
         page.page.keyboard.press("Escape")
     assert {name: lines for name, lines in violations.items() if lines} == {}
 

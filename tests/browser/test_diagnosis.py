@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 READY = "() => document.querySelector('#diagnosis').dataset.state === 'ready'"
 
 
@@ -32,6 +34,7 @@ def test_diagnosis_names_causes_and_opens_their_moments(open_page: Any) -> None:
     assert again.page.locator("#diagnosis .headline").text_content() == headline
 
 
+@pytest.mark.long  # tests/app/api/test_diagnosis.py has the same search
 def test_the_smallest_repair_is_drawn_in_the_timeline(open_page: Any) -> None:
     faults = "image_occluded%3D14%3Afrom%3D40%3Ato%3D60"
     page = open_page(f"?task=push&filter=crossmodal-ekf&episode=9&faults={faults}&tab=diagnosis", size=(1280, 720))

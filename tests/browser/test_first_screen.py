@@ -23,8 +23,3 @@ def test_a_first_visit_opens_an_example_with_its_finding(open_page: Any) -> None
     assert finding.text_content().startswith("The camera repeats one image")
     page.page.get_by_role("button", name="Close the introduction").click()
     assert page.page.locator("#intro").is_hidden()
-
-
-def test_a_permalink_has_no_introduction(open_page: Any) -> None:
-    page = open_page("?task=door&filter=crossmodal-ekf")
-    assert page.page.locator("#intro").is_hidden()

@@ -34,7 +34,3 @@ def test_layers_belong_to_a_view_and_its_permalink(open_page: Any) -> None:
     assert all(others.values())
     for page in (first, second):
         assert page.page.evaluate("() => document.querySelector('#messages').textContent") == ""
-    click(first, "#tab-scene")
-    click(first, "#scene-layers")
-    click(first, "#scene-options .viewpoints button:nth-of-type(2)")
-    first.screenshot("scene-layers")
