@@ -83,6 +83,6 @@ def architecture(task: str | Task, name: str, networks: str = "default") -> Arch
 def build(architecture: Architecture, seed: int = 0) -> Filter:
     """A filter with initial weights that depend only on the seed."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.default_generator.manual_seed(seed)  # torch.manual_seed also prepares those of all GPUs: 2 ms
         classes = INFORMATION if architecture.fusion == "information" else KINDS
         return classes[architecture.kind](architecture)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
@@ -25,6 +26,8 @@ Fusion = Literal["crossmodal", "unimodal", "information", "none"]
 
 WEIGHTED: tuple[Fusion, ...] = ("crossmodal", "information")
 """Fusion rules with a weight model."""
+
+_type_hints = cache(get_type_hints)  # evaluated from text: most of the time of listing a task's filters
 
 MAX_SIZE = 4096
 """Upper limit of layer widths and other integers of an architecture."""
@@ -68,7 +71,7 @@ class Architecture:
 
     def __post_init__(self) -> None:
         """Raises BadInput for an invalid value."""
-        for name, kind in get_type_hints(Architecture).items():
+        for name, kind in _type_hints(Architecture).items():
             value = getattr(self, name)
             if get_origin(kind) is Literal and value not in get_args(kind):
                 raise unknown_name(f"{name} of a filter", value, get_args(kind))

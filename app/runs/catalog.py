@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ class TaskCatalog:
             if name not in filters:
                 with suppress(BadInput):  # no pretrained checkpoint ships
                     self.paths[name] = shipped(self.task, name)
-                    filters[name] = load_checkpoint(self.paths[name])
+                    filters[name] = _included(self.paths[name])
         return filters
 
     @cached_property
@@ -123,6 +123,12 @@ class TaskCatalog:
         """Close the open data sets."""
         for data in (self.user_data | vars(self).get("data", {})).values():
             data.close()
+
+
+@cache
+def _included(path: Path) -> Checkpoint:
+    """A pretrained checkpoint, shared by all catalogs of the process: its file does not change."""
+    return load_checkpoint(path)
 
 
 def task_catalogs(
