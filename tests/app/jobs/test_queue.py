@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -241,17 +240,10 @@ def test_routes(open_jobs: OpenJobs, tmp_path: Path) -> None:
         assert [job["title"] for job in client.get("/api/jobs").json()] == ["Wait for a"]
 
 
-def test_jobs_import_no_web_framework() -> None:
-    """The functions of all kinds exist and their modules do not import FastAPI."""
-    code = (
-        "import importlib, sys\n"
-        f"for kind in {list(KINDS.values())!r}:\n"
-        "    module, _, name = kind.partition(':')\n"
-        "    getattr(importlib.import_module(module), name)\n"
-        "print(*sorted({'fastapi', 'starlette', 'uvicorn'} & sys.modules.keys()))"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == ""
+def test_functions_of_all_kinds_exist() -> None:
+    for kind in KINDS.values():
+        module, _, name = kind.partition(":")
+        assert callable(getattr(import_module(module), name))
 
 
 def test_record_of_an_earlier_version(folder: Path, open_jobs: OpenJobs) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -49,6 +50,14 @@ def read(data: bytes) -> tuple[dict[str, Any], np.ndarray[Any, Any]]:
 def socket(client: TestClient, trace_url: str) -> Any:
     view = client.post("/api/views").json()
     with client.websocket_connect(view["socket"]) as socket:
+        yield socket
+
+
+@pytest.fixture(scope="module")
+def shared_socket(shared_client: TestClient, shared_trace_url: str) -> Iterator[WebSocketTestSession]:
+    """Socket of a view for tests that leave nothing behind."""
+    view = shared_client.post("/api/views").json()
+    with shared_client.websocket_connect(view["socket"]) as socket:
         yield socket
 
 
@@ -155,13 +164,16 @@ def test_outdated_cursors_are_skipped(
         (json.dumps(cursor(angle=float("nan"))), "Not JSON: NaN is not a JSON number."),
     ],
 )
-def test_invalid_messages_are_answered_with_an_error(socket: WebSocketTestSession, text: str, error: str) -> None:
-    socket.send_text(text)
-    answer = socket.receive_json()
+def test_invalid_messages_are_answered_with_an_error(
+    shared_socket: WebSocketTestSession, text: str, error: str
+) -> None:
+    shared_socket.send_text(text)
+    answer = shared_socket.receive_json()
     assert answer["type"] == "error"
     assert error in answer["error"]
-    socket.send_json(cursor(serial=2))
-    assert maps(socket)[0]["serial"] == 2
+    shared_socket.send_json(cursor(serial=2))
+    assert maps(shared_socket)[0]["serial"] == 2
+    assert shared_socket.receive_json()["type"] == "drawn"
 
 
 def test_internal_errors_are_reported(socket: WebSocketTestSession, monkeypatch: pytest.MonkeyPatch) -> None:
