@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-EXTRAS = ("", "attribution", "tensorboard", "ray", "export", "meshes")
-"""Extras of users; ``test`` and ``dev`` are for developers."""
+EXTRAS = ("", "attribution", "tensorboard", "ray", "export", "logs", "meshes")
+"""Extras of users but ``video`` (docs/dependencies.md); ``test`` and ``dev`` are for developers."""
 
 ALLOWED = {
     "MIT": r"\bmit\b",
@@ -33,7 +33,10 @@ ALLOWED = {
 }
 """Licence -> pattern of its names in package metadata. All allow use and redistribution with this project's licence."""
 
-EXCEPTIONS = {"uplot-python": "LGPL 3: not imported and not changed; the file served from it, uPlot itself, is MIT"}
+EXCEPTIONS = {
+    "uplot-python": "LGPL 3: not imported and not changed; the file served from it, uPlot itself, is MIT",
+    "apsw": "any licence that the OSI approves, at the user's choice, so also MIT",
+}
 """Package with another licence -> reason for the exception."""
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import tomllib
@@ -14,10 +13,18 @@ from typing import Any
 import numpy as np
 
 from beliefscope.datasets.errors import BadInput, check_name
-from beliefscope.recordings.logs.columns import Columns
+from beliefscope.datasets.task import DISPLAY_UNITS
 
-UNITS = {"m": ("m", 1.0), "cm": ("m", 0.01), "mm": ("m", 0.001), "rad": ("rad", 1.0), "deg": ("rad", math.pi / 180.0)}
-"""Unit of a column -> internal unit, and its factor."""
+QUATERNION = "quaternion_yaw"
+"""Unit of a component whose column is a quaternion (x, y, z, w): the angle about z, in rad."""
+
+UNITS = {"mm": ("m", 1e-3), QUATERNION: ("rad", 1.0)} | {
+    shown: (unit, 1.0 / factor) for unit, (shown, factor) in DISPLAY_UNITS.items()
+}
+"""Unit of a column -> internal unit, and its factor. Others are internal units."""
+
+ELEMENTS = re.compile(r"(.*)\[(\d{1,9}(?:,\d{1,9})*)\]")
+"""``NAME[I]`` or ``NAME[I,J,...]``: elements of the rows of an array."""
 
 KEYS = ("task", "dt", "time", "episode", "control", "contact", "state", "sensors", "covariates", "estimate")
 VALUES = ("mean", "std", "covariance", "particles")
@@ -26,11 +33,20 @@ ESTIMATE = ("filter", *VALUES, "weights")
 References = str | list[str]
 
 
+def base_name(reference: str) -> str:
+    """Name of a column without the elements of its rows."""
+    return match[1] if (match := ELEMENTS.fullmatch(reference)) else reference
+
+
+def _listed(references: References) -> list[str]:
+    return [references] if isinstance(references, str) else references
+
+
 @dataclass(frozen=True)
 class StateColumn:
-    """Column of a component's true value, empty if it is unknown, and its unit."""
+    """Column of a component's true value, empty if it is unknown, and its unit. Quaternions may have four columns."""
 
-    column: str
+    column: References
     unit: str = "m"
 
     @property
@@ -54,7 +70,8 @@ class ColumnMap:
 
     Attributes:
         task: name of the new task.
-        dt: seconds per row; None if ``time``, a column in s, is given.
+        dt: seconds per row, or per step of logs of messages; None if ``time``, a column in s, is given.
+        time: column in s, or timeline of a Rerun recording.
         episode: column that numbers or names the episodes; empty for a single one.
         state: component -> its column. control: columns. contact: column that is not zero in contact.
         sensors: modality -> columns, or one column of images. covariates: name -> column.
@@ -78,6 +95,25 @@ class ColumnMap:
         """(n,) internal units per unit of each component's column."""
         return np.array([component.internal[1] for component in self.state.values()])
 
+    @property
+    def truth(self) -> set[str]:
+        """References to columns of the true state."""
+        return {name for component in self.state.values() for name in _listed(component.column) if name}
+
+    @property
+    def required(self) -> set[str]:
+        """References to columns that have values at all steps: state, sensors, control and estimate."""
+        estimate = (self.estimate.get(key, []) for key in VALUES)
+        weights = self.estimate.get("weights", {}).values()
+        parts = (*self.sensors.values(), self.control, *estimate, *weights)
+        return self.truth | {name for part in parts for name in _listed(part)}
+
+    @property
+    def references(self) -> set[str]:
+        """References to all columns but ``time``."""
+        others = {self.episode, self.contact, *(covariate.column for covariate in self.covariates.values())}
+        return self.required | (others - {""})
+
 
 def read_map(path: Path) -> ColumnMap:
     """Read a map. Raises BadInput for a damaged file, unknown keys and wrong types."""
@@ -91,7 +127,7 @@ def read_map(path: Path) -> ColumnMap:
     for key in estimate:
         check_name("key of [estimate]", key, ESTIMATE)
     dt = values.get("dt")
-    if (dt is None) == ("time" not in values) or not (dt is None or (type(dt) in (int, float) and dt > 0)):
+    if (dt is None and "time" not in values) or not (dt is None or (type(dt) in (int, float) and 0 < dt < math.inf)):
         raise BadInput(f"{path.name} needs either dt, in s and more than 0, or time, the name of a column in s")
     state = {name: _component(name, value) for name, value in _table(values, "state", path).items()}
     if len(state) < 2:
@@ -109,50 +145,6 @@ def read_map(path: Path) -> ColumnMap:
     )
 
 
-def guess_map(columns: Columns, name: str) -> str:
-    """Text of a first map: columns are assigned by their names and shapes; what is unclear is left to the user."""
-    flat = [n for n, values in columns.items() if values.ndim == 1 and values.dtype.kind in "fiub"]
-    rows = {n: values for n, values in columns.items() if values.ndim > 1}
-
-    def named(pattern: str, names: list[str]) -> list[str]:
-        return [n for n in names if re.search(pattern, n, re.IGNORECASE)]
-
-    time = named(r"^(t|time|timestamp|stamp)(_s)?$", flat)
-    truth, estimates = r"truth|true|gt|ground|state", r"est|mean|pred|filter|posterior|belief"
-    state = _components(named(truth, flat), rows, named(truth, [*rows]))
-    std = named(r"std|sigma|(^|_)sd(_|$)", flat)
-    mean = [n for n in named(estimates, flat) if n not in std] or [
-        n for n in named(estimates, [*rows]) if rows[n].ndim == 2
-    ][:1]
-    covariance = [n for n in rows if rows[n].ndim == 3 and rows[n].shape[1] == rows[n].shape[2]][:1]
-    ensemble = named(r"ensemble|particle|sample", [n for n in rows if rows[n].ndim == 3])[:1]
-    used = {*time, *state.values(), *mean, *std, *covariance, *ensemble, *(n.partition("[")[0] for n in state.values())}
-    sensors = [n for n in columns if n not in used and (n in flat or n in rows)]
-    lines = [f'task = "{re.sub(r"[^A-Za-z0-9_.-]", "-", name)}"']
-    lines.append(f'time = "{time[0]}"' if time else "dt = 0.1  # s per row")
-    lines += ["[state]  # true values: component = column, or {column = NAME, unit = m, cm, mm, rad or deg}"]
-    lines += [f'{component} = "{reference}"' for component, reference in state.items()] or ['x = ""', 'y = ""']
-    lines += ["[sensors]  # modality = column or list of columns"] + [f'{_key(n)} = "{n}"' for n in sensors]
-    if mean or ensemble:
-        lines.append("[estimate]")
-        found = {"mean": mean, "std": std if not covariance else [], "covariance": covariance, "particles": ensemble}
-        lines += [f"{key} = {json.dumps(n[0] if len(n) == 1 else n)}" for key, n in found.items() if n]
-    return "\n".join(lines) + "\n"
-
-
-def _components(flat: list[str], rows: Columns, arrays: list[str]) -> dict[str, str]:
-    if flat:
-        return {_key(name): name for name in flat}
-    if not arrays or rows[arrays[0]].ndim != 2:
-        return {}
-    name = arrays[0]
-    return {f"s{i}" if rows[name].shape[1] > 3 else "xyz"[i]: f"{name}[{i}]" for i in range(rows[name].shape[1])}
-
-
-def _key(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "_", name)
-
-
 def _table(values: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:
     table = values.get(name, {})
     if not isinstance(table, dict):
@@ -162,12 +154,14 @@ def _table(values: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any
 
 def _component(name: str, value: Any) -> StateColumn:
     settings = {"column": value} if isinstance(value, str) else value
-    if not isinstance(settings, dict) or not isinstance(settings.get("column"), str) or len(settings) > 2:
+    if not isinstance(settings, dict) or "column" not in settings or not settings.keys() <= {"column", "unit"}:
         raise BadInput(f"state {name!r} is {value!r:.100}, expected a column or {{column = NAME, unit = UNIT}}")
-    unit = settings.get("unit", "m")
+    column, unit = settings["column"], settings.get("unit", "m")
     if not isinstance(unit, str):
         raise BadInput(f"unit of state {name!r} is {unit!r:.100}, expected a text such as m, cm, rad, deg or m/s")
-    return StateColumn(settings["column"], unit)
+    if not isinstance(column, str) and not (unit == QUATERNION and _texts(column) and len(column) == 4):
+        raise BadInput(f"column of state {name!r} is {column!r:.100}, expected a name, or four of a {QUATERNION}")
+    return StateColumn(column, unit)
 
 
 def _covariate(name: str, value: Any) -> CovariateColumn:

@@ -1,96 +1,121 @@
-"""Columns of a log: arrays of T rows by name, from NumPy archives, CSV and Parquet."""
+"""Columns of a log: arrays of T rows by name, from files and folders of other programs."""
 
 from __future__ import annotations
 
-import re
-import struct
-import tokenize
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.recordings.logs.arrays import Columns
+from beliefscope.recordings.logs.column_map import ELEMENTS, ColumnMap, base_name
+from beliefscope.recordings.logs.messages import on_clock, preview
 
-Columns = Mapping[str, NDArray[Any]]
+SUFFIXES = {
+    **{".npz": "tables", ".csv": "tables", ".parquet": "tables", ".mcap": "mcap_file", ".db3": "ros_bag"},
+}
+"""Suffix of a file -> its reader, a module of this package."""
 
-DAMAGED = (
-    *(OSError, ValueError, KeyError, EOFError, RuntimeError, MemoryError, OverflowError, SyntaxError),
-    *(struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
-)
-"""Errors of the readers for damaged files, and for encrypted archives."""
+FOLDERS = {"metadata.yaml": "ros_bag"}
+"""A file in a folder -> the reader of the folder."""
 
-ELEMENT = re.compile(r"(.*)\[(\d+)\]")
-"""``NAME[I]``: element I of the rows of an array."""
+PACKAGES = {"mcap": "logs", "rosbags": "logs", "zarr": "logs", "av": "video"}
+"""Package -> the extra of this package that installs it."""
 
 
-def read_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """The columns of a ``.npz``, ``.csv`` or ``.parquet`` file; nested lists in Parquet become arrays.
+def read_columns(path: Path, mapping: ColumnMap | None = None) -> Columns:
+    """The columns of a log that the map uses, of the same length; without a map, a preview of all columns.
 
-    Raises BadInput for another format, a damaged file, and rows of different sizes.
+    Logs of messages are resampled with the map's ``dt`` (see ``messages``). Of other logs, all columns are returned;
+    large ones that the map does not use are zeros.
+
+    Raises BadInput for another format, a package that is not installed, a damaged file, rows of different sizes, and
+    columns that the map names and the log does not have.
     """
-    try:
-        match path.suffix.lower():
-            case ".npz":
-                with np.load(path, allow_pickle=False) as archive:
-                    columns = {name: archive[name] for name in archive.files}
-            case ".csv" | ".parquet":
-                columns = _read_table(path)
-            case suffix:
-                raise BadInput(f"{path.name} has the format {suffix or 'unknown'!r}; logs are .npz, .csv or .parquet")
-    except BadInput:
-        raise
-    except DAMAGED as error:
-        raise BadInput(f"{path.name} cannot be read: {(str(error).splitlines() or ['no message'])[0]:.200}") from None
+    return _read(path, mapping)[0]
+
+
+def preview_columns(path: Path) -> tuple[Columns, Mapping[str, float]]:
+    """Columns for a first map, with few rows of logs of messages; topic -> median interval of its messages, s."""
+    return _read(path, None)
+
+
+def _read(path: Path, mapping: ColumnMap | None) -> tuple[Columns, Mapping[str, float]]:
+    intervals: Mapping[str, float] = {}
+    with _reading(path):
+        reader = import_module(f"beliefscope.recordings.logs.{_reader(path)}")
+        if hasattr(reader, "open_log"):
+            with reader.open_log(path, mapping and mapping.time) as log:
+                columns, intervals = preview(log) if mapping is None else (on_clock(log, mapping), {})
+        elif mapping and mapping.dt is not None and mapping.time:
+            raise BadInput("the map needs either dt or time, not both")
+        else:
+            references = mapping.references if mapping else set()
+            used = references | {base_name(reference) for reference in references}
+            columns = reader.read(path, used.__contains__)
     columns = {name: column for name, column in columns.items() if column.ndim and len(column)}
     if not columns:
         raise BadInput(f"{path.name} has no column with rows")
-    return columns
+    return columns, intervals
 
 
-def _read_table(path: Path) -> dict[str, NDArray[Any]]:
-    import pyarrow as pa
-    from pyarrow import csv, parquet
+def _reader(path: Path) -> str:
+    if path.is_dir():
+        for name, reader in FOLDERS.items():
+            if (path / name).is_file():
+                return reader
+        raise BadInput(f"folder {path.name} has none of {', '.join(FOLDERS)}: not a ROS 2 bag")
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise BadInput(
+            f"{path.name} has the format {suffix or 'unknown'!r}; logs are {', '.join(SUFFIXES)} or a folder"
+        )
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist")
+    return SUFFIXES[suffix]
 
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Errors of the formats' libraries as BadInput with one line: damaged files raise errors of every type."""
     try:
-        table = csv.read_csv(path) if path.suffix.lower() == ".csv" else parquet.read_table(path)
-        return {name: _array(table.column(name)) for name in table.column_names}
-    except pa.ArrowException as error:
-        raise ValueError(error) from None
-
-
-def _array(column: Any) -> NDArray[Any]:
-    """Rows of lists of equal lengths become further axes; missing numbers NaN."""
-    import pyarrow as pa
-
-    values = column.to_numpy(zero_copy_only=False)
-    if pa.types.is_nested(column.type):
-        return np.array(column.to_pylist(), dtype=np.float64)
-    return values if values.dtype != object else values.astype(str)
+        yield
+    except BadInput as error:
+        raise error if path.name in str(error) else BadInput(f"{path.name}: {error}") from None
+    except ImportError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in PACKAGES:
+            raise
+        extra = f"pip install 'beliefscope[{PACKAGES[package]}]'"
+        raise BadInput(f"{path.name} needs the package {package}: {extra}") from None
+    except Exception as error:
+        reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise BadInput(f"{path.name} cannot be read: {reason:.200}") from None
 
 
 def column(columns: Columns, reference: str, purpose: str) -> NDArray[np.float64]:
-    """(T, ...) numbers of a column, ``NAME``, or of one element of its rows, ``NAME[I]``.
+    """(T, ...) numbers of a column, ``NAME``, or of elements of its rows: ``NAME[I]`` (T,), ``NAME[I,J]`` (T, 2).
 
     Raises BadInput for an unknown name, an element that the rows do not have, and text.
     """
-    name, element = reference, None
-    if reference not in columns and (match := ELEMENT.fullmatch(reference)):
-        name, element = match[1], int(match[2])
+    name, elements = reference, ""
+    if reference not in columns and (match := ELEMENTS.fullmatch(reference)):
+        name, elements = match[1], match[2]
     if name not in columns:
         raise unknown_name(f"column of {purpose}", name, columns)
     values = columns[name]
     if values.dtype.kind not in "fiub":
         raise BadInput(f"column {name!r} of {purpose} has text, such as {str(values.flat[0])!r:.50}, expected numbers")
-    if element is None:
+    if not elements:
         return values.astype(np.float64)
-    if values.ndim < 2 or element >= values.shape[1]:
-        raise BadInput(f"column {name!r} of {purpose} has rows of shape {values.shape[1:]}, which have no [{element}]")
-    return values[:, element].astype(np.float64)
+    index = [int(element) for element in elements.split(",")]
+    if values.ndim < 2 or max(index) >= values.shape[1]:
+        raise BadInput(f"column {name!r} of {purpose} has rows of shape {values.shape[1:]}, which have no [{elements}]")
+    return values[:, index if len(index) > 1 else index[0]].astype(np.float64)
 
 
 def joined(columns: Columns, references: str | list[str], purpose: str) -> NDArray[np.float64]:

@@ -16,8 +16,10 @@ from beliefscope.datasets.task_json import check_definition
 from beliefscope.filters.external.adapter import check_values, derived
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
-from beliefscope.recordings.logs.column_map import ColumnMap, CovariateColumn
-from beliefscope.recordings.logs.columns import Columns, column, joined
+from beliefscope.recordings.logs.arrays import Columns
+from beliefscope.recordings.logs.column_map import QUATERNION, ColumnMap, CovariateColumn, References, StateColumn
+from beliefscope.recordings.logs.columns import column, joined
+from beliefscope.recordings.logs.images import grey
 
 Array = NDArray[np.float64]
 
@@ -102,7 +104,7 @@ def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
     estimate, factors, n = mapping.estimate, mapping.factors, len(mapping.state)
     values: dict[str, Array] = {}
     if "mean" in estimate:
-        mean = joined(columns, estimate["mean"], "estimate")
+        mean = _mean(columns, estimate["mean"], [*mapping.state.values()])
         if mean.shape[1] != n:
             raise BadInput(f"mean of [estimate] has {mean.shape[1]} columns, expected {n}: {', '.join(mapping.state)}")
         values["estimate_mean"] = mean * factors
@@ -117,16 +119,42 @@ def _estimate(columns: Columns, mapping: ColumnMap) -> dict[str, Array]:
             raise BadInput(f"std of [estimate] has {std.shape[1]} columns, expected {n}: {', '.join(mapping.state)}")
         values["estimate_covariance"] = np.square(std * factors)[:, :, None] * np.eye(n)
     if "particles" in estimate:
-        particles = joined(columns, estimate["particles"], "estimate")
-        if particles.shape[1] % n:
-            raise BadInput(f"particles of [estimate] have {particles.shape[1]} numbers per row, not a multiple of {n}")
-        values["particles"] = particles.reshape(len(particles), -1, n) * factors
+        values["particles"] = _particles(columns, estimate["particles"], n) * factors
         values["log_weights"] = np.full(values["particles"].shape[:2], -np.log(values["particles"].shape[1]))
         values.setdefault("estimate_mean", values["particles"].mean(axis=1))
         values.setdefault("estimate_covariance", _sample_covariance(values["particles"]))
     if weights := estimate.get("weights"):
         values["weights"] = joined(columns, list(weights.values()), "weights")[:, :, None]
     return values
+
+
+def _mean(columns: Columns, references: References, state: list[StateColumn]) -> Array:
+    """(T, d) means in the units of the state; quaternions as angles."""
+    if isinstance(references, str) or len(references) != len(state):
+        return joined(columns, references, "estimate")
+    pairs = zip(references, state, strict=True)
+    return np.concatenate([_scalar(columns, name, s.unit, "estimate") for name, s in pairs], axis=1)
+
+
+def _particles(columns: Columns, references: References, n: int) -> Array:
+    """(T, M, n): from a column with M n numbers per row, or a column with M numbers for each component."""
+    if isinstance(references, list) and len(references) == n:
+        parts = [joined(columns, name, "estimate") for name in references]
+        if len({part.shape for part in parts}) == 1:
+            return np.stack(parts, axis=-1)
+    particles = joined(columns, references, "estimate")
+    if particles.shape[1] % n:
+        raise BadInput(f"particles of [estimate] have {particles.shape[1]} numbers per row, not a multiple of {n}")
+    return particles.reshape(len(particles), -1, n)
+
+
+def _scalar(columns: Columns, references: References, unit: str, purpose: str) -> Array:
+    """(T, d) values of columns; (T, 1) of a quaternion (x, y, z, w) of any norm: its angle about z, rad."""
+    values = joined(columns, references, purpose)
+    if unit != QUATERNION or values.shape[1] != 4:
+        return values
+    x, y, z, w = values.T
+    return np.arctan2(2.0 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)[:, None]
 
 
 def _sample_covariance(ensemble: Array) -> Array:
@@ -137,24 +165,24 @@ def _sample_covariance(ensemble: Array) -> Array:
 
 def _states(columns: Columns, mapping: ColumnMap) -> Array:
     """(T, n) true states, SI units; NaN where they are unknown."""
-    known = {name: s for name, s in mapping.state.items() if s.column}
-    count = (
-        len(column(columns, next(iter(known.values())).column, "state")) if known else len(next(iter(columns.values())))
-    )
-    parts = [column(columns, s.column, f"state {name}") if s.column else np.full(count, np.nan)
-             for name, s in mapping.state.items()]  # fmt: skip
-    for (name, s), part in zip(mapping.state.items(), parts, strict=True):
-        if part.shape != (count,):
-            raise BadInput(f"state {name!r} has column {s.column!r} of shape {part.shape}, expected ({count},)")
-    return np.stack(parts, axis=1) * mapping.factors
+    known = {name: _scalar(columns, s.column, s.unit, f"state {name}") for name, s in mapping.state.items() if s.column}
+    count = len(next(iter((known or columns).values())))
+    for name, part in known.items():
+        if part.shape != (count, 1):
+            reference = mapping.state[name].column
+            raise BadInput(f"state {name!r} has column {reference!r} of shape {part.shape}, expected ({count}, 1)")
+    missing = np.full((count, 1), np.nan)
+    return np.concatenate([known.get(name, missing) for name in mapping.state], axis=1) * mapping.factors
 
 
 def _sensor(columns: Columns, name: str, references: str | list[str]) -> NDArray[Any]:
-    """(T, H, W) bytes of an image column, or (T, d) float32."""
-    if isinstance(references, str) and references in columns and columns[references].ndim == 3:
+    """(T, H, W) bytes of an image column, colours as grey; or (T, d) float32."""
+    if isinstance(references, str) and references in columns:
         images = columns[references]
-        if images.dtype == np.uint8:
+        if images.ndim == 3 and images.dtype == np.uint8:
             return images
+        if images.ndim == 4 and images.shape[3] == 3 and images.dtype.kind in "uif":
+            return grey(images)
     return joined(columns, references, f"sensor {name}").astype(np.float32)
 
 
@@ -185,10 +213,12 @@ def _time_step(columns: Columns, mapping: ColumnMap, rows: dict[str, NDArray[np.
 
 
 def _covariate(columns: Columns, name: str, entry: CovariateColumn) -> tuple[Covariate, NDArray[np.float32]]:
-    """A covariate and its values (T,): categories are numbered in alphabetical order."""
+    """A covariate and its values (T,): categories are numbered in alphabetical order, empty texts are unknown."""
     if entry.column in columns and columns[entry.column].dtype.kind in "US":
-        groups, index = np.unique(columns[entry.column], return_inverse=True)
-        return Covariate("categorical", tuple(map(str, groups))), index.astype(np.float32)
+        texts = columns[entry.column]
+        groups = np.unique(texts[texts != ""])
+        values = np.where(texts == "", np.nan, np.searchsorted(groups, texts)).astype(np.float32)
+        return Covariate("categorical", tuple(map(str, groups))), values
     numbers = column(columns, entry.column, f"covariate {name}")
     if numbers.ndim != 1:
         raise BadInput(f"covariate {name!r} has column {entry.column!r} of shape {numbers.shape}, expected one number")

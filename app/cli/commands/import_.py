@@ -14,7 +14,7 @@ RECORDINGS = (".rrd", ".live")
 
 
 @opt.with_options(
-    source=opt.argument("FILE", "Recording (.rrd), file of a live run (.live), or log (.npz, .csv, .parquet)."),
+    source=opt.argument("FILE", "Recording (.rrd), file of a live run (.live), or log: a file or folder, see below."),
     map=opt.option("MAP.toml", "Map of the columns of a log (docs/import.md).", "--map"),
     guess=opt.flag("Print a first map of a log instead of importing it.", "--guess"),
     output=opt.output_file(
@@ -41,6 +41,8 @@ def import_(
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
     run that the page displays.
 
+    Formats of logs: NumPy (.npz), CSV, Parquet, MCAP, ROS 2 bags (folder or .db3).
+
     \b
     Examples:
       beliefscope import run.rrd -o run.trace
@@ -48,23 +50,27 @@ def import_(
       beliefscope import log.csv --map map.toml -o log.h5
       beliefscope import log.csv --map map.toml --episode 2 -o run.trace
       beliefscope import log.csv --map map.toml -o run.live
+      beliefscope import drive.mcap --map map.toml -o drive.h5
     """
     from beliefscope.datasets.store import write_dataset
-    from beliefscope.recordings.logs.column_map import guess_map, read_map
-    from beliefscope.recordings.logs.columns import read_columns
+    from beliefscope.recordings.logs.column_map import read_map
+    from beliefscope.recordings.logs.columns import preview_columns, read_columns
+    from beliefscope.recordings.logs.guess import guess_map
     from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
     if guess:
-        text = guess_map(read_columns(source), source.stem)
+        columns, intervals = preview_columns(source)
+        text = guess_map(columns, source.stem, intervals)
         return console.Result({"map": text}, text.rstrip())
     if output is None:
         raise BadInput("give the output: -o RUN.trace, -o RUN.live or -o DATA.h5")
-    if source.suffix.lower() in RECORDINGS:
+    if source.suffix.lower() in RECORDINGS and map is None:
         opt.check_output(output, ".trace", ".live")
         return _written(opt.open_recording(source, task), output)
     if map is None:
         raise BadInput(f"the columns of {source.name} need a map: --map MAP.toml; --guess prints a first one")
-    columns, mapping = read_columns(source), read_map(map)
+    mapping = read_map(map)
+    columns = read_columns(source, mapping)
     episodes = read_log(columns, mapping, source.name)
     if output.suffix != ".h5":
         if not 0 <= episode < len(episodes):

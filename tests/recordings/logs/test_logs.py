@@ -13,8 +13,9 @@ from pyarrow import csv, parquet
 from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.statistics.measures import nees
 from beliefscope.inspect.trace import load_trace, save_trace
-from beliefscope.recordings.logs.column_map import guess_map, read_map
+from beliefscope.recordings.logs.column_map import read_map
 from beliefscope.recordings.logs.columns import column, joined, read_columns
+from beliefscope.recordings.logs.guess import guess_map
 from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
 MAP = """

@@ -1,0 +1,119 @@
+"""First map of a log, from the names and shapes of its columns; what is unclear is left to the user."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+
+from beliefscope.recordings.logs.arrays import Columns
+from beliefscope.recordings.logs.column_map import QUATERNION
+
+TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
+ESTIMATE = r"est|mean|pred|filter|posterior|belief"
+POSE_ESTIMATE = ESTIMATE + r"|odom|ekf|amcl|slam|local"
+
+PLANAR = "[0,1,5,6,7,11,30,31,35]"
+"""x, y and yaw in the covariance of x, y, z, roll, pitch and yaw of a ROS message."""
+
+
+def guess_map(columns: Columns, name: str, intervals: Mapping[str, float] | None = None) -> str:
+    """Text of a first map. intervals: of a log of messages, topic -> s between its messages."""
+    body = _messages(columns, intervals) if intervals else _table(columns)
+    return "\n".join([f'task = "{re.sub(r"[^A-Za-z0-9_.-]", "-", name)}"', *body]) + "\n"
+
+
+def _table(columns: Columns) -> list[str]:
+    flat = [n for n, values in columns.items() if values.ndim == 1 and values.dtype.kind in "fiub"]
+    rows = {n: values for n, values in columns.items() if values.ndim > 1}
+    time = _named(r"^(t|time|timestamp|stamp)(_s)?$", flat)
+    episode = _named(r"^episode(_index|_id)?$", [*columns])
+    counters = _named(r"^(frame_|task_)?index$", flat)
+    state = _components(_named(TRUTH, flat), rows, _named(TRUTH, [*rows]))
+    std = _named(r"std|sigma|(^|_)sd(_|$)", flat)
+    mean = [n for n in _named(ESTIMATE, flat) if n not in std] or [
+        n for n in _named(ESTIMATE, [*rows]) if rows[n].ndim == 2
+    ][:1]
+    covariance = [n for n in rows if rows[n].ndim == 3 and rows[n].shape[1] == rows[n].shape[2]][:1]
+    ensemble = _named(r"ensemble|particle|sample", [n for n in rows if rows[n].ndim == 3])[:1]
+    control = _named(r"^(action|control|u)$", [*columns])[:1]
+    used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control}
+    used |= {n.partition("[")[0] for n in state.values()}
+    sensors = {_key(n): n for n in columns if n not in used and (n in flat or n in rows)}
+    lines = [f'time = "{time[0]}"' if time else "dt = 0.1  # s per row"]
+    lines += [f'episode = "{episode[0]}"'] if episode else []
+    lines += [f'control = "{control[0]}"'] if control else []
+    lines += _sections({component: f'"{reference}"' for component, reference in state.items()}, sensors)
+    if mean or ensemble:
+        lines.append("[estimate]")
+        found = {"mean": mean, "std": std if not covariance else [], "covariance": covariance, "particles": ensemble}
+        lines += [f"{key} = {json.dumps(n[0] if len(n) == 1 else n)}" for key, n in found.items() if n]
+    return lines
+
+
+def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
+    """The first pose with a name of truth is the state, the first other one the estimate, the rest are sensors."""
+    poses = dict(filter(None, (_pose(columns, name) for name in columns)))
+    truth = next(iter(_named(TRUTH, [*poses])), "")
+    estimate = next(iter(_named(POSE_ESTIMATE, [p for p in poses if p != truth])), "")
+    state = {}
+    if truth:
+        x, y, orientation = poses[truth]
+        state = {"x": f'"{x}"', "y": f'"{y}"', "yaw": f'{{column = "{orientation}", unit = "{QUATERNION}"}}'}
+    topics = {_topic(intervals, pose) for pose in (truth, estimate) if pose}
+    rest = [n for n, v in columns.items() if v.dtype.kind in "fiub" and _topic(intervals, n) not in topics]
+    sensors: dict[str, str] = {}
+    for name in rest:
+        parent, _, leaf = name.rpartition(".")
+        if not re.search(r"\.(header|stamp)\.|covariance|\.(sec|nanosec|timestamp)$", name):
+            reference = parent if leaf in ("x", "y", "z", "w") else name
+            sensors[_key(reference.strip("/"))] = reference
+    interval = intervals.get(_topic(intervals, truth), min(intervals.values()))
+    lines = [f"dt = {interval:.3g}  # s per step of the common clock", *_sections(state, sensors)]
+    if estimate:
+        lines += ["[estimate]", f"mean = {json.dumps(poses[estimate])}"]
+        covariance = f"{estimate.removesuffix('.pose')}.covariance"
+        if covariance in columns and columns[covariance].shape[1:] == (36,):
+            lines.append(f'covariance = "{covariance}{PLANAR}"  # of x, y and yaw')
+    return lines
+
+
+def _pose(columns: Columns, name: str) -> tuple[str, tuple[str, str, str]] | None:
+    """Prefix of a pose, and its columns of x, y and orientation, for the first column of a pose."""
+    if name.endswith(".position.x"):  # ROS
+        prefix = name.removesuffix(".position.x")
+        found = (name, f"{prefix}.position.y", f"{prefix}.orientation")
+        return (prefix, found) if f"{prefix}.orientation.w" in columns else None
+    if name.endswith(".translation") and name.replace(".translation", ".quaternion") in columns:  # Rerun
+        prefix = name.removesuffix(".translation")
+        return prefix, (f"{name}[0]", f"{name}[1]", f"{prefix}.quaternion")
+    return None
+
+
+def _sections(state: Mapping[str, str], sensors: Mapping[str, str]) -> list[str]:
+    """Lines of [state] and [sensors]."""
+    lines = ["[state]  # true values: component = column, or {column = NAME, unit = m, cm, mm, rad or deg}"]
+    lines += [f"{component} = {value}" for component, value in state.items()] or ['x = ""', 'y = ""']
+    lines += ["[sensors]  # modality = column or list of columns"]
+    return lines + [f'{key} = "{reference}"' for key, reference in sensors.items()]
+
+
+def _named(pattern: str, names: Sequence[str]) -> list[str]:
+    return [n for n in names if re.search(pattern, n, re.IGNORECASE)]
+
+
+def _topic(topics: Mapping[str, float], name: str) -> str:
+    return max((t for t in topics if name == t or name.startswith(f"{t}.")), key=len, default="")
+
+
+def _components(flat: Sequence[str], rows: Columns, arrays: Sequence[str]) -> dict[str, str]:
+    if flat:
+        return {_key(name): name for name in flat}
+    if not arrays or rows[arrays[0]].ndim != 2:
+        return {}
+    name = arrays[0]
+    return {f"s{i}" if rows[name].shape[1] > 3 else "xyz"[i]: f"{name}[{i}]" for i in range(rows[name].shape[1])}
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)

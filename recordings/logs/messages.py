@@ -1,0 +1,241 @@
+"""Logs of messages: topics with their own rates, resampled on one clock.
+
+The ticks of the clock are the whole multiples of the map's ``dt``. At each tick, a column has the value of the topic's
+last message at or before it (zero-order hold).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.recordings.logs.arrays import Columns, check_size
+from beliefscope.recordings.logs.column_map import ColumnMap, base_name
+from beliefscope.recordings.logs.images import image_of, is_image
+
+LONGEST = 10_000_000
+"""Largest number of ticks."""
+
+SAMPLE = 100
+"""Messages per topic in a preview, of which ``DECODED`` are decoded."""
+
+DECODED = 3
+
+AGE = "age"
+"""Field of every topic: s since its last message."""
+
+
+class MessageLog(Protocol):
+    """An open log.
+
+    Attributes:
+        topics: names. second: units of time per second: 10^9 for ns; None: the unit is a step.
+    """
+
+    topics: Sequence[str]
+    second: float | None
+
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
+        """Topic, time, and function that decodes the message: numbers, text, arrays, and nested messages.
+
+        The messages of a topic should be in the order of their times; then only those that are used are decoded.
+        """
+
+
+@dataclass
+class Series:
+    """Messages of a topic, without those that another follows before the next tick.
+
+    Attributes:
+        paths: column -> fields that lead to its value. times: of the messages. values: column -> their values.
+    """
+
+    paths: Mapping[str, list[str]]
+    times: list[int] = field(default_factory=list)
+    values: dict[str, list[Any]] = field(default_factory=dict)
+    pending: tuple[int, int, Callable[[], Any]] | None = None
+
+    def add(self, tick: int, time: int, decode: Callable[[], Any]) -> None:
+        """Add a message whose first tick is ``tick``."""
+        if self.pending and self.pending[0] != tick:
+            self.flush()
+        self.pending = tick, time, decode
+
+    def flush(self) -> None:
+        """Decode the last message."""
+        if self.pending:
+            _, time, decode = self.pending
+            message = decode()
+            self.times.append(time)
+            for name, path in self.paths.items():
+                if path != [AGE] or AGE in entries_of(message):
+                    self.values.setdefault(name, []).append(value_at(message, path, name))
+            self.pending = None
+
+
+def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
+    """The columns of a map at the ticks of the clock.
+
+    The first tick is the first at which every topic of state, sensors, control and estimate has a message; covariates
+    are missing (NaN, empty text) before their first. The last tick is the first after the last message of the state's
+    topics, or of all topics if the state is unknown.
+
+    Raises BadInput for unknown topics and fields, topics without messages or whose times do not overlap, more than
+    ``LONGEST`` ticks, and values of different shapes.
+    """
+    if mapping.dt is None:
+        raise BadInput("the topics have their own rates: the map needs dt, s per step of the common clock")
+    series = {topic: Series(paths) for topic, paths in _paths(log.topics, mapping.references).items()}
+    step = max(round(mapping.dt * log.second), 1) if log.second else 1
+    for topic, time, decode in log.messages([*series]):
+        series[topic].add(-(-time // step), time, decode)
+    ticks = {}
+    for topic, entry in series.items():
+        entry.flush()
+        if not entry.times:
+            raise BadInput(f"topic {topic!r} has no message")
+        ticks[topic] = -(-np.array(entry.times, np.int64) // step)
+    clock = _clock(ticks, _topics(log.topics, mapping.required), _topics(log.topics, mapping.truth), mapping.dt)
+    columns: dict[str, NDArray[Any]] = {}
+    for topic, entry in series.items():
+        order = np.argsort(entry.times, kind="stable")
+        index = np.searchsorted(ticks[topic][order], clock, side="right") - 1
+        for name in entry.paths:
+            if name not in entry.values:  # the age
+                times = np.array(entry.times, np.int64)[order]
+                values = (clock * step - times[index]) / (log.second or 1.0)
+                columns[name] = np.where(index < 0, np.nan, values)
+            else:
+                columns[name] = _held(_stacked(name, entry.values[name]), order, index, name)
+    return columns
+
+
+def _clock(ticks: Mapping[str, NDArray[np.int64]], required: set[str], truth: set[str], dt: float) -> NDArray[np.int64]:
+    """(T,) ticks of the clock."""
+    first = max((int(ticks[topic].min()) for topic in required), default=min(int(t.min()) for t in ticks.values()))
+    last = min((int(ticks[topic].max()) for topic in truth), default=max(int(t.max()) for t in ticks.values()))
+    if last < first:
+        raise BadInput(f"the topics of state and sensors do not overlap in time: {', '.join(sorted(required))}")
+    if last - first >= LONGEST:
+        raise BadInput(f"the log has {last - first + 1} steps of {dt:g} s, more than {LONGEST}: increase dt")
+    return np.arange(first, last + 1)
+
+
+def _held(values: NDArray[Any], order: NDArray[np.intp], index: NDArray[np.intp], name: str) -> NDArray[Any]:
+    """(T, ...) value at each tick; missing where ``index`` is -1: NaN, empty text, and zeros for images."""
+    check_size(name, (len(index), *values.shape[1:]), values.dtype)
+    held, missing = values[order[index]], index < 0
+    if not missing.any():
+        return held
+    if held.dtype.kind in "iub" and held.ndim < 3:
+        held = held.astype(np.float64)
+    held[missing] = "" if held.dtype.kind == "U" else np.nan if held.dtype.kind == "f" else 0
+    return held
+
+
+def _stacked(name: str, values: Sequence[Any]) -> NDArray[Any]:
+    shapes = sorted({np.shape(value) for value in values})
+    if len(shapes) > 1:
+        raise BadInput(f"column {name!r} has values of the shapes {', '.join(map(str, shapes[:4]))}, expected one")
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiubU":
+        raise BadInput(f"column {name!r} has neither numbers nor text, such as {values[0]!r:.50}")
+    return array
+
+
+def _paths(topics: Sequence[str], references: set[str]) -> dict[str, dict[str, list[str]]]:
+    """Topic -> column -> fields. A column is a topic, or a topic and fields, joined by dots."""
+    paths: dict[str, dict[str, list[str]]] = {}
+    for name in sorted(map(base_name, references)):
+        topic = _topic(topics, name)
+        paths.setdefault(topic, {})[name] = name[len(topic) + 1 :].split(".") if name != topic else []
+    if not paths:
+        raise BadInput("the map names no column")
+    return paths
+
+
+def _topic(topics: Sequence[str], name: str) -> str:
+    matches = [topic for topic in topics if name == topic or name.startswith(f"{topic}.")]
+    if not matches:
+        raise unknown_name("topic of column", name, topics)
+    return max(matches, key=len)
+
+
+def _topics(topics: Sequence[str], references: set[str]) -> set[str]:
+    return {_topic(topics, base_name(reference)) for reference in references}
+
+
+def value_at(message: Any, path: Sequence[str], name: str) -> NDArray[Any]:
+    """The value of a message at a path of fields; of a nested message, all of its numbers in the order of its fields.
+
+    A path through a list of M messages gives M values. Raises BadInput for a field that does not exist.
+    """
+    for depth, part in enumerate(path):
+        if isinstance(message, list | tuple):
+            return np.array([value_at(item, path[depth:], name) for item in message])
+        entries = entries_of(message)
+        if part not in entries:
+            raise unknown_name(f"field of column {name!r}", part, entries)
+        if part == "data" and is_image(entries):
+            return image_of(entries)
+        message = entries[part]
+    return _numbers(message)
+
+
+def _numbers(value: Any) -> NDArray[Any]:
+    if isinstance(value, list | tuple):
+        return np.array([_numbers(item) for item in value])
+    entries = entries_of(value)
+    if not entries:
+        return np.asarray(np.nan if value is None else value)
+    if len(entries) == 1:
+        return _numbers(next(iter(entries.values())))
+    parts = [_numbers(item) for item in entries.values()]
+    return np.concatenate([part.ravel() for part in parts if part.dtype.kind in "fiub"])
+
+
+def entries_of(message: Any) -> Mapping[str, Any]:
+    """Fields of a message; empty for a number, a text or an array."""
+    if isinstance(message, dict):
+        return message
+    if is_dataclass(message):
+        return {entry.name: getattr(message, entry.name) for entry in fields(message)}
+    return {}
+
+
+def leaves(message: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Columns of a message with numbers, text and images, and their values; without lists of messages."""
+    entries = entries_of(message)
+    if not entries:
+        if not (isinstance(message, list | tuple) and any(map(entries_of, message))):
+            yield name, np.asarray(np.nan if message is None else message)
+    elif is_image(entries) and "data" in entries:
+        yield f"{name}.data", image_of(entries)
+    else:
+        for key, value in entries.items():
+            yield from leaves(value, f"{name}.{key}")
+
+
+def preview(log: MessageLog) -> tuple[Columns, Mapping[str, float]]:
+    """The first messages of every topic as columns, and the median interval of each topic, s. Raises no BadInput."""
+    times: dict[str, list[int]] = {topic: [] for topic in log.topics}
+    values: dict[str, list[NDArray[Any]]] = {}
+    for topic, time, decode in log.messages(log.topics):
+        times[topic].append(time)
+        if len(times[topic]) <= DECODED:
+            try:
+                for name, value in leaves(decode(), topic):
+                    values.setdefault(name, []).append(value)
+            except BadInput:
+                continue  # a topic that cannot be decoded may not be needed
+        elif all(len(t) >= SAMPLE for t in times.values()):
+            break
+    usable = {n: v for n, v in values.items() if len({i.shape for i in v}) == 1 and v[0].size}
+    stacked = {name: np.asarray(value) for name, value in usable.items()}
+    intervals = {t: float(np.median(np.diff(v))) / (log.second or 1.0) for t, v in times.items() if len(v) > 1}
+    return {n: v for n, v in stacked.items() if v.dtype.kind in "fiubU"}, intervals

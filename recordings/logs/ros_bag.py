@@ -1,0 +1,45 @@
+"""ROS 2 bags: folders with metadata.yaml, and single storage files (sqlite3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from beliefscope.recordings.logs.ros_types import RosTypes
+
+
+@contextmanager
+def open_log(path: Path, timeline: str | None) -> Iterator[BagLog]:
+    """The log in a bag with the storage sqlite3 or mcap. The time of a message is that of its recording."""
+    from rosbags.rosbag2 import Reader
+
+    with Reader(path) as reader:
+        yield BagLog(reader)
+
+
+@dataclass
+class BagLog:
+    """An open bag."""
+
+    reader: Any
+    second: float | None = 1e9
+    _ros: RosTypes = field(default_factory=RosTypes)
+
+    def __post_init__(self) -> None:
+        self.topics = tuple(sorted({connection.topic for connection in self.reader.connections}))
+
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
+        """Topic, time in ns and decoder of each message, in the order of times."""
+        connections = [connection for connection in self.reader.connections if connection.topic in topics]
+        for connection, time, data in self.reader.messages(connections):
+            yield connection.topic, time, partial(self._decode, connection, data)
+
+    def _decode(self, connection: Any, data: bytes) -> Any:
+        from rosbags.interfaces import MessageDefinitionFormat
+
+        kind, text = connection.msgdef.format, connection.msgdef.data
+        return self._ros.decode(connection.msgtype, text if kind == MessageDefinitionFormat.MSG else "", data)

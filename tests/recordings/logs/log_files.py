@@ -1,0 +1,193 @@
+"""Logs written by the libraries of their formats, with values that are functions of the time."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+START = 1_700_000_000 * 10**9
+"""ns: time of the first messages."""
+
+SECONDS = 2.0
+
+
+def pose(t: float) -> tuple[float, float, float]:
+    """x, y (m) and yaw (rad) at a time (s)."""
+    return 2.0 * t, np.sin(t), 0.9 * t - 1.0
+
+
+def spin(t: float) -> list[float]:
+    """Angular velocity, rad/s."""
+    return [0.1 * t, -t, 0.9]
+
+
+def colour(t: float) -> np.ndarray:
+    """(4, 6, 3) image that becomes brighter."""
+    return np.full((4, 6, 3), [100, 50, 20 * t], np.uint8)
+
+
+def stage(t: float) -> str:
+    return "reach" if t < 1.0 else "lift"
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Messages every ``period`` s from ``first`` s on. name: of the ROS type."""
+
+    name: str
+    period: float
+    first: float = 0.0
+
+    def times(self) -> np.ndarray:
+        """(N,) s since ``START``."""
+        return self.first + self.period * np.arange(int((SECONDS - self.first) / self.period + 1e-9) + 1)
+
+
+STREAMS = {
+    "/truth": Stream("nav_msgs/msg/Odometry", 0.02),
+    "/odom": Stream("nav_msgs/msg/Odometry", 0.03, 0.31),
+    "/imu": Stream("sensor_msgs/msg/Imu", 0.007, 0.1),
+    "/camera": Stream("sensor_msgs/msg/Image", 0.2, 0.05),
+    "/preview": Stream("sensor_msgs/msg/CompressedImage", 0.5, 0.01),
+    "/stage": Stream("std_msgs/msg/String", 0.25, 0.6),
+}
+"""Topic -> its messages."""
+
+
+def held(topic: str, ticks: np.ndarray) -> np.ndarray:
+    """(T,) time of the last message of a topic at or before each tick, s; NaN without one."""
+    times = STREAMS[topic].times()
+    return np.array([max(times[times <= tick + 1e-9], default=np.nan) for tick in ticks])
+
+
+def in_order() -> Iterator[tuple[str, float, int]]:
+    """Topic, time in s, and time in ns of all messages in the order of their times."""
+    every = [(float(t), topic) for topic, stream in STREAMS.items() for t in stream.times()]
+    for t, topic in sorted(every):
+        yield topic, t, START + round(t * 1e9)
+
+
+def png(image: np.ndarray) -> bytes:
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(image).save(data, "png")
+    return data.getvalue()
+
+
+def fields(topic: str, t: float) -> dict[str, Any]:
+    """A message as nested fields."""
+    header = {"stamp": {"sec": int(t), "nanosec": 0}, "frame_id": "map"}
+    match topic:
+        case "/truth" | "/odom":
+            x, y, yaw = pose(t)
+            half = {"x": 0.0, "y": 0.0, "z": np.sin(yaw / 2), "w": np.cos(yaw / 2)}
+            covariance = (np.diag([0.04, 0.09, 1.0, 1.0, 1.0, 0.01]) * (1.0 + t)).ravel()
+            zero = {"x": 0.0, "y": 0.0, "z": 0.0}
+            place = {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": half}, "covariance": covariance}
+            twist = {"twist": {"linear": zero, "angular": zero}, "covariance": np.zeros(36)}
+            return {"header": header, "child_frame_id": "base", "pose": place, "twist": twist}
+        case "/imu":
+            zero = {"x": 0.0, "y": 0.0, "z": 0.0}
+            turn = dict(zip("xyz", spin(t), strict=True))
+            names = ("orientation_covariance", "angular_velocity_covariance", "linear_acceleration_covariance")
+            values = {"orientation": zero | {"w": 1.0}, "angular_velocity": turn, "linear_acceleration": zero}
+            parts = [pair for n, c in zip(values, names, strict=True) for pair in ((n, values[n]), (c, np.zeros(9)))]
+            return {"header": header, **dict(parts)}
+        case "/camera":
+            image = colour(t)
+            size = {"height": 4, "width": 6, "encoding": "rgb8", "is_bigendian": 0, "step": 18}
+            return {"header": header, **size, "data": image.ravel()}
+        case "/preview":
+            return {"header": header, "format": "png", "data": np.frombuffer(png(colour(t)), np.uint8)}
+    return {"data": stage(t)}
+
+
+def write_json_mcap(path: Path, chunk_size: int = 20_000) -> None:
+    """MCAP with JSON messages; bytes are base64."""
+    import base64
+
+    from mcap.writer import Writer
+
+    def encode(value: Any) -> Any:
+        return base64.b64encode(value.tobytes()).decode() if value.dtype == np.uint8 else value.tolist()
+
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=chunk_size)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        channels = {topic: writer.register_channel(topic, "json", schema) for topic in STREAMS}
+        for topic, t, time in in_order():
+            data = json.dumps(fields(topic, t), default=encode).encode()
+            writer.add_message(channels[topic], time, data, time)
+        writer.finish()
+
+
+def ros_store() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def ros_message(store: Any, name: str, values: dict[str, Any]) -> Any:
+    """A message of rosbags from nested fields."""
+    types = dict(store.fielddefs[name][1])
+    parts = {
+        key: ros_message(store, types[key][1], value) if isinstance(value, dict) else value
+        for key, value in values.items()
+    }
+    return store.types[name](**parts)
+
+
+def write_ros_mcap(path: Path, chunk_size: int = 20_000) -> None:
+    """MCAP with CDR messages, written by the mcap library."""
+    from mcap.writer import Writer
+
+    store = ros_store()
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=chunk_size)
+        writer.start("ros2")
+        channels = {}
+        for topic, entry in STREAMS.items():
+            definition = store.generate_msgdef(entry.name, ros_version=2)[0].encode()
+            schema = writer.register_schema(entry.name, "ros2msg", definition)
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        for topic, t, time in in_order():
+            name = STREAMS[topic].name
+            data = store.serialize_cdr(ros_message(store, name, fields(topic, t)), name)
+            writer.add_message(channels[topic], time, bytes(data), time)
+        writer.finish()
+
+
+def write_bag(path: Path, storage: str = "SQLITE3", compression: str = "") -> None:
+    """ROS 2 bag, a folder; compression: ``FILE`` or ``MESSAGE``."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    store = ros_store()
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage])
+    if compression:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
+        connections = {t: writer.add_connection(t, s.name, typestore=store) for t, s in STREAMS.items()}
+        for topic, t, time in in_order():
+            name = STREAMS[topic].name
+            writer.write(
+                connections[topic], time, store.serialize_cdr(ros_message(store, name, fields(topic, t)), name)
+            )
+
+
+MESSAGE_LOGS: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "mcap-json": ("log.mcap", write_json_mcap),
+    "mcap-ros2": ("log.mcap", write_ros_mcap),
+    "bag-sqlite3": ("bag", write_bag),
+    "bag-mcap": ("bag", lambda path: write_bag(path, "MCAP")),
+    "bag-messages-zstd": ("bag", lambda path: write_bag(path, compression="MESSAGE")),
+    "bag-file-zstd": ("bag", lambda path: write_bag(path, compression="FILE")),
+}
+"""Format -> name of the file or folder, and its writer."""
