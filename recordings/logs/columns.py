@@ -17,10 +17,14 @@ from beliefscope.recordings.logs.messages import on_clock, preview
 
 SUFFIXES = {
     **{".npz": "tables", ".csv": "tables", ".parquet": "tables", ".mcap": "mcap_file", ".db3": "ros_bag"},
+    **{".zip": "zarr_buffer"},
 }
 """Suffix of a file -> its reader, a module of this package."""
 
-FOLDERS = {"metadata.yaml": "ros_bag"}
+FOLDERS = {
+    **{"metadata.yaml": "ros_bag", "meta/info.json": "lerobot"},
+    **{"zarr.json": "zarr_buffer", ".zgroup": "zarr_buffer"},
+}
 """A file in a folder -> the reader of the folder."""
 
 PACKAGES = {"mcap": "logs", "rosbags": "logs", "zarr": "logs", "av": "video"}
@@ -68,7 +72,7 @@ def _reader(path: Path) -> str:
         for name, reader in FOLDERS.items():
             if (path / name).is_file():
                 return reader
-        raise BadInput(f"folder {path.name} has none of {', '.join(FOLDERS)}: not a ROS 2 bag")
+        raise BadInput(f"folder {path.name} has none of {', '.join(FOLDERS)}: not a ROS 2 bag, LeRobot or Zarr data")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise BadInput(

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from beliefscope.recordings.logs.arrays import Columns
-from beliefscope.recordings.logs.column_map import QUATERNION
+from beliefscope.recordings.logs.column_map import QUATERNION, base_name
 
 TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"est|mean|pred|filter|posterior|belief"
@@ -60,7 +60,7 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
     if truth:
         x, y, orientation = poses[truth]
         state = {"x": f'"{x}"', "y": f'"{y}"', "yaw": f'{{column = "{orientation}", unit = "{QUATERNION}"}}'}
-    topics = {_topic(intervals, pose) for pose in (truth, estimate) if pose}
+    topics = {_topic(intervals, base_name(column)) for pose in (truth, estimate) if pose for column in poses[pose]}
     rest = [n for n, v in columns.items() if v.dtype.kind in "fiub" and _topic(intervals, n) not in topics]
     sensors: dict[str, str] = {}
     for name in rest:
@@ -68,8 +68,8 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
         if not re.search(r"\.(header|stamp)\.|covariance|\.(sec|nanosec|timestamp)$", name):
             reference = parent if leaf in ("x", "y", "z", "w") else name
             sensors[_key(reference.strip("/"))] = reference
-    interval = intervals.get(_topic(intervals, truth), min(intervals.values()))
-    lines = [f"dt = {interval:.3g}  # s per step of the common clock", *_sections(state, sensors)]
+    clock = _topic(intervals, base_name(poses[truth][0])) if truth else min(intervals, key=lambda t: intervals[t])
+    lines = [f"dt = {intervals[clock]:.3g}  # s per step of the common clock", *_sections(state, sensors)]
     if estimate:
         lines += ["[estimate]", f"mean = {json.dumps(poses[estimate])}"]
         covariance = f"{estimate.removesuffix('.pose')}.covariance"

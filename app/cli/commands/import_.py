@@ -41,7 +41,8 @@ def import_(
     become a data set; an estimate of one episode becomes a trace, which every command reads without the filter, or a
     run that the page displays.
 
-    Formats of logs: NumPy (.npz), CSV, Parquet, MCAP, ROS 2 bags (folder or .db3).
+    Formats of logs: NumPy (.npz), CSV, Parquet, MCAP, ROS 2 bags (folder or .db3), Zarr replay buffers (folder or
+    .zip), LeRobot data sets (folder, version 3), and Rerun recordings of other programs (.rrd with --map or --guess).
 
     \b
     Examples:

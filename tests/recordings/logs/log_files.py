@@ -182,6 +182,143 @@ def write_bag(path: Path, storage: str = "SQLITE3", compression: str = "") -> No
             )
 
 
+def write_rerun(path: Path) -> None:
+    """Rerun recording of another program, with the time since ``START`` and the number of the message as timelines."""
+    import rerun as rr
+
+    recording = rr.RecordingStream("other", recording_id="log")
+    recording.save(path)
+    for number, (topic, t, time) in enumerate(in_order()):
+        recording.set_time("sim", duration=np.timedelta64(time - START, "ns"))
+        recording.set_time("number", sequence=number)
+        match topic:
+            case "/truth" | "/odom":
+                x, y, yaw = pose(t)
+                rotation = rr.Quaternion(xyzw=[0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
+                recording.log(topic, rr.Transform3D(translation=[x, y, 0.0], rotation=rotation))
+            case "/imu":
+                recording.log(topic, rr.Scalars(spin(t)))
+                recording.log("/turn", rr.Scalars(spin(t)[1]))
+                recording.log("/matrix", rr.Tensor(np.array([spin(t), pose(t)])))
+            case "/camera":
+                recording.log(topic, rr.Image(colour(t)[:, :, ::-1], color_model="BGR"))
+                recording.log("/depth", rr.DepthImage(np.full((4, 6), 1000 * t, np.uint16), meter=1000))
+            case "/preview":
+                recording.log(topic, rr.EncodedImage(contents=png(colour(t)), media_type="image/png"))
+            case _:
+                recording.log(topic, rr.TextLog(stage(t)))
+    recording.disconnect()
+
+
+EPISODES = (7, 4, 9)
+"""Lengths of the episodes of replay buffers and data sets."""
+
+
+def buffer_arrays() -> dict[str, np.ndarray]:
+    """Arrays over the steps of all episodes."""
+    steps = np.arange(sum(EPISODES))
+    action = np.stack([steps, 0.5 * steps], axis=1).astype(np.float32)
+    state = np.stack([0.1 * steps, -0.2 * steps, np.sin(steps)], axis=1)
+    image = np.stack([colour(0.4 * step) for step in steps])
+    return {"action": action, "state": state, "img": image.astype(np.float32), "camera": image}
+
+
+def write_zarr(path: Path, zarr_format: int = 3) -> None:
+    """Replay buffer in a folder, or a zip archive if the path ends in .zip."""
+    import zarr
+
+    is_zip = path.suffix == ".zip"
+    store = zarr.storage.ZipStore(path, mode="w") if is_zip else zarr.storage.LocalStore(path)
+    group = zarr.create_group(store, zarr_format=zarr_format)
+    data, meta = group.create_group("data"), group.create_group("meta")
+    for name, array in buffer_arrays().items():
+        stored = data.create_array(name, shape=array.shape, dtype=array.dtype, chunks=(8, *array.shape[1:]))
+        stored[:] = array
+    ends = meta.create_array("episode_ends", shape=(len(EPISODES),), dtype="i8")
+    ends[:] = np.cumsum(EPISODES)
+    store.close()
+
+
+FPS = 10
+FRAME = (32, 48)
+
+
+def level(episode: int, frame: int) -> int:
+    """Grey level of a frame of the videos."""
+    return 40 + 60 * episode + 5 * frame
+
+
+def write_lerobot(path: Path, video: bool = True) -> None:
+    """LeRobot data set in the layout of version 3: two data files, and two videos, one with two episodes."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    starts = np.cumsum([0, *EPISODES])
+    arrays, rows = buffer_arrays(), []
+    features = {
+        name: {"dtype": str(arrays[key].dtype), "shape": list(arrays[key].shape[1:]), "names": None}
+        for name, key in (("observation.state", "state"), ("action", "action"))
+    }
+    height, width = FRAME
+    features["observation.images.wrist"] = {
+        "dtype": "image",
+        "shape": [4, 6, 3],
+        "names": ["height", "width", "channel"],
+    }
+    if video:
+        features["observation.images.top"] = {"dtype": "video", "shape": [height, width, 3], "names": None}
+    tables = []
+    for episode, length in enumerate(EPISODES):
+        at = slice(starts[episode], starts[episode + 1])
+        images = [{"bytes": png(image), "path": None} for image in arrays["camera"][at]]
+        columns = {
+            "observation.state": pa.array(list(arrays["state"][at]), pa.list_(pa.float64(), 3)),
+            "action": pa.array(list(arrays["action"][at]), pa.list_(pa.float32(), 2)),
+            "observation.images.wrist": images,
+            "timestamp": pa.array(np.arange(length) / FPS, pa.float32()),
+            "frame_index": np.arange(length),
+            "episode_index": np.full(length, episode),
+            "index": np.arange(at.start, at.stop),
+            "task_index": np.zeros(length, int),
+        }
+        tables.append(pa.table(columns))
+        file, first = (0, sum(EPISODES[:episode])) if episode < 2 else (1, 0)
+        row = {"episode_index": episode, "tasks": ["drive"], "length": length, "data/chunk_index": 0}
+        row |= {"data/file_index": file, "dataset_from_index": int(at.start), "dataset_to_index": int(at.stop)}
+        top = "videos/observation.images.top"
+        row |= {f"{top}/chunk_index": 0, f"{top}/file_index": file, f"{top}/from_timestamp": first / FPS}
+        rows.append(row | {f"{top}/to_timestamp": (first + length) / FPS})
+    for file, part in enumerate((tables[:2], tables[2:])):
+        target = path / "data" / "chunk-000" / f"file-{file:03d}.parquet"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        parquet.write_table(pa.concat_tables(part), target)
+        if video:
+            episodes = [(e, n) for e, n in enumerate(EPISODES) if (e < 2) == (file == 0)]
+            target = path / "videos" / "observation.images.top" / "chunk-000" / f"file-{file:03d}.mp4"
+            write_video(target, [level(e, frame) for e, n in episodes for frame in range(n)])
+    meta = path / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    meta.parent.mkdir(parents=True)
+    parquet.write_table(pa.Table.from_pylist(rows), meta)
+    info = {"codebase_version": "v3.0", "robot_type": "test", "fps": FPS, "features": features}
+    info |= {"total_episodes": len(EPISODES), "total_frames": int(starts[-1]), "splits": {"train": "0:3"}}
+    (path / "meta" / "info.json").write_text(json.dumps(info))
+
+
+def write_video(path: Path, levels: list[int]) -> None:
+    """Grey frames in H.264, as LeRobot writes them: pixels in YUV with half the resolution of colours."""
+    import av
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=FPS, options={"crf": "10", "g": "2"})
+        stream.height, stream.width = FRAME
+        stream.pix_fmt = "yuv420p"
+        for grey in levels:
+            frame = av.VideoFrame.from_ndarray(np.full((*FRAME, 3), grey, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
 MESSAGE_LOGS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "mcap-json": ("log.mcap", write_json_mcap),
     "mcap-ros2": ("log.mcap", write_ros_mcap),

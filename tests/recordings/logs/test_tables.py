@@ -1,0 +1,192 @@
+"""Replay buffers in Zarr and LeRobot data sets: columns over the steps of all episodes."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import log_files as logs
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.recordings.logs.column_map import read_map
+from beliefscope.recordings.logs.columns import preview_columns, read_columns
+from beliefscope.recordings.logs.guess import guess_map
+from beliefscope.recordings.logs.images import LUMA
+from beliefscope.recordings.logs.read_log import read_log
+
+ZARR = """
+dt = 0.1
+episode = "episode"
+control = "action"
+[state]
+x = "state[0]"
+y = "state[1]"
+[sensors]
+image = "camera"
+"""
+
+LEROBOT = """
+time = "timestamp"
+episode = "episode_index"
+control = "action"
+[state]
+x = "observation.state[0]"
+y = "observation.state[1]"
+[sensors]
+top = "observation.images.top"
+wrist = "observation.images.wrist"
+"""
+
+
+def map_file(folder: Path, text: str) -> Path:
+    path = folder / "map.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(params=[(2, "buffer.zarr"), (3, "buffer.zarr"), (2, "buffer.zarr.zip"), (3, "buffer.zip")])
+def buffer(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    zarr_format, name = request.param
+    logs.write_zarr(tmp_path / name, zarr_format)
+    return tmp_path / name
+
+
+@pytest.fixture
+def lerobot(tmp_path: Path) -> Path:
+    pytest.importorskip("av", reason="av is not installed: no video can be written")
+    logs.write_lerobot(tmp_path / "dataset")
+    return tmp_path / "dataset"
+
+
+def grey(image: np.ndarray) -> np.ndarray:
+    return np.rint(image @ LUMA).astype(np.uint8)
+
+
+def test_episodes_of_a_replay_buffer(buffer: Path, tmp_path: Path) -> None:
+    mapping = read_map(map_file(tmp_path, ZARR))
+    episodes = read_log(read_columns(buffer, mapping), mapping, buffer.name)
+    assert [len(e) for e in episodes] == [*logs.EPISODES]
+    expected, at = logs.buffer_arrays(), slice(7, 11)
+    assert np.array_equal(episodes[1].controls, expected["action"][at])
+    np.testing.assert_allclose(episodes[1].states, expected["state"][at, :2], rtol=1e-6)
+    assert np.array_equal(episodes[1].observations["image"], grey(expected["camera"][at]))
+
+
+def test_only_columns_of_the_map_are_read(buffer: Path, tmp_path: Path) -> None:
+    columns = read_columns(buffer, read_map(map_file(tmp_path, ZARR)))
+    assert columns["img"].shape == (20, 4, 6, 3)
+    assert columns["img"].strides == (0, 0, 0, 0)
+    assert columns["camera"].any()
+
+
+@pytest.mark.parametrize("scale", [1.0, 255.0])
+def test_float_images_become_bytes(tmp_path: Path, scale: float) -> None:
+    logs.write_zarr(tmp_path / "buffer.zarr")
+    columns = dict(read_columns(tmp_path / "buffer.zarr", read_map(map_file(tmp_path, ZARR))))
+    images = logs.buffer_arrays()["camera"]
+    columns["camera"] = images.astype(np.float32) / scale
+    episodes = read_log(columns, read_map(map_file(tmp_path, ZARR)), "buffer")
+    np.testing.assert_allclose(episodes[0].observations["image"], grey(images[:7]), atol=1)
+
+
+def test_episodes_of_a_lerobot_data_set(lerobot: Path, tmp_path: Path) -> None:
+    """Frames are those of the episode's part of its video; H.264 changes levels by a few units."""
+    mapping = read_map(map_file(tmp_path, LEROBOT))
+    episodes = read_log(read_columns(lerobot, mapping), mapping, lerobot.name)
+    assert [len(e) for e in episodes] == [*logs.EPISODES]
+    assert episodes[0].dt == pytest.approx(1.0 / logs.FPS)
+    expected, at = logs.buffer_arrays(), slice(11, 20)
+    np.testing.assert_allclose(episodes[2].states, expected["state"][at, :2], rtol=1e-6)
+    assert np.array_equal(episodes[2].observations["wrist"], grey(expected["camera"][at]))
+    for number, episode in enumerate(episodes):
+        levels = [logs.level(number, frame) for frame in range(len(episode))]
+        np.testing.assert_allclose(episode.observations["top"].mean(axis=(1, 2)), levels, atol=2.0)
+
+
+def test_guessed_maps_import_the_logs(buffer: Path, lerobot: Path, tmp_path: Path) -> None:
+    for log, time in ((buffer, {"dt": 0.1}), (lerobot, {"time": "timestamp"})):
+        columns, intervals = preview_columns(log)
+        text = guess_map(columns, "log", intervals)
+        values = tomllib.loads(text)
+        assert values.items() >= (time | {"control": "action"}).items()
+        mapping = read_map(map_file(tmp_path, text))
+        assert len(read_log(read_columns(log, mapping), mapping, "log")) == 3
+
+
+def test_videos_without_av_name_the_package(lerobot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(BadInput, match=r"need the package av: pip install 'beliefscope\[video\]', or leave the camera"):
+        read_columns(lerobot, read_map(map_file(tmp_path, LEROBOT)))
+    without = LEROBOT.replace('top = "observation.images.top"\n', "")
+    assert read_columns(lerobot, read_map(map_file(tmp_path, without)))["action"].shape == (20, 2)
+
+
+def test_missing_packages_are_named(buffer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(BadInput, match=r"needs the package zarr: pip install 'beliefscope\[logs\]'"):
+        read_columns(buffer)
+
+
+def test_objects_are_refused(tmp_path: Path) -> None:
+    """A type of objects, whose codec can be pickle, is refused before anything is decoded."""
+    path = tmp_path / "buffer.zarr"
+    logs.write_zarr(path, 2)
+    for key, value in (("dtype", "|O"), ("filters", [{"id": "pickle"}])):
+        file = path / "data" / "state" / ".zarray"
+        original = file.read_text()
+        file.write_text(json.dumps(json.loads(original) | {key: value}))
+        with pytest.raises(BadInput, match=r"buffer\.zarr") as error:
+            read_columns(path, read_map(map_file(tmp_path, ZARR)))
+        assert "\n" not in str(error.value)
+        file.write_text(original)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("codebase_version", "v2.1", "version 'v2.1', expected v3"),
+        ("fps", 0, "fps in info.json is 0"),
+        ("features", {}, "'observation.images.top' does not exist"),
+    ],
+)
+def test_wrong_metadata_of_lerobot(lerobot: Path, tmp_path: Path, key: str, value: object, message: str) -> None:
+    info = lerobot / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {key: value}))
+    mapping = read_map(map_file(tmp_path, LEROBOT))
+    with pytest.raises(BadInput, match=message):
+        read_log(read_columns(lerobot, mapping), mapping, "log")
+
+
+@pytest.mark.parametrize(("frames", "message"), [(8, "has no frame at 0.8 s"), (0, "cannot be read")])
+def test_short_videos_are_refused(lerobot: Path, tmp_path: Path, frames: int, message: str) -> None:
+    video = lerobot / "videos" / "observation.images.top" / "chunk-000" / "file-001.mp4"
+    video.unlink()
+    if frames:
+        logs.write_video(video, [0] * frames)
+    with pytest.raises(BadInput, match=message):
+        read_columns(lerobot, read_map(map_file(tmp_path, LEROBOT)))
+
+
+@pytest.mark.parametrize(
+    ("ends", "message"), [([7, 5, 20], "ascending"), ([0, 20], "ascending"), ([7, 19], "ends at 19")]
+)
+def test_wrong_ends_of_episodes(tmp_path: Path, ends: list[int], message: str) -> None:
+    import zarr
+
+    logs.write_zarr(tmp_path / "buffer.zarr")
+    meta = zarr.open_group(tmp_path / "buffer.zarr")["meta"]
+    meta.create_array("episode_ends", data=np.array(ends), overwrite=True)
+    with pytest.raises(BadInput, match=message):
+        read_columns(tmp_path / "buffer.zarr")
+
+
+def test_folders_of_other_formats_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"none of metadata\.yaml, meta/info\.json"):
+        read_columns(tmp_path)
