@@ -17,7 +17,7 @@ from beliefscope.recordings.logs.messages import on_clock, preview
 
 SUFFIXES = {
     **{".npz": "tables", ".csv": "tables", ".parquet": "tables", ".mcap": "mcap_file", ".db3": "ros_bag"},
-    **{".zip": "zarr_buffer"},
+    **{".rrd": "rerun_file", ".zip": "zarr_buffer"},
 }
 """Suffix of a file -> its reader, a module of this package."""
 
