@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.recordings.logs.arrays import Columns
 from beliefscope.recordings.logs.column_map import ELEMENTS, ColumnMap, base_name
-from beliefscope.recordings.logs.messages import on_clock, preview
+from beliefscope.recordings.logs.messages import Preview, on_clock, preview
 
 SUFFIXES = {
     **{".npz": "tables", ".csv": "tables", ".parquet": "tables", ".mcap": "mcap_file", ".db3": "ros_bag"},
@@ -40,31 +40,30 @@ def read_columns(path: Path, mapping: ColumnMap | None = None) -> Columns:
     Raises BadInput for another format, a package that is not installed, a damaged file, rows of different sizes, and
     columns that the map names and the log does not have.
     """
-    return _read(path, mapping)[0]
+    return _read(path, mapping).columns
 
 
-def preview_columns(path: Path) -> tuple[Columns, Mapping[str, float]]:
-    """Columns for a first map, with few rows of logs of messages; topic -> median interval of its messages, s."""
+def preview_columns(path: Path) -> Preview:
+    """Columns for a first map, with few rows of logs of messages. Raises BadInput as ``read_columns``."""
     return _read(path, None)
 
 
-def _read(path: Path, mapping: ColumnMap | None) -> tuple[Columns, Mapping[str, float]]:
-    intervals: Mapping[str, float] = {}
+def _read(path: Path, mapping: ColumnMap | None) -> Preview:
     with _reading(path):
         reader = import_module(f"beliefscope.recordings.logs.{_reader(path)}")
         if hasattr(reader, "open_log"):
-            with reader.open_log(path, mapping and mapping.time) as log:
-                columns, intervals = preview(log) if mapping is None else (on_clock(log, mapping), {})
+            with reader.open_log(path, None if mapping is None else mapping.time) as log:
+                result = preview(log) if mapping is None else Preview(on_clock(log, mapping))
         elif mapping and mapping.dt is not None and mapping.time:
             raise BadInput("the map needs either dt or time, not both")
         else:
             references = mapping.references if mapping else set()
             used = references | {base_name(reference) for reference in references}
-            columns = reader.read(path, used.__contains__)
-    columns = {name: column for name, column in columns.items() if column.ndim and len(column)}
+            result = Preview(reader.read(path, used.__contains__))
+    columns = {name: column for name, column in result.columns.items() if column.ndim and len(column)}
     if not columns:
         raise BadInput(f"{path.name} has no column with rows")
-    return columns, intervals
+    return result._replace(columns=columns)
 
 
 def _reader(path: Path) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from beliefscope.recordings.logs.arrays import Columns
 from beliefscope.recordings.logs.column_map import QUATERNION, base_name
+from beliefscope.recordings.logs.messages import Preview
 
 TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"est|mean|pred|filter|posterior|belief"
@@ -17,10 +18,12 @@ PLANAR = "[0,1,5,6,7,11,30,31,35]"
 """x, y and yaw in the covariance of x, y, z, roll, pitch and yaw of a ROS message."""
 
 
-def guess_map(columns: Columns, name: str, intervals: Mapping[str, float] | None = None) -> str:
-    """Text of a first map. intervals: of a log of messages, topic -> s between its messages."""
-    body = _messages(columns, intervals) if intervals else _table(columns)
-    return "\n".join([f'task = "{re.sub(r"[^A-Za-z0-9_.-]", "-", name)}"', *body]) + "\n"
+def guess_map(log: Preview, name: str) -> str:
+    """Text of a first map."""
+    lines = [f'task = "{re.sub(r"[^A-Za-z0-9_.-]", "-", name)}"']
+    lines += [f"time = {_text(log.timeline)}"] if log.timeline else []
+    lines += _messages(log.columns, log.intervals) if log.intervals else _table(log.columns)
+    return "\n".join(lines) + "\n"
 
 
 def _table(columns: Columns) -> list[str]:
@@ -40,14 +43,14 @@ def _table(columns: Columns) -> list[str]:
     used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control}
     used |= {n.partition("[")[0] for n in state.values()}
     sensors = {_key(n): n for n in columns if n not in used and (n in flat or n in rows)}
-    lines = [f'time = "{time[0]}"' if time else "dt = 0.1  # s per row"]
-    lines += [f'episode = "{episode[0]}"'] if episode else []
-    lines += [f'control = "{control[0]}"'] if control else []
-    lines += _sections({component: f'"{reference}"' for component, reference in state.items()}, sensors)
+    lines = [f"time = {_text(time[0])}" if time else "dt = 0.1  # s per row"]
+    lines += [f"episode = {_text(episode[0])}"] if episode else []
+    lines += [f"control = {_text(control[0])}"] if control else []
+    lines += _sections({component: _text(reference) for component, reference in state.items()}, sensors)
     if mean or ensemble:
         lines.append("[estimate]")
         found = {"mean": mean, "std": std if not covariance else [], "covariance": covariance, "particles": ensemble}
-        lines += [f"{key} = {json.dumps(n[0] if len(n) == 1 else n)}" for key, n in found.items() if n]
+        lines += [f"{key} = {_text(n[0]) if len(n) == 1 else _texts(n)}" for key, n in found.items() if n]
     return lines
 
 
@@ -59,7 +62,7 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
     state = {}
     if truth:
         x, y, orientation = poses[truth]
-        state = {"x": f'"{x}"', "y": f'"{y}"', "yaw": f'{{column = "{orientation}", unit = "{QUATERNION}"}}'}
+        state = {"x": _text(x), "y": _text(y), "yaw": f'{{column = {_text(orientation)}, unit = "{QUATERNION}"}}'}
     topics = {_topic(intervals, base_name(column)) for pose in (truth, estimate) if pose for column in poses[pose]}
     rest = [n for n, v in columns.items() if v.dtype.kind in "fiub" and _topic(intervals, n) not in topics]
     sensors: dict[str, str] = {}
@@ -71,10 +74,10 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
     clock = _topic(intervals, base_name(poses[truth][0])) if truth else min(intervals, key=lambda t: intervals[t])
     lines = [f"dt = {intervals[clock]:.3g}  # s per step of the common clock", *_sections(state, sensors)]
     if estimate:
-        lines += ["[estimate]", f"mean = {json.dumps(poses[estimate])}"]
+        lines += ["[estimate]", f"mean = {_texts(poses[estimate])}"]
         covariance = f"{estimate.removesuffix('.pose')}.covariance"
         if covariance in columns and columns[covariance].shape[1:] == (36,):
-            lines.append(f'covariance = "{covariance}{PLANAR}"  # of x, y and yaw')
+            lines.append(f"covariance = {_text(covariance + PLANAR)}  # of x, y and yaw")
     return lines
 
 
@@ -95,7 +98,7 @@ def _sections(state: Mapping[str, str], sensors: Mapping[str, str]) -> list[str]
     lines = ["[state]  # true values: component = column, or {column = NAME, unit = m, cm, mm, rad or deg}"]
     lines += [f"{component} = {value}" for component, value in state.items()] or ['x = ""', 'y = ""']
     lines += ["[sensors]  # modality = column or list of columns"]
-    return lines + [f'{key} = "{reference}"' for key, reference in sensors.items()]
+    return lines + [f"{key} = {_text(reference)}" for key, reference in sensors.items()]
 
 
 def _named(pattern: str, names: Sequence[str]) -> list[str]:
@@ -116,4 +119,13 @@ def _components(flat: Sequence[str], rows: Columns, arrays: Sequence[str]) -> di
 
 
 def _key(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "_", name)
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name) or "column"
+
+
+def _text(name: str) -> str:
+    """A name as a TOML string: JSON's escapes, and that of DEL."""
+    return json.dumps(name, ensure_ascii=False).replace("\x7f", r"\u007f")
+
+
+def _texts(names: Sequence[str]) -> str:
+    return f"[{', '.join(map(_text, names))}]"

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.recordings.logs.ros_types import RosTypes
+from beliefscope.recordings.logs import ros_types
 
 
 @contextmanager
@@ -27,7 +27,7 @@ class McapLog:
 
     stream: IO[bytes]
     second: float | None = 1e9
-    _ros: RosTypes = field(default_factory=RosTypes)
+    timeline: str = ""
 
     def __post_init__(self) -> None:
         from mcap.reader import make_reader
@@ -43,13 +43,14 @@ class McapLog:
 
         self.stream.seek(0)
         for schema, channel, message in make_reader(self.stream, validate_crcs=True).iter_messages([*topics]):
-            yield channel.topic, message.log_time, partial(self._decode, schema, channel, message)
+            yield channel.topic, message.log_time, partial(_decode, schema, channel, message)
 
-    def _decode(self, schema: Any, channel: Any, message: Any) -> Any:
-        encoding = channel.message_encoding
-        if encoding == "json":
-            return json.loads(message.data)
-        if encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
-            return self._ros.decode(schema.name, schema.data.decode(), message.data)
-        kind = f"{encoding} with schema {schema.encoding!r}" if schema is not None else encoding
-        raise BadInput(f"topic {channel.topic!r} is encoded as {kind}, expected json, or cdr with schema 'ros2msg'")
+
+def _decode(schema: Any, channel: Any, message: Any) -> Any:
+    encoding = channel.message_encoding
+    if encoding == "json":
+        return json.loads(message.data)
+    if encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
+        return ros_types.decode(schema.name, schema.data.decode(), message.data)
+    kind = f"{encoding} with schema {schema.encoding!r}" if schema is not None else encoding
+    raise BadInput(f"topic {channel.topic!r} is encoded as {kind}, expected json, or cdr with schema 'ros2msg'")

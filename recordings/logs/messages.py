@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,15 +30,29 @@ AGE = "age"
 """Field of every topic: s since its last message."""
 
 
+class Preview(NamedTuple):
+    """First messages of a log.
+
+    Attributes:
+        columns: with few rows. intervals: topic -> median s between messages. timeline: empty if there is no choice.
+    """
+
+    columns: Columns
+    intervals: Mapping[str, float] = {}
+    timeline: str = ""
+
+
 class MessageLog(Protocol):
     """An open log.
 
     Attributes:
-        topics: names. second: units of time per second: 10^9 for ns; None: the unit is a step.
+        topics: names. second: units of time per second: 10^9 for ns; None: the unit is a step. timeline: its name, if
+            the log has several, else empty.
     """
 
     topics: Sequence[str]
     second: float | None
+    timeline: str
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
         """Topic, time, and function that decodes the message: numbers, text, arrays, and nested messages.
@@ -221,8 +235,8 @@ def leaves(message: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
             yield from leaves(value, f"{name}.{key}")
 
 
-def preview(log: MessageLog) -> tuple[Columns, Mapping[str, float]]:
-    """The first messages of every topic as columns, and the median interval of each topic, s. Raises no BadInput."""
+def preview(log: MessageLog) -> Preview:
+    """The first messages of every topic. Topics that cannot be decoded are left out."""
     times: dict[str, list[int]] = {topic: [] for topic in log.topics}
     values: dict[str, list[NDArray[Any]]] = {}
     for topic, time, decode in log.messages(log.topics):
@@ -238,4 +252,4 @@ def preview(log: MessageLog) -> tuple[Columns, Mapping[str, float]]:
     usable = {n: v for n, v in values.items() if len({i.shape for i in v}) == 1 and v[0].size}
     stacked = {name: np.asarray(value) for name, value in usable.items()}
     intervals = {t: float(np.median(np.diff(v))) / (log.second or 1.0) for t, v in times.items() if len(v) > 1}
-    return {n: v for n, v in stacked.items() if v.dtype.kind in "fiubU"}, intervals
+    return Preview({n: v for n, v in stacked.items() if v.dtype.kind in "fiubU"}, intervals, log.timeline)

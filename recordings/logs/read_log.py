@@ -35,13 +35,14 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
 
     Raises BadInput for missing columns, columns of different lengths and irregular time.
     """
-    states = _states(columns, mapping)
+    states = _float32(_states(columns, mapping), "the state")
     sensors = {name: _sensor(columns, name, refs) for name, refs in mapping.sensors.items()}
-    controls = joined(columns, mapping.control, "control") if mapping.control else np.zeros((len(states), 0))
+    control = joined(columns, mapping.control, "control") if mapping.control else np.zeros((len(states), 0))
+    controls = _float32(control, "the control")
     contact = column(columns, mapping.contact, "contact") if mapping.contact else np.zeros(len(states))
     covariates = {name: _covariate(columns, name, entry) for name, entry in mapping.covariates.items()}
     values = {name: numbers for name, (_, numbers) in covariates.items()}
-    arrays = {"state": states, "control": controls, "contact": contact, **sensors, **values}
+    arrays: dict[str, NDArray[Any]] = {"state": states, "control": controls, "contact": contact, **sensors, **values}
     for name, array in arrays.items():
         if len(array) != len(states):
             raise BadInput(f"{name} has {len(array)} rows and the state {len(states)}")
@@ -52,8 +53,8 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
     return [
         Episode(
             task=task,
-            states=states[at].astype(np.float32),
-            controls=controls[at].astype(np.float32),
+            states=states[at],
+            controls=controls[at],
             observations={name: array[at] for name, array in sensors.items()},
             contact=contact[at] != 0.0,
             qpos=np.zeros((len(at), 0), np.float32),
@@ -183,7 +184,17 @@ def _sensor(columns: Columns, name: str, references: str | list[str]) -> NDArray
             return images
         if images.ndim == 4 and images.shape[3] == 3 and images.dtype.kind in "uif":
             return grey(images)
-    return joined(columns, references, f"sensor {name}").astype(np.float32)
+    return _float32(joined(columns, references, f"sensor {name}"), f"sensor {name!r}")
+
+
+def _float32(values: Array, name: str) -> NDArray[np.float32]:
+    """The values in single precision. Raises BadInput for infinite ones and those beyond its range."""
+    with np.errstate(over="ignore"):
+        single = values.astype(np.float32)
+    if (infinite := np.isinf(single)).any():
+        row = int(np.argwhere(infinite)[0][0])
+        raise BadInput(f"{name} has the value {values[infinite][0]:g} in row {row}, expected a finite number")
+    return single
 
 
 def _episodes(columns: Columns, mapping: ColumnMap, count: int) -> dict[str, NDArray[np.intp]]:
@@ -224,12 +235,12 @@ def _covariate(columns: Columns, name: str, entry: CovariateColumn) -> tuple[Cov
         raise BadInput(f"covariate {name!r} has column {entry.column!r} of shape {numbers.shape}, expected one number")
     boolean = not entry.cuts and np.isin(numbers[~np.isnan(numbers)], (0.0, 1.0)).all()
     covariate = Covariate("boolean") if boolean else Covariate("continuous", cuts=entry.cuts, unit=entry.unit)
-    return covariate, numbers.astype(np.float32)
+    return covariate, _float32(numbers, f"covariate {name!r}")
 
 
 def _task(
     mapping: ColumnMap,
-    states: Array,
+    states: NDArray[np.float32],
     sensors: dict[str, NDArray[Any]],
     controls: int,
     dt: float,

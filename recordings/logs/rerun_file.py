@@ -37,7 +37,7 @@ AUTOMATIC = ("log_time", "log_tick")
 def open_log(path: Path, timeline: str | None) -> Iterator[RerunLog]:
     """The first recording of a file. A separate process reads the file first, because Rerun may crash.
 
-    timeline: its name; by default the only one besides ``AUTOMATIC``, else ``log_time``.
+    timeline: its name; if empty, the only one besides ``AUTOMATIC``, else ``log_time``; None takes the first.
     """
     info = RecordingProbe()(path)
     if info.problem and not info.application:
@@ -46,7 +46,7 @@ def open_log(path: Path, timeline: str | None) -> Iterator[RerunLog]:
         store = next(iter(reader.recordings()), None)
         if store is None:
             raise BadInput("the file has no recording")
-        yield RerunLog.of([chunk.to_record_batch() for chunk in reader.stream(store=store)], timeline or "")
+        yield RerunLog.of([chunk.to_record_batch() for chunk in reader.stream(store=store)], timeline)
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ class RerunLog:
 
     parts: Mapping[str, Sequence[Part]]
     second: float | None
+    timeline: str
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -71,12 +72,12 @@ class RerunLog:
         return tuple(sorted(self.parts))
 
     @classmethod
-    def of(cls, batches: Sequence[pa.RecordBatch], timeline: str) -> RerunLog:
+    def of(cls, batches: Sequence[pa.RecordBatch], timeline: str | None) -> RerunLog:
         """The components in the chunks of a recording."""
         indices = {f.name: f.type for batch in batches for f in _fields(batch, b"index")}
+        own = sorted(indices.keys() - {*AUTOMATIC}, key=lambda name: (pa.types.is_int64(indices[name]), name))
         if not timeline:
-            own = sorted(indices.keys() - {*AUTOMATIC})
-            if len(own) > 1:
+            if len(own) > 1 and timeline is not None:
                 raise BadInput(f'the recording has the timelines {", ".join(own)}: add time = "{own[0]}" to the map')
             timeline = own[0] if own else AUTOMATIC[0]
         check_name("timeline", timeline, sorted(indices))
@@ -98,7 +99,8 @@ class RerunLog:
             for entity, components in entities.items()
             for name, chunks in components.items()
         }
-        return cls(parts, None if pa.types.is_int64(indices[timeline]) else 1e9)
+        second = None if pa.types.is_int64(indices[timeline]) else 1e9
+        return cls(parts, second, timeline if len(own) > 1 else "")
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
         """Topic, time (ns, or number of a step) and decoder of each row with a value, by topic and chunk."""

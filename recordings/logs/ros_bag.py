@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from beliefscope.recordings.logs.ros_types import RosTypes
+from beliefscope.recordings.logs import ros_types
 
 
 @contextmanager
@@ -27,7 +27,7 @@ class BagLog:
 
     reader: Any
     second: float | None = 1e9
-    _ros: RosTypes = field(default_factory=RosTypes)
+    timeline: str = ""
 
     def __post_init__(self) -> None:
         self.topics = tuple(sorted({connection.topic for connection in self.reader.connections}))
@@ -36,10 +36,11 @@ class BagLog:
         """Topic, time in ns and decoder of each message, in the order of times."""
         connections = [connection for connection in self.reader.connections if connection.topic in topics]
         for connection, time, data in self.reader.messages(connections):
-            yield connection.topic, time, partial(self._decode, connection, data)
+            yield connection.topic, time, partial(_decode, connection, data)
 
-    def _decode(self, connection: Any, data: bytes) -> Any:
-        from rosbags.interfaces import MessageDefinitionFormat
 
-        kind, text = connection.msgdef.format, connection.msgdef.data
-        return self._ros.decode(connection.msgtype, text if kind == MessageDefinitionFormat.MSG else "", data)
+def _decode(connection: Any, data: bytes) -> Any:
+    from rosbags.interfaces import MessageDefinitionFormat
+
+    kind, text = connection.msgdef.format, connection.msgdef.data
+    return ros_types.decode(connection.msgtype, text if kind == MessageDefinitionFormat.MSG else "", data)

@@ -1,8 +1,9 @@
-"""Message types of ROS 2: from their definitions in the log to decoded messages."""
+"""Messages of ROS 2, decoded with the definitions of their types in the log."""
 
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from typing import Any
 
 from beliefscope.datasets.errors import BadInput
@@ -11,26 +12,19 @@ LONG_ARRAY = re.compile(r"\[(?:<=)?\s*\d{6,}")
 """An array whose size makes the generated decoder too long."""
 
 
-class RosTypes:
-    """Decodes CDR messages. Each type has its own store, so that only the types in use need valid definitions."""
+def decode(name: str, definition: str, data: bytes) -> Any:
+    """A CDR message as a dataclass of numbers, text, arrays and nested messages.
 
-    def __init__(self) -> None:
-        self._stores: dict[tuple[str, str], Any] = {}
-
-    def decode(self, name: str, definition: str, data: bytes) -> Any:
-        """A message as a dataclass of numbers, text, arrays and nested messages.
-
-        Args:
-            name: of the type, such as ``nav_msgs/msg/Odometry``. definition: ``.msg`` text of the type and those that
-                it uses; empty for the standard types of ROS 2.
-        """
-        store = self._stores.get((name, definition))
-        if store is None:
-            store = self._stores[name, definition] = _store(name, definition)
-        return store.deserialize_cdr(data, name)
+    Args:
+        name: of the type, such as ``nav_msgs/msg/Odometry``. definition: ``.msg`` text of the type and those that it
+            uses; empty for the standard types of ROS 2.
+    """
+    return _store(name, definition).deserialize_cdr(data, name)
 
 
+@lru_cache(maxsize=100)
 def _store(name: str, definition: str) -> Any:
+    """Types of a definition. Each has its own store, so that only the types in use need valid definitions."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     if not definition:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+import zipfile
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,12 @@ from numpy.typing import NDArray
 from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.logs.arrays import Wanted, check_size, unread
 
+DATA = "data/"
+
 ENDS = "meta/episode_ends"
+
+METADATA = (".zarray", "zarr.json")
+"""Files with the metadata of an array, of format 2 and 3."""
 
 EPISODE = "episode"
 """Column with the number of the episode, from its ends."""
@@ -27,25 +34,37 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
 
     storage = zarr.storage
     store = storage.ZipStore(path, mode="r") if path.is_file() else storage.LocalStore(path, read_only=True)
-    with closing(store):
-        group = zarr.open_group(store, mode="r", use_consolidated=False)
-        data = group.get("data")
-        if not isinstance(data, zarr.Group) or not isinstance(group.get(ENDS), zarr.Array):
-            raise BadInput(f"the store has no group 'data' and array {ENDS!r}: not a replay buffer")
-        ends = _array(group[ENDS], ENDS, True)
+    with closing(store), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about unknown files
+        nodes = {name: zarr.open(store, path=name, mode="r") for name in _nodes(path)}
+        arrays = {name: node for name, node in nodes.items() if isinstance(node, zarr.Array)}
+        if ENDS not in arrays:
+            raise BadInput(f"the store has no array {ENDS!r}: not a replay buffer")
+        ends = _values(arrays.pop(ENDS), ENDS, True)
         if ends.ndim != 1 or ends.dtype.kind not in "iu" or not len(ends) or np.any(np.diff(ends, prepend=0) <= 0):
             raise BadInput(f"{ENDS} is {ends!r:.100}, expected ascending whole numbers, the first above 0")
         columns = {}
-        for name, array in data.members(max_depth=None):
-            if isinstance(array, zarr.Array):
-                if array.shape[:1] != (ends[-1],):
-                    raise BadInput(f"array {name!r} has shape {array.shape}, and the last episode ends at {ends[-1]}")
-                columns[name] = _array(array, name, wanted(name))
+        for path_, array in arrays.items():
+            name = path_.removeprefix(DATA)
+            if array.shape[:1] != (ends[-1],):
+                raise BadInput(f"array {name!r} has shape {array.shape}, and the last episode ends at {ends[-1]}")
+            columns[name] = _values(array, name, wanted(name))
     check_size(EPISODE, (ends[-1],), np.int64)
     return {EPISODE: np.repeat(np.arange(len(ends)), np.diff(ends, prepend=0))} | columns
 
 
-def _array(array: Any, name: str, wanted: bool) -> NDArray[Any]:
+def _nodes(path: Path) -> list[str]:
+    """Paths of the arrays and groups in ``data``, and of the episodes' ends."""
+    if path.is_file():
+        with zipfile.ZipFile(path) as archive:
+            files = archive.namelist()
+    else:
+        files = [file.relative_to(path).as_posix() for file in path.rglob("*") if file.name in METADATA]
+    nodes = {file.rpartition("/")[0] for file in files if file.endswith(METADATA)}
+    return sorted(node for node in nodes if node.startswith(DATA) or node == ENDS)
+
+
+def _values(array: Any, name: str, wanted: bool) -> NDArray[Any]:
     codecs = {str(getattr(codec, "codec_id", "")) for codec in (*array.filters, *array.compressors)}
     if array.dtype.kind not in "fiub" or codecs & {*REFUSED}:
         raise BadInput(f"array {name!r} has the type {array.dtype}, expected numbers")

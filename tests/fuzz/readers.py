@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 from random import Random
@@ -21,6 +21,8 @@ import mutate
 import numpy as np
 import torch
 from fastapi import FastAPI
+from log_readers import LOG_READERS
+from reader import Corrupt, Reader, check_serializable, corrupt_with
 from starlette.testclient import TestClient
 from valid_files import PAPER_LAYOUTS, episodes, write_episodes, write_paper_file, write_push
 
@@ -45,39 +47,6 @@ from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 from beliefscope.inspect.traces.live_file import LiveFileReader, LiveFileWriter, load_live
 from beliefscope.recordings.read import read_recording
 from beliefscope.recordings.write import write_recording
-
-Write = Callable[[Path], None]
-Corrupt = Callable[[Path, Random], None]
-Read = Callable[[Path], None]
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A reader under test.
-
-    Attributes:
-        write: writes a valid file. corrupt: modifies it in place. read: reads it as the program does.
-    """
-
-    write: Write
-    corrupt: Corrupt
-    read: Read
-    suffix: str = ""
-
-
-def corrupt_with(change: Callable[[bytes, Random], bytes]) -> Corrupt:
-    """Corrupt a file by changing its bytes."""
-
-    def corrupt(path: Path, rng: Random) -> None:
-        path.write_bytes(change(path.read_bytes(), rng))
-
-    return corrupt
-
-
-def check_serializable(value: Any) -> None:
-    """Serialize as the server does: without NaN and lone surrogates."""
-    json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
-
 
 # Episodes.
 
@@ -334,6 +303,7 @@ READERS: dict[str, Reader] = {
     "job": Reader(write_job, CORRUPT_JSON, read_job, ".json"),
     "saved-filters": Reader(write_saved_filters, CORRUPT_JSON, read_saved_filters, ".json"),
     "finetune": Reader(write_finetune, corrupt_finetune, read_finetune, ".json"),
+    **LOG_READERS,
 }
 """Readers by name."""
 
@@ -347,6 +317,11 @@ def check_valid(name: str, folder: Path) -> None:
     READERS[name].read(path)
 
 
+def copy(source: Path, target: Path) -> None:
+    """Copy a file or a folder."""
+    (shutil.copytree if source.is_dir() else shutil.copy)(source, target)
+
+
 @contextmanager
 def corrupted(name: str, seed: int, number: int, folder: Path) -> Iterator[Path]:
     """The corrupt file with this number; deterministic for a seed."""
@@ -354,13 +329,13 @@ def corrupted(name: str, seed: int, number: int, folder: Path) -> Iterator[Path]
     valid, path = folder / f"valid{reader.suffix}", folder / f"motion_surface=abs_shape=rect1_{number}{reader.suffix}"
     if not valid.exists():
         reader.write(valid)
-    shutil.copy(valid, path)
+    copy(valid, path)
     try:
         reader.corrupt(path, Random(f"{seed} {name} {number}"))
         yield path
     finally:
         for file in folder.glob(f"{path.stem}.*"):
-            file.unlink()
+            shutil.rmtree(file) if file.is_dir() else file.unlink()
 
 
 def attempt(name: str, seed: int, number: int, folder: Path) -> str:

@@ -13,7 +13,6 @@ import argparse
 import mmap
 import os
 import resource
-import shutil
 import signal
 import sys
 import tempfile
@@ -54,7 +53,9 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
     from beliefscope.app.cli.options import open_recording
     from beliefscope.datasets.errors import BadInput
     from beliefscope.datasets.store import open_dataset
+    from beliefscope.recordings.logs.columns import preview_columns
 
+    guarded = {"recording": open_recording, "log-rerun": preview_columns} | dict.fromkeys(readers.HDF5, open_dataset)
     outcome = Outcome(inputs)
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
@@ -67,14 +68,14 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
                 target = keep / f"{name.replace(' ', '-')}-{number}"
                 target.mkdir(parents=True, exist_ok=True)
                 for file in Path(folder).glob(f"{path.stem}.*"):
-                    shutil.copy(file, target)
+                    readers.copy(file, target / file.name)
                 (target / "error.txt").write_text(error)
 
         def is_contained(number: int) -> bool:
             """Whether the package refuses a file that crashes its reader, because a subprocess reads it first."""
             with readers.corrupted(name, seed, number, Path(folder)) as path:
                 try:
-                    (open_dataset if name in readers.HDF5 else open_recording)(path)
+                    guarded[name](path)
                 except BadInput:
                     return True
             return False
@@ -93,7 +94,7 @@ def fuzz_reader(name: str, inputs: int, seed: int, keep: Path) -> Outcome:
                 save_failure(int(error.name), error.read_text())
                 error.unlink()
             first = at + 1 if code else last
-            if code < 0 and name in ("recording", *readers.HDF5) and is_contained(at):
+            if code < 0 and name in guarded and is_contained(at):
                 outcome.refused += 1
             elif code:
                 save_failure(at, f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}")

@@ -60,8 +60,7 @@ def import_(
     from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
     if guess:
-        columns, intervals = preview_columns(source)
-        text = guess_map(columns, source.stem, intervals)
+        text = guess_map(preview_columns(source), source.stem)
         return console.Result({"map": text}, text.rstrip())
     if output is None:
         raise BadInput("give the output: -o RUN.trace, -o RUN.live or -o DATA.h5")

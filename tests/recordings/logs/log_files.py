@@ -109,17 +109,22 @@ def fields(topic: str, t: float) -> dict[str, Any]:
     return {"data": stage(t)}
 
 
-def write_json_mcap(path: Path, chunk_size: int = 20_000) -> None:
-    """MCAP with JSON messages; bytes are base64."""
-    import base64
+def mcap_writer(stream: io.BufferedWriter, plain: bool) -> Any:
+    from mcap.writer import CompressionType, Writer
 
-    from mcap.writer import Writer
+    compression = CompressionType.NONE if plain else CompressionType.ZSTD
+    return Writer(stream, chunk_size=20_000, compression=compression, enable_crcs=not plain)
+
+
+def write_json_mcap(path: Path, plain: bool = False) -> None:
+    """MCAP with JSON messages; bytes are base64. plain: without compression and checksums."""
+    import base64
 
     def encode(value: Any) -> Any:
         return base64.b64encode(value.tobytes()).decode() if value.dtype == np.uint8 else value.tolist()
 
     with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=chunk_size)
+        writer = mcap_writer(stream, plain)
         writer.start()
         schema = writer.register_schema("any", "jsonschema", b"{}")
         channels = {topic: writer.register_channel(topic, "json", schema) for topic in STREAMS}
@@ -145,13 +150,11 @@ def ros_message(store: Any, name: str, values: dict[str, Any]) -> Any:
     return store.types[name](**parts)
 
 
-def write_ros_mcap(path: Path, chunk_size: int = 20_000) -> None:
+def write_ros_mcap(path: Path, plain: bool = False) -> None:
     """MCAP with CDR messages, written by the mcap library."""
-    from mcap.writer import Writer
-
     store = ros_store()
     with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=chunk_size)
+        writer = mcap_writer(stream, plain)
         writer.start("ros2")
         channels = {}
         for topic, entry in STREAMS.items():

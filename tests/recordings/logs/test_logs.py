@@ -16,6 +16,7 @@ from beliefscope.inspect.trace import load_trace, save_trace
 from beliefscope.recordings.logs.column_map import read_map
 from beliefscope.recordings.logs.columns import column, joined, read_columns
 from beliefscope.recordings.logs.guess import guess_map
+from beliefscope.recordings.logs.messages import Preview
 from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
 MAP = """
@@ -119,7 +120,7 @@ speed = {column = "gps_x", cuts = [3, 6], unit = "m/s"}
 
 def test_a_guessed_map_is_valid(log: Path, tmp_path: Path) -> None:
     columns = read_columns(log)
-    text = guess_map(columns, "my log")
+    text = guess_map(Preview(columns), "my log")
     values = tomllib.loads(text)
     assert (values["task"], values["time"]) == ("my-log", "t")
     assert values["estimate"] == {"mean": ["est_x", "est_y", "est_yaw"], "std": ["sd_x", "sd_y", "sd_yaw"]}
@@ -206,7 +207,7 @@ def test_damaged_maps_give_one_line(tmp_path: Path) -> None:
 def test_estimates_need_as_many_rows_as_the_state(tmp_path: Path) -> None:
     np.savez(tmp_path / "log.npz", truth=np.ones((5, 2)), estimate=np.ones((4, 2)))
     columns = read_columns(tmp_path / "log.npz")
-    mapping = read_map(map_file(tmp_path, guess_map(columns, "log")))
+    mapping = read_map(map_file(tmp_path, guess_map(Preview(columns), "log")))
     episodes = read_log(columns, mapping, "log")
     with pytest.raises(BadInput, match="estimate mean has 4 rows and the state 5"):
         recorded_trace(columns, mapping, episodes, 0, "log")
@@ -224,7 +225,7 @@ def test_a_published_ensemble_filter(tmp_path: Path) -> None:
     if not path.exists():
         pytest.skip(f"{path.name} is not here")
     columns = read_columns(path)
-    text = guess_map(columns, "vehicle")
+    text = guess_map(Preview(columns), "vehicle")
     mapping = read_map(map_file(tmp_path, text))
     trace = recorded_trace(columns, mapping, read_log(columns, mapping, path.name), 0, path.name)
     assert nees(trace)[:, -1].mean() == pytest.approx(0.0747, rel=0.01)

@@ -99,8 +99,7 @@ def test_compressed_images_have_their_colours(log: Path, tmp_path: Path) -> None
 
 def test_a_guessed_map_imports_the_log(log: Path, tmp_path: Path) -> None:
     """The pose named truth becomes the state, the other one the estimate, the rest sensors; text is left out."""
-    columns, intervals = preview_columns(log)
-    text = guess_map(columns, log.stem, intervals)
+    text = guess_map(preview_columns(log), log.stem)
     values = tomllib.loads(text)
     assert values["dt"] == pytest.approx(0.02)
     assert values["state"]["yaw"] == {"column": "/truth.pose.pose.orientation", "unit": "quaternion_yaw"}

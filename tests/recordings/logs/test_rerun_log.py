@@ -100,8 +100,7 @@ def test_a_guessed_map_imports_the_recording(tmp_path: Path) -> None:
             recording.log(name, rr.Transform3D(translation=[step, 0, 0], rotation=rr.Quaternion(xyzw=[0, 0, 0, 1])))
         recording.log("gyro", rr.Scalars([1.0, 2.0]))
     recording.disconnect()
-    columns, intervals = preview_columns(tmp_path / "log.rrd")
-    text = guess_map(columns, "log", intervals)
+    text = guess_map(preview_columns(tmp_path / "log.rrd"), "log")
     values = tomllib.loads(text)
     assert values["dt"] == pytest.approx(0.1)
     assert values["sensors"] == {"gyro": "/gyro"}
@@ -114,7 +113,7 @@ def test_a_guessed_map_imports_the_recording(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('time = "sim"\n', "", 'timelines number, sim: add time = "number"'),
+        ('time = "sim"\n', "", 'timelines sim, number: add time = "sim"'),
         ('"sim"', '"simulated"', "timeline 'simulated' does not exist. Available: log_time, number, sim"),
         ('"/imu"', '"/imi"', "topic of column '/imi'"),
         ('"/imu"', '"/stage"', "has text"),

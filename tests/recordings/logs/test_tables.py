@@ -112,8 +112,7 @@ def test_episodes_of_a_lerobot_data_set(lerobot: Path, tmp_path: Path) -> None:
 
 def test_guessed_maps_import_the_logs(buffer: Path, lerobot: Path, tmp_path: Path) -> None:
     for log, time in ((buffer, {"dt": 0.1}), (lerobot, {"time": "timestamp"})):
-        columns, intervals = preview_columns(log)
-        text = guess_map(columns, "log", intervals)
+        text = guess_map(preview_columns(log), "log")
         values = tomllib.loads(text)
         assert values.items() >= (time | {"control": "action"}).items()
         mapping = read_map(map_file(tmp_path, text))
