@@ -46,7 +46,10 @@ def open_log(path: Path, timeline: str | None) -> Iterator[RerunLog]:
         store = next(iter(reader.recordings()), None)
         if store is None:
             raise BadInput("the file has no recording")
-        yield RerunLog.of([chunk.to_record_batch() for chunk in reader.stream(store=store)], timeline)
+        batches = [chunk.to_record_batch() for chunk in reader.stream(store=store)]
+        for batch in batches:
+            batch.validate(full=True)  # offsets outside of a damaged array would be read
+        yield RerunLog.of(batches, timeline)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,8 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
             raise BadInput(f"the store has no array {ENDS!r}: not a replay buffer")
         ends = _values(arrays.pop(ENDS), ENDS, True)
         if ends.ndim != 1 or ends.dtype.kind not in "iu" or not len(ends) or np.any(np.diff(ends, prepend=0) <= 0):
-            raise BadInput(f"{ENDS} is {ends!r:.100}, expected ascending whole numbers, the first above 0")
+            text = f"{ends.dtype} {ends.ravel()[:9].tolist()}"
+            raise BadInput(f"{ENDS} is {text}, expected ascending whole numbers, the first above 0")
         columns = {}
         for path_, array in arrays.items():
             name = path_.removeprefix(DATA)

@@ -29,7 +29,7 @@ OMITTED = ("definition", "shapes", "episode", "versions", "modalities")  # prope
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Describe a recording without its arrays. Reads every chunk once, one at a time.
+    """Describe a recording without its arrays. Reads every chunk once, one at a time; those of other programs fully.
 
     Returns:
         ``application`` and ``title`` from the file; numbers of ``entities`` and ``rows``; ``properties`` of a
@@ -49,6 +49,8 @@ def describe(path: str | Path) -> dict[str, Any]:
         for chunk in (chunk for store in stores for chunk in reader.stream(store=store)):
             entities.add(chunk.entity_path)
             rows += chunk.num_rows
+            if selected.application_id != APPLICATION:
+                chunk.to_record_batch()  # as the import of logs does; may crash
             if chunk.entity_path == f"/{HEADER}" and selected.application_id == APPLICATION:
                 properties |= properties_of(chunk.to_record_batch())
             elif chunk.entity_path == "/__properties":
