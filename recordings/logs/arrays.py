@@ -16,7 +16,7 @@ Columns = Mapping[str, NDArray[Any]]
 """Name -> (T, ...) values of a column of a log."""
 
 Wanted = Callable[[str], bool]
-"""Whether a column is to be read."""
+"""Whether the values of a column are used."""
 
 
 def check_size(name: str, shape: Sequence[int], dtype: DTypeLike) -> None:

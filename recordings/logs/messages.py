@@ -22,7 +22,7 @@ LONGEST = 10_000_000
 """Largest number of ticks."""
 
 SAMPLE = 100
-"""Messages per topic in a preview, of which ``DECODED`` are decoded."""
+"""Messages per topic in a preview. The first ``DECODED`` are decoded."""
 
 DECODED = 3
 
@@ -57,13 +57,13 @@ class MessageLog(Protocol):
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
         """Topic, time, and function that decodes the message: numbers, text, arrays, and nested messages.
 
-        The messages of a topic should be in the order of their times; then only those that are used are decoded.
+        Messages of a topic should be in the order of their times; then only the used ones are decoded.
         """
 
 
 @dataclass
 class Series:
-    """Messages of a topic, without those that another follows before the next tick.
+    """Messages of a topic: the last one before each tick.
 
     Attributes:
         paths: column -> fields that lead to its value. times: of the messages. values: column -> their values.

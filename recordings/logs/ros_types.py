@@ -16,7 +16,7 @@ def decode(name: str, definition: str, data: bytes) -> Any:
     """A CDR message as a dataclass of numbers, text, arrays and nested messages.
 
     Args:
-        name: of the type, such as ``nav_msgs/msg/Odometry``. definition: ``.msg`` text of the type and those that it
+        name: of the type, such as ``nav_msgs/msg/Odometry``. definition: ``.msg`` text of the type and of the types it
             uses; empty for the standard types of ROS 2.
     """
     return _store(name, definition).deserialize_cdr(data, name)
