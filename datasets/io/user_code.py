@@ -6,9 +6,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 
 from beliefscope.datasets.errors import BadInput
 
@@ -31,10 +32,18 @@ def importable(place: str) -> Iterator[None]:
         sys.path.reverse()
 
 
+class _SourceLoader(SourceFileLoader):
+    """Ignores stored bytecode: Python compares times in whole seconds, so it would run the file before a quick edit."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 def _run_file(path: Path) -> ModuleType:
     if not path.is_file():
         raise BadInput(f"{path} does not exist.")
-    spec = spec_from_file_location(f"beliefscope_user_{path.stem}", path)
+    name = f"beliefscope_user_{path.stem}"
+    spec = spec_from_file_location(name, path, loader=_SourceLoader(name, str(path)))
     assert spec is not None
     assert spec.loader is not None
     module = module_from_spec(spec)
