@@ -204,7 +204,8 @@ def _external_runs(
     mean = values["estimate_mean"]
     truth = torch.from_numpy(np.stack([episode.states for episode in episodes], axis=1))
     unknown = torch.full((*mean.shape, mean.shape[-1]), torch.nan)
-    return {FILTER: (mean - truth, values.get("estimate_covariance", unknown)), STAY: _stay(start.mean, truth)}
+    runs = {FILTER: (mean - truth, values.get("estimate_covariance", unknown))}
+    return runs if start.mean.isnan().any() else runs | {STAY: _stay(start.mean, truth)}
 
 
 def _stay(mean: Tensor, states: Tensor) -> Run:

@@ -29,7 +29,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.adapter import Values, check_values, derived, named_values
+from beliefscope.filters.external.adapter import MEASUREMENTS, Values, check_values, derived, named_values, stacked
 from beliefscope.filters.external.load import model_names
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
@@ -304,8 +304,7 @@ class LiveRecorder:
     def _external_part(self, steps: Sequence[Values], episode: Episode, start: Gaussian) -> Trace:
         """Steps of an external filter as a trace, without values that some of the steps lack."""
         n = self._sizes["n"]
-        common = [name for name in steps[0] if all(name in step for step in steps)]
-        values = derived({name: _typed(name, torch.cat([step[name] for step in steps])) for name in common})
+        values = derived({name: _typed(name, value[:, 0]) for name, value in stacked(steps).items()})
         modalities = model_names(values, 1, self._modalities, self._task)
         arrays = {name: np.ascontiguousarray(value.numpy()) for name, value in values.items()}
         fields: dict[str, Any] = {"filter": "own"} | self._fields | fill_missing(arrays, len(modalities))
@@ -331,7 +330,8 @@ def _unused_path(folder: Path, name: str) -> Path:
 def _tensors(values: Any) -> Any:
     """NumPy arrays and numbers as tensors, including those in a dictionary or pair."""
     if isinstance(values, Mapping):
-        return {name: _tensors(value) for name, value in values.items()}
+        kept = (*MEASUREMENTS, "extra")
+        return {name: value if name in kept else _tensors(value) for name, value in values.items()}
     if isinstance(values, tuple):
         return tuple(map(_tensors, values))
     return values if isinstance(values, Tensor) else torch.from_numpy(np.array(values))

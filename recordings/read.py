@@ -32,7 +32,7 @@ from beliefscope.recordings.schema import (
 )
 
 VALUES = (TRACE_COMPONENT, "Image:buffer", "Scalars:scalars")
-STORED = ["/trace/**", "/observations/**", "/covariates/**", f"/{HEADER}"]
+STORED = ["/trace/**", "/observations/**", "/covariates/**", "/extra/**", f"/{HEADER}"]
 
 
 Rows = dict[str, list[tuple[NDArray[np.int64] | None, NDArray[Any]]]]
@@ -95,6 +95,7 @@ def _trace(path: Path, header: dict[str, Any], rows: Rows, given: Iterable[Task]
         seed=int(header["seed"]),
         faults=stored_faults(_parsed(header, "faults", "recipe") | {"settings": settings}),
         settings=settings,
+        extra={n.removeprefix("extra/"): a for n, a in arrays.items() if n.startswith("extra/")},
         **{name: stored[name] for name in stored.keys() - episode_fields},
     )
 

@@ -33,6 +33,8 @@ Needs = Literal[
     "ekf",
     "sensors",
     "pf",
+    "measurements",
+    "extra",
     "maps",
     "diagnostics",
     "replay",
@@ -54,7 +56,7 @@ class Entity:
             W weights per modality, B bounds.
         unit: of the stored numbers.
         needs: property of the trace that the path requires; ``ekf`` includes UKFs; ``sensors`` are
-            virtual ones.
+            virtual ones; ``measurements`` and ``extra`` come from external filters.
         meaning: one-line description for the documentation.
     """
 
@@ -104,6 +106,10 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("trace/log_weights", "Trace", "(M,)", "log", "pf", "normalised weights after it, before resampling"),
     Entity("trace/log_likelihood", "Trace", "(K, M)", "log", "pf", "log-likelihood of each particle, unnormalised"),
     Entity("trace/ancestors", "Trace", "(M,)", "index", "pf", "index of the particle before resampling"),
+    Entity("trace/innovation", "Trace", "(K, m)", "task's", "measurements", "innovation of each measurement, or NaN"),
+    Entity("trace/innovation_covariance", "Trace", "(K, m, m)", "task's", "measurements", "its predicted covariance S"),
+    Entity("trace/accepted", "Trace", "(K,)", "1", "measurements", "whether the gate accepted the measurement"),
+    Entity("extra/{name}", "Scalars", "()", "filter's", "extra", "scalar that only this filter has"),
     Entity("observations/{key}", "Image or Scalars", "task's", "task's", "always", "input of the filter"),
     Entity("covariates/{name}", "Scalars", "()", "task's", "covariates", "covariate except contact; NaN: unknown"),
     # The scene: metres, z up. The plane shows the belief over the task's two map components.

@@ -198,6 +198,7 @@ def _send_properties(stream: rr.RecordingStream, trace: Trace, steps: int) -> No
         f"observations/{key}": [list(array.shape[1:]), array.dtype.str] for key, array in episode.observations.items()
     }
     shapes |= {f"covariates/{name}": [[], array.dtype.str] for name, array in episode.covariates.items()}
+    shapes |= {f"extra/{name}": [[], array.dtype.str] for name, array in trace.extra.items()}
     # Arrays that every trace has are listed even if empty.
     shapes.setdefault("trace/qpos", [list(episode.qpos.shape[1:]), episode.qpos.dtype.str])
     for name in ("modality_mean", "modality_covariance"):
@@ -268,6 +269,8 @@ def send_steps(
         stream.send_columns(f"observations/{key}", times, columns)
     for name, array in trace.episode.covariates.items():
         stream.send_columns(f"covariates/{name}", times, entities.series(array[steps]))
+    for name, array in trace.extra.items():
+        stream.send_columns(f"extra/{name}", times, entities.series(array[steps]))
     for path, columns in entities.columns(trace, task, steps):
         stream.send_columns(path, times, columns)
     for path, columns in bodies.columns(trace.episode.qpos[steps]):

@@ -13,7 +13,7 @@ from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import innovations
+from beliefscope.inspect.statistics.innovations import virtual_innovations
 from beliefscope.inspect.trace import Trace
 
 SENSORS = ("effector_position", "force")
@@ -25,7 +25,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
     Returns:
         Descriptions ``{"name", "shape", "offset"}`` (offset in bytes) and the float32 buffer they refer to.
     """
-    innovation, groups = innovations(trace), measures.shaded_groups(trace)
+    innovation, groups = virtual_innovations(trace), measures.shaded_groups(trace)
     unimodal = bool(trace.modalities_with_posterior)
     arrays: dict[str, NDArray[Any] | None] = {
         "truth": trace.episode.states,

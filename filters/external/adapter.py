@@ -1,16 +1,19 @@
 """Conventions of an external filter: its adapter, unit conversion, and validation of its output.
 
-Values are in SI units and in the task's order of components, unless an ``Adapter`` defines others.
+Values are in SI units and in the task's order of components, unless an ``Adapter`` defines others. Innovations are in
+the units of their sensors.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.task import Task
@@ -32,40 +35,70 @@ SHAPES = {
     "log_weights": "M",
     "log_likelihood": "KM",
     "ancestors": "M",
+    "innovation": "Km",
+    "innovation_covariance": "Kmm",
+    "accepted": "K",
 }
 """Values that a filter can return for a step, by the names of ``Trace``; their shapes after N (docs/conventions.md)."""
 
-PAIRS = (("modality_mean", "modality_covariance"), ("particles", "log_weights"))
+MEASUREMENTS = ("innovation", "innovation_covariance", "accepted")
+"""Values in the spaces of the K measurements: NaN after the last channel, and where there is no measurement."""
+
+EXTRA = "extra/"
+"""Start of the names of the filter's own scalars."""
+
+PAIRS = (
+    ("modality_mean", "modality_covariance"),
+    ("particles", "log_weights"),
+    ("innovation", "innovation_covariance"),
+)
 """Values that require each other."""
 
 Values = dict[str, Tensor]
 
 
-def unchanged(observations: dict[str, Tensor], controls: Tensor) -> tuple[Any, Any]:
+def unchanged(observations: dict[str, Any], controls: Any) -> tuple[Any, Any]:
     """The default ``Adapter.inputs``: the task's observations and controls."""
     return observations, controls
 
 
 @dataclass(frozen=True)
 class Adapter:
-    """Conventions of a module that differ from the task's: units, names and order.
+    """Conventions of a filter that differ from the task's: units, names and order.
 
     Attributes:
-        module: follows the contract, in its own units.
+        module: follows the contract, in its own units. A ``torch.nn.Module`` takes tensors on the device of its
+            parameters, any other object NumPy arrays.
         components: names of its state's components in its own order; by default the task's.
         mean, std: (n,) m and rad, in its order: its states are ``(state - mean) / std``.
         inputs: observations by key and controls, SI units -> arguments of the module.
         modalities: names of its K measurement models, in order.
         task: its task, by name, ``path/to/file.py:NAME`` or definition; needed by a server if not given elsewhere.
+        batched: whether it filters N trajectories at once. Otherwise it runs once per trajectory, without the axis N.
+        absent: reading of a sensor that an ablation removes: ``mean`` over the episode, or ``nan`` for a filter that
+            skips such readings (an image is black).
     """
 
-    module: nn.Module
+    module: Any
     components: Sequence[str] = ()
     mean: Sequence[float] = ()
     std: Sequence[float] = ()
     inputs: Callable[[dict[str, Tensor], Tensor], tuple[Any, Any]] = unchanged
     modalities: Sequence[str] = ()
     task: str | Task = ""
+    batched: bool = True
+    absent: Literal["mean", "nan"] = "mean"
+
+
+def letters_of(name: str) -> str:
+    """Letters of the axes of a value after N. Raises BadInput for an unknown name."""
+    if name.startswith(EXTRA):
+        if not re.fullmatch(r"[\w-]{1,80}", name.removeprefix(EXTRA)):
+            raise BadInput(f"extra value {name.removeprefix(EXTRA)!r}: a name has letters, digits, - and _ only")
+        return ""
+    if name not in SHAPES:
+        raise unknown_name("value of a filter", name, [*SHAPES, "extra"])
+    return SHAPES[name]
 
 
 class Units:
@@ -104,19 +137,22 @@ class Units:
     def _convert(self, name: str, value: Tensor) -> Tensor:
         if name == "ancestors":
             return value.int()
-        value = value.double()
-        if name.endswith("covariance"):
+        value, letters = value.double(), letters_of(name)
+        if letters.endswith("nn"):
             value = value[..., self.order, :][..., self.order] * self.std * self.std[:, None]
-        elif SHAPES[name].endswith("n"):
+        elif letters.endswith("n"):
             value = value[..., self.order] * self.std + self.mean
-        elif SHAPES[name] == "KW" and value.shape[-1] == len(self.order):
+        elif letters == "KW" and value.shape[-1] == len(self.order):
             value = value[..., self.order]
         return value.float()
 
 
 def named_values(output: Any, source: str) -> Values:
-    """A module's return value, by name."""
-    if isinstance(output, Tensor):
+    """A filter's return value for a step or all steps, by name, as tensors on the CPU.
+
+    Raises BadInput for unknown names, incomplete pairs and values that are no arrays.
+    """
+    if isinstance(output, Tensor | np.ndarray):
         output = {"estimate_mean": output}
     elif isinstance(output, tuple) and len(output) == 2:
         output = dict(zip(("estimate_mean", "estimate_covariance"), output, strict=True))
@@ -124,18 +160,67 @@ def named_values(output: Any, source: str) -> Values:
         raise BadInput(
             f"{source} returns a {type(output).__name__}, expected a mean, a pair of mean and covariance, or a dict"
         )
-    for name, value in output.items():
-        if name not in SHAPES:
-            raise unknown_name("value of a filter", str(name), SHAPES)
-        if not isinstance(value, Tensor):
-            raise BadInput(f"{source} returns {name} as a {type(value).__name__}, expected a Tensor")
-    if "estimate_mean" not in output:
-        raise BadInput(f"{source} returns {', '.join(output) or 'nothing'}, but not estimate_mean")
+    named = {name: value for name, value in output.items() if name != "extra"}
+    named |= {f"{EXTRA}{name}": value for name, value in output.get("extra", {}).items()}
+    letters = {name: letters_of(str(name)) for name in named}
+    if "estimate_mean" not in named:
+        raise BadInput(f"{source} returns {', '.join(named) or 'nothing'}, but not estimate_mean")
+    values: Values = {}
+    leading = np.shape(named["estimate_mean"])[:-1]
+    for name, value in named.items():
+        if isinstance(value, list | tuple) and name in MEASUREMENTS:
+            parts = [None if part is None else _tensor(part, name, source) for part in value]
+            values[name] = _padded(parts, len(letters[name]) - 1, leading)
+        else:
+            values[name] = _tensor(value, name, source)
     for pair in PAIRS:
-        present = [name for name in pair if name in output]
+        present = [name for name in pair if name in values]
         if len(present) == 1:
             raise BadInput(f"{source} returns only {present[0]}, expected both {pair[0]} and {pair[1]}, or neither")
-    return {name: value.detach().cpu().clone() for name, value in output.items()}
+    return values
+
+
+def _tensor(value: Any, name: str, source: str) -> Tensor:
+    """A copy on the CPU, since the filter may modify its own in place."""
+    if isinstance(value, Tensor):
+        return value.detach().cpu().clone()
+    is_scalar = name.startswith(EXTRA) or name == "accepted"
+    if isinstance(value, np.ndarray | np.generic) or (is_scalar and isinstance(value, bool | int | float)):
+        array = np.array(value)
+        if array.dtype.kind in "biuf":
+            return torch.from_numpy(array)
+    raise BadInput(f"{source} returns {name} as a {type(value).__name__}, expected an array or a Tensor")
+
+
+def _padded(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int]) -> Tensor:
+    """K values (..., m_k) or (..., m_k, m_k) as (..., K, m, m), m the largest m_k; NaN elsewhere and for None.
+
+    Args:
+        axes: number of axes of size m_k, 0 to 2. leading: sizes of the axes before.
+    """
+    m = max((part.shape[-1] for part in parts if part is not None), default=0) if axes else 0
+    values = torch.full((*leading, len(parts), *(m,) * axes), torch.nan, dtype=torch.float64)
+    for k, part in enumerate(parts):
+        if part is not None:
+            size = slice(part.shape[-1] if axes else None)
+            values[(..., k, *(size,) * axes)] = part.double()
+    return values
+
+
+def stacked(steps: Sequence[Values]) -> Values:
+    """Values of T steps with a leading axis T, without values that some steps lack; measurements of the largest m."""
+    common = [name for name in steps[0] if all(name in step for step in steps)]
+    return {name: torch.stack(_of_one_size([step[name] for step in steps], name)) for name in common}
+
+
+def _of_one_size(values: list[Tensor], name: str) -> list[Tensor]:
+    """The values of steps with different numbers m of channels, extended by NaN to the largest."""
+    axes = letters_of(name).count("m")
+    sizes = {value.shape[-1] for value in values} if axes else set()
+    if len(sizes) < 2:
+        return values
+    ends = [[0, max(sizes) - value.shape[-1]] * axes for value in values]
+    return [torch.nn.functional.pad(v, end, value=torch.nan) for v, end in zip(values, ends, strict=True)]
 
 
 def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], source: str) -> Values:
@@ -146,7 +231,7 @@ def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], 
             that occur for the first time.
     """
     for name, value in values.items():
-        shape, letters = tuple(value.shape), SHAPES[name]
+        shape, letters = tuple(value.shape), letters_of(name)
         expected = (*leading, *(sizes.get(letter, letter) for letter in letters))
         fits = len(shape) == len(expected) and all(
             isinstance(e, str) or e == f for f, e in zip(shape, expected, strict=True)
@@ -155,8 +240,10 @@ def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], 
             text = ", ".join(str(size) for size in expected)
             raise BadInput(f"{source} returns {name} of shape {shape}, expected ({text})")
         sizes |= dict(zip(letters, shape[len(leading) :], strict=True))
-        if value.isnan().any() or (not name.startswith(("log_", "prior_")) and not torch.isfinite(value).all()):
+        may_be_infinite, may_be_nan = name.startswith(("log_", "prior_")), name in MEASUREMENTS
+        if (not may_be_nan and value.isnan().any()) or (not may_be_infinite and value.isinf().any()):
             raise BadInput(f"{source} returns {name} with a number that is not finite")
+    sizes.pop("m", None)  # the number of channels may change between steps
     return values
 
 

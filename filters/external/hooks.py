@@ -44,12 +44,13 @@ class Capture:
             filter has only one, whose sensors are unknown.
     """
 
-    def __init__(self, filter_: nn.Module) -> None:
+    def __init__(self, filter_: nn.Module | None) -> None:
+        """filter_: None for a filter without submodules to record."""
         self.models: tuple[int, ...] = ()
         self._filter: Any = filter_
         self._calls: dict[nn.Module, Call] = {}
         self._hooks = ExitStack()
-        named = filter_.named_modules()
+        named = filter_.named_modules() if filter_ is not None else ()
         self._weight_model = next((part for name, part in named if name.endswith("crossmodal_weight_model")), None)
         self._has_particles = hasattr(filter_, "particle_states") and hasattr(filter_, "particle_log_weights")
 
@@ -238,10 +239,10 @@ def _stack(values: dict[str, Tensor], name: str, beliefs: list[tuple[Tensor, ...
 
 
 def _copy(value: Any) -> Any:
-    """A detached copy of a tensor or tuple of tensors, since the filter may modify its own in place."""
+    """A detached copy of a tensor or tuple of tensors on the CPU, since the filter may modify its own in place."""
     if isinstance(value, tuple):
         return tuple(_copy(item) for item in value)
-    return value.detach().clone() if isinstance(value, Tensor) else value
+    return value.detach().cpu().clone() if isinstance(value, Tensor) else value
 
 
 def _first_equal(after: Tensor, before: Tensor) -> Tensor:

@@ -1,18 +1,20 @@
-"""External filters: torch modules that follow a small contract, or torchfilter's interface.
+"""External filters: Python objects that follow a small contract, or torchfilter's interface.
 
 The contract (examples in ``docs/own_filter.md``):
 
-* ``module.initialize_beliefs(mean=, covariance=)`` starts N trajectories, (N, n) and (N, n, n). A module with this
-  method is then called step by step, ``module(observations=, controls=)``: a dictionary of (N, ...) by the task's
-  observation keys, and (N, c). A module without it is called once for all steps, with (T, N, ...) and (T, N, c).
+* ``filter.initialize_beliefs(mean=, covariance=)`` starts N trajectories, (N, n) and (N, n, n); without parameters, the
+  filter supplies its own initial belief and may return it. A filter with this method is then called step by step,
+  ``filter(observations=, controls=)``: a dictionary of (N, ...) by the task's observation keys, and (N, c). A filter
+  without it is called once for all steps, with (T, N, ...) and (T, N, c). Instead of ``__call__`` it may have
+  ``forward``.
 * It returns the mean (N, n), a pair of mean and covariance (N, n, n), or a dictionary with the keys of
-  ``adapter.SHAPES``; with a leading axis T if called once for all steps.
+  ``adapter.SHAPES`` and ``extra``; with a leading axis T if called once for all steps.
+* With ``Adapter(batched=False)``, no array has the axis N.
+* ``get_state()`` and ``set_state(state)`` are optional: by default all attributes but parameters are copied.
 """
 
 from __future__ import annotations
 
-import hashlib
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -32,18 +34,41 @@ from beliefscope.filters.batch import check_shapes, start_offset
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.external.adapter import SHAPES, Adapter, Units, Values, check_values, derived, named_values
+from beliefscope.filters.external.adapter import (
+    SHAPES,
+    Adapter,
+    Units,
+    Values,
+    check_values,
+    derived,
+    named_values,
+    stacked,
+)
+from beliefscope.filters.external.calls import (
+    call,
+    dtype_of,
+    has_own_start,
+    initialize,
+    is_stepwise,
+    restore,
+    seeded,
+    snapshot,
+)
+from beliefscope.filters.external.fingerprint import fingerprint
 from beliefscope.filters.external.hooks import Capture
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import START_VARIANCE
+
+NO_BELIEF = (torch.zeros(0), torch.zeros(0))
+"""Arguments of ``initialize`` for a filter that supplies its own initial belief."""
 
 
 class ExternalFilter(Checkpoint):
     """An external filter as a checkpoint: it can be traced, evaluated and displayed, but not stepped by the caller.
 
     Attributes:
-        adapter: the module and its conventions. source: its origin, as given by the user.
-        hash: SHA-256 of the source's name, of the files of its classes and of its state dictionary.
+        adapter: the filter and its conventions. source: its origin, as given by the user.
+        hash: SHA-256 of the source's name, of the files of its classes and of its parameters.
     """
 
     def __init__(self, adapter: Adapter, task: Task, name: str, source: str = "") -> None:
@@ -51,7 +76,7 @@ class ExternalFilter(Checkpoint):
         values = {
             "name": name,
             "record": {"source": source or name},
-            "hash": _hash(adapter, source or name),
+            "hash": fingerprint(adapter, source or name),
             "adapter": adapter,
             "source": source or name,
             "_task": task,
@@ -59,7 +84,8 @@ class ExternalFilter(Checkpoint):
         }
         for key, value in values.items():
             object.__setattr__(self, key, value)  # a checkpoint is frozen
-        adapter.module.eval()
+        if isinstance(adapter.module, nn.Module):
+            adapter.module.eval()
 
     adapter: Adapter
     source: str
@@ -83,14 +109,27 @@ class ExternalFilter(Checkpoint):
         """The first belief, as in ``rollout.first_belief``: (N, n), (N, n, n), SI units.
 
         The variance 0.1 of components that start at the truth is in the adapter's standardised units, or in those of
-        the task's pretrained filters. It is NaN if there are neither.
+        the task's pretrained filters. It is NaN if there are neither. A filter with a start of its own is initialised,
+        and its belief is NaN as far as it returns none.
         """
+        if has_own_start(self.adapter.module):
+            return self._own_start(len(episodes))
         means = [episode.states[0] + start_offset(self._task, episode) for episode in episodes]
         mean = torch.from_numpy(np.stack(means)).float()
         std = self._units.std if self.adapter.std else _state_std(self._task)
         variance = torch.from_numpy(self._task.start_variance()).float()
         variance = torch.where(variance.isnan(), START_VARIANCE * std.float() ** 2, variance)
         return Gaussian(mean, torch.diag(variance).expand(len(mean), -1, -1))
+
+    def _own_start(self, count: int) -> Gaussian:
+        n = len(self._task.components)
+        with self._errors_at("initialize_beliefs"):
+            belief = initialize(self.adapter.module, *NO_BELIEF)
+            values = {} if belief is None else named_values(belief, self.source)
+            values = {name: value.expand(count, *value.shape[-len(SHAPES[name]) :]) for name, value in values.items()}
+        values = self._units.to_si(check_values(values, (count,), {"n": n}, f"{self.source} at initialize_beliefs"))
+        unknown = torch.full((count, n, n), torch.nan)
+        return Gaussian(values.get("estimate_mean", unknown[..., 0]), values.get("estimate_covariance", unknown))
 
     def run(
         self,
@@ -115,70 +154,105 @@ class ExternalFilter(Checkpoint):
             BadInput: an episode does not fit the task, the module fails, or it returns invalid values; the message
                 names the step.
         """
-        observations, controls = _inputs(self._task, episodes, _dtype(self.adapter.module))
-        models: tuple[int, ...] = ()
-        with torch.no_grad(), torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            if self._stepwise:
-                steps: list[Values] = []
-                for values, models in self._steps(observations, controls, start or self.start(episodes)):  # noqa: B007
-                    steps.append(values)
-                    if progress is not None:
-                        progress(len(steps) / len(controls))
-                common = [name for name in steps[0] if all(name in step for step in steps)]
-                values = {name: torch.stack([step[name] for step in steps]) for name in common}
-            else:
-                values = self._at_once(observations, controls)
+        start, runs = start or self.start(episodes), []
+        groups = [range(len(episodes))] if self.adapter.batched else [range(i, i + 1) for i in range(len(episodes))]
+        for number, group in enumerate(groups):
+
+            def share(done: float, number: int = number) -> None:
                 if progress is not None:
-                    progress(1.0)
+                    progress((number + done) / len(groups))
+
+            belief = Gaussian(start.mean[group], start.covariance[group])
+            runs.append(self._run([episodes[i] for i in group], seed, share, belief))
+        models = runs[0][1]
+        common = [name for name in runs[0][0] if all(name in values for values, _ in runs)]
+        values = {name: torch.cat([run[name] for run, _ in runs], dim=1) for name in common}
         return derived(self._units.to_si(values)), self._names(values, models)
+
+    def _run(
+        self, episodes: Sequence[Episode], seed: int, progress: Callable[[float], None], start: Gaussian
+    ) -> tuple[Values, tuple[int, ...]]:
+        """One call of a filter of whole sequences, or T calls; values (T, N, ...) in the filter's units."""
+        observations, controls = _inputs(self._task, episodes, dtype_of(self.adapter.module))
+        models: tuple[int, ...] = ()
+        with torch.no_grad(), seeded(seed, self.adapter.module):
+            if not is_stepwise(self.adapter.module):
+                values = self._at_once(observations, controls)
+                progress(1.0)
+                return values, models
+            steps: list[Values] = []
+            for values, models in self._steps(observations, controls, start):  # noqa: B007
+                steps.append(values)
+                progress(len(steps) / len(controls))
+            return stacked(steps), models
 
     def live(self, episode: Episode, seed: int = 0) -> Iterator[tuple[Values, tuple[str, ...]]]:
         """Like ``run`` for one episode, as an iterator over steps: (N, ...) with N = 1, and the models' names.
 
-        Raises BadInput as ``run``, and for a module that processes whole sequences.
+        Raises BadInput as ``run``, and for a filter that processes whole sequences.
         """
-        if not self._stepwise:
+        if not is_stepwise(self.adapter.module):
             raise BadInput(
                 f"{self.source} has no initialize_beliefs: it processes all steps at once, and cannot run live"
             )
-        observations, controls = _inputs(self._task, [episode], _dtype(self.adapter.module))
-        with torch.no_grad(), torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        observations, controls = _inputs(self._task, [episode], dtype_of(self.adapter.module))
+        with torch.no_grad(), seeded(seed, self.adapter.module):
             for step, models in self._steps(observations, controls, self.start([episode])):
                 yield self._units.to_si(step), self._names({n: v[None] for n, v in step.items()}, models)
 
-    @property
-    def _stepwise(self) -> bool:
-        return hasattr(self.adapter.module, "initialize_beliefs")
+    def snapshot(self) -> Any:
+        """The filter's state, for ``restore``. Raises BadInput if it can be neither returned nor copied."""
+        return snapshot(self.adapter.module, self.source)
+
+    def restore(self, state: Any) -> None:
+        """Returns the filter to a state of ``snapshot``, which stays valid."""
+        restore(self.adapter.module, state)
 
     def _steps(
         self, observations: Mapping[str, Tensor], controls: Tensor, start: Gaussian
     ) -> Iterator[tuple[Values, tuple[int, ...]]]:
         """The values of each step, in the module's units, and the indices of the measurement models that took part."""
+        self._initialize(start)
+        sizes: dict[str, int] = {"n": len(self._task.components)}
+        filter_ = self.adapter.module
+        recorded = filter_ if isinstance(filter_, nn.Module) and self.adapter.batched else None
+        with Capture(recorded) as capture:
+            for t in range(len(controls)):
+                with self._errors_at(f"step {t}"):
+                    inputs = {key: value[t] for key, value in observations.items()}
+                    output = self._call(inputs, controls[t], self.source)
+                    values = capture.step(output["estimate_mean"]) | output
+                yield check_values(values, controls.shape[1:2], sizes, f"{self.source} at step {t}"), capture.models
+
+    def _initialize(self, start: Gaussian) -> None:
+        filter_ = self.adapter.module
+        if has_own_start(filter_):
+            with self._errors_at("initialize_beliefs"):
+                initialize(filter_, *NO_BELIEF)
+            return
         if start.covariance.isnan().any():
             raise BadInput(
                 f"{self.source} needs an initial covariance, and task {self._task.name!r} has no pretrained filter to "
                 "take it from: give Adapter(module, mean=..., std=...)"
             )
-        module, (n, count) = self.adapter.module, (len(self._task.components), len(start.mean))
-        mean, covariance = self._units.from_si(start, _dtype(module))
+        mean, covariance = self._units.from_si(start, dtype_of(filter_))
+        if not self.adapter.batched:
+            mean, covariance = mean[0], covariance[0]
         with self._errors_at("initialize_beliefs"):
-            getattr(module, "initialize_beliefs")(mean=mean, covariance=covariance)  # noqa: B009 - mypy infers a Tensor
-        sizes: dict[str, int] = {"n": n}
-        with Capture(module) as capture:
-            for t in range(len(controls)):
-                where = f"step {t}"
-                with self._errors_at(where):
-                    inputs = self.adapter.inputs({key: value[t] for key, value in observations.items()}, controls[t])
-                    output = named_values(module(observations=inputs[0], controls=inputs[1]), self.source)
-                    values = capture.step(output["estimate_mean"]) | output
-                yield check_values(values, (count,), sizes, f"{self.source} at {where}"), capture.models
+            initialize(filter_, mean, covariance)
+
+    def _call(self, observations: Mapping[str, Tensor], controls: Tensor, source: str) -> Values:
+        """The filter's output by name, with the axis N, for inputs whose axis N is the last but one of the controls."""
+        if self.adapter.batched:
+            return named_values(call(self.adapter, observations, controls), source)
+        axis = controls.ndim - 2
+        single = {key: value.select(axis, 0) for key, value in observations.items()}
+        values = named_values(call(self.adapter, single, controls.select(axis, 0)), source)
+        return {name: value.unsqueeze(axis) for name, value in values.items()}
 
     def _at_once(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
         with self._errors_at("all steps"):
-            inputs = self.adapter.inputs(dict(observations), controls)
-            output = named_values(self.adapter.module(observations=inputs[0], controls=inputs[1]), self.source)
+            output = self._call(observations, controls, self.source)
         return check_values(
             output, controls.shape[:2], {"n": len(self._task.components)}, f"{self.source} over all steps"
         )
@@ -243,7 +317,7 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
         given: user-defined tasks that the filter may name.
 
     Raises:
-        BadInput: the name does not exist, the call fails or does not return a torch module, or the task differs.
+        BadInput: the name does not exist, the call fails or does not return a filter, or the task differs.
     """
     place, _, attribute = source.rpartition(":")
     with user_code.importable(place):
@@ -259,10 +333,12 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
             result = build()
         except Exception as error:
             raise BadInput(f"{source} fails when called: {type(error).__name__}: {error}") from error
-    adapter = Adapter(result) if isinstance(result, nn.Module) else result
-    if not isinstance(adapter, Adapter) or not isinstance(adapter.module, nn.Module):
-        value = adapter.module if isinstance(adapter, Adapter) else adapter
-        raise BadInput(f"{source} returns a {type(value).__name__}, expected a torch.nn.Module, or an Adapter of one")
+    adapter = result if isinstance(result, Adapter) else Adapter(result)
+    if not callable(adapter.module) and not hasattr(adapter.module, "forward"):
+        raise BadInput(
+            f"{source} returns a {type(adapter.module).__name__}, expected a filter, which can be called or has "
+            "forward, or an Adapter of one"
+        )
     loaded = load_task(task) if task else None
     own = adapter.task or getattr(adapter.module, "task", "")
     if isinstance(own, str | Task) and own:
@@ -296,29 +372,3 @@ def _state_std(task: Task) -> Tensor:
         with suppress(BadInput):  # not every filter is pretrained
             return load_checkpoint(shipped(task, name)).filter.statistics.mean_std("state")[1]
     return torch.full((len(task.components),), torch.nan)
-
-
-def _dtype(module: nn.Module) -> torch.dtype:
-    """The floating-point type of the module's parameters and buffers."""
-    types = (tensor.dtype for tensor in (*module.parameters(), *module.buffers()) if tensor.is_floating_point())
-    return next(types, torch.float32)
-
-
-def _hash(adapter: Adapter, source: str) -> str:
-    """SHA-256 of the adapter's settings, the module's source files and its state dictionary."""
-    digest = hashlib.sha256(repr((source, [*adapter.components], [*adapter.mean], [*adapter.std])).encode())
-    digest.update(repr([*adapter.modalities]).encode())
-    names = {type(part).__module__ for part in adapter.module.modules()} | {adapter.inputs.__module__}
-    files = {getattr(sys.modules.get(name), "__file__", None) for name in names}
-    for file in sorted(filter(None, files)):
-        with suppress(OSError):
-            digest.update(Path(file).read_bytes())
-    for key, value in sorted(adapter.module.state_dict().items()):
-        digest.update(key.encode())
-        if isinstance(value, Tensor):
-            value = value.detach().cpu().contiguous()
-            digest.update(repr((value.dtype, value.shape)).encode())
-            digest.update(value.flatten().view(torch.uint8).numpy().tobytes())
-        else:
-            digest.update(repr(value).encode())
-    return digest.hexdigest()

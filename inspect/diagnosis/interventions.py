@@ -12,7 +12,7 @@ from beliefscope.inspect.diagnosis.cause import Cause, Recovery
 from beliefscope.inspect.diagnosis.setting import Deviations, Setting
 from beliefscope.inspect.diagnosis.undo import undo
 from beliefscope.inspect.statistics import measures
-from beliefscope.inspect.statistics.innovations import innovations
+from beliefscope.inspect.statistics.innovations import virtual_innovations
 from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.statistics.measures import Array
 from beliefscope.inspect.trace import Trace
@@ -64,7 +64,7 @@ def negative_log_likelihood(trace: Trace) -> float:
     if np.isfinite(trace.episode.states).all():
         pair = (measures.errors(trace)[:, -1], measures.covariances(trace)[:, -1]) if trace.has_covariance else None
     else:
-        pair = innovations(trace)
+        pair = virtual_innovations(trace)
     return float("nan") if pair is None else float(_gaussian_nll(pair[0][keep], pair[1][keep]).mean())
 
 

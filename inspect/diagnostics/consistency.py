@@ -233,13 +233,13 @@ def consistency(traces: Sequence[Trace], healthy: Comparison | None = None) -> C
         steps = {name: values[where, k] for name, values in pooled.items()}
         by_layer.append(_summarise(layer, phase, owner[where], steps, len(cells)))
     keep = len(first) if len(traces) == 1 else 0
-    has_nis = first.observation_mean is not None
+    has_nis = nis_of(first) is not None
     return Consistency(
         task=first.task,
         filter=first.filter,
         trajectories=len(traces),
         by_layer=tuple(by_layer),
-        whiteness=tuple(whiteness_of(traces)),
+        whiteness=tuple(test for test in whiteness_of(traces) if any(test.modality == e.layer for e in by_layer)),
         levels=LEVELS,
         nees=pooled["nees"][:keep],
         nis=pooled["nis"][:keep, : len(first.modalities) if has_nis else 0],
@@ -259,7 +259,7 @@ def trajectory_statistics(trace: Trace) -> dict[str, float]:
         for phase, mask in phases.items()
     }
     if nis is not None and ALL in phases:
-        values |= {f"nis/{m}/{ALL}": float(nis[phases[ALL], k].mean()) for k, m in enumerate(trace.modalities)}
+        values |= {f"nis/{m}/{ALL}": _known_mean(nis[phases[ALL], k]) for k, m in enumerate(trace.modalities)}
     values |= {f"autocorrelation/{m} {c}/{ALL}": r for (m, c), r in autocorrelations(trace).items()}
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
@@ -307,7 +307,7 @@ def _summarise(
         nees=float(steps["nees"].mean()),
         interval=(float(low), float(high)),
         adjusted=(float(lowest), float(highest)),
-        nis=float(steps["nis"].mean()),
+        nis=_known_mean(steps["nis"]),
         coverage95=float((level <= 0.95).mean()),
         calibration=curve,
         miscalibration=float(np.abs(curve - LEVELS).mean()),
@@ -316,6 +316,12 @@ def _summarise(
         sharpness=np.sqrt(steps["variance"].mean(0)),
         crps=steps["crps"].mean(0),
     )
+
+
+def _known_mean(values: Array) -> float:
+    """Mean of the values that are not NaN; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else math.nan
 
 
 def _sentence(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Innovations of Kalman filters and their whiteness test."""
+"""Innovations of Kalman filters, in the space of the measurement or the state, and their whiteness test."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from beliefscope.inspect.statistics.calibration import LAGS, ljung_box
@@ -50,7 +51,18 @@ class Whiteness:
 
 
 def innovations(trace: Trace) -> tuple[Array, Array] | None:
-    """``z - H x`` (T, K, n), angles wrapped, and ``P + R`` (T, K, n, n), H = I; None unless a Kalman filter."""
+    """Innovations and their predicted covariance S; None unless a Kalman filter.
+
+    (T, K, m) and (T, K, m, m) in the spaces of the measurements if the filter reports them, NaN where there is none;
+    else (T, K, n) and (T, K, n, n) of the virtual observations.
+    """
+    if trace.innovation is not None and trace.innovation_covariance is not None:
+        return trace.innovation.astype(np.float64), trace.innovation_covariance.astype(np.float64)
+    return virtual_innovations(trace)
+
+
+def virtual_innovations(trace: Trace) -> tuple[Array, Array] | None:
+    """``z - H x`` (T, K, n), angles wrapped, and ``P + R`` (T, K, n, n), H = I; None without virtual observations."""
     parts = (
         trace.observation_mean,
         trace.predicted_mean,
@@ -63,12 +75,31 @@ def innovations(trace: Trace) -> tuple[Array, Array] | None:
     return wrapped(trace.task, z - predicted), p + r
 
 
-def nis_of(trace: Trace) -> Array | None:
-    """(T, K): ``nu^T S^-1 nu / n`` of the innovations; mean 1 if consistent. None unless a Kalman filter."""
+def squared_innovations(trace: Trace) -> tuple[Array, NDArray[np.int64]] | None:
+    """``nu^T S^-1 nu`` (T, K), NaN without a measurement, and the number of its channels (T, K).
+
+    None unless a Kalman filter.
+    """
     if (pair := innovations(trace)) is None:
         return None
     nu, s = pair
-    return np.einsum("tkn,tkn->tk", nu, np.linalg.solve(s, nu[..., None])[..., 0]) / nu.shape[-1]
+    used = np.isfinite(nu)
+    both = used[..., :, None] & used[..., None, :]
+    s = np.where(both, s, np.eye(nu.shape[-1]))  # unused channels add nothing
+    nu = np.where(used, nu, 0.0)
+    squared = np.einsum("tkm,tkm->tk", nu, np.linalg.solve(s, nu[..., None])[..., 0])
+    channels = used.sum(-1)
+    return np.where(channels > 0, squared, np.nan), channels
+
+
+def nis_of(trace: Trace) -> Array | None:
+    """(T, K): ``nu^T S^-1 nu / m`` of the innovations; mean 1 if consistent, NaN without a measurement.
+
+    None unless a Kalman filter.
+    """
+    if (pair := squared_innovations(trace)) is None:
+        return None
+    return pair[0] / np.maximum(pair[1], 1)
 
 
 def autocorrelations(trace: Trace) -> dict[tuple[str, str], float]:
@@ -94,14 +125,28 @@ def whiteness_of(traces: Sequence[Trace]) -> list[Whiteness]:
 
 
 def _names(trace: Trace) -> list[tuple[str, str]]:
-    return [(modality, c.name) for modality in trace.modalities for c in trace.task.components]
+    """(modality, channel) of each series of ``_ljung_box``: components of the state, or channels of the measurement."""
+    if trace.innovation is None:
+        return [(modality, c.name) for modality in trace.modalities for c in trace.task.components]
+    keep = np.isfinite(trace.innovation).any(0)  # (K, m)
+    return [(trace.modalities[k], f"channel {i + 1}") for k, i in np.argwhere(keep)]
 
 
 def _ljung_box(trace: Trace) -> tuple[Array, Array, int] | None:
-    """Ljung-Box statistic and autocorrelation at lag 1, (K n,) each, and the number of steps; None for too few."""
+    """Ljung-Box statistic and autocorrelation at lag 1 of each series, and the number of steps; None for too few.
+
+    Steps without a measurement do not count.
+    """
     pair, keep = innovations(trace), counted(trace)
-    if pair is None or keep.sum() <= 2 * LAGS:
+    if pair is None:
         return None
     nu, s = pair
-    normalised = nu / np.sqrt(np.diagonal(s, axis1=-2, axis2=-1))
-    return *ljung_box(normalised[keep].reshape(keep.sum(), -1)), int(keep.sum())
+    normalised = (nu / np.sqrt(np.diagonal(s, axis1=-2, axis2=-1)))[keep].reshape(keep.sum(), -1)
+    series = [column[np.isfinite(column)] for column in normalised.T if np.isfinite(column).any()]
+    if not series or min(map(len, series)) <= 2 * LAGS:
+        return None
+    if len({len(column) for column in series}) == 1:
+        return *ljung_box(np.stack(series, axis=1)), len(series[0])
+    tests = [ljung_box(column[:, None]) for column in series]
+    q, r = (np.concatenate(parts) for parts in zip(*tests, strict=True))
+    return q, r, min(map(len, series))

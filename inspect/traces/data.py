@@ -53,6 +53,10 @@ class Trace:
         prior_log_weights, log_weights: PF: (T, M) normalised, before and after the observation.
         log_likelihood: PF: (T, K, M), not normalised.
         ancestors: PF: (T, M) int32 index of the particle that each resampled particle was copied from.
+        innovation, innovation_covariance: external filters: (T, K, m), (T, K, m, m) in the space and units of each
+            measurement; NaN after its last channel and where there was none.
+        accepted: external filters with a gate: (T, K) 1 if the measurement was used, 0 if not; NaN without one.
+        extra: external filters: name -> (T,) scalar of the filter, in its own unit.
         checkpoint_hash, data_hash: SHA-256 of the checkpoint file and of the episode (``Episode.digest``).
         episode_index: index in the data set.
         seed: seed of the filter and of the fault injection.
@@ -81,6 +85,10 @@ class Trace:
     log_weights: Array | None = None
     log_likelihood: Array | None = None
     ancestors: NDArray[np.int32] | None = None
+    innovation: Array | None = None
+    innovation_covariance: Array | None = None
+    accepted: Array | None = None
+    extra: Mapping[str, Array] = field(default_factory=dict)
     checkpoint_hash: str = ""
     data_hash: str = ""
     episode_index: int = 0
@@ -123,16 +131,17 @@ class Trace:
         return None if self.log_weights is None else effective_sample_size(torch.from_numpy(self.log_weights)).numpy()
 
 
-ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type))
+ARRAYS = tuple(f.name for f in fields(Trace) if "Array" in str(f.type) and "Mapping" not in str(f.type))
 """Names of the array fields of a trace."""
 
 
 def arrays_of(trace: Trace) -> dict[str, NDArray[Any]]:
-    """All arrays of a trace by name; those of its episode start with ``episode/``."""
+    """All arrays of a trace by name; those of its episode start with ``episode/``, its own scalars with ``extra/``."""
     episode = trace.episode
     arrays: dict[str, NDArray[Any]] = {
         name: getattr(trace, name) for name in ARRAYS if getattr(trace, name) is not None
     }
+    arrays |= {f"extra/{name}": value for name, value in trace.extra.items()}
     arrays |= {f"episode/{name}": getattr(episode, name) for name in ("states", "controls", "contact", "qpos")}
     arrays |= {f"episode/covariates/{key}": value for key, value in episode.covariates.items()}
     return arrays | {f"episode/observations/{key}": value for key, value in episode.observations.items()}

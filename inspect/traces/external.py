@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.filters.external.adapter import EXTRA
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
 
@@ -56,12 +57,15 @@ def trace_external(
     )
 
 
-def fill_missing(arrays: Mapping[str, NDArray[Any]], k: int) -> dict[str, NDArray[Any]]:
-    """The arrays, with NaN for required arrays of K models that are missing."""
+def fill_missing(arrays: Mapping[str, NDArray[Any]], k: int) -> dict[str, Any]:
+    """The arrays, with NaN for required arrays of K models that are missing; ``extra`` as a dictionary."""
     steps, n = arrays["estimate_mean"].shape
     shapes = {
         "estimate_covariance": (steps, n, n),
         "modality_mean": (steps, k, n),
         "modality_covariance": (steps, k, n, n),
     }
-    return {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items()} | dict(arrays)
+    missing = {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items()}
+    own = {name: value for name, value in arrays.items() if not name.startswith(EXTRA)}
+    extra = {name.removeprefix(EXTRA): value for name, value in arrays.items() if name.startswith(EXTRA)}
+    return missing | own | ({"extra": extra} if extra else {})

@@ -40,7 +40,7 @@ def save_trace(trace: Trace, path: Path) -> None:
 def header_of(trace: Trace) -> dict[str, Any]:
     """All fields of a trace except the arrays, as JSON values."""
     episode = trace.episode
-    separate = (*ARRAYS, "episode", "faults", "settings")
+    separate = (*ARRAYS, "extra", "episode", "faults", "settings")
     return {
         "format": FORMAT,
         **{f.name: getattr(trace, f.name) for f in fields(Trace) if f.name not in separate},
@@ -107,8 +107,9 @@ def trace_from_arrays(header: Mapping[str, Any], arrays: Mapping[str, Any], give
         "kind": current_kind(values["kind"]),
         "faults": stored_faults(header),
     }
-    own_arrays = {current_array(n): a for n, a in arrays.items() if not n.startswith("episode/")}
-    trace = Trace(**values, episode=episode, **own_arrays)
+    own_arrays = {current_array(n): a for n, a in arrays.items() if not n.startswith(("episode/", "extra/"))}
+    extra = {name.removeprefix("extra/"): a for name, a in arrays.items() if name.startswith("extra/")}
+    trace = Trace(**values, episode=episode, extra=extra, **own_arrays)
     validate_trace(trace)
     return trace
 

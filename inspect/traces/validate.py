@@ -37,6 +37,8 @@ def validate_trace(trace: Trace) -> None:
     shapes = {name: f"T{letters}" for name, letters in SHAPES.items()} | STATIC
     for name, letters in shapes.items():
         _check_array(name, getattr(trace, name), letters, sizes, "i" if name == "ancestors" else "f")
+    for name, values in trace.extra.items():
+        _check_array(f"extra {name!r}", values, "T", sizes, "f")
     for name, letters, kinds in (("states", "Tn", "f"), ("controls", "Tc", "f"), ("contact", "T", "b")):
         _check_array(name, getattr(episode, name), letters, sizes, kinds)
     _check_array("qpos", episode.qpos, "Tq", sizes, "f")

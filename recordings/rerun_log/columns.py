@@ -21,7 +21,7 @@ class Column:
     """One column.
 
     Attributes:
-        group: ``trace``, ``covariates`` or ``observations``.
+        group: ``trace``, ``extra``, ``covariates`` or ``observations``.
         parts: name of the array, then modality and components if any.
         values: (T,), or (T, S) for S values per step: particles, sensor channels, pixels.
         shape: per step before flattening in C order.
@@ -50,6 +50,8 @@ def columns(trace: Trace) -> Iterator[Column]:
         array = getattr(trace if hasattr(trace, name) else trace.episode, name)
         if array is not None and array.size:
             yield from _split(name, array, re.findall(r"\w+", entity.shape), entity.unit, trace, task)
+    for name, array in sorted(trace.extra.items()):
+        yield Column("extra", (name,), *_flat(array))
     for name, array in sorted(trace.episode.covariates.items()):
         yield Column("covariates", (name,), *_flat(array))
     for key, array in sorted(trace.episode.observations.items()):

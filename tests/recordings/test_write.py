@@ -41,6 +41,8 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
         "ekf": trace.kind in ("ekf", "ukf"),
         "sensors": trace.observation_mean is not None,
         "pf": trace.kind == "pf",
+        "measurements": trace.innovation is not None,
+        "extra": bool(trace.extra),
         "maps": maps,
         "diagnostics": False,  # tests/recordings/rerun_log/test_diagnostics.py
         "replay": trace.episode.qpos.size > 0,

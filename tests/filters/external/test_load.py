@@ -50,7 +50,7 @@ def other():
         ("no.such.module:build", "", r"^module 'no\.such\.module' cannot be imported: ModuleNotFoundError"),
         ("own.py:biuld", "", r"^own\.py has no 'biuld'\. Available: Filter, build, number, fails, other\.$"),
         ("own.py:NUMBER", "", r"^own\.py has 'NUMBER', which is not callable\. Available"),
-        ("own.py:number", "", r"^own\.py:number returns a int, expected a torch\.nn\.Module, or an Adapter of one$"),
+        ("own.py:number", "", r"^own\.py:number returns a int, expected a filter, which can be called or has forward"),
         ("own.py:fails", "", r"^own\.py:fails fails when called: KeyError: 'weights\.pt'$"),
         ("own.py:other", "", r"^filter 'own\.py:other' is for task 'push', not for 'door'$"),
         ("own.py:build", "1 / 0", r"^own\.py cannot be run: ZeroDivisionError"),

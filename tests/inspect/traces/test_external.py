@@ -340,7 +340,7 @@ INVALID = {
         "particles": torch.ones(T, 1, 4, 3)
     },
     "value of a filter 'wieghts' does not exist. Available: estimate_mean, ": {"wieghts": torch.zeros(1)},
-    "returns weights as a float, expected a Tensor": {"weights": 0.5},
+    "returns weights as a float, expected an array or a Tensor": {"weights": 0.5},
 }
 
 

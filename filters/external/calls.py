@@ -1,0 +1,150 @@
+"""Calls of an external filter: types and devices of its arguments, its random numbers and its state."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.external.adapter import Adapter
+
+CPU = torch.device("cpu")
+
+
+def is_stepwise(filter_: Any) -> bool:
+    """Whether the filter is called for one step at a time."""
+    return hasattr(filter_, "initialize_beliefs")
+
+
+def has_own_start(filter_: Any) -> bool:
+    """Whether the filter supplies its initial belief: ``initialize_beliefs`` has no parameters."""
+    if not is_stepwise(filter_):
+        return False
+    try:
+        return not inspect.signature(filter_.initialize_beliefs).parameters
+    except (TypeError, ValueError):  # some built-in functions have no signature
+        return False
+
+
+def device_of(filter_: Any) -> torch.device:
+    """The device of a module's parameters and buffers."""
+    return next((tensor.device for tensor in _tensors(filter_)), CPU)
+
+
+def dtype_of(filter_: Any) -> torch.dtype:
+    """The floating-point type of a module's parameters and buffers; that of any other filter is float64."""
+    if not isinstance(filter_, nn.Module):
+        return torch.float64
+    types = (tensor.dtype for tensor in _tensors(filter_) if tensor.is_floating_point())
+    return next(types, torch.float32)
+
+
+def call(adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor) -> Any:
+    """The filter's output for inputs on the CPU, (N, ...) or (T, N, ...), in the types that it takes."""
+    filter_ = adapter.module
+    inputs = adapter.inputs(
+        {key: _argument(filter_, value) for key, value in observations.items()}, _argument(filter_, controls)
+    )
+    return _function(filter_)(observations=inputs[0], controls=inputs[1])
+
+
+def initialize(filter_: Any, mean: Tensor, covariance: Tensor) -> Any:
+    """Starts the filter at a belief (N, n), (N, n, n), or at its own; returns the result of ``initialize_beliefs``."""
+    if has_own_start(filter_):
+        return filter_.initialize_beliefs()
+    return filter_.initialize_beliefs(mean=_argument(filter_, mean), covariance=_argument(filter_, covariance))
+
+
+def _function(filter_: Any) -> Any:
+    """A module is called, so that its hooks run; another object's ``forward``, or else itself."""
+    return filter_ if isinstance(filter_, nn.Module) else getattr(filter_, "forward", filter_)
+
+
+def _argument(filter_: Any, value: Tensor) -> Any:
+    return value.to(device_of(filter_)) if isinstance(filter_, nn.Module) else value.numpy()
+
+
+def _tensors(filter_: Any) -> Iterator[Tensor]:
+    if isinstance(filter_, nn.Module):
+        yield from filter_.parameters()
+        yield from filter_.buffers()
+
+
+@contextmanager
+def seeded(seed: int, filter_: Any) -> Iterator[None]:
+    """Seeds the global generators of torch and NumPy; restores them afterwards."""
+    device = device_of(filter_)
+    state = np.random.get_state()  # noqa: NPY002 - filters of other projects use the global generator
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        np.random.seed(seed % 2**32)  # noqa: NPY002
+        try:
+            yield
+        finally:
+            np.random.set_state(state)  # noqa: NPY002
+
+
+def snapshot(filter_: Any, source: str) -> Any:
+    """Everything that a step may change: the result of ``get_state``, or a copy of all attributes but parameters.
+
+    Raises BadInput if the attributes cannot be copied.
+    """
+    if hasattr(filter_, "get_state"):
+        return copy.deepcopy(filter_.get_state())
+    try:
+        return copy.deepcopy([_state(part) for part in _parts(filter_)], _shared(filter_))
+    except Exception as error:
+        raise BadInput(
+            f"{source} cannot be copied ({type(error).__name__}: {error}): give it get_state and set_state"
+        ) from error
+
+
+def restore(filter_: Any, state: Any) -> None:
+    """Returns the filter to a state of ``snapshot``, which stays valid."""
+    if hasattr(filter_, "get_state"):
+        filter_.set_state(copy.deepcopy(state))
+        return
+    copied = copy.deepcopy(state, _shared(filter_))
+    for part, (attributes, buffers) in zip(_parts(filter_), copied, strict=True):
+        for name in [name for name in _attributes(part) if name not in attributes]:
+            delattr(part, name)
+        vars(part).update(attributes)
+        if isinstance(part, nn.Module):
+            part._buffers.update(buffers)
+
+
+def _parts(filter_: Any) -> list[Any]:
+    """The filter and, of a module, all submodules; their identity is kept, since hooks refer to it."""
+    if isinstance(filter_, nn.Module):
+        return list(filter_.modules())
+    return [filter_] if hasattr(filter_, "__dict__") else []
+
+
+def _state(part: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Attributes and buffers."""
+    return _attributes(part), dict(part._buffers) if isinstance(part, nn.Module) else {}
+
+
+def _attributes(part: Any) -> dict[str, Any]:
+    internal = vars(nn.Module()).keys() if isinstance(part, nn.Module) else ()
+    return {name: value for name, value in vars(part).items() if name not in internal}
+
+
+def _shared(filter_: Any) -> dict[int, Any]:
+    """Memo of ``copy.deepcopy`` for objects that are not copied: modules of the filter and parameters."""
+    owned = [filter_] if isinstance(filter_, nn.Module) else [v for v in _values(filter_) if isinstance(v, nn.Module)]
+    shared: list[Any] = [parameter for module in owned for parameter in module.parameters()]
+    if isinstance(filter_, nn.Module):
+        shared += filter_.modules()
+    return {id(item): item for item in shared}
+
+
+def _values(filter_: Any) -> list[Any]:
+    return list(vars(filter_).values()) if hasattr(filter_, "__dict__") else []
