@@ -14,11 +14,12 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.errors import check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
+from beliefscope.filters.external.ablation import without
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.models.sequence import SequenceModel
@@ -112,13 +113,11 @@ def evaluate(
         start_offset: of the first belief from the true state; its covariance matches the offset. Default: as the task.
         baselines: whether to evaluate ``BASELINES`` as well, with the same starts, faults and random numbers.
         modalities: whether to evaluate the single-modality updates and standalone filters as well, in the same way.
-            None of an external filter.
+            An external filter runs without information of the others' sensors (``external/ablation.py``).
 
     Raises:
         BadInput: there is no episode, or episodes, faults or modality do not fit the filter's task.
     """
-    if isinstance(filter_, ExternalFilter) and only is not None:
-        raise BadInput(f"only {only!r}: {filter_.source} is an external filter, whose observations cannot be masked")
     device = torch.device("cpu") if isinstance(filter_, ExternalFilter) else next(filter_.parameters()).device
     offsets = torch.from_numpy(start_offset.vectors(filter_.task, episodes, seed)).to(device)
     variances = torch.from_numpy(start_offset.variances(filter_.task)).to(device)
@@ -132,7 +131,8 @@ def evaluate(
     runs: dict[str, dict[int, Run]] = {}
     for done, (length, members) in enumerate(sorted(groups.items()), 1):
         if isinstance(filter_, ExternalFilter):
-            results = _external_runs(filter_, [episodes[i] for i in members], seed, offsets[members], variances)
+            start = shifted(filter_.start([episodes[i] for i in members]), offsets[members], variances)
+            results = _external_runs(filter_, [episodes[i] for i in members], start, only, seed, modalities)
         else:
             batch = steps.windows(steps.first[members], length)
             start = offset_start(filter_, batch, offsets[members], variances)
@@ -143,7 +143,7 @@ def evaluate(
         if progress is not None:
             progress(done / len(groups))
     pooled = {name: _pool(filter_.task, [by[i] for i in range(len(by))], episodes) for name, by in runs.items()}
-    names = () if isinstance(filter_, ExternalFilter) else input_modalities(filter_)
+    names = filter_.task.modalities if isinstance(filter_, ExternalFilter) else input_modalities(filter_)
     return replace(
         pooled[FILTER],
         baselines={name: pooled.get(name) for name in BASELINES} if baselines else {},
@@ -195,17 +195,35 @@ def _si_run(filter_: Filter, batch: Batch, estimate: Gaussian) -> Run:
 
 
 def _external_runs(
-    external: ExternalFilter, episodes: Sequence[Episode], seed: int, offsets: Tensor, variances: Tensor
+    external: ExternalFilter,
+    episodes: Sequence[Episode],
+    start: Gaussian,
+    only: str | None,
+    seed: int,
+    modalities: bool,
 ) -> dict[str, Run]:
     """As ``_filter_runs``; covariances are NaN where the filter gives none."""
-    start = external.start(episodes)
-    start = shifted(start, offsets, variances)
-    values, _ = external.run(episodes, seed, start=start)
-    mean = values["estimate_mean"]
     truth = torch.from_numpy(np.stack([episode.states for episode in episodes], axis=1))
-    unknown = torch.full((*mean.shape, mean.shape[-1]), torch.nan)
-    runs = {FILTER: (mean - truth, values.get("estimate_covariance", unknown))}
+    used = {FILTER: only} | {STANDALONE.format(name): name for name in external.task.modalities if modalities}
+    runs = {}
+    for run_name, modality in used.items():
+        absent = [] if modality is None else [name for name in external.task.modalities if name != modality]
+        if modality is not None:
+            check_name(f"modality of task {external.task.name!r}", modality, external.task.modalities)
+        seen = [without(episode, absent, external.adapter.absent) for episode in episodes]
+        values, names = external.run(seen, seed, start=start)
+        runs[run_name] = _external_run(values, truth)
+        if run_name == FILTER and modalities and "modality_mean" in values:
+            for k, name in enumerate(names):
+                moments = {"estimate_mean": values["modality_mean"][:, :, k]}
+                runs[UPDATE.format(name)] = _external_run(moments, truth)
     return runs if start.mean.isnan().any() else runs | {STAY: _stay(start.mean, truth)}
+
+
+def _external_run(values: Mapping[str, Tensor], truth: Tensor) -> Run:
+    mean = values["estimate_mean"]
+    unknown = torch.full((*mean.shape, mean.shape[-1]), torch.nan)
+    return mean - truth, values.get("estimate_covariance", unknown)
 
 
 def _stay(mean: Tensor, states: Tensor) -> Run:

@@ -15,12 +15,21 @@ from torch import Tensor
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence
+from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
 
 
 def input_modalities(filter_: Filter) -> tuple[str, ...]:
     """The K input modalities of a filter, including modalities with a shared model."""
     return tuple(dict.fromkeys(modality for model in filter_.names for modality in model.split("+")))
+
+
+def modalities_of(checkpoint: Checkpoint) -> tuple[str, ...]:
+    """As ``input_modalities``; all of the task for an external filter, which may not read some of them."""
+    if isinstance(checkpoint, ExternalFilter):
+        return tuple(checkpoint.task.modalities)
+    return input_modalities(checkpoint.filter)
 
 
 def check_modality(filter_: Filter, modality: str) -> None:

@@ -17,24 +17,24 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.rollout import first_belief, rollout
-from beliefscope.filters.subsets import check_modality, input_modalities, standalone_evidence
+from beliefscope.filters.subsets import modalities_of, standalone_evidence
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.external_replay import run_alone
 from beliefscope.inspect.traces.run import assemble_trace
 
 
 def check_standalone(checkpoint: Checkpoint, modality: str) -> None:
-    """Raise BadInput for a modality that the filter does not use, and for an external filter."""
-    if isinstance(checkpoint, ExternalFilter):
-        raise BadInput(f"{checkpoint.source} is an external filter, whose observations cannot be masked")
-    check_modality(checkpoint.filter, modality)
+    """Raise BadInput for a modality that the filter does not use."""
+    if modality not in (modalities := modalities_of(checkpoint)):
+        raise BadInput(f"Modality {modality!r} is not in this filter. Available: {', '.join(modalities)}.")
 
 
 def standalone_runs(traces: Sequence[Trace], checkpoint: Checkpoint | None) -> dict[str, list[Trace]]:
-    """Modality -> standalone run of each trace; empty for one modality, an external filter, and without checkpoint."""
-    if checkpoint is None or isinstance(checkpoint, ExternalFilter):
+    """Modality -> standalone run of each trace; empty for one modality, and without checkpoint."""
+    if checkpoint is None:
         return {}
-    modalities = input_modalities(checkpoint.filter)
+    modalities = modalities_of(checkpoint)
     other = any("standalone" in trace.settings or trace.checkpoint_hash != checkpoint.hash for trace in traces)
     if other or len(modalities) < 2:
         return {}
@@ -45,7 +45,7 @@ def standalone_errors(
     traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
 ) -> list[measures.Array]:
     """Errors (T, K, n) of the standalone filter of each of the K input modalities, by trace; m and rad."""
-    modalities = input_modalities(checkpoint.filter)
+    modalities = modalities_of(checkpoint)
     runs = len(traces) * len(modalities)
     errors = []
     for i, trace in enumerate(traces):
@@ -71,16 +71,19 @@ def standalone(
     those of its interventions. At every step the evidence of all other modalities is masked (``filters/subsets.py``);
     fusion weights, given or manual, play no part. The result is the trace of a filter with one modality: its estimate
     is the standalone estimate, and ``settings`` name the modality as ``standalone``. For a filter of one modality, all
-    arrays but its effective weights equal those of the trace bit for bit.
+    arrays but its effective weights equal those of the trace bit for bit. An external filter sees the other sensors
+    without information (``filters/external/ablation.py``).
 
     Args:
-        modality: an input of the filter (``input_modalities``).
+        modality: an input of the filter (``modalities_of``).
         progress: called with the completed fraction, 0..1.
 
     Raises:
-        BadInput: the filter does not use the modality, is external, or the trace is of another filter.
+        BadInput: the filter does not use the modality, or the trace is of another filter.
     """
     check_standalone(checkpoint, modality)
+    if isinstance(checkpoint, ExternalFilter):
+        return run_alone(checkpoint, trace, modality, progress)
     if trace.checkpoint_hash != checkpoint.hash:
         raise BadInput(f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}")
     filter_ = checkpoint.filter

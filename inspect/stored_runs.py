@@ -12,6 +12,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
+from beliefscope.inspect.traces.external_replay import ExternalReplay, open_replay
 from beliefscope.inspect.traces.replay import Edit, Replay
 
 Progress = Callable[[float], None]
@@ -22,7 +23,7 @@ class StoredRuns:
     """Runs filters, one at a time. Keeps the replay of the run that was edited last."""
 
     def __init__(self) -> None:
-        self._replay: tuple[Path, Replay] | None = None
+        self._replay: tuple[Path, Replay | ExternalReplay] | None = None
 
     def run(
         self,
@@ -48,7 +49,7 @@ class StoredRuns:
             return _run_or_load(path, checkpoint, episode, progress, settings)
         if self._replay is None or self._replay[0] != path:
             original = _run_or_load(path, checkpoint, episode, progress, settings)
-            self._replay = path, Replay(checkpoint, original, progress)
+            self._replay = path, open_replay(checkpoint, original, progress)
         return self._replay[1].edited(edit)
 
 

@@ -51,16 +51,15 @@ MIN_STEPS = 10
 
 
 def model_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float]:
-    """``KIND/SUBJECT/PHASE`` -> value, SI units, of all modules.
+    """``KIND/SUBJECT/PHASE`` -> value, SI units, of all modules; of an external filter those of its reported values.
 
     Statistics that do not apply are absent.
     """
-    if isinstance(checkpoint, ExternalFilter):
-        return {}
-    values = weight_statistics(trace) | equation_statistics(trace, checkpoint)
-    if np.isfinite(trace.episode.states).all():
-        values |= error_statistics(trace)
-        values |= measurement_statistics(trace, checkpoint)
+    known, external = bool(np.isfinite(trace.episode.states).all()), isinstance(checkpoint, ExternalFilter)
+    values = {} if external else weight_statistics(trace) | equation_statistics(trace, checkpoint)
+    if known:
+        values |= error_statistics(trace) | measurement_statistics(trace, checkpoint)
+    if known and not external:
         values |= dynamics_statistics(trace.episode, checkpoint)
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
@@ -88,6 +87,8 @@ def measurement_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, fl
         observed = trace.observation_mean.astype(np.float64)
         variance = np.diagonal(trace.observation_covariance, axis1=-2, axis2=-1).astype(np.float64)
         power = 1.0 / variance
+    elif isinstance(checkpoint, ExternalFilter):
+        return {}
     elif trace.log_likelihood is not None and isinstance(checkpoint.filter, MixtureParticleFilter):
         steps = np.arange(0, len(trace), EVERY)
         observed, variance, power = likelihood_moments(checkpoint.filter, trace.episode, steps)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.ablation import without
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
 
@@ -28,3 +30,15 @@ class Setting:
 
 Deviations = Mapping[str, Deviation]
 """Statistic -> deviation."""
+
+
+def without_sensor(setting: Setting, external: ExternalFilter, modality: str) -> Setting | None:
+    """The affected steps without information of a modality's sensors; None if no other modality remains."""
+    if modality not in external.task.modalities or len(external.task.modalities) < 2:
+        return None
+    steps = slice(*(setting.steps or (None,)))
+    episodes = {
+        index: without(episode, [modality], external.adapter.absent, steps) if index in setting.affected else episode
+        for index, episode in setting.episodes.items()
+    }
+    return replace(setting, episodes=episodes)

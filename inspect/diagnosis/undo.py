@@ -20,10 +20,11 @@ from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.catalog import build
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import MAX_LOGIT, Filter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
-from beliefscope.inspect.diagnosis.setting import Deviations, Setting
+from beliefscope.inspect.diagnosis.setting import Deviations, Setting, without_sensor
 from beliefscope.inspect.diagnostics.healthy_comparison import Deviation
 
 POSITION, CHANGE = slice(0, 3), slice(3, 6)
@@ -102,7 +103,12 @@ def _with_readings(setting: Setting, key: str, change: Callable[[NDArray[Any], f
 
 
 def drop(modality: str, setting: Setting, deviations: Deviations) -> Setting | None:
-    """Without all models that use a modality in the affected steps; None if no other model remains."""
+    """Without all models that use a modality in the affected steps; None if no other model remains.
+
+    An external filter sees the modality's sensors without information (``filters/external/ablation.py``).
+    """
+    if isinstance(setting.checkpoint, ExternalFilter):
+        return without_sensor(setting, setting.checkpoint, modality)
     keep = torch.tensor([modality not in model.split("+") for model in setting.checkpoint.filter.names])
     if keep.all() or not keep.any():
         return None

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.subsets import input_modalities
+from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.fusion_gaps import Reason, reasons_of
 from beliefscope.inspect.diagnostics.standalone_modalities import why_not
@@ -166,7 +166,7 @@ def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequen
     return FusionEfficiency(
         task=first.task,
         filter=first.filter,
-        modalities=input_modalities(checkpoint.filter),
+        modalities=modalities_of(checkpoint),
         trajectories=len(traces),
         phases=tuple(
             _phase(name, moments, steps, list(members))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.views import Array, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import jackknife, mean_interval
@@ -63,7 +64,10 @@ class Reason:
 
 
 def reasons_of(traces: Sequence[Trace], checkpoint: Checkpoint) -> tuple[Reason, ...]:
-    """All reasons that can be measured for this filter."""
+    """All reasons that can be measured for this filter; of an external filter only the weights."""
+    if isinstance(checkpoint, ExternalFilter):
+        weighted = traces[0].effective_weights is not None and traces[0].modalities_with_posterior
+        return (_weights(traces, of_sensors=False),) if weighted else ()
     architecture = checkpoint.filter.architecture
     one_prior = architecture.fusion in ("crossmodal", "unimodal") and architecture.feedback
     reasons = []

@@ -9,19 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import rollout
-from beliefscope.filters.subsets import input_modalities, subset_evidence
+from beliefscope.filters.subsets import modalities_of, subset_evidence
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import MIN_TRAJECTORIES, jackknife, too_few
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.external_replay import check_origin, run_with
 from beliefscope.inspect.traces.replay import Replay
 
 Mask = NDArray[np.bool_]
@@ -220,13 +223,13 @@ def run_subsets(
             the trace's seed and episode.
     """
     report = progress or (lambda share: None)
+    if isinstance(checkpoint, ExternalFilter):
+        return _external_subsets(checkpoint, trace, offset, report)
     replay = Replay(checkpoint, trace, lambda share: report(REPLAY_TIME * share))
-    filter_, member = checkpoint.filter, members(len(input_modalities(checkpoint.filter)))
+    filter_, member = checkpoint.filter, members(len(modalities_of(checkpoint)))
     start = replay.start
-    noise = np.random.default_rng([trace.seed, trace.episode_index]).standard_normal(start.mean.shape)
-    shift = torch.linalg.cholesky(start.covariance) @ torch.from_numpy(noise).to(start.mean)[..., None]
-    count = len(member)
-    start = Gaussian((start.mean + offset * shift[..., 0]).expand(count, -1), start.covariance.expand(count, -1, -1))
+    count, mean = len(member), _offset_mean(start, trace, offset)
+    start = Gaussian(mean.expand(count, -1), start.covariance.expand(count, -1, -1))
     result = rollout(
         filter_,
         subset_evidence(filter_, replay.batch, replay.evidence, torch.from_numpy(member)),
@@ -236,6 +239,27 @@ def run_subsets(
         progress=lambda share: report(REPLAY_TIME + (1.0 - REPLAY_TIME) * share),
     )
     return filter_.statistics.state_to_si(result.estimate.mean).double().numpy()
+
+
+def _offset_mean(start: Gaussian, trace: Trace, offset: float) -> Tensor:
+    """Mean (1, n) of the initial belief with its error."""
+    if not offset:
+        return start.mean
+    noise = np.random.default_rng([trace.seed, trace.episode_index]).standard_normal(start.mean.shape)
+    shift = torch.linalg.cholesky(start.covariance) @ torch.from_numpy(noise).to(start.mean)[..., None]
+    return start.mean + offset * shift[..., 0]
+
+
+def _external_subsets(external: ExternalFilter, trace: Trace, offset: float, report: Callable[[float], None]) -> Array:
+    """As ``run_subsets``, one run by subset: absent sensors carry no information (``filters/external/ablation.py``)."""
+    check_origin(external, trace)
+    modalities, start = np.array(modalities_of(external)), external.start([trace.episode])
+    start = Gaussian(_offset_mean(start, trace, offset), start.covariance)
+    estimates = []
+    for has in members(len(modalities)):
+        estimates.append(run_with(external, trace, tuple(modalities[has]), start))
+        report(len(estimates) / 2 ** len(modalities))
+    return np.stack(estimates, axis=1)
 
 
 def shapley(
@@ -251,7 +275,7 @@ def shapley(
     if not 0.0 <= offset < math.inf:
         raise BadInput(f"offset must be a finite number of standard deviations, at least 0, not {offset:g}")
     first, task = traces[0], traces[0].task
-    modalities = input_modalities(checkpoint.filter)
+    modalities = modalities_of(checkpoint)
     weights = shapley_weights(len(modalities))
     errors = []
     for i, trace in enumerate(traces):
@@ -305,7 +329,7 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if checkpoint is None:
         return None
-    count = len(input_modalities(checkpoint.filter))
+    count = len(modalities_of(checkpoint))
     return (
         f"{trace.filter} has {count} modalities; at most {MAX_MODALITIES} are supported"
         if count > MAX_MODALITIES

@@ -14,8 +14,7 @@ import numpy as np
 
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.subsets import input_modalities
+from beliefscope.filters.subsets import modalities_of
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Array, Curve, Table, Value
 from beliefscope.inspect.standalone import standalone_errors
@@ -144,11 +143,9 @@ class StandaloneModalities(Diagnostic):
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
-    if isinstance(checkpoint, ExternalFilter):
-        return f"{trace.filter} is an external filter, whose observations cannot be masked"
     if "standalone" in trace.settings:
         return f"the trace is of a standalone run of {trace.settings['standalone']}"
-    if checkpoint is not None and len(input_modalities(checkpoint.filter)) < 2:
+    if checkpoint is not None and len(modalities_of(checkpoint)) < 2:
         return f"{trace.filter} has one modality: it is the standalone filter"
     return None
 
@@ -157,7 +154,7 @@ def standalone_modalities(
     traces: Sequence[Trace], checkpoint: Checkpoint, progress: Callable[[float], None] | None = None
 ) -> StandaloneModalities:
     """Run the standalone filter of every modality over the episodes of one or more traces, and compare all errors."""
-    first, modalities = traces[0], input_modalities(checkpoint.filter)
+    first, modalities = traces[0], modalities_of(checkpoint)
     alone = standalone_errors(traces, checkpoint, progress)
     errors = [_with_position(trace, modalities, values) for trace, values in zip(traces, alone, strict=True)]
     keep = len(first) if len(traces) == 1 else 0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.filters.external.adapter import EXTRA
+from beliefscope.filters.external.adapter import EXTRA, letters_of
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.traces.data import Trace
 
@@ -32,9 +32,33 @@ def trace_external(
     Raises BadInput as ``trace``, and if the filter fails or returns invalid values.
     """
     external.check_task(episode)
-    data_hash = episode.digest()
-    episode = faults.apply(episode, seed)
-    values, modalities = external.run([episode], seed, progress)
+    provenance: dict[str, Any] = {
+        "data_hash": episode.digest(),
+        "episode_index": episode_index,
+        "seed": seed,
+        "faults": faults,
+    }
+    return run_external(external, faults.apply(episode, seed), progress, **provenance)
+
+
+def run_external(
+    external: ExternalFilter,
+    episode: Episode,
+    progress: Callable[[float], None] | None = None,
+    *,
+    seen: Episode | None = None,
+    **provenance: Any,
+) -> Trace:
+    """The trace of a run over an episode after fault injection.
+
+    Args:
+        seen: episode that the filter runs on, if it lacks sensors of the trace's episode. Such a trace has no values
+            of single modalities.
+        provenance: trace fields that identify the run.
+    """
+    values, modalities = external.run([seen or episode], provenance["seed"], progress)
+    if seen is not None:
+        modalities, values = (), {name: v for name, v in values.items() if not letters_of(name).startswith("K")}
     start = external.start([episode])
     arrays = {name: np.ascontiguousarray(value[:, 0].numpy()) for name, value in values.items()}
     settings: dict[str, Any] = {"torch": torch.__version__, "source": external.source}
@@ -48,11 +72,7 @@ def trace_external(
         start_mean=start.mean[0].numpy(),
         start_covariance=np.ascontiguousarray(start.covariance[0].numpy()),
         checkpoint_hash=external.hash,
-        data_hash=data_hash,
-        episode_index=episode_index,
-        seed=seed,
-        faults=faults,
-        settings=settings,
+        **{**provenance, "settings": settings | dict(provenance.get("settings", {}))},
         **fill_missing(arrays, len(modalities)),
     )
 

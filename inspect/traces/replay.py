@@ -172,7 +172,7 @@ class Replay:
         self.original = assemble_trace(
             checkpoint, trace.episode, self.start, self.evidence, self.steps, **self._provenance
         )
-        self.exact = all(_equal(getattr(trace, name), getattr(self.original, name)) for name in ARRAYS)
+        self.exact = all(equal(getattr(trace, name), getattr(self.original, name)) for name in ARRAYS)
 
     def check_step(self, step: int) -> None:
         """Raise BadInput for a step outside the trace."""
@@ -251,7 +251,8 @@ def repeat_belief(belief: Belief, count: int) -> Belief:
     return type(belief)(*(tensor.expand(count, *tensor.shape[1:]) for tensor in tensors))
 
 
-def _equal(a: NDArray[Any] | None, b: NDArray[Any] | None) -> bool:
+def equal(a: NDArray[Any] | None, b: NDArray[Any] | None) -> bool:
+    """Whether two arrays of a trace have the same values, NaN included, or are both missing."""
     if a is None or b is None:
         return a is b
     return np.array_equal(a, b, equal_nan=True)

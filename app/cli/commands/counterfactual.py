@@ -41,7 +41,8 @@ def counterfactual(
     from beliefscope.inspect.compare.counterfactual import compare
     from beliefscope.inspect.diagnostics.plotting import figure_format, write_figure
     from beliefscope.inspect.trace import save_trace, trace
-    from beliefscope.inspect.traces.replay import Edit, Replay, parse_weights
+    from beliefscope.inspect.traces.external_replay import open_replay
+    from beliefscope.inspect.traces.replay import Edit, parse_weights
 
     if output is not None:
         figure_format(output)
@@ -52,7 +53,7 @@ def counterfactual(
     recorded, index = run.read_episode(checkpoint.task)
     with console.progress("Filtering") as advance:
         original = trace(checkpoint, recorded, index, run.seed, run.particles)
-        replay = Replay(checkpoint, original, progress=advance)
+        replay = open_replay(checkpoint, original, progress=advance)
         edited = replay.edited(edit)
     result = compare(replay.original, edited, edit)
     if output is not None:

@@ -36,11 +36,11 @@ def evaluate(runs: opt.Runs, only: str | None = None, start_offset: str = "", al
     from beliefscope.filters.evaluate import evaluate as measure
     from beliefscope.filters.external.load import ExternalFilter
     from beliefscope.filters.start_offset import StartOffset
-    from beliefscope.filters.subsets import check_modality
+    from beliefscope.inspect.standalone import check_standalone
 
     checkpoint, faults = runs.open()
-    if only is not None and not isinstance(checkpoint, ExternalFilter):
-        check_modality(checkpoint.filter, only)
+    if only is not None:
+        check_standalone(checkpoint, only)
     offset = StartOffset.parse(start_offset, checkpoint.task)
     with runs.episodes(checkpoint.task) as data:
         data_hash, held_out = data.hash, [data[i] for i in data.held_out()]

@@ -231,7 +231,7 @@ def test_missing_inputs_of_shared_models_are_neutral(name: str) -> None:
     base = episode()
     run = trace(checkpoint, base, 9, seed=1, particles=40)
     result = run_subsets(checkpoint, run)
-    assert shapley.input_modalities(checkpoint.filter) == ("image", "haptics")
+    assert shapley.modalities_of(checkpoint) == ("image", "haptics")
     black = trace(checkpoint, base, 9, seed=1, particles=40, faults=Faults.parse("blackout"))
     keys, first = checkpoint.task.modalities["haptics"], 0
     average = dict(base.observations)

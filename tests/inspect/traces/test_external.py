@@ -135,8 +135,6 @@ def test_evaluation_equals_the_built_in_filter(episodes: list[Episode]) -> None:
     result = evaluate(external(PlainFilter()), episodes).to_dict()
     assert result["rmse"] == pytest.approx(native["rmse"], rel=2e-3)
     assert result["nees"] == pytest.approx(native["nees"], rel=2e-3)
-    with pytest.raises(BadInput, match="only 'image': mine is an external filter"):
-        evaluate(external(PlainFilter()), episodes, only="image")
 
 
 class ReorderedUnits(nn.Module):
