@@ -8,7 +8,10 @@ from typing import Any
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import (
     consistency,
+    ensemble,
+    errors,
     fusion_efficiency,
+    gates,
     likelihood_maps,
     particle_health,
     saliency,
@@ -25,7 +28,10 @@ ENTRIES: tuple[Entry, ...] = (
     standalone_modalities.ENTRY,
     fusion_efficiency.ENTRY,
     consistency.ENTRY,
+    gates.ENTRY,
+    errors.ENTRY,
     particle_health.ENTRY,
+    ensemble.ENTRY,
     shapley.ENTRY,
     saliency.ENTRY,
 )

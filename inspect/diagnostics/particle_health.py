@@ -11,6 +11,7 @@ from scipy.ndimage import label
 
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.ensemble import has_equal_weights
 from beliefscope.inspect.diagnostics.healthy_comparison import Comparison
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.statistics import measures
@@ -203,6 +204,8 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     """One-line reason why the diagnostic does not apply, or None."""
     if trace.particles is None or trace.log_weights is None:
         return f"{trace.filter} has no particles"
+    if trace.ancestors is None and trace.prior_log_weights is None and has_equal_weights(trace):
+        return f"all particles of {trace.filter} have the same weight in every step: see the diagnostic ensemble"
     return None
 
 

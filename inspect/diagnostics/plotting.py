@@ -51,6 +51,7 @@ BANDS = {
     "blackout": {"facecolor": "#000000", "alpha": 0.12},
     "edit": {"facecolor": "#0072B2", "alpha": 0.12},
 }
+OTHER_BAND = {"facecolor": "#999999", "alpha": 0.25}
 
 PANEL_HEIGHT = 1.5
 """Inches, height of a full-width chart over time; plots and image panels are half as wide and 1.6 x as high."""
@@ -149,7 +150,8 @@ def draw_bands(axes: Axes, bands: Mapping[str, NDArray[np.bool_]], labelled: boo
     for phase, mask in bands.items():
         if mask.any():
             spans = [(first - 0.5, end - first) for first, end in intervals(mask)]
-            shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, "zorder": 0, **BANDS[phase]}
+            style = BANDS.get(phase, OTHER_BAND)
+            shade: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "lw": 0, "zorder": 0, **style}
             axes.broken_barh(spans, (0, 1), label=phase if labelled else None, **shade)
 
 
