@@ -77,7 +77,7 @@ def test_diagnose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert all(f"{entry.title}. {entry.question}\n  " in output for entry in DIAGNOSTICS.values())
     assert "; oracle: " in output
     assert "95 % interval -" in output, "five trajectories are enough for intervals"
-    assert {path.stem for path in tmp_path.glob("*.pdf")} == {"weights", "consistency", "particles"}
+    assert {path.stem for path in tmp_path.glob("*.pdf")} == {"weights", "consistency", "errors", "particles"}
 
 
 def test_counterfactual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
