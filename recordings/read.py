@@ -122,7 +122,9 @@ def _load(path: Path) -> tuple[dict[str, Any], Rows]:
                     rows[chunk.entity_path.removeprefix("/")] += _values(batch)
     version = header.get("format_version")
     if version is None:
-        raise BadInput(f"{path}: a Rerun recording, but not written by {APPLICATION}.")
+        raise BadInput(
+            f"{path}: a Rerun recording, but not written by {APPLICATION}; `import --map` reads it as a log."
+        )
     if version != FORMAT_VERSION:
         versions = " ".join(str(header.get("versions", "an unknown version")).split())
         raise BadInput(

@@ -7,7 +7,7 @@ last message at or before it (zero-order hold).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -66,9 +66,11 @@ class Series:
     """Messages of a topic: the last one before each tick.
 
     Attributes:
-        paths: column -> fields that lead to its value. times: of the messages. values: column -> their values.
+        topic: its name. paths: column -> fields that lead to its value. times: of the messages. values: column -> their
+            values.
     """
 
+    topic: str
     paths: Mapping[str, list[str]]
     times: list[int] = field(default_factory=list)
     values: dict[str, list[Any]] = field(default_factory=dict)
@@ -84,12 +86,23 @@ class Series:
         """Decode the last message."""
         if self.pending:
             _, time, decode = self.pending
-            message = decode()
+            message = decoded(self.topic, decode)
             self.times.append(time)
             for name, path in self.paths.items():
                 if path != [AGE] or AGE in entries_of(message):
                     self.values.setdefault(name, []).append(value_at(message, path, name))
             self.pending = None
+
+
+def decoded(topic: str, decode: Callable[[], Any]) -> Any:
+    """A decoded message. Raises BadInput with the topic: the libraries raise errors of every type."""
+    try:
+        return decode()
+    except BadInput:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise BadInput(f"a message of topic {topic!r} cannot be decoded: {reason:.150}") from None
 
 
 def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
@@ -104,7 +117,7 @@ def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
     """
     if mapping.dt is None:
         raise BadInput("the topics have their own rates: the map needs dt, s per step of the common clock")
-    series = {topic: Series(paths) for topic, paths in _paths(log.topics, mapping.references).items()}
+    series = {topic: Series(topic, paths) for topic, paths in _paths(log.topics, mapping.references).items()}
     step = max(round(mapping.dt * log.second), 1) if log.second else 1
     for topic, time, decode in log.messages([*series]):
         series[topic].add(-(-time // step), time, decode)
@@ -215,11 +228,7 @@ def _numbers(value: Any) -> NDArray[Any]:
 
 def entries_of(message: Any) -> Mapping[str, Any]:
     """Fields of a message; empty for a number, a text or an array."""
-    if isinstance(message, dict):
-        return message
-    if is_dataclass(message):
-        return {entry.name: getattr(message, entry.name) for entry in fields(message)}
-    return {}
+    return message if isinstance(message, dict) else {}
 
 
 def leaves(message: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -236,20 +245,24 @@ def leaves(message: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def preview(log: MessageLog) -> Preview:
-    """The first messages of every topic. Topics that cannot be decoded are left out."""
+    """The first messages of every topic. Topics that cannot be decoded are left out; raises BadInput if none can."""
     times: dict[str, list[int]] = {topic: [] for topic in log.topics}
     values: dict[str, list[NDArray[Any]]] = {}
+    problem = BadInput("the log has no message")
     for topic, time, decode in log.messages(log.topics):
         times[topic].append(time)
         if len(times[topic]) <= DECODED:
             try:
-                for name, value in leaves(decode(), topic):
+                for name, value in leaves(decoded(topic, decode), topic):
                     values.setdefault(name, []).append(value)
-            except BadInput:
-                continue  # a topic that cannot be decoded may not be needed
+            except BadInput as error:
+                problem = error
         elif all(len(t) >= SAMPLE for t in times.values()):
             break
+    if not values:
+        raise problem
     usable = {n: v for n, v in values.items() if len({i.shape for i in v}) == 1 and v[0].size}
     stacked = {name: np.asarray(value) for name, value in usable.items()}
-    intervals = {t: float(np.median(np.diff(v))) / (log.second or 1.0) for t, v in times.items() if len(v) > 1}
+    medians = {t: float(np.median(np.diff(v))) / (log.second or 1.0) for t, v in times.items() if len(v) > 1}
+    intervals = {topic: median for topic, median in medians.items() if median > 0.0}
     return Preview({n: v for n, v in stacked.items() if v.dtype.kind in "fiubU"}, intervals, log.timeline)

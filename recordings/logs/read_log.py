@@ -68,6 +68,17 @@ def read_log(columns: Columns, mapping: ColumnMap, source: str) -> list[Episode]
     ]
 
 
+def check_complete(episodes: list[Episode]) -> None:
+    """Raise BadInput for episodes with unknown values, which a data set cannot have."""
+    for index, episode in enumerate(episodes):
+        arrays = {c.name: episode.states[:, i] for i, c in enumerate(episode.task.components)}
+        for name, array in (arrays | {"control": episode.controls} | dict(episode.observations)).items():
+            if (unknown := np.isnan(array)).any():
+                row = int(np.argwhere(unknown)[0][0])
+                where = f"episode {index}, step {row}" if row else f"episode {index}"
+                raise BadInput(f"{name} is unknown in {where}: a data set needs all states, controls and readings")
+
+
 def recorded_trace(columns: Columns, mapping: ColumnMap, episodes: list[Episode], index: int, source: str) -> Trace:
     """The recorded estimate of an episode as a trace, float32.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,32 +11,44 @@ from typing import Any
 
 from beliefscope.recordings.logs import ros_types
 
+STORAGES = (".db3", ".mcap")
+"""Suffixes of the files of a bag."""
+
 
 @contextmanager
 def open_log(path: Path, timeline: str | None) -> Iterator[BagLog]:
     """The log in a bag with the storage sqlite3 or mcap. The time of a message is that of its recording."""
     from rosbags.rosbag2 import Reader
 
-    with Reader(path) as reader:
-        yield BagLog(reader)
+    with ExitStack() as stack:
+        bag = stack.enter_context(Reader(path))
+        if path.is_dir() and not bag.compression_mode:
+            # The topics of metadata.yaml may differ from those in the files, and then have no messages.
+            files = sorted(file for file in path.iterdir() if file.suffix in STORAGES)
+            yield BagLog([stack.enter_context(Reader(file)) for file in files])
+        else:
+            yield BagLog([bag])
 
 
 @dataclass
 class BagLog:
-    """An open bag."""
+    """An open bag. readers: of its files."""
 
-    reader: Any
+    readers: Sequence[Any]
     second: float | None = 1e9
     timeline: str = ""
 
-    def __post_init__(self) -> None:
-        self.topics = tuple(sorted({connection.topic for connection in self.reader.connections}))
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Names of the topics."""
+        return tuple(sorted({connection.topic for reader in self.readers for connection in reader.connections}))
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
-        """Topic, time in ns and decoder of each message, in the order of times."""
-        connections = [connection for connection in self.reader.connections if connection.topic in topics]
-        for connection, time, data in self.reader.messages(connections):
-            yield connection.topic, time, partial(_decode, connection, data)
+        """Topic, time in ns and decoder of each message, in the order of files and times."""
+        for reader in self.readers:
+            connections = [connection for connection in reader.connections if connection.topic in topics]
+            for connection, time, data in reader.messages(connections) if connections else ():
+                yield connection.topic, time, partial(_decode, connection, data)
 
 
 def _decode(connection: Any, data: bytes) -> Any:

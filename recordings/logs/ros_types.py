@@ -12,14 +12,24 @@ LONG_ARRAY = re.compile(r"\[(?:<=)?\s*\d{6,}")
 """An array whose size makes the generated decoder too long."""
 
 
-def decode(name: str, definition: str, data: bytes) -> Any:
-    """A CDR message as a dataclass of numbers, text, arrays and nested messages.
+def decode(name: str, definition: str, data: bytes) -> dict[str, Any]:
+    """A CDR message: fields -> numbers, text, arrays and nested messages.
 
     Args:
         name: of the type, such as ``nav_msgs/msg/Odometry``. definition: ``.msg`` text of the type and of the types it
             uses; empty for the standard types of ROS 2.
     """
-    return _store(name, definition).deserialize_cdr(data, name)
+    name = name if "/msg/" in name else name.replace("/", "/msg/")
+    store = _store(name, definition)
+    return _fields(store, store.deserialize_cdr(data, name))
+
+
+def _fields(store: Any, value: Any) -> Any:
+    if isinstance(value, list):
+        return [_fields(store, item) for item in value]
+    if (name := getattr(value, "__msgtype__", None)) is None:
+        return value
+    return {field: _fields(store, getattr(value, field)) for field, _ in store.get_msgdef(name).fields}
 
 
 @lru_cache(maxsize=100)

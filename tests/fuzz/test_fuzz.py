@@ -17,7 +17,7 @@ from beliefscope.datasets.readers import hdf5_guard
 
 pytestmark = pytest.mark.slow
 
-SLOW = ("study", "mit-hdf5", "mit-json", "recording")
+SLOW = ("study", "mit-hdf5", "mit-json", "recording", "log-rerun")
 """Readers whose files need a training or rendering, or that can crash the process."""
 
 
@@ -37,6 +37,13 @@ def test_slow_reader_raises_only_bad_input(name: str, tmp_path: Path) -> None:
     readers.check_valid(name, tmp_path)
     for number in range(100):
         readers.attempt(name, seed=11, number=number, folder=tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [name for name in readers.LOG_READERS if name not in SLOW])
+def test_readers_of_logs_raise_only_bad_input(name: str, tmp_path: Path) -> None:
+    for number in range(10_000):
+        readers.attempt(name, seed=12, number=number, folder=tmp_path)
 
 
 def test_server_survives_invalid_requests_and_messages(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def import_(
     from beliefscope.recordings.logs.column_map import read_map
     from beliefscope.recordings.logs.columns import preview_columns, read_columns
     from beliefscope.recordings.logs.guess import guess_map
-    from beliefscope.recordings.logs.read_log import read_log, recorded_trace
+    from beliefscope.recordings.logs.read_log import check_complete, read_log, recorded_trace
 
     if guess:
         text = guess_map(preview_columns(source), source.stem)
@@ -76,6 +76,7 @@ def import_(
         if not 0 <= episode < len(episodes):
             raise BadInput(f"episode {episode} does not exist: {source.name} has {len(episodes)}")
         return _written(recorded_trace(columns, mapping, episodes, episode, source.name), output)
+    check_complete(episodes)
     write_dataset(output, episodes[0].task, episodes)
     steps = sum(len(e) for e in episodes)
     document = {"task": mapping.task, "episodes": len(episodes), "steps": steps}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import log_files as logs
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset
 from beliefscope.recordings.logs.column_map import read_map
 from beliefscope.recordings.logs.columns import preview_columns, read_columns
 from beliefscope.recordings.logs.guess import guess_map
@@ -145,3 +148,100 @@ def test_wrong_maps_name_the_value(json_log: Path, tmp_path: Path, old: str, new
     with pytest.raises(BadInput, match=message) as error:
         read()
     assert "\n" not in str(error.value)
+
+
+def test_a_bag_written_by_ros(tmp_path: Path) -> None:
+    """Values are the defaults in the definition of test_msgs/Arrays."""
+    bag = Path(__file__).with_name("rosbag2_cdr_test")
+    text = 'dt = 0.05\n[state]\nx = "/test_topic.int32_value"\ny = ""\n'
+    text += '[sensors]\nfloats = "/array_topic.float32_values_default"\n'
+    text += 'limits = "/array_topic.int16_values_default"\n'
+    mapping = read_map(map_file(tmp_path, text))
+    columns = read_columns(bag, mapping)
+    (episode,) = read_log(columns, mapping, "bag")
+    assert set(episode.states[:, 0]) == {123.0}
+    assert np.array_equal(episode.observations["floats"], len(episode) * [[1.125, 0.0, -1.125]])
+    assert np.array_equal(episode.observations["limits"], len(episode) * [[0, 32767, -32768]])
+    assert not [name for name in preview_columns(bag).columns if "__" in name]
+
+
+def test_topics_that_differ_from_the_metadata_have_messages(tmp_path: Path) -> None:
+    """In bags of some versions of ROS, metadata.yaml has another quality of service than the file."""
+    from rosbags.rosbag2 import Reader
+
+    logs.write_bag(tmp_path / "bag")
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    times = ("deadline", "lifespan", "liveliness_lease_duration")
+    quality = {"history": 1, "depth": 9, "reliability": 1, "durability": 2, "liveliness": 1}
+    quality |= {"avoid_ros_namespace_conventions": False} | {name: {"sec": 0, "nsec": 0} for name in times}
+    metadata.write_text(metadata.read_text().replace("profiles: []", f"profiles: {json.dumps([quality])}"))
+    with Reader(tmp_path / "bag") as reader:
+        assert reader.connections
+        assert not [*reader.messages()]
+    text = MAP.partition("[covariates]")[0]
+    assert len(read_columns(tmp_path / "bag", read_map(map_file(tmp_path, text)))["/imu.angular_velocity"]) == 39
+
+
+def test_lists_of_messages_are_particles(tmp_path: Path) -> None:
+    """A pose array with five members: each column of x and y has one value per member."""
+    from mcap.writer import Writer
+
+    with (tmp_path / "log.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/cloud", "json", 0)
+        for step in range(10):
+            poses = [{"position": {"x": step + i, "y": step * i}} for i in range(5)]
+            writer.add_message(channel, step * 10**8, json.dumps({"poses": poses}).encode(), 0)
+        writer.finish()
+    text = 'dt = 0.1\n[state]\nx = ""\ny = ""\n'
+    text += '[estimate]\nparticles = ["/cloud.poses.position.x", "/cloud.poses.position.y"]\n'
+    mapping = read_map(map_file(tmp_path, text))
+    columns = read_columns(tmp_path / "log.mcap", mapping)
+    trace = recorded_trace(columns, mapping, read_log(columns, mapping, "log"), 0, "log")
+    assert trace.particles is not None
+    assert trace.particles[3].tolist() == [[3.0 + i, 3.0 * i] for i in range(5)]
+    np.testing.assert_allclose(trace.estimate_mean[3], [5.0, 6.0])
+
+
+def test_a_topic_that_cannot_be_decoded_only_matters_if_it_is_used(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "log.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, encoding, data in (("/good", "json", b'{"x": 1.5}'), ("/bad", "protobuf", b"?")):
+            channel = writer.register_channel(topic, encoding, 0)
+            for step in range(4):
+                writer.add_message(channel, step * 10**8, data, 0)
+        writer.finish()
+    assert [*preview_columns(tmp_path / "log.mcap").columns] == ["/good.x"]
+    text = 'dt = 0.1\n[state]\nx = "/good.x"\ny = "/bad.x"\n'
+    with pytest.raises(BadInput, match="topic '/bad' is encoded as protobuf, expected json, or cdr"):
+        read_columns(tmp_path / "log.mcap", read_map(map_file(tmp_path, text)))
+
+
+def test_files_without_an_index_are_refused(json_log: Path, tmp_path: Path) -> None:
+    """A recorder that was killed writes no summary."""
+    (tmp_path / "cut.mcap").write_bytes(json_log.read_bytes()[:-3000])
+    with pytest.raises(BadInput, match=r"cut\.mcap") as error:
+        preview_columns(tmp_path / "cut.mcap")
+    assert "\n" not in str(error.value)
+
+
+def test_the_command_line_imports_a_log(json_log: Path, tmp_path: Path, run: Callable[..., tuple]) -> None:
+    """A data set with the map's sensors, and one line with the cause for a wrong map."""
+    code, _, error = run("import", json_log, "--map", map_file(tmp_path), "-o", tmp_path / "log.h5")
+    assert (code, error) == (0, "")
+    with open_dataset(tmp_path / "log.h5") as data:
+        assert [*data.task.observations] == ["gyro", "image"]
+    code, _, error = run(
+        "import", json_log, "--map", map_file(tmp_path, MAP.replace("/imu", "/imi")), "-o", tmp_path / "b.h5"
+    )
+    assert code == 2
+    assert error.startswith("error: log.mcap: topic of column '/imi.angular_velocity' does not exist")
+    assert error.count("\n") == 1
+    unknown = map_file(tmp_path, MAP.replace('"/truth.pose.pose.position.x"', '""'))
+    code, _, error = run("import", json_log, "--map", unknown, "-o", tmp_path / "b.h5")
+    assert (code, (tmp_path / "b.h5").exists()) == (2, False)
+    assert "x is unknown in episode 0: a data set needs all states" in error

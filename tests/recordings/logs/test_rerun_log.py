@@ -21,6 +21,8 @@ from beliefscope.recordings.logs.guess import guess_map
 from beliefscope.recordings.logs.images import LUMA
 from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
+pytestmark = pytest.mark.slow  # a process reads each recording first
+
 MAP = """
 dt = 0.05
 time = "sim"
@@ -125,8 +127,9 @@ def test_wrong_maps_name_the_value(log: Path, tmp_path: Path, old: str, new: str
         read_log(read_columns(log, mapping), mapping, "log")
 
 
-def test_files_of_other_formats_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "log.rrd").write_bytes(b"not a recording")
+@pytest.mark.parametrize("size", [0, 15, 4000])
+def test_damaged_files_are_refused(log: Path, tmp_path: Path, size: int) -> None:
+    (tmp_path / "log.rrd").write_bytes(log.read_bytes()[:size])
     with pytest.raises(BadInput, match=r"log\.rrd") as error:
         read_columns(tmp_path / "log.rrd")
     assert "\n" not in str(error.value)
