@@ -183,6 +183,11 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert trained["record"]["command"].startswith("beliefscope train door --filter crossmodal-pf --data ten.h5")
     assert trained["record"]["faults"] == []
     episodes = trained["record"]["episodes"]
+    code, out, _ = run("evaluate door --filter pf.safetensors --data ten.h5 --particles 50 --json -")
+    assert code == 0
+    assert json.loads(out)["checkpoint_hash"] == trained["checkpoint_hash"]
+    assert json.loads(out)["episodes"] == 1
+
     options = "--faults force_bias:x=5,blackout=0.4 --blackouts 0,0.8 --json"
     hardened = json.loads(run(line.replace("--json", options))[1])["record"]
     assert (trained["record"]["blackouts"], hardened["blackouts"]) == ([0.0, 0.4, 0.8], [0.0, 0.8])
@@ -190,11 +195,6 @@ def test_train_writes_a_checkpoint_that_evaluates(run: Run, folder: Path) -> Non
     assert [fault["fault"] for fault in hardened["faults"]] == ["force_bias", "blackout"]
     assert hardened["episodes"] == episodes | {"train": 2 * episodes["train"]}
     assert "--faults force_bias=5,blackout=0.4" in hardened["command"]
-    trained = json.loads(run(line)[1])
-    code, out, _ = run("evaluate door --filter pf.safetensors --data ten.h5 --particles 50 --json -")
-    assert code == 0
-    assert json.loads(out)["checkpoint_hash"] == trained["checkpoint_hash"]
-    assert json.loads(out)["episodes"] == 1
 
 
 def test_inspect_reports_applicable_diagnostics_and_reasons(run: Run, folder: Path) -> None:

@@ -265,7 +265,7 @@ def test_scene_slider_changes_the_step(open_page: Any) -> None:
 
 
 def test_recording_is_saved_and_synchronized_with_rerun(open_page: Any, tmp_path: Path) -> None:
-    page = open_page("?step=12")
+    page = open_page("?step=12&filter=crossmodal-ekf")
     with page.page.expect_download(timeout=120_000) as download:
         page.page.keyboard.press("s")
         page.until("() => document.querySelector('#save-status progress:not([hidden])')")
