@@ -55,42 +55,64 @@ def _table(columns: Columns) -> list[str]:
 
 
 def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
-    """The first pose with a name of truth is the state, the first other one the estimate, the rest are sensors."""
-    poses = dict(filter(None, (_pose(columns, name) for name in columns)))
+    """State and estimate from poses, or topics of numbers, with such names; the rest are sensors."""
+    poses = dict(filter(None, (_pose(columns, name) for name in columns))) | _groups(columns, intervals)
     truth = next(iter(_named(TRUTH, [*poses])), "")
-    estimate = next(iter(_named(POSE_ESTIMATE, [p for p in poses if p != truth])), "")
-    state = {}
-    if truth:
-        x, y, orientation = poses[truth]
-        state = {"x": _text(x), "y": _text(y), "yaw": f'{{column = {_text(orientation)}, unit = "{QUATERNION}"}}'}
-    topics = {_topic(intervals, base_name(column)) for pose in (truth, estimate) if pose for column in poses[pose]}
-    rest = [n for n, v in columns.items() if v.dtype.kind in "fiub" and _topic(intervals, n) not in topics]
-    sensors: dict[str, str] = {}
-    for name in rest:
-        parent, _, leaf = name.rpartition(".")
-        if not re.search(r"\.(header|stamp)\.|covariance|\.(sec|nanosec|timestamp)$", name):
-            reference = parent if leaf in ("x", "y", "z", "w") else name
-            sensors[_key(reference.strip("/"))] = reference
-    clock = _topic(intervals, base_name(poses[truth][0])) if truth else min(intervals, key=lambda t: intervals[t])
-    lines = [f"dt = {intervals[clock]:.3g}  # s per step of the common clock", *_sections(state, sensors)]
+    state = poses.get(truth, {})
+    others = [pose for pose in poses if pose != truth and (not truth or poses[pose].keys() == state.keys())]
+    estimate = next(iter(_named(POSE_ESTIMATE, others)), "")
+    used = [*state.values(), *poses.get(estimate, {}).values()]
+    topics = {_topic(intervals, base_name(reference)) for reference in used}
+    references = [
+        _vector(columns, n) for n in columns if _is_reading(columns, n) and _topic(intervals, n) not in topics
+    ]
+    clock = _topic(intervals, base_name(used[0])) if used else min(intervals, key=lambda topic: intervals[topic])
+    lines = [f"dt = {intervals[clock]:.3g}  # s per step of the common clock"]
+    values = {_key(component): _component(reference) for component, reference in state.items()}
+    lines += _sections(values, {_key(reference.strip("/")): reference for reference in references})
     if estimate:
-        lines += ["[estimate]", f"mean = {_texts(poses[estimate])}"]
+        lines += ["[estimate]", f"mean = {_texts([*poses[estimate].values()])}"]
         covariance = f"{estimate.removesuffix('.pose')}.covariance"
         if covariance in columns and columns[covariance].shape[1:] == (36,):
             lines.append(f"covariance = {_text(covariance + PLANAR)}  # of x, y and yaw")
     return lines
 
 
-def _pose(columns: Columns, name: str) -> tuple[str, tuple[str, str, str]] | None:
-    """Prefix of a pose, and its columns of x, y and orientation, for the first column of a pose."""
-    if name.endswith(".position.x"):  # ROS
-        prefix = name.removesuffix(".position.x")
-        found = (name, f"{prefix}.position.y", f"{prefix}.orientation")
-        return (prefix, found) if f"{prefix}.orientation.w" in columns else None
-    if name.endswith(".translation") and name.replace(".translation", ".quaternion") in columns:  # Rerun
-        prefix = name.removesuffix(".translation")
-        return prefix, (f"{name}[0]", f"{name}[1]", f"{prefix}.quaternion")
+def _component(reference: str) -> str:
+    """A component of the state: its column, or that of a quaternion."""
+    is_quaternion = reference.endswith((".orientation", ".quaternion"))
+    return f'{{column = {_text(reference)}, unit = "{QUATERNION}"}}' if is_quaternion else _text(reference)
+
+
+def _pose(columns: Columns, name: str) -> tuple[str, dict[str, str]] | None:
+    """Prefix of a pose and its columns of x, y and orientation, if ``name`` is the first column of a pose."""
+    if name.endswith(".position.x") and f"{(prefix := name.removesuffix('.position.x'))}.orientation.w" in columns:
+        return prefix, {"x": name, "y": f"{prefix}.position.y", "yaw": f"{prefix}.orientation"}  # ROS
+    if name.endswith(".translation") and f"{(prefix := name.removesuffix('.translation'))}.quaternion" in columns:
+        return prefix, {"x": f"{name}[0]", "y": f"{name}[1]", "yaw": f"{prefix}.quaternion"}  # Rerun
     return None
+
+
+def _groups(columns: Columns, topics: Mapping[str, float]) -> dict[str, dict[str, str]]:
+    """Topics of two numbers or more: field -> column."""
+    groups: dict[str, dict[str, str]] = {}
+    for name, values in columns.items():
+        topic, _, field = name.rpartition(".")
+        if topic in topics and values.ndim == 1 and _is_reading(columns, name):
+            groups.setdefault(topic, {})[field] = name
+    return {topic: group for topic, group in groups.items() if len(group) > 1}
+
+
+def _is_reading(columns: Columns, name: str) -> bool:
+    """Whether a column has numbers that are neither times nor covariances."""
+    return columns[name].dtype.kind in "fiub" and not re.search(r"covariance|\b(sec|nanosec|timestamp)$", name)
+
+
+def _vector(columns: Columns, name: str) -> str:
+    """The message of a field if it has only single numbers, else the field."""
+    parent = name.rpartition(".")[0]
+    fields = [n for n in columns if n.startswith(f"{parent}.")]
+    return parent if parent and all(_is_reading(columns, n) and columns[n].ndim == 1 for n in fields) else name
 
 
 def _sections(state: Mapping[str, str], sensors: Mapping[str, str]) -> list[str]:

@@ -76,4 +76,7 @@ def channels(image: NDArray[Any]) -> NDArray[Any]:
 def grey(images: NDArray[Any]) -> NDArray[np.uint8]:
     """(T, H, W) of colour images (T, H, W, 3): bytes, or numbers up to 255, or up to 1."""
     scale = 255.0 if images.dtype.kind == "f" and np.nanmax(images, initial=0.0) <= 1.0 else 1.0
-    return np.stack([np.clip(np.rint(i @ LUMA * scale), 0, 255).astype(np.uint8) for i in images.astype(np.float32)])
+    result = np.empty(images.shape[:3], np.uint8)
+    for image, target in zip(images, result, strict=True):  # one at a time: floats take four times the memory
+        target[:] = np.clip(np.rint(image.astype(np.float32) @ (LUMA * np.float32(scale))), 0, 255)
+    return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import tomllib
 from collections.abc import Callable
@@ -17,12 +18,15 @@ import log_files as logs
 
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset
+from beliefscope.inspect.trace import Trace
+from beliefscope.recordings.export import export_trace
 from beliefscope.recordings.logs.column_map import read_map
 from beliefscope.recordings.logs.columns import preview_columns, read_columns
 from beliefscope.recordings.logs.guess import guess_map
 from beliefscope.recordings.logs.images import LUMA
 from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
+ROOT = Path(__file__).parents[3]
 DT = 0.05
 
 MAP = """
@@ -219,6 +223,26 @@ def test_a_topic_that_cannot_be_decoded_only_matters_if_it_is_used(tmp_path: Pat
     text = 'dt = 0.1\n[state]\nx = "/good.x"\ny = "/bad.x"\n'
     with pytest.raises(BadInput, match="topic '/bad' is encoded as protobuf, expected json, or cdr"):
         read_columns(tmp_path / "log.mcap", read_map(map_file(tmp_path, text)))
+
+
+def test_the_documented_map_is_valid(json_log: Path, tmp_path: Path) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "import.md").read_text(), re.DOTALL)
+    (text,) = (block for block in blocks if "/truth" in block)
+    assert len(text.splitlines()) <= 10
+    mapping = read_map(map_file(tmp_path, text))
+    assert len(read_log(read_columns(json_log, mapping), mapping, "log")[0]) == 34
+
+
+def test_an_exported_trace_is_imported_again(new_trace: Callable[[str], Trace], tmp_path: Path) -> None:
+    """State and estimate are found by their names; the default clock has the steps of the trace."""
+    recorded = new_trace("pf")
+    export_trace(recorded, tmp_path / "run.mcap")
+    mapping = read_map(map_file(tmp_path, guess_map(preview_columns(tmp_path / "run.mcap"), "run")))
+    columns = read_columns(tmp_path / "run.mcap", mapping)
+    episodes = read_log(columns, mapping, "run")
+    np.testing.assert_allclose(episodes[0].states, recorded.episode.states, rtol=1e-6)
+    again = recorded_trace(columns, mapping, episodes, 0, "run")
+    np.testing.assert_allclose(again.estimate_mean, recorded.estimate_mean, rtol=1e-6)
 
 
 def test_files_without_an_index_are_refused(json_log: Path, tmp_path: Path) -> None:
