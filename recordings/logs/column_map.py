@@ -102,16 +102,16 @@ class ColumnMap:
 
     @property
     def required(self) -> set[str]:
-        """References to columns that have values at all steps: state, sensors, control and estimate."""
+        """References to columns that have values at all steps: state, sensors, control, estimate and episode."""
         estimate = (self.estimate.get(key, []) for key in VALUES)
         weights = self.estimate.get("weights", {}).values()
         parts = (*self.sensors.values(), self.control, *estimate, *weights)
-        return self.truth | {name for part in parts for name in _listed(part)}
+        return self.truth | {name for part in parts for name in _listed(part)} | ({self.episode} - {""})
 
     @property
     def references(self) -> set[str]:
         """References to all columns but ``time``."""
-        others = {self.episode, self.contact, *(covariate.column for covariate in self.covariates.values())}
+        others = {self.contact, *(covariate.column for covariate in self.covariates.values())}
         return self.required | (others - {""})
 
 

@@ -108,9 +108,9 @@ def decoded(topic: str, decode: Callable[[], Any]) -> Any:
 def on_clock(log: MessageLog, mapping: ColumnMap) -> Columns:
     """The columns of a map at the ticks of the clock.
 
-    The first tick is the first at which every topic of state, sensors, control and estimate has a message; covariates
-    are missing (NaN, empty text) before their first. The last tick is the first after the last message of the state's
-    topics, or of all topics if the state is unknown.
+    The first tick is the first at which every topic of state, sensors, control, estimate and episode has a message;
+    covariates are missing (NaN, empty text) before their first. The last tick is the first after the last message of
+    the state's topics, or of all topics if the state is unknown.
 
     Raises BadInput for unknown topics and fields, topics without messages or whose times do not overlap, more than
     ``LONGEST`` ticks, and values of different shapes.

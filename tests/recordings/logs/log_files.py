@@ -223,7 +223,13 @@ def buffer_arrays() -> dict[str, np.ndarray]:
     action = np.stack([steps, 0.5 * steps], axis=1).astype(np.float32)
     state = np.stack([0.1 * steps, -0.2 * steps, np.sin(steps)], axis=1)
     image = np.stack([colour(0.4 * step) for step in steps])
-    return {"action": action, "state": state, "img": image.astype(np.float32), "camera": image}
+    return {
+        "action": action,
+        "state": state,
+        "img": image.astype(np.float32),
+        "camera": image,
+        "obs/pose": state[:, :2],
+    }
 
 
 def write_zarr(path: Path, zarr_format: int = 3) -> None:

@@ -186,6 +186,14 @@ def test_topics_that_differ_from_the_metadata_have_messages(tmp_path: Path) -> N
     assert len(read_columns(tmp_path / "bag", read_map(map_file(tmp_path, text)))["/imu.angular_velocity"]) == 39
 
 
+def test_a_topic_names_the_episodes(json_log: Path, tmp_path: Path) -> None:
+    """The stage changes at 1.1 s; the clock starts with its first message at 0.6 s."""
+    text = MAP.partition("[covariates]")[0].replace("dt = 0.05", 'dt = 0.05\nepisode = "/stage.data"')
+    mapping = read_map(map_file(tmp_path, text))
+    episodes = read_log(read_columns(json_log, mapping), mapping, "log")
+    assert {e.provenance["episode"]: len(e) for e in episodes} == {"reach": 10, "lift": 19}
+
+
 def test_lists_of_messages_are_particles(tmp_path: Path) -> None:
     """A pose array with five members: each column of x and y has one value per member."""
     from mcap.writer import Writer

@@ -30,6 +30,7 @@ x = "state[0]"
 y = "state[1]"
 [sensors]
 image = "camera"
+pose = "obs/pose"
 """
 
 LEROBOT = """
@@ -77,6 +78,7 @@ def test_episodes_of_a_replay_buffer(buffer: Path, tmp_path: Path) -> None:
     assert np.array_equal(episodes[1].controls, expected["action"][at])
     np.testing.assert_allclose(episodes[1].states, expected["state"][at, :2], rtol=1e-6)
     assert np.array_equal(episodes[1].observations["image"], grey(expected["camera"][at]))
+    np.testing.assert_allclose(episodes[1].observations["pose"], expected["obs/pose"][at], rtol=1e-6)
 
 
 def test_only_columns_of_the_map_are_read(buffer: Path, tmp_path: Path) -> None:
