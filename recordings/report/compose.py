@@ -153,6 +153,7 @@ class Writer:
         files = tuple(f"figures/{name}.{suffix}" for suffix in ("svg", "pdf"))
         for file in files:
             write_figure(figure, self.folder / file)
+            figure.set_layout_engine("none")  # both files have the layout of the first, which takes most of the time
         return Item(caption, (*files, *data), svg=(self.folder / files[0]).read_text(encoding="utf-8"))
 
     def table(self, name: str, table: Table) -> Item:
