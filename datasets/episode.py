@@ -23,7 +23,7 @@ class Episode:
         task: definition of the state, the sensors and the control.
         states: (T, n) true state, components as in ``Task.components`` (m, rad), float32.
         controls: (T, c) control applied between steps t-1 and t, float32.
-        observations: observation key -> (T, ...) sensor readings (images uint8, others float32).
+        observations: observation key -> (T, ...) sensor readings, uint8 images and float32 (``Task.dtype``).
         contact: (T,) bool, ground truth of contact between robot and object; False if the task has no such covariate.
         qpos: (T, nq) joint positions for replay, float32; nq is 0 without replay.
         dt: seconds per step.
@@ -65,3 +65,13 @@ class Episode:
             digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
             digest.update(array.tobytes())
         return digest.hexdigest()
+
+
+def is_image(readings: NDArray[Any]) -> bool:
+    """Whether readings (T, ...) are images: (T, H, W) grey or (T, H, W, 3) RGB, uint8."""
+    return readings.dtype == np.uint8 and readings.ndim in (3, 4)
+
+
+def lost_images(images: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(T,): whether all pixels of an image (T, H, W) or (T, H, W, 3) are equal."""
+    return np.asarray((images == images[:, :1, :1]).reshape(len(images), -1).all(axis=1))

@@ -220,9 +220,7 @@ class EpisodeFile(Dataset):
             states=self._array(group, "states", (steps, len(task.components))),
             controls=self._array(group, "controls", (steps, task.control_size)),
             observations={
-                key: self._array(
-                    group, f"observations/{key}", (steps, *shape), np.uint8 if len(shape) == 2 else np.float32
-                )
+                key: self._array(group, f"observations/{key}", (steps, *shape), task.dtype(key))
                 for key, shape in task.observations.items()
             },
             contact=self._array(group, "contact", (steps,), np.uint8).astype(bool),

@@ -97,8 +97,9 @@ class Task:
     Attributes:
         name: without spaces, colons and slashes.
         components: n state components, in order.
-        observations: observation key -> shape per step, e.g. ``{"image": (32, 32), "force": (3,)}``.
-        modalities: modality -> its observation keys: one image, or vectors to concatenate.
+        observations: observation key -> shape per step, e.g. ``{"image": (32, 32), "force": (3,)}``: (d,) a vector,
+            (H, W) a grey and (H, W, 3) an RGB image.
+        modalities: modality -> its observation keys. The built-in networks take one grey image, or vectors.
         control_size: length of the control vector.
         dt: seconds per step.
         map_components: the two components of the likelihood map (x to the right, y up).
@@ -118,6 +119,8 @@ class Task:
             are missing start at the truth. An episode's provenance has the difference, ``start_offset``.
         covariates: name -> what is known about each step besides state and sensors; metrics are grouped by it. The
             values of ``contact`` are in ``Episode.contact``, others in ``Episode.covariates``.
+        arrays: observation keys with several axes that are arrays of numbers instead of images, such as depth, tactile
+            grids, spectrograms and point clouds.
         warmup: first steps that are excluded from metrics, because runs start at the truth.
     """
 
@@ -139,9 +142,14 @@ class Task:
     start_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warmup: int = 30
     covariates: Mapping[str, Covariate] = field(default_factory=lambda: {"contact": CONTACT})
+    arrays: tuple[str, ...] = ()
 
     def __hash__(self) -> int:
         return hash(self.name)
+
+    def dtype(self, key: str) -> type[np.uint8] | type[np.float32]:
+        """Type of an observation's values: uint8 for images, else float32."""
+        return np.uint8 if len(self.observations[key]) > 1 and key not in self.arrays else np.float32
 
     def index(self, component: str) -> int:
         """Index of a component in the state vector. Raises BadInput for an unknown name."""

@@ -48,6 +48,7 @@ def task_from_json(values: Any) -> Task:
             },
             start_distance=_tuples(values["start_distance"]),
             warmup=values["warmup"],
+            arrays=tuple(values.get("arrays", ())),  # definitions of earlier versions lack it
             **_covariates(values),
         )
         check_definition(task)
@@ -129,15 +130,21 @@ def check_definition(task: Task, where: str = "") -> None:
         if (unit := task.components[task.index(name)].unit) != "m":
             raise BadInput(f"{place}: map component {name!r} has unit {unit!r}, expected m.")
     for key, shape in task.observations.items():
-        if not all(_whole(size, 1) for size in shape):
+        if not shape or not all(_whole(size, 1) for size in shape):
             raise BadInput(f"{place}: observation {key!r} has shape {shape!r:.200}, expected whole numbers above 0.")
+        if key not in task.arrays and len(shape) > 2 and (len(shape) > 3 or shape[2] != 3):
+            raise BadInput(
+                f"{place}: observation {key!r} has shape {shape!r:.200}, expected (d,), (H, W) or (H, W, 3), or "
+                f"its name in arrays."
+            )
+    if unknown := [key for key in task.arrays if key not in task.observations]:
+        raise BadInput(f"{place}: arrays has {unknown[0]!r:.200}, which is not an observation.")
     for modality, keys in task.modalities.items():
         missing = [key for key in keys if key not in task.observations]
         if missing:
             raise BadInput(f"{place}: modality {modality!r} has {missing[0]!r}, which is not an observation.")
-        ranks = [len(task.observations[key]) for key in keys]
-        if ranks != [2] and set(ranks) != {1}:
-            raise BadInput(f"{place}: modality {modality!r} has {', '.join(keys)}, expected one image or only vectors.")
+        if not keys:
+            raise BadInput(f"{place}: modality {modality!r} has no observations.")
     for name, value in (("control_size", task.control_size), ("warmup", task.warmup)):
         if not _whole(value, 0):
             raise BadInput(f"{place}: {name} is {value!r:.200}, expected a whole number.")

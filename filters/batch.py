@@ -195,7 +195,7 @@ class Statistics(nn.Module):
         sizes = {"state": len(task.components), "control": task.control_size}
         for modality, keys in task.modalities.items():
             shapes = [task.observations[key] for key in keys]
-            sizes[modality] = 1 if len(shapes[0]) == 2 else sum(shape[0] for shape in shapes)
+            sizes[modality] = 1 if len(shapes[0]) > 1 else sum(shape[0] for shape in shapes)
         for name, size in sizes.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))

@@ -208,9 +208,17 @@ def vector_groups(task: Task, modality: str, steps: int = 1) -> list[list[int]]:
 
 
 def modality_shape(task: Task, modality: str) -> tuple[int, ...]:
-    """(H, W) of an image, or (d,) of concatenated vectors."""
-    keys = [task.observations[key] for key in task.modalities[modality]]
-    return keys[0] if len(keys[0]) == 2 else (sum(shape[0] for shape in keys),)
+    """(H, W) of an image, or (d,) of concatenated vectors. Raises BadInput for other sensors."""
+    keys = task.modalities[modality]
+    shapes = [task.observations[key] for key in keys]
+    is_image = len(keys) == 1 and len(shapes[0]) == 2 and keys[0] not in task.arrays
+    if not is_image and any(len(shape) > 1 for shape in shapes):
+        sensors = ", ".join(f"{key} {shape}" for key, shape in zip(keys, shapes, strict=True))
+        raise BadInput(
+            f"modality {modality!r} of task {task.name!r} has {sensors}; the built-in filters take one gray image or "
+            f"only vectors. Use a filter of your own."
+        )
+    return shapes[0] if is_image else (sum(shape[0] for shape in shapes),)
 
 
 MAX_LOGIT = 3.0

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.inspect.diagnostics.views import as_json
@@ -115,7 +116,7 @@ def _topics(trace: Trace) -> Topics:
     arrays: dict[str, list[Column]] = {}
     topics: Topics = []
     for column in columns(trace):
-        if column.group == "observations" and len(column.shape) == 2 and column.values.dtype == np.uint8:
+        if column.group == "observations" and is_image(column.values):
             topics.append((f"/observations/{column.parts[0]}", _images(column, trace)))
         else:
             arrays.setdefault(f"/{column.group}/{column.parts[0]}", []).append(column)
@@ -153,7 +154,7 @@ def _numbers(topic: str, group: list[Column]) -> tuple[dict[str, Any], Callable[
 
 
 def _images(column: Column, trace: Trace) -> tuple[dict[str, Any], Callable[[int], dict[str, Any]]]:
-    height, width = column.shape
+    height, width, *channels = column.shape
     numbers = {name: {"type": "integer"} for name in ("width", "height", "step")}
     texts = {name: {"type": "string"} for name in ("frame_id", "encoding")}
     schema = _schema("foxglove.RawImage", {"timestamp": TIME, **texts, **numbers, "data": BYTES})
@@ -162,10 +163,10 @@ def _images(column: Column, trace: Trace) -> tuple[dict[str, Any], Callable[[int
         return {
             "timestamp": _time(step, trace),
             "frame_id": column.parts[0],
-            "encoding": "mono8",
+            "encoding": "rgb8" if channels else "mono8",
             "width": width,
             "height": height,
-            "step": width,
+            "step": width * (channels[0] if channels else 1),
             "data": _packed(column.values[step]),
         }
 

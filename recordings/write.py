@@ -14,7 +14,7 @@ from errno import ENOSPC
 from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +26,7 @@ from rerun.chunk import RrdReader
 from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
 import beliefscope
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, is_image
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.task import Task
@@ -172,11 +172,6 @@ def stored_arrays(trace: Trace) -> Iterator[tuple[str, bool, NDArray[Any]]]:
                 yield entity.path, entity.static, array
 
 
-def is_image(array: NDArray[Any]) -> bool:
-    """Whether an observation (T, ...) is stored as images; all others are stored as scalars."""
-    return array.ndim == 3 and array.dtype == np.uint8
-
-
 def send_header(stream: rr.RecordingStream, trace: Trace, bodies: Bodies, steps: int = GROWING) -> None:
     """Send the recording's properties and static entities.
 
@@ -237,9 +232,10 @@ def _send_static(stream: rr.RecordingStream, trace: Trace, task: Task, steps: in
             stream.log(path, [_values(array)], static=True)
     for key, array in trace.episode.observations.items():
         if is_image(array):
-            height, width = array.shape[1:]
-            gray = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8")
-            stream.log(f"observations/{key}", rr.Image.from_fields(format=gray), static=True)
+            height, width, *channels = array.shape[1:]
+            model: Literal["RGB", "L"] = "RGB" if channels else "L"
+            pixels = rr.components.ImageFormat(width=width, height=height, color_model=model, channel_datatype="U8")
+            stream.log(f"observations/{key}", rr.Image.from_fields(format=pixels), static=True)
     for path, style in entities.style(trace, task):
         stream.log(path, style, static=True)
     stream.log("about", entities.about(trace, task, steps), static=True)

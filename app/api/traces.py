@@ -11,9 +11,9 @@ from fastapi.responses import JSONResponse, Response
 from beliefscope import __version__
 from beliefscope.app.api.models.catalog import Catalog, Health, Progress
 from beliefscope.app.api.models.traces import TraceHeader
-from beliefscope.app.protocol.errors import InProgress, NotFound
+from beliefscope.app.protocol.errors import InProgress
 from beliefscope.app.protocol.etag import tagged
-from beliefscope.app.protocol.trace_format import camera_images
+from beliefscope.app.protocol.trace_format import displayed_sensors, sensor_pixels
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.traced_run import TracedRun
@@ -68,12 +68,11 @@ def routes(store: TraceStore, views: Views) -> APIRouter:
         return _immutable(request, run, "columns", lambda: run.columns[1])
 
     @router.get("/api/trace/{task}/{filter}/{episode}/images", response_class=Response, responses=IN_PROGRESS)
-    def trace_images(selection: RequestedRunOrComparison, request: Request) -> Response:
+    def trace_images(selection: RequestedRunOrComparison, request: Request, sensor: str = "") -> Response:
         run = finished_run(store, selection)
-        images = camera_images(run.trace)
-        if images is None:
-            raise NotFound(f"Task {selection.task!r} has no images.")
-        return _immutable(request, run, "images", images.tobytes)
+        name = sensor or next((each["name"] for each in displayed_sensors(run.trace)), "")
+        pixels = sensor_pixels(run.trace, name)
+        return _immutable(request, run, f"images {name}", pixels.tobytes)
 
     return router
 

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.protocol.messages import LAYERS, SceneLayer
+from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import Component, Task
 from beliefscope.filters.evaluate import nees_bounds
 from beliefscope.inspect.maps.likelihood_map import Quantity
@@ -41,6 +43,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "contact": trace.episode.contact,
         "groups": np.stack(list(groups.values()), axis=1) if groups else None,
         "effective_sample_size": trace.effective_sample_size,
+        "blackout": measures.blackout(trace) if camera_images(trace) is not None else None,
     }
     arrays |= {key: trace.episode.observations.get(key) for key in SENSORS}
     descriptions: list[dict[str, Any]] = []
@@ -55,9 +58,44 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
 
 
 def camera_images(trace: Trace) -> NDArray[np.uint8] | None:
-    """(T, H, W) the first image observation, as the filter received it; None if there is none."""
-    observations = trace.episode.observations.values()
-    return next((array for array in observations if array.ndim == 3 and array.dtype == np.uint8), None)
+    """(T, H, W) or (T, H, W, 3) the first image observation, as the filter received it; None if there is none."""
+    return next((readings for readings in trace.episode.observations.values() if is_image(readings)), None)
+
+
+def displayed_sensors(trace: Trace) -> list[dict[str, Any]]:
+    """Sensors that the page draws as images: images first, then arrays of numbers with two axes.
+
+    ``low`` and ``high`` are the range of an array's values in the run, from the first to the last colour; None for
+    images.
+    """
+    observations = trace.episode.observations
+    images = [key for key, readings in observations.items() if is_image(readings)]
+    arrays = [key for key, readings in observations.items() if readings.ndim == 3 and key not in images]
+    sensors = []
+    for key in images + arrays:
+        height, width, *channels = observations[key].shape[1:]
+        low = high = None
+        if key in arrays and len(trace):
+            low, high = float(observations[key].min()), float(observations[key].max())
+        sensor = {"name": key, "height": height, "width": width, "channels": channels[0] if channels else 1}
+        sensors.append(sensor | {"low": low, "high": high})
+    return sensors
+
+
+def sensor_pixels(trace: Trace, key: str) -> NDArray[np.uint8]:
+    """(T, H, W) or (T, H, W, 3): a sensor of ``displayed_sensors``; arrays of numbers are scaled to 0..255."""
+    sensor = next((s for s in displayed_sensors(trace) if s["name"] == key), None)
+    if sensor is None:
+        raise NotFound(f"Sensor {key!r} has no images. Available: {_names(trace)}.")
+    readings = trace.episode.observations[key]
+    if sensor["low"] is None:
+        return np.asarray(readings, np.uint8)
+    span = max(sensor["high"] - sensor["low"], 1e-12)
+    return np.rint(255.0 * (readings - sensor["low"]) / span).astype(np.uint8)
+
+
+def _names(trace: Trace) -> str:
+    return ", ".join(sensor["name"] for sensor in displayed_sensors(trace)) or "none"
 
 
 def scene_layers(task: Task, trace: Trace, no_maps: str | None) -> list[SceneLayer]:
@@ -87,7 +125,6 @@ def header(
     Args:
         no_maps: why there are no maps, or None. missing: quantities without maps, and the reasons.
     """
-    images = camera_images(trace)
     components = [component_json(c) for c in task.components]
     return {
         "steps": len(trace),
@@ -107,7 +144,7 @@ def header(
         "nees_bounds": nees_bounds(len(components), 1) if trace.has_covariance else None,
         "no_maps": no_maps,
         "missing_quantities": dict(missing),
-        "image_size": None if images is None else list(images.shape[1:]),
+        "sensors": displayed_sensors(trace),
         "columns": column_descriptions,
         "scene": scene_layers(task, trace, no_maps),
     }

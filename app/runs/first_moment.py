@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.dataset import Dataset
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, is_image
 
 BEFORE, DURING = 3, 5
 """Steps of the first contact with images before the outage, and in it."""
@@ -44,5 +44,5 @@ def outage_in_first_contact(episode: Episode) -> int | None:
 
 def _black(episode: Episode) -> NDArray[np.bool_]:
     """(T,): whether all pixels of an image are zero."""
-    images = (values for values in episode.observations.values() if values.dtype == np.uint8 and values.ndim == 3)
-    return np.any([values.max(axis=(1, 2)) == 0 for values in images], axis=0)
+    images = [values.reshape(len(values), -1) for values in episode.observations.values() if is_image(values)]
+    return np.any([values.max(axis=1) == 0 for values in images], axis=0)

@@ -82,7 +82,9 @@ class GrowingRun(TracedRun):
         """Description of the run for the page. Each block of steps describes its own columns."""
         missing = missing_quantities(self.checkpoint, self._last)
         description = header(self._last, [], self._run.task, self.no_maps, missing)
-        return description | {"steps": self._steps, "live": describe(self._run)}
+        # A growing array of numbers has no range yet; the page receives the images of one sensor.
+        sensors = [sensor for sensor in description["sensors"] if sensor["low"] is None][:1]
+        return description | {"sensors": sensors, "steps": self._steps, "live": describe(self._run)}
 
 
 class LiveRuns:

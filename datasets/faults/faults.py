@@ -27,6 +27,7 @@ from beliefscope.datasets.faults.fault import (
     number_field,
     value_field,
 )
+from beliefscope.datasets.faults.sensor_faults import SENSOR_FAULTS
 from beliefscope.datasets.task import Task
 
 PERMUTATIONS = tuple("".join(order) for order in permutations(AXES))[1:]
@@ -114,8 +115,10 @@ class ImageBlur(Fault):
     std: float = number_field(1.0, "pixels", "standard deviation of the kernel", 0, 32)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        rows, columns = (self._kernel(size) for size in readings.shape[1:])
-        return rows @ readings.astype(float) @ columns.T
+        rows, columns = (self._kernel(size) for size in readings.shape[1:3])
+        channels = np.moveaxis(readings.astype(float), -1, 1) if readings.ndim == 4 else readings.astype(float)
+        blurred = rows @ channels @ columns.T
+        return np.moveaxis(blurred, 1, -1) if readings.ndim == 4 else blurred
 
     def _kernel(self, size: int) -> Readings:
         """(size, size): weights of the pixels of a line, normalised at the borders."""
@@ -135,7 +138,7 @@ class ImageOccluded(Fault):
     gray: float = number_field(0.0, "gray levels", "gray level of the square", 0, 255)
 
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        room = np.maximum(np.array(readings.shape[1:]) - self.size, 0)
+        room = np.maximum(np.array(readings.shape[1:3]) - self.size, 0)
         top, left = (int(n) for n in rng.integers(room + 1))
         top, left = top if self.y is None else self.y, left if self.x is None else self.x
         occluded = readings.copy()
@@ -154,7 +157,7 @@ class ImageShift(Fault):
     def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
         rows, columns = (
             np.clip(np.arange(size) - shift, 0, size - 1)
-            for size, shift in zip(readings.shape[1:], (self.y, self.x), strict=True)
+            for size, shift in zip(readings.shape[1:3], (self.y, self.x), strict=True)
         )
         return readings[:, rows[:, None], columns]
 
@@ -380,6 +383,7 @@ FAULTS: dict[str, type[Fault]] = {
         ContactDelayed,
         Delay,
         Drop,
+        *SENSOR_FAULTS,
         ControlDelayed,
         ControlScaled,
     )

@@ -23,7 +23,7 @@ from beliefscope.datasets.faults.fault import Fault, Readings, parameters
 from beliefscope.datasets.faults.faults import FAULTS
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.simulation.simulate import hand_controls
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, display_name
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ RENAMED_FAULTS = {
 
 
 def available_presets(task: Task) -> dict[str, str]:
-    """``FAULT_PRESETS`` that apply to the sensors of the task."""
+    """``FAULT_PRESETS`` that apply to the sensors of the task, and faults of its other sensors and modalities."""
 
     def fits(text: str) -> bool:
         with suppress(BadInput):
@@ -146,7 +146,14 @@ def available_presets(task: Task) -> dict[str, str]:
             return True
         return False
 
-    return {name: text for name, text in FAULT_PRESETS.items() if fits(text)}
+    presets = {name: text for name, text in FAULT_PRESETS.items() if fits(text)}
+    common = {key for text in presets.values() for key in Faults.parse(text).sequence[0].keys(task)}
+    for key in (key for key in task.observations if key not in common):
+        presets[f"{display_name(key)} frozen"] = f"sensor_frozen={key}:from=20"
+    for name in (name for name in task.modalities if name not in ("image", "haptics")):
+        presets[f"{display_name(name)} dropped"] = f"drop={name}:from=20"
+        presets[f"{display_name(name)} delayed 5 steps"] = f"delay={name}:steps=5"
+    return presets
 
 
 def read_faults(text: str, task: Task) -> Faults:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.statistics.reference_images import HAND, Gray, Reference, lost_images, median_image, normalised
+from beliefscope.datasets.episode import Episode, lost_images
+from beliefscope.inspect.statistics.reference_images import HAND, Gray, Reference, median_image, normalised
 from beliefscope.inspect.statistics.signals import MIN_STEPS, Array, Mask, lag, noise_level, repeats
 
 BLACK = 8

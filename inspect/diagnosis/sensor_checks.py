@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode import Episode, lost_images
 from beliefscope.inspect.diagnosis.image_checks import brightness_of, frozen_images, image_statistics
 from beliefscope.inspect.diagnosis.vector_checks import AXES, free_motion, saturated, stuck, vector_statistics
-from beliefscope.inspect.statistics.reference_images import Reference, image_keys, lost_images
+from beliefscope.inspect.statistics.reference_images import Reference, image_keys
 from beliefscope.inspect.statistics.signals import Array, Mask, deviating_interval, long_runs, repeats
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array, Mask
@@ -98,9 +99,10 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
         if component.unit == "rad":
             yield f"{component.label} speed", "rad/s", np.abs(change[:, i]) / dt
     for key, array in episode.observations.items():
-        if array.ndim == 3 and array.dtype == np.uint8:
-            yield f"{display_name(key)} brightness", "", array.mean((1, 2))
-            yield f"{display_name(key)} contrast", "", array.std((1, 2))
+        if is_image(array):
+            pixels = array.reshape(len(array), -1)
+            yield f"{display_name(key)} brightness", "", pixels.mean(1)
+            yield f"{display_name(key)} contrast", "", pixels.std(1)
         elif array.ndim == 2 and array.shape[1] > 1:
             yield f"{display_name(key)} magnitude", "", np.linalg.norm(array, axis=1)
             motion = np.diff(array, axis=0, prepend=array[:1])

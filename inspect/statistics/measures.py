@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.episode import is_image, lost_images
 from beliefscope.datasets.task import Task
 from beliefscope.inspect.traces.data import Trace
 
@@ -101,9 +102,9 @@ def particle_log_weights(trace: Trace) -> Array:
 def blackout(trace: Trace) -> Mask:
     """(T,): whether an image is blacked out: all its pixels are equal."""
     black = np.zeros(len(trace), dtype=bool)
-    for array in trace.episode.observations.values():
-        if array.ndim == 3 and array.dtype == np.uint8:
-            black |= (array == array[:, :1, :1]).all(axis=(1, 2))
+    for readings in trace.episode.observations.values():
+        if is_image(readings):
+            black |= lost_images(readings)
     return black
 
 

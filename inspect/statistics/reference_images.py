@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.episode import Episode
-from beliefscope.inspect.statistics.signals import Array, Mask
+from beliefscope.datasets.episode import Episode, lost_images
+from beliefscope.inspect.statistics.signals import Array
 
 Gray = NDArray[np.uint8]
 
@@ -90,14 +90,8 @@ class Reference:
 
 
 def image_keys(episode: Episode) -> list[str]:
-    """Observation keys of images (T, H, W), uint8."""
+    """Observation keys of grey images (T, H, W)."""
     return [key for key, array in episode.observations.items() if array.ndim == 3 and array.dtype == np.uint8]
-
-
-def lost_images(images: Gray) -> Mask:
-    """(T,): whether all pixels of an image are equal."""
-    lost: Mask = (images == images[:, :1, :1]).all(axis=(1, 2))
-    return lost
 
 
 def median_image(images: Gray) -> Array:

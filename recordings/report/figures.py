@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from beliefscope.datasets.episode import is_image
 from beliefscope.datasets.task import display_name
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
 from beliefscope.inspect.likelihood import LikelihoodMap
@@ -77,7 +78,7 @@ def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int 
         map_: None to show the estimates only.
         zoom: magnification of the map.
     """
-    images = {key: array[step] for key, array in trace.episode.observations.items() if array.ndim == 3}
+    images = {key: readings[step] for key, readings in trace.episode.observations.items() if is_image(readings)}
     layers = map_.layers if map_ is not None else ("estimates",)
     count = len(images) + len(layers)
     columns = min(COLUMNS, count)

@@ -39,7 +39,7 @@ def blueprint(
         diagnostics: by name; each has a tab next to the time series.
         growing: whether the run is in progress: the cursor and axes follow its end.
     """
-    observed = [_camera(key) for key, shape in task.observations.items() if len(shape) == 2]
+    observed = [_camera(key) for key in task.observations if task.dtype(key) is np.uint8]
     if first is not None:
         observed += [_map(layer, first) for layer in first.layers]
     scene = rrb.Vertical(

@@ -83,7 +83,7 @@ export function makeTrace(arrays, header = {}, images = null) {
       modalities: TASK.modalities,
       groups: ['contact'],
       settings: {},
-      image_size: null,
+      sensors: [],
       nees_bounds: null,
       no_maps: null,
       missing_quantities: {},

@@ -151,8 +151,7 @@ test('the summary of a step names error, deviation and dominant modality', () =>
 });
 
 test('the summary explains an uninformative dominant modality', () => {
-  const images = new Uint8Array(8).buffer;
-  const dark = makeTrace(FUSION, { image_size: [2, 2] }, images);
+  const dark = makeTrace({ ...FUSION, blackout: { shape: [2], values: [1, 1] } });
   assert.match(stepSummary(dark, 1, 0).text, /although the image is blacked out\.$/);
   const truth = { shape: [2, 3], values: [NaN, NaN, 0, NaN, NaN, 0] };
   assert.deepEqual(stepSummary(makeTrace({ truth, estimate_mean: FUSION.estimate_mean }), 0, 0), {

@@ -51,10 +51,10 @@ test('weights are shared by all components or separate', () => {
   assert.equal(trace.weight('raw', 'sound', 0), undefined);
 });
 
-test('a black image is a blackout', () => {
+test('images of the first sensor', () => {
   const images = Uint8Array.from([0, 0, 0, 0, 0, 7, 0, 0]).buffer;
-  const trace = makeTrace(FUSION, { image_size: [2, 2] }, images);
-  assert.deepEqual([...trace.blackout], [1, 0]);
+  const sensors = [{ name: 'image', height: 2, width: 2, channels: 1, low: null, high: null }];
+  const trace = makeTrace(FUSION, { sensors }, images);
   assert.deepEqual([...(trace.image(1) ?? [])], [0, 7, 0, 0]);
 });
 

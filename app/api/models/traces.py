@@ -52,6 +52,17 @@ class Column(Reply):
     offset: int
 
 
+class DisplayedSensor(Reply):
+    """A sensor that is drawn as an image. channels: 1, or 3 for RGB. low, high: range of an array of numbers."""
+
+    name: str
+    height: int
+    width: int
+    channels: int
+    low: float | None
+    high: float | None
+
+
 class TraceHeader(Reply):
     """Metadata of a trace.
 
@@ -60,7 +71,7 @@ class TraceHeader(Reply):
         weight_width: 0 for a filter without weights. settings: of the run.
         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
-            reasons. image_size: height and width of the camera images, or None.
+            reasons. sensors: those drawn as images.
         data_warning: how the data differ from the checkpoint's training data, or None.
         scene: layers of its 3D scene. live: present while the trace is of a live run.
     """
@@ -82,7 +93,7 @@ class TraceHeader(Reply):
     nees_bounds: tuple[float, float] | None
     no_maps: str | None
     missing_quantities: dict[Quantity, str]
-    image_size: tuple[int, int] | None
+    sensors: list[DisplayedSensor]
     columns: list[Column]
     data_warning: str | None = None
     scene: list[SceneLayer]

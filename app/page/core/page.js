@@ -90,7 +90,7 @@ export class Page {
     this.timeline = new Timeline(html('#timeline .body'), store);
     this.maps = new MapPanel(html('#maps'), store, (cursor) => this.socket.requestMaps(cursor));
     this.adaptMapMenu = mapMenu(html('#maps-options'), html('#maps-view'), store, this.maps);
-    this.camera = new Camera(html('#camera'));
+    this.camera = new Camera(html('#camera'), store);
     this.stepTable = new StepTable(html('#step-table'));
     this.angleSlider = new AngleSlider(
       html('#angle-label'),

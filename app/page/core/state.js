@@ -29,6 +29,7 @@ import { displayName } from './units.js';
  * @property {string} by score that ranks failures
  * @property {string} phase of the failures in the list, empty for all
  * @property {'likelihood' | 'posterior'} map quantity of the maps
+ * @property {string} sensor that is displayed as an image, empty for the first one
  * @property {string} plane components of the maps' axes, such as x,y; empty for those of the task's map
  * @property {string} others components off the maps: `auto`, `fixed` at the true values, or `marginal`, integrated out
  * @property {string} scale of the maps: `normalised` or `log`
@@ -97,6 +98,7 @@ const TEXTS = {
   quantity: '',
   pin: '',
   plane: '',
+  sensor: '',
   by: 'error',
   phase: '',
   hide: '',

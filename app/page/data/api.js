@@ -133,6 +133,16 @@ function traceUrl({ task, filter, data, episode, faults, against }, part) {
 }
 
 /**
+ * Loads the images of a sensor of a trace that the server has computed.
+ * @param {Selection} selection
+ * @param {string} sensor
+ */
+export const sensorImages = async (selection, sensor) =>
+  (
+    await request(`${traceUrl(selection, 'images')}&sensor=${encodeURIComponent(sensor)}`)
+  ).arrayBuffer();
+
+/**
  * Checks that a trace can be computed. Throws ServerError for an unknown name or an invalid fault injection.
  * @param {Selection} selection
  */
@@ -173,7 +183,7 @@ export async function loadTrace(task, selection, progress, signal) {
   const buffer = async (part) => (await load(part)).arrayBuffer();
   const [columns, images] = await Promise.all([
     buffer('columns'),
-    header.image_size && buffer('images'),
+    header.sensors.length ? buffer('images') : null,
   ]);
   return new Trace(task, selection, header, columns, images);
 }

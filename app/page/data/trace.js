@@ -30,7 +30,7 @@ export class Trace {
    * @param {Selection} selection
    * @param {TraceHeader} header
    * @param {ArrayBuffer} buffer columns, end to end
-   * @param {ArrayBuffer | null} images T x H x W bytes
+   * @param {ArrayBuffer | null} images of the first displayed sensor, T x H x W x channels bytes
    */
   constructor(task, selection, header, buffer, images) {
     this.task = task;
@@ -52,9 +52,9 @@ export class Trace {
     this.angles = this.components.map((c, i) => (c.unit === 'rad' ? i : -1)).filter((i) => i >= 0);
     /** Whether each step is in contact. @type {Series} */
     this.contact = new Float32Array();
-    /** Whether the image of each step is blacked out. @type {Uint8Array} */
-    this.blackout = new Uint8Array();
-    this.#update(0);
+    /** Whether an image of each step is blacked out. @type {Series} */
+    this.blackout = new Float32Array();
+    this.#update();
   }
 
   /**
@@ -86,7 +86,7 @@ export class Trace {
     }
     this.steps += steps;
     this.#cache.clear();
-    this.#update(before);
+    this.#update();
     return added.length > 0;
   }
 
@@ -310,12 +310,12 @@ export class Trace {
   }
 
   /**
-   * Returns the camera image of a step, H x W bytes.
+   * Returns the image of the first displayed sensor at a step, H x W x channels bytes.
    * @param {number} step
    */
   image(step) {
-    const [height, width] = this.header.image_size ?? [0, 0];
-    return this.images && this.images.subarray(step * height * width, (step + 1) * height * width);
+    const [sensor] = this.header.sensors;
+    return this.images && sensor ? imageAt(this.images, sensor, step) : null;
   }
 
   /**
@@ -363,16 +363,19 @@ export class Trace {
     return this.#cache.get(key);
   }
 
-  /**
-   * Updates the contact and the blackouts of the steps from `first`.
-   * @param {number} first
-   */
-  #update(first) {
+  #update() {
     this.contact = this.#slice('contact') ?? new Float32Array(this.steps);
-    const blackout = new Uint8Array(this.steps);
-    blackout.set(this.blackout.subarray(0, first));
-    for (let t = first; t < this.steps; t++)
-      blackout[t] = Number(this.image(t)?.every((v, _, image) => v === image[0]) ?? false);
-    this.blackout = blackout;
+    this.blackout = this.#slice('blackout') ?? new Float32Array(this.steps);
   }
+}
+
+/**
+ * Returns the bytes of one of the images of a sensor.
+ * @param {Uint8Array} images
+ * @param {{height: number, width: number, channels: number}} sensor
+ * @param {number} step
+ */
+export function imageAt(images, { height, width, channels }, step) {
+  const size = height * width * channels;
+  return images.subarray(step * size, (step + 1) * size);
 }

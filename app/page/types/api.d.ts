@@ -278,6 +278,24 @@ export interface components {
             trajectories: number;
         };
         /**
+         * DisplayedSensor
+         * @description A sensor that is drawn as an image. channels: 1, or 3 for RGB. low, high: range of an array of numbers.
+         */
+        DisplayedSensor: {
+            /** Name */
+            name: string;
+            /** Height */
+            height: number;
+            /** Width */
+            width: number;
+            /** Channels */
+            channels: number;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+        };
+        /**
          * EpisodeErrors
          * @description Position errors of one episode.
          */
@@ -1544,7 +1562,7 @@ export interface components {
          *         weight_width: 0 for a filter without weights. settings: of the run.
          *         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
          *         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
-         *             reasons. image_size: height and width of the camera images, or None.
+         *             reasons. sensors: those drawn as images.
          *         data_warning: how the data differ from the checkpoint's training data, or None.
          *         scene: layers of its 3D scene. live: present while the trace is of a live run.
          */
@@ -1590,11 +1608,8 @@ export interface components {
             missing_quantities: {
                 [key: string]: string;
             };
-            /** Image Size */
-            image_size: [
-                number,
-                number
-            ] | null;
+            /** Sensors */
+            sensors: components["schemas"]["DisplayedSensor"][];
             /** Columns */
             columns: components["schemas"]["Column"][];
             /** Data Warning */
@@ -1693,6 +1708,7 @@ export type DiagnosisRecovery = components['schemas']['DiagnosisRecovery'];
 export type DiagnosticInfo = components['schemas']['DiagnosticInfo'];
 export type DiagnosticOption = components['schemas']['DiagnosticOption'];
 export type DiagnosticResult = components['schemas']['DiagnosticResult'];
+export type DisplayedSensor = components['schemas']['DisplayedSensor'];
 export type EpisodeErrors = components['schemas']['EpisodeErrors'];
 export type EpisodeSummary = components['schemas']['EpisodeSummary'];
 export type Error = components['schemas']['Error'];

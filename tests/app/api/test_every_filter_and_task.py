@@ -118,7 +118,7 @@ PLAIN = replace(PUSH, name="plain", replay=None, outline=None)
 def test_task_without_replay(serve: Serve) -> None:
     client = serve(PLAIN, "crossmodal-pf")
     assert [c["name"] for c in header(client, PLAIN)["components"]] == ["x", "y"]
-    assert header(client, PLAIN)["image_size"] == [32, 32]
+    assert [(s["name"], s["height"], s["width"]) for s in header(client, PLAIN)["sensors"]] == [("image", 32, 32)]
     assert map_layers(client, PLAIN) == ["image", "haptics", "fused"]
     images = client.get(f"/api/trace/{PLAIN.name}/own/0/images").content
     assert len(images) == 20 * 32 * 32
@@ -133,6 +133,6 @@ def test_task_without_images(serve: Serve) -> None:
         modalities={"haptics": PUSH.modalities["haptics"]},
     )
     client = serve(task, "haptics-ekf")
-    assert header(client, task)["image_size"] is None
+    assert header(client, task)["sensors"] == []
     assert map_layers(client, task) == ["haptics", "fused"]
     assert client.get(f"/api/trace/{task.name}/own/0/images").status_code == 404
