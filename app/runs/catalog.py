@@ -62,7 +62,7 @@ class TaskCatalog:
         data = dict(self.user_data)
         if SAMPLE not in data:
             with suppress(BadInput):  # no sample set ships
-                data[SAMPLE] = open_dataset(sample_path(self.task), self.task)
+                data[SAMPLE] = _sample(sample_path(self.task), self.task)
         return data
 
     def add_filter(self, name: str, checkpoint: Checkpoint, path: Path, first: bool) -> None:
@@ -120,15 +120,14 @@ class TaskCatalog:
         }
 
     def close(self) -> None:
-        """Close the open data sets."""
-        for data in (self.user_data | vars(self).get("data", {})).values():
+        """Close the user's data sets."""
+        for data in self.user_data.values():
             data.close()
 
 
-@cache
-def _included(path: Path) -> Checkpoint:
-    """A pretrained checkpoint, shared by all catalogs of the process: its file does not change."""
-    return load_checkpoint(path)
+# Included files do not change: the catalogs of a process share them.
+_included = cache(load_checkpoint)
+_sample = cache(open_dataset)
 
 
 def task_catalogs(

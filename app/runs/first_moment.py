@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,8 @@ BEFORE, DURING = 3, 5
 SEARCHED = 100
 """Largest number of episodes that are searched."""
 
+_moments: WeakKeyDictionary[Dataset, tuple[int, int]] = WeakKeyDictionary()
+
 
 def first_moment(data: Dataset) -> tuple[int, int]:
     """Episode and step to open first: of a data set with outages, where an outage begins in the first contact.
@@ -23,6 +27,12 @@ def first_moment(data: Dataset) -> tuple[int, int]:
     object, and in the next step the information share passes from image to haptics. Otherwise: the start of the first
     held-out episode.
     """
+    if data not in _moments:
+        _moments[data] = _search(data)
+    return _moments[data]
+
+
+def _search(data: Dataset) -> tuple[int, int]:
     held_out = data.held_out()
     if "outages" in data[held_out[0]].provenance.get("ingredients", {}):
         for index in held_out[:SEARCHED]:
