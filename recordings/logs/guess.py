@@ -14,6 +14,9 @@ TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"est|mean|pred|filter|posterior|belief"
 POSE_ESTIMATE = ESTIMATE + r"|odom|ekf|amcl|slam|local"
 
+DT = 0.1
+"""s per step, if the log has no times."""
+
 PLANAR = "[0,1,5,6,7,11,30,31,35]"
 """x, y and yaw in the covariance of x, y, z, roll, pitch and yaw of a ROS message."""
 
@@ -43,7 +46,7 @@ def _table(columns: Columns) -> list[str]:
     used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control}
     used |= {n.partition("[")[0] for n in state.values()}
     sensors = {_key(n): n for n in columns if n not in used and (n in flat or n in rows)}
-    lines = [f"time = {_text(time[0])}" if time else "dt = 0.1  # s per row"]
+    lines = [f"time = {_text(time[0])}" if time else f"dt = {DT}  # s per row"]
     lines += [f"episode = {_text(episode[0])}"] if episode else []
     lines += [f"control = {_text(control[0])}"] if control else []
     lines += _sections({component: _text(reference) for component, reference in state.items()}, sensors)
@@ -66,8 +69,9 @@ def _messages(columns: Columns, intervals: Mapping[str, float]) -> list[str]:
     references = [
         _vector(columns, n) for n in columns if _is_reading(columns, n) and _topic(intervals, n) not in topics
     ]
-    clock = _topic(intervals, base_name(used[0])) if used else min(intervals, key=lambda topic: intervals[topic])
-    lines = [f"dt = {intervals[clock]:.3g}  # s per step of the common clock"]
+    clock = intervals[_topic(intervals, base_name(used[0]))] if used else 0.0
+    clock = clock or min((interval for interval in intervals.values() if interval > 0.0), default=DT)
+    lines = [f"dt = {clock:.3g}  # s per step of the common clock"]
     values = {_key(component): _component(reference) for component, reference in state.items()}
     lines += _sections(values, {_key(reference.strip("/")): reference for reference in references})
     if estimate:

@@ -34,7 +34,8 @@ class Preview(NamedTuple):
     """First messages of a log.
 
     Attributes:
-        columns: with few rows. intervals: topic -> median s between messages. timeline: empty if there is no choice.
+        columns: with few rows. intervals: topic -> median s between messages, 0 if unknown. timeline: empty if there is
+            no choice.
     """
 
     columns: Columns
@@ -263,6 +264,5 @@ def preview(log: MessageLog) -> Preview:
         raise problem
     usable = {n: v for n, v in values.items() if len({i.shape for i in v}) == 1 and v[0].size}
     stacked = {name: np.asarray(value) for name, value in usable.items()}
-    medians = {t: float(np.median(np.diff(v))) / (log.second or 1.0) for t, v in times.items() if len(v) > 1}
-    intervals = {topic: median for topic, median in medians.items() if median > 0.0}
+    intervals = {t: float(np.median(np.diff(v))) / (log.second or 1.0) if len(v) > 1 else 0.0 for t, v in times.items()}
     return Preview({n: v for n, v in stacked.items() if v.dtype.kind in "fiubU"}, intervals, log.timeline)

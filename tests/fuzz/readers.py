@@ -318,7 +318,9 @@ def check_valid(name: str, folder: Path) -> None:
 
 
 def copy(source: Path, target: Path) -> None:
-    """Copy a file or a folder."""
+    """Copy a file or a folder; replace what a killed process left."""
+    if target.is_dir():
+        shutil.rmtree(target)
     (shutil.copytree if source.is_dir() else shutil.copy)(source, target)
 
 

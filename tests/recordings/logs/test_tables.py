@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import tomllib
 from pathlib import Path
@@ -163,6 +164,20 @@ def test_wrong_metadata_of_lerobot(lerobot: Path, tmp_path: Path, key: str, valu
     mapping = read_map(map_file(tmp_path, LEROBOT))
     with pytest.raises(BadInput, match=message):
         read_log(read_columns(lerobot, mapping), mapping, "log")
+
+
+@pytest.mark.parametrize("name", ["buffer.zarr", "buffer.zip"])
+def test_short_chunks_of_blosc_are_refused(tmp_path: Path, name: str) -> None:
+    """Blosc takes the length from the header of the chunk and would read beyond its end."""
+    logs.write_zarr(tmp_path / "full.zarr", 2)
+    chunk = tmp_path / "full.zarr" / "data" / "state" / "0.0"
+    chunk.write_bytes(chunk.read_bytes()[:-20])
+    if name.endswith("zip"):
+        shutil.make_archive(str(tmp_path / "buffer"), "zip", tmp_path / "full.zarr")
+    else:
+        (tmp_path / "full.zarr").rename(tmp_path / name)
+    with pytest.raises(BadInput, match=r"chunk data/state/0\.0 has \d+ bytes, and \d+ according to its header"):
+        read_columns(tmp_path / name, read_map(map_file(tmp_path, ZARR)))
 
 
 @pytest.mark.parametrize(("frames", "message"), [(8, "has no frame at 0.8 s"), (0, "cannot be read")])
