@@ -26,9 +26,6 @@ RAW = {
 }
 """Encoding of an image message -> type of its numbers, and its channels in the order red, green, blue."""
 
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-"""Weights of red, green and blue in grey (ITU-R BT.601)."""
-
 
 def is_image(fields: Mapping[str, Any]) -> bool:
     """Whether a message with the field ``data`` is an image, raw or compressed."""
@@ -71,12 +68,3 @@ def channels(image: NDArray[Any]) -> NDArray[Any]:
     """(H, W) of an image with one channel, (H, W, 3) without transparency, in the byte order of the machine."""
     image = image.astype(image.dtype.newbyteorder("="), copy=False)
     return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image[..., :3] if image.ndim == 3 else image
-
-
-def grey(images: NDArray[Any]) -> NDArray[np.uint8]:
-    """(T, H, W) of colour images (T, H, W, 3): bytes, or numbers up to 255, or up to 1."""
-    scale = 255.0 if images.dtype.kind == "f" and np.nanmax(images, initial=0.0) <= 1.0 else 1.0
-    result = np.empty(images.shape[:3], np.uint8)
-    for image, target in zip(images, result, strict=True):  # one at a time: floats take four times the memory
-        target[:] = np.clip(np.rint(image.astype(np.float32) @ (LUMA * np.float32(scale))), 0, 255)
-    return result

@@ -19,7 +19,6 @@ from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.recordings.logs.arrays import Columns
 from beliefscope.recordings.logs.column_map import QUATERNION, ColumnMap, CovariateColumn, References, StateColumn
 from beliefscope.recordings.logs.columns import column, joined
-from beliefscope.recordings.logs.images import grey
 
 Array = NDArray[np.float64]
 
@@ -188,14 +187,18 @@ def _states(columns: Columns, mapping: ColumnMap) -> Array:
 
 
 def _sensor(columns: Columns, name: str, references: str | list[str]) -> NDArray[Any]:
-    """(T, H, W) bytes of an image column, colours as grey; or (T, d) float32."""
-    if isinstance(references, str) and references in columns:
-        images = columns[references]
-        if images.ndim == 3 and images.dtype == np.uint8:
+    """Images (T, H, W) or (T, H, W, 3) uint8; or (T, d) vectors and arrays of other shapes, float32."""
+    if not isinstance(references, str) or references not in columns or columns[references].ndim < 3:
+        return _float32(joined(columns, references, f"sensor {name}"), f"sensor {name!r}")
+    values = columns[references]
+    is_colour = values.ndim == 4 and values.shape[3] == 3
+    if values.dtype == np.uint8 and (values.ndim == 3 or is_colour):
+        return values
+    if is_colour and values.dtype.kind in "fiu" and values.min() >= 0 and 1 < values.max() <= 255:
+        images = values.astype(np.uint8)  # colours are often stored as floats
+        if np.array_equal(images, values):
             return images
-        if images.ndim == 4 and images.shape[3] == 3 and images.dtype.kind in "uif":
-            return grey(images)
-    return _float32(joined(columns, references, f"sensor {name}"), f"sensor {name!r}")
+    return _float32(column(columns, references, f"sensor {name}"), f"sensor {name!r}")
 
 
 def _float32(values: Array, name: str) -> NDArray[np.float32]:
@@ -270,6 +273,7 @@ def _task(
         map_half_width=float(MARGIN * max(extent, 0.01)),
         warmup=0,
         covariates=({"contact": CONTACT} if mapping.contact else {}) | covariates,
+        arrays=tuple(name for name, array in sensors.items() if array.ndim > 2 and array.dtype != np.uint8),
     )
     check_definition(task, f"task {mapping.task!r}")
     return task

@@ -23,7 +23,6 @@ from beliefscope.recordings.export import export_trace
 from beliefscope.recordings.logs.column_map import read_map
 from beliefscope.recordings.logs.columns import preview_columns, read_columns
 from beliefscope.recordings.logs.guess import guess_map
-from beliefscope.recordings.logs.images import LUMA
 from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
 ROOT = Path(__file__).parents[3]
@@ -76,8 +75,9 @@ def test_columns_have_the_last_message_at_each_tick(log: Path, tmp_path: Path) -
     np.testing.assert_allclose(episode.states, truth, atol=1e-6)
     gyro = np.stack([logs.spin(t) for t in logs.held("/imu", ticks)])
     np.testing.assert_allclose(episode.observations["gyro"], gyro, atol=1e-6)
-    images = np.stack([np.rint(logs.colour(t) @ LUMA) for t in logs.held("/camera", ticks)])
-    assert np.array_equal(episode.observations["image"], images.astype(np.uint8))
+    images = np.stack([logs.colour(t) for t in logs.held("/camera", ticks)])
+    assert np.array_equal(episode.observations["image"], images)
+    assert episode.observations["image"].dtype == np.uint8
     stages = [np.nan if np.isnan(t) else ["lift", "reach"].index(logs.stage(t)) for t in logs.held("/stage", ticks)]
     assert np.array_equal(episode.covariate("stage"), np.array(stages, np.float32), equal_nan=True)
     assert np.isnan(stages[:10]).all()

@@ -18,7 +18,6 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.logs.column_map import read_map
 from beliefscope.recordings.logs.columns import preview_columns, read_columns
 from beliefscope.recordings.logs.guess import guess_map
-from beliefscope.recordings.logs.images import LUMA
 from beliefscope.recordings.logs.read_log import read_log, recorded_trace
 
 pytestmark = pytest.mark.slow  # a process reads each recording first
@@ -66,13 +65,15 @@ def test_entities_on_a_timeline(log: Path, tmp_path: Path) -> None:
     spins = np.array([logs.spin(t) for t in logs.held("/imu", ticks)])
     np.testing.assert_allclose(episode.observations["gyro"], spins, atol=1e-6)
     np.testing.assert_allclose(episode.observations["turn"], spins[:, 1:2], atol=1e-6)
-    np.testing.assert_allclose(episode.observations["matrix"][:, :3], spins, atol=1e-6)
-    images = [np.rint(logs.colour(t) @ LUMA) for t in logs.held("/camera", ticks)]
+    np.testing.assert_allclose(episode.observations["matrix"][:, 0], spins, atol=1e-6)
+    assert episode.task.arrays == ("matrix", "depth")
+    images = [logs.colour(t) for t in logs.held("/camera", ticks)]
     assert np.array_equal(episode.observations["image"], images)
-    images = [np.rint(logs.colour(t) @ LUMA) for t in logs.held("/preview", ticks)]
+    images = [logs.colour(t) for t in logs.held("/preview", ticks)]
     assert np.array_equal(episode.observations["front"], images)
-    assert columns["/depth.buffer"].shape == (len(ticks), 4, 6)
-    np.testing.assert_allclose(columns["/depth.buffer"][:, 0, 0], 1000 * logs.held("/camera", ticks), atol=1.0)
+    assert episode.observations["depth"].shape == (len(ticks), 4, 6)
+    depths = episode.observations["depth"][:, 0, 0]
+    np.testing.assert_allclose(depths, 1000 * logs.held("/camera", ticks), atol=1.0)
     assert set(columns["/stage"]) == {"", "reach", "lift"}
     trace = recorded_trace(columns, mapping, [episode], 0, log.name)
     np.testing.assert_allclose(trace.estimate_mean, [logs.pose(t) for t in logs.held("/odom", ticks)], atol=1e-6)

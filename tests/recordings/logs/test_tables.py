@@ -19,7 +19,6 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.logs.column_map import read_map
 from beliefscope.recordings.logs.columns import preview_columns, read_columns
 from beliefscope.recordings.logs.guess import guess_map
-from beliefscope.recordings.logs.images import LUMA
 from beliefscope.recordings.logs.read_log import read_log
 
 ZARR = """
@@ -67,10 +66,6 @@ def lerobot(tmp_path: Path) -> Path:
     return tmp_path / "dataset"
 
 
-def grey(image: np.ndarray) -> np.ndarray:
-    return np.rint(image @ LUMA).astype(np.uint8)
-
-
 def test_episodes_of_a_replay_buffer(buffer: Path, tmp_path: Path) -> None:
     mapping = read_map(map_file(tmp_path, ZARR))
     episodes = read_log(read_columns(buffer, mapping), mapping, buffer.name)
@@ -78,7 +73,7 @@ def test_episodes_of_a_replay_buffer(buffer: Path, tmp_path: Path) -> None:
     expected, at = logs.buffer_arrays(), slice(7, 11)
     assert np.array_equal(episodes[1].controls, expected["action"][at])
     np.testing.assert_allclose(episodes[1].states, expected["state"][at, :2], rtol=1e-6)
-    assert np.array_equal(episodes[1].observations["image"], grey(expected["camera"][at]))
+    assert np.array_equal(episodes[1].observations["image"], expected["camera"][at])
     np.testing.assert_allclose(episodes[1].observations["pose"], expected["obs/pose"][at], rtol=1e-6)
 
 
@@ -89,14 +84,17 @@ def test_only_columns_of_the_map_are_read(buffer: Path, tmp_path: Path) -> None:
     assert columns["camera"].any()
 
 
-@pytest.mark.parametrize("scale", [1.0, 255.0])
-def test_float_images_become_bytes(tmp_path: Path, scale: float) -> None:
+@pytest.mark.parametrize(("scale", "kind"), [(1.0, np.uint8), (255.0, np.float32)])
+def test_floats_of_whole_levels_are_images(tmp_path: Path, scale: float, kind: type) -> None:
+    """Other floats are arrays of numbers."""
     logs.write_zarr(tmp_path / "buffer.zarr")
-    columns = dict(read_columns(tmp_path / "buffer.zarr", read_map(map_file(tmp_path, ZARR))))
+    mapping = read_map(map_file(tmp_path, ZARR))
     images = logs.buffer_arrays()["camera"]
-    columns["camera"] = images.astype(np.float32) / scale
-    episodes = read_log(columns, read_map(map_file(tmp_path, ZARR)), "buffer")
-    np.testing.assert_allclose(episodes[0].observations["image"], grey(images[:7]), atol=1)
+    columns = {**read_columns(tmp_path / "buffer.zarr", mapping), "camera": images.astype(np.float32) / scale}
+    (episode, *_) = read_log(columns, mapping, "buffer")
+    assert episode.observations["image"].dtype == kind
+    assert episode.task.arrays == (() if kind is np.uint8 else ("image",))
+    np.testing.assert_allclose(episode.observations["image"] * scale, images[:7], atol=1e-4)
 
 
 def test_episodes_of_a_lerobot_data_set(lerobot: Path, tmp_path: Path) -> None:
@@ -107,10 +105,10 @@ def test_episodes_of_a_lerobot_data_set(lerobot: Path, tmp_path: Path) -> None:
     assert episodes[0].dt == pytest.approx(1.0 / logs.FPS)
     expected, at = logs.buffer_arrays(), slice(11, 20)
     np.testing.assert_allclose(episodes[2].states, expected["state"][at, :2], rtol=1e-6)
-    assert np.array_equal(episodes[2].observations["wrist"], grey(expected["camera"][at]))
+    assert np.array_equal(episodes[2].observations["wrist"], expected["camera"][at])
     for number, episode in enumerate(episodes):
         levels = [logs.level(number, frame) for frame in range(len(episode))]
-        np.testing.assert_allclose(episode.observations["top"].mean(axis=(1, 2)), levels, atol=2.0)
+        np.testing.assert_allclose(episode.observations["top"].mean(axis=(1, 2, 3)), levels, atol=2.0)
 
 
 def test_guessed_maps_import_the_logs(buffer: Path, lerobot: Path, tmp_path: Path) -> None:
