@@ -138,9 +138,9 @@ def _attributes(part: Any) -> dict[str, Any]:
 
 
 def _shared(filter_: Any) -> dict[int, Any]:
-    """Memo of ``copy.deepcopy`` for objects that are not copied: modules of the filter and parameters."""
+    """Memo of ``copy.deepcopy`` for objects that are not copied: the filter, its modules and parameters."""
     owned = [filter_] if isinstance(filter_, nn.Module) else [v for v in _values(filter_) if isinstance(v, nn.Module)]
-    shared: list[Any] = [parameter for module in owned for parameter in module.parameters()]
+    shared: list[Any] = [filter_, *(parameter for module in owned for parameter in module.parameters())]
     if isinstance(filter_, nn.Module):
         shared += filter_.modules()
     return {id(item): item for item in shared}

@@ -312,6 +312,8 @@ def model_names(
 def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()) -> ExternalFilter:
     """The filter that ``path/to/file.py:NAME`` or ``package.module:NAME`` returns when called without arguments.
 
+    The global generators of torch and NumPy are seeded for the call.
+
     Args:
         task: of the filter. Default: ``Adapter.task`` or an attribute ``task``, else the only given task.
         given: user-defined tasks that the filter may name.
@@ -330,7 +332,8 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
             problem = f"has no {attribute!r}" if build is None else f"has {attribute!r}, which is not callable"
             raise BadInput(f"{place} {problem}. Available: {', '.join(functions) or 'none'}.")
         try:
-            result = build()
+            with seeded(0, None):  # the same parameters, and so the same hash, in every process
+                result = build()
         except Exception as error:
             raise BadInput(f"{source} fails when called: {type(error).__name__}: {error}") from error
     adapter = result if isinstance(result, Adapter) else Adapter(result)

@@ -45,7 +45,9 @@ class GroupErrors:
 
 @dataclass(frozen=True)
 class Outages:
-    """Outages of a sensor: at least ``MIN_OUTAGE`` steps in succession without a reading (NaN, or a blank image).
+    """Outages of a sensor: at least ``MIN_OUTAGE`` steps in succession without a reading.
+
+    A reading is missing if it is NaN or a blank image, or the filter reports no innovation of the modality.
 
     Attributes:
         modality: of the sensor. count, steps: number of outages and of their steps. longest: in s.
@@ -107,7 +109,7 @@ class Errors(Diagnostic):
         unit, scale = self._unit
         total = self.groups[0]
         text = f"Position RMSE {scale * total.position:.3g} {unit}"
-        others = [group for group in self.groups[1:] if group.steps >= measures.MIN_STEPS]
+        others = [group for group in self.groups[1:] if measures.MIN_STEPS <= group.steps < total.steps]
         if others:
             worst = max(others, key=lambda group: group.position)
             steps = worst.steps / total.steps
@@ -118,7 +120,7 @@ class Errors(Diagnostic):
             text = f"{outage.count} outages of {outage.modality}, up to {outage.longest:.3g} s, have "
             text += f"{outage.share:.0%} of the squared error in {outage.steps:.0%} of the steps"
             if not math.isnan(outage.recovery):
-                text += f"; recovery takes {outage.recovery:.3g} s"
+                text += f"; recovery takes {outage.recovery:.3g} s" if outage.recovery else "; recovery is immediate"
             if outage.unrecovered:
                 text += f", and is missing after {outage.unrecovered}"
             parts.append(f"{text}.")
@@ -212,12 +214,14 @@ def errors_of(traces: Sequence[Trace]) -> Errors:
 
 
 def missing_steps(trace: Trace) -> dict[str, Mask]:
-    """Modality -> (T,): outages, in which no observation of the modality has a reading."""
+    """Modality -> (T,): outages, in which no observation of the modality has a reading, or the filter used none."""
     result = {}
     for name, keys in trace.task.modalities.items():
         lost = np.ones(len(trace), dtype=bool)
         for key in keys:
             lost &= _without_reading(trace.episode.observations.get(key), len(trace))
+        if trace.innovation is not None and name in trace.modalities:
+            lost |= np.isnan(trace.innovation[:, trace.modalities.index(name)]).all(1)
         runs = [(a, b) for a, b in measures.intervals(lost) if b - a >= MIN_OUTAGE]
         result[name] = np.zeros(len(trace), dtype=bool)
         for a, b in runs:
@@ -301,13 +305,15 @@ def _readings(traces: Sequence[Trace], distance: Sequence[Array]) -> dict[str, t
     for key, channels in task.positions.items():
         if task.observations.get(key) != (2,):
             continue
-        rows = []
+        rows, modality = [], next((name for name, keys in task.modalities.items() if key in keys), "")
         for trace, d in zip(traces, distance, strict=True):
             if key not in trace.episode.observations:
                 continue
             reading = trace.episode.observations[key][:, list(channels)].astype(np.float64)
             off = np.linalg.norm(reading - trace.episode.states[:, where], axis=1)
-            at = _known_steps(trace) & np.isfinite(off)
+            at = (
+                _known_steps(trace) & np.isfinite(off) & ~missing_steps(trace).get(modality, np.zeros(len(trace), bool))
+            )
             rows.append(np.stack([off[at], d[at]]))
         if rows and (both := np.concatenate(rows, axis=1)).size:
             result[key] = (_root(both[0]), _root(both[1]))

@@ -37,7 +37,8 @@ class ModalityInnovations:
 
     Attributes:
         measurements: number of counted steps with a measurement. channels: largest number of channels.
-        nis: mean of NIS / m. low, high: its 95 % interval over trajectories; NaN for too few.
+        nis: mean of NIS / m, of the accepted measurements if there are any.
+        low, high: its 95 % interval over trajectories; NaN for too few.
         extreme: number of innovations beyond the ``TAIL`` quantile of a consistent filter.
         accepted: share of accepted measurements; NaN without a gate. missed: number of accepted extreme innovations.
         longest: largest number of rejections in succession.
@@ -101,6 +102,8 @@ class Innovations(Diagnostic):
             gate = f"the gate {entry.gate}" if entry.gate and not entry.gate.startswith("never n") else ""
             if entry.gate == "never acts":
                 gate += f", although {entry.missed} of {entry.measurements} innovations exceed the 99.9 % quantile"
+            elif not entry.gate and entry.extreme > EXCESS * TAIL * entry.measurements:
+                gate = f"{entry.extreme} of {entry.measurements} exceed the 99.9 % quantile, and there is no gate"
             elif entry.gate:
                 share = f"{1.0 - entry.accepted:.1%} of {entry.measurements} measurements rejected"
                 gate = f"{gate}, {share}" if gate else "no measurement had to be rejected"
@@ -178,12 +181,14 @@ def _modality(traces: Sequence[Trace], k: int, name: str) -> ModalityInnovations
         squared.append(pair[0][keep, k])
         channels.append(pair[1][keep, k])
         accepted.append(used[keep])
-        sums.append((squared[-1] / channels[-1]).sum())
-        counts.append(keep.sum())
+        usable = accepted[-1] != 0.0
+        sums.append((squared[-1] / channels[-1])[usable].sum())
+        counts.append(usable.sum())
         runs = measures.intervals(used[np.isfinite(pair[0][:, k])] == 0.0)
         longest = max([longest, *(int(stop - start) for start, stop in runs)])
     value, m, used = (np.concatenate(parts) for parts in (squared, channels, accepted))
     total = len(value)
+    usable = used != 0.0 if (used != 0.0).any() else np.ones(total, dtype=bool)
     low = high = math.nan
     if too_few(len(traces)) is None and min(counts) > 0:
         _, low, high = (float(x) for x in mean_interval(np.array(sums), np.array(counts, np.float64)))
@@ -193,7 +198,7 @@ def _modality(traces: Sequence[Trace], k: int, name: str) -> ModalityInnovations
         modality=name,
         measurements=total,
         channels=int(m.max(initial=0)),
-        nis=float(np.mean(value / m)) if total else math.nan,
+        nis=float(np.mean((value / m)[usable])) if total else math.nan,
         low=low,
         high=high,
         extreme=int(extreme.sum()),

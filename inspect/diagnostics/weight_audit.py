@@ -267,6 +267,8 @@ def why_not(trace: Trace, checkpoint: Checkpoint | None = None) -> str | None:
     if trace.effective_weights is not None:
         missing = np.isnan(trace.modality_mean).all()
         return f"{trace.filter} reports no single-modality updates" if missing else None
+    if not trace.modalities and trace.kind == "external":
+        return f"{trace.filter} reports no fusion weights"
     if not trace.modalities:
         return f"{trace.filter} has no fusion weights: one network processes all modalities"
     if len(trace.modalities) > 1:

@@ -17,7 +17,7 @@ from beliefscope.recordings.rerun_log.columns import columns
 from beliefscope.recordings.write import write_recording
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "filters" / "external"))
-import vehicle
+import vehicle_filters as vehicle
 
 NAMES = ("innovation", "innovation_covariance", "accepted")
 

@@ -20,7 +20,7 @@ from beliefscope.inspect.statistics.innovations import nis_of
 from beliefscope.inspect.trace import load_trace, save_trace, trace
 
 sys.path.insert(0, str(Path(__file__).parent))
-import vehicle
+import vehicle_filters as vehicle
 
 STD = tuple(np.sqrt(10 * np.diag(vehicle.P0)))
 

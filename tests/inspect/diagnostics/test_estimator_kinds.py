@@ -17,7 +17,7 @@ from beliefscope.inspect.catalog import DIAGNOSTICS, quick
 from beliefscope.inspect.trace import Trace, trace
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "filters" / "external"))
-import vehicle
+import vehicle_filters as vehicle
 
 STEPS = 300
 CHI2 = {1: 10.828, 2: 13.816}  # 99.9 % quantiles
@@ -105,7 +105,9 @@ def test_collapse_is_an_alarm() -> None:
 def point_estimate(jump: float, steps: int = STEPS) -> Trace:
     """An estimate 0.1 m off, and in two GPS gaps ``jump`` m off, which decreases by half per step afterwards."""
     episode = vehicle.drive(0, steps, gap=(100, 150))
-    episode.observations["gps"][250:270] = np.nan
+    for start, stop in ((100, 150), (250, 270)):
+        episode.observations["gps"][start:stop] = np.nan
+        episode.observations["fix"][start:stop] = np.nan
     run = trace(ExternalFilter(Adapter(vehicle.NumpyKalman(), batched=False), vehicle.TASK, "mine"), episode)
     offset = np.full(steps, 0.1)
     for start, stop in ((100, 150), (250, 270)):

@@ -29,6 +29,9 @@ from beliefscope.inspect.trace import Trace, load_trace, save_trace, trace
 sys.path.insert(0, str(Path(__file__).parent))
 import torchfilter_stubs as stubs
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "filters" / "external"))
+from user_libraries import from_folder
+
 SEED = 3
 
 
@@ -350,7 +353,7 @@ def test_invalid_results_are_refused(episode: Episode, message: str) -> None:
 
 
 def test_torchfilter(episode: Episode) -> None:
-    torchfilter = pytest.importorskip("torchfilter", reason="torchfilter is not installed")
+    torchfilter: Any = from_folder("torchfilter", "BELIEFSCOPE_TORCHFILTER")
 
     class Walk(torchfilter.base.DynamicsModel):  # type: ignore[misc, name-defined]
         def forward(self, *, initial_states: Tensor, controls: Tensor) -> tuple[Tensor, Tensor]:

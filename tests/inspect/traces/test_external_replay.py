@@ -30,7 +30,7 @@ from beliefscope.inspect.traces.external_replay import open_replay
 from beliefscope.inspect.traces.replay import Edit
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "filters" / "external"))
-import vehicle
+import vehicle_filters as vehicle
 
 EXAMPLE = str(Path(__file__).parents[3] / "examples" / "04_own_filter.py:build")
 
@@ -60,7 +60,7 @@ def test_counterfactual_changes_only_later_steps_and_its_own_sensors(door: list[
     assert open_replay(filter_, edited).exact  # of an edited run
     with pytest.raises(BadInput, match="fusion weights cannot be set"):
         replay.edited(Edit(20, 40, weights={"image": 0.5}))
-    with pytest.raises(BadInput, match="step 100 is after the last step"):
+    with pytest.raises(BadInput, match="step 101 is after the last step"):
         replay.edited(Edit(20, 101, Faults.parse("blackout")))
 
 

@@ -1,66 +1,21 @@
-"""A vehicle with GPS and wheel speed, and Kalman filters of it in NumPy and torch, for tests of external filters."""
+"""Kalman filters in NumPy and torch of the vehicle of the gallery, for tests of external filters."""
 
 from __future__ import annotations
 
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from beliefscope.datasets.covariate import Covariate
-from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.task import Component, Task
-
-DT, ACCELERATION, GPS, SPEED = 0.1, 0.5, 0.3, 0.05  # s; standard deviations in m/s^2, m, m/s
-
-TASK = Task(
-    name="vehicle",
-    components=(Component("x", "m"), Component("y", "m"), Component("vx", "m/s"), Component("vy", "m/s")),
-    observations={"gps": (2,), "speed": (1,)},
-    modalities={"gps": ("gps",), "speed": ("speed",)},
-    control_size=1,
-    dt=DT,
-    map_components=("x", "y"),
-    map_half_width=2.0,
-    warmup=5,
-    covariates={"fix": Covariate("boolean")},
+GALLERY = Path(__file__).parents[3] / "examples" / "gallery"
+data = SimpleNamespace(**runpy.run_path(str(GALLERY / "vehicle.py")))
+TASK, drive, F, Q, H, R, P0, GPS, SPEED = (
+    getattr(data, name) for name in ("TASK", "drive", "F", "Q", "H", "R", "P0", "GPS", "SPEED")
 )
-
-F = np.eye(4) + DT * np.eye(4, k=2)
-Q = ACCELERATION**2 * np.block(
-    [[DT**4 / 4 * np.eye(2), DT**3 / 2 * np.eye(2)], [DT**3 / 2 * np.eye(2), DT**2 * np.eye(2)]]
-)
-Q += 1e-9 * np.eye(4)
-H = {"gps": np.eye(2, 4), "speed": np.array([[0.0, 0.0, 1.0, 0.0]])}
-R = {"gps": GPS**2 * np.eye(2), "speed": SPEED**2 * np.eye(1)}
-P0 = np.diag([0.1, 0.1, 0.1, 0.1])
-
-
-def drive(seed: int, steps: int = 120, gap: tuple[int, int] | None = None) -> Episode:
-    """A linear-Gaussian trajectory; the speed sensor measures vx. In ``gap`` there is no GPS fix: readings are NaN."""
-    rng = np.random.default_rng(seed)
-    root = np.linalg.cholesky(Q)
-    states = np.zeros((steps, 4))
-    for t in range(1, steps):
-        states[t] = F @ states[t - 1] + root @ rng.standard_normal(4)
-    gps = states[:, :2] + GPS * rng.standard_normal((steps, 2))
-    fix = np.ones(steps, np.float32)
-    if gap is not None:
-        gps[slice(*gap)], fix[slice(*gap)] = np.nan, 0.0
-    speed = states[:, 2:3] + SPEED * rng.standard_normal((steps, 1))
-    return Episode(
-        task=TASK,
-        states=states.astype(np.float32),
-        controls=np.zeros((steps, 1), np.float32),
-        observations={"gps": gps.astype(np.float32), "speed": speed.astype(np.float32)},
-        contact=np.zeros(steps, bool),
-        qpos=np.zeros((steps, 0), np.float32),
-        dt=DT,
-        seed=seed,
-        split="test",
-        covariates={"fix": fix},
-    )
 
 
 class NumpyKalman:
@@ -82,7 +37,7 @@ class NumpyKalman:
         innovations, covariances, accepted = [], [], []
         for name in TASK.modalities:
             z = observations[name]
-            if np.isnan(z).any():
+            if np.isnan(z).any() or (name == "gps" and not observations["fix"] > 0.0):
                 innovations, covariances, accepted = [*innovations, None], [*covariances, None], [*accepted, None]
                 continue
             nu, s = z - H[name] @ self.x, H[name] @ self.P @ H[name].T + R[name] * self.scale
