@@ -41,12 +41,19 @@ log = logging.getLogger("beliefscope.app")
 _process_lock = threading.Lock()
 
 
+HIDDEN_PANEL = "<style>[data-floating-window] { display: none !important; }</style>"
+"""Hides viser's control panel: the page has the controls of the scene."""
+
+
 def client_page(script: str) -> bytes:
-    """viser's client page with an additional script before its own. Raises RuntimeError if the page has no head."""
+    """viser's client page without its control panel and with a script before its own.
+
+    Raises RuntimeError if the page has no head.
+    """
     before, head, after = CLIENT_PAGE.read_bytes().partition(b"<head>")
     if not head:
         raise RuntimeError(f"the client page of viser {viser.__version__} has no <head>")
-    return before + head + f'<script src="{script}"></script>'.encode() + after
+    return before + head + f'{HIDDEN_PANEL}<script src="{script}"></script>'.encode() + after
 
 
 class _Connection:

@@ -1,12 +1,8 @@
-"""3D scene of one view: its viser server, the drawn run, and the step slider."""
+"""3D scene of one view: its viser server and the drawn run."""
 
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable
-
-from viser import GuiEvent, GuiSliderHandle
 
 from beliefscope.app.protocol.messages import SceneLayers, Viewpoint
 from beliefscope.app.runs.traced_run import TracedRun
@@ -15,22 +11,17 @@ from beliefscope.app.views.scene_belief import BeliefScene, ComparisonEstimate
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
-PANEL_WIDTH = 180  # pixels
-SLIDER_HOLD = 0.5  # s after the user moved the slider, during which the page's cursor does not move it
-
 
 class Scene:
     """Draws one run at a time. ``show`` and ``close`` block and may be called from any thread.
 
     Args:
-        on_slider: called in another thread with the step that the user chose in the scene.
         dark: whether the background is dark.
     """
 
-    def __init__(self, on_slider: Callable[[int], None], dark: bool) -> None:
+    def __init__(self, dark: bool) -> None:
         self.viser = EmbeddedViser()
         self._server = self.viser.server
-        self._on_slider = on_slider
         self._lock = threading.Lock()
         self._belief: BeliefScene | None = None
         self._layers = SceneLayers()
@@ -39,11 +30,7 @@ class Scene:
         self._comparison: ComparisonEstimate | None = None
         self._closed = False
         self._key = ""
-        self._slider: GuiSliderHandle[int] | None = None
-        self._slider_moved = -SLIDER_HOLD
-        self._server.gui.set_panel_label("Step")
         self.set_dark(dark)
-        self._fold_panel()
 
     def set_dark(self, dark: bool) -> None:
         """Use the dark or the light theme."""
@@ -90,19 +77,15 @@ class Scene:
             if self._key != run.scene_key:
                 self._build(run, trace)
             assert self._belief is not None
-            assert self._slider is not None
             with self._server.atomic():
                 if run.growing:
                     self._belief.set_trace(trace)
-                    self._slider.max = max(1, len(run) - 1)
                 self._position = index, maps
                 self._belief.move(index, maps)
                 if comparison is not self._comparison_trace:
                     self._set_comparison(run, comparison)
                 if self._comparison is not None:
                     self._comparison.move(step)
-                if time.monotonic() - self._slider_moved > SLIDER_HOLD:
-                    self._slider.value = step  # type: ignore[misc]
             self._server.flush()
 
     def close(self) -> None:
@@ -115,12 +98,8 @@ class Scene:
         server = self._server
         with server.atomic():
             server.scene.reset()
-            server.gui.reset()
             self._belief = BeliefScene(server, run, trace, self._layers)
             self._comparison = self._comparison_trace = None
-            self._slider = server.gui.add_slider("step", 0, max(1, len(run) - 1), 1, 0)
-            self._slider.on_update(self._slider_updated)
-            self._fold_panel()
         self._key = run.scene_key
 
     def _set_comparison(self, run: TracedRun, trace: Trace | None) -> None:
@@ -128,14 +107,3 @@ class Scene:
             self._comparison.remove()
         self._comparison = None if trace is None else ComparisonEstimate(self._server, run.checkpoint.task, trace)
         self._comparison_trace = trace
-
-    def _fold_panel(self) -> None:
-        panel = self._server.gui.main_panel
-        panel.set_width(PANEL_WIDTH)
-        panel.minimize()
-
-    def _slider_updated(self, event: GuiEvent[GuiSliderHandle[int]]) -> None:
-        # Updates without a client come from ``show`` and must not be sent back to the page.
-        if event.client_id is not None:
-            self._slider_moved = time.monotonic()
-            self._on_slider(int(event.target.value))

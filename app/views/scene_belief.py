@@ -23,6 +23,7 @@ from beliefscope.inspect.statistics.measures import layer_label
 from beliefscope.inspect.trace import Trace
 
 POLE_RADIUS = 0.005  # m
+MAX_LABELED = 2  # modalities; the labels of more would overlap, and the timeline has their colors
 FLOOR_MAP_HEIGHT = 0.003  # m above the floor
 EDGE_OFFSET = 0.002  # m from the surfaces of an object to the edges of its outline
 NO_SHADOW: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
@@ -32,9 +33,12 @@ class Pole:
     """A labeled pole at an estimate."""
 
     def __init__(self, server: ViserServer, path: str, text: str, height: float, radius: float, color: RGB) -> None:
+        """text: of the label; without a label if empty."""
         self._height = height
         self._pole = server.scene.add_cylinder(f"{path}/pole", radius, height, color=color, cast_shadow=False)
-        self._label = server.scene.add_label(f"{path}/label", text, anchor="bottom-center", **SMALL_LABEL)
+        self._label = server.scene.add_label(
+            f"{path}/label", text, anchor="bottom-center", visible=bool(text), **SMALL_LABEL
+        )
 
     def move(self, anchor: Array) -> None:
         """Place the pole below and above an anchor (3,)."""
@@ -156,7 +160,10 @@ class BeliefScene:
             self._camera = CameraView(self._server, self._task, self._trace)
 
     def _add_pole(self, index: int, name: str) -> Pole:
-        text = "estimate" if name == "fused" and len(self._trace.modalities) < 2 else layer_label(name)
+        names = self._trace.modalities
+        text = "estimate" if name == "fused" and len(names) < 2 else layer_label(name)
+        if name in names and len(names) > MAX_LABELED:
+            text = ""
         color, height = rgb(name, self._trace), self._belief.pole_height(index)
         return Pole(self._server, f"/estimates/{name}", text, height, POLE_RADIUS, color)
 

@@ -59,7 +59,7 @@ class View:
     def __init__(self, store: TraceStore, executor: DeadlineExecutor, scene_lock: FairLock, dark: bool) -> None:
         """Start the scene's server, which blocks for about 50 ms. scene_lock: held while a scene is drawn."""
         self.name = secrets.token_urlsafe(12)
-        self.scene = Scene(self._slider_moved, dark)
+        self.scene = Scene(dark)
         self.idle_since: float | None = time.monotonic()
         self._store = store
         self._executor = executor
@@ -71,8 +71,6 @@ class View:
         self._scene_outdated = asyncio.Event()
         self._prefetch_center: tuple[Cursor, TracedRun] | None = None
         self._maps_sent = asyncio.Event()
-        self._slider_step: int | None = None
-        self._slider_lock = asyncio.Lock()
         self._socket: WebSocket | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -235,18 +233,6 @@ class View:
         if complete.done():
             complete.result()
         return complete.done()
-
-    def _slider_moved(self, step: int) -> None:
-        """Send the step of the scene's slider; of several pending steps, only the newest. Runs in viser's threads."""
-        pending, self._slider_step = self._slider_step is not None, step
-        if not pending and self._loop is not None and not self._loop.is_closed():
-            asyncio.run_coroutine_threadsafe(self._send_slider_step(), self._loop)
-
-    async def _send_slider_step(self) -> None:
-        async with self._slider_lock:
-            step, self._slider_step = self._slider_step, None
-            if step is not None and self._socket is not None:
-                await _ignore_disconnect(self._socket.send_json({"type": "cursor", "step": step, "origin": "scene"}))
 
 
 async def _ignore_disconnect(sending: Any) -> None:

@@ -249,19 +249,23 @@ def test_back_and_forward_restore_selections(open_page: Any) -> None:
     assert page.page.locator("#episode").input_value() == "19"
 
 
-@pytest.mark.long
-def test_scene_slider_changes_the_step(open_page: Any) -> None:
-    page = open_page("?step=20", scene=True)
-    page.until("() => document.querySelector('#scene').dataset.state === 'ready'")
-    scene = page.page.frame_locator("#scene iframe")
-    slider = scene.locator("[role=slider]").first
-    if not slider.is_visible():
-        scene.get_by_text("Step", exact=True).first.click(timeout=60_000)
-    slider.focus(timeout=60_000)
-    assert page.page.frames[-1].evaluate("() => frameThrottle.pause(0)")  # resumes drawing, which the page pauses
-    page.page.keyboard.press("ArrowRight")
+def test_panels_are_maximised_and_restored(open_page: Any) -> None:
+    page = open_page("?step=20")
+    side = "() => document.querySelector('#heatmaps canvas').getBoundingClientRect().width"
+    before = page.page.evaluate(side)
+    page.page.locator("#maps .maximise").click()
+    page.until(f"() => ({side})() > {1.3 * before}")
+    assert not page.page.locator("#timeline").is_visible()
+    page.screenshot("maximised-maps")
+    page.page.keyboard.press("ArrowRight")  # shortcuts still work
     page.until("() => beliefscope.state().step === 21")
-    page.settle(21)
+    page.page.keyboard.press("Escape")
+    page.until(f"() => ({side})() < {1.1 * before}")
+    assert page.page.locator("#timeline").is_visible()
+    page.page.locator("#timeline .bar h2").dblclick()
+    assert page.page.locator("#timeline .maximise").get_attribute("aria-label") == "Restore: Timeline"
+    page.page.keyboard.press("x")
+    assert page.page.locator("#maps").is_visible()
 
 
 def test_recording_is_saved_and_synchronized_with_rerun(open_page: Any, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@
 
 import { element, html } from './dom.js';
 import { bindKeys } from './keys.js';
+import { bindMaximise, toggleMaximised } from './maximise.js';
 
 /** @param {Page} page */
 export function bindControls(page) {
@@ -52,9 +53,11 @@ export function bindControls(page) {
     m: () => page.maps.togglePin(),
     p: () => page.maps.switchQuantity(),
     s: () => page.save(),
+    x: toggleMaximised,
     '?': showHelp,
   });
   bindButtons(page, showHelp);
+  bindMaximise();
 }
 
 /**

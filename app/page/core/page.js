@@ -223,8 +223,6 @@ export class Page {
         stats.drawn = { step };
         if (inputTime) addLatency(stats.scene, performance.now() - inputTime);
       },
-      moved: (step) =>
-        this.#store.set({ step: this.#clamp(step), playing: false }, { origin: 'scene' }),
       error: (line) => this.#messages.show('cursor', line),
       connection: (problem) => {
         this.#messages.show('connection', problem ?? '');

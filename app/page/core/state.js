@@ -136,7 +136,7 @@ const HISTORY_KEYS = [
 ];
 const LINK_DELAY = 250; // ms; browsers limit how often a page may change its address
 
-/** @typedef {'page' | 'scene' | 'rerun' | 'clock' | 'live'} Origin of a change of the step */
+/** @typedef {'page' | 'rerun' | 'clock' | 'live'} Origin of a change of the step */
 /** @typedef {(state: State, changed: Set<string>) => void} Listener */
 
 /** Holds the state and notifies listeners of changes once per frame. */

@@ -19,7 +19,6 @@ import { openView } from './api.js';
  * @property {(maps: Maps, inputTime: number | null) => void} maps
  * @property {(step: number, size: number | undefined) => void} noMaps the filter has no maps
  * @property {(step: number, cause: Cause) => void} drawn the 3D scene shows the step
- * @property {(step: number) => void} moved the step was changed in the 3D scene
  * @property {(line: string) => void} error
  * @property {(problem: string | null) => void} connection
  */
@@ -234,7 +233,6 @@ export class ViewSocket {
   /** @param {{type: string, serial: number, step: number, error: string}} message */
   #receive({ type, serial, step, error }) {
     const cause = this.#sent.get(serial) ?? {};
-    if (type === 'cursor') this.#handlers.moved(step);
     if (type === 'no_maps') {
       this.#handlers.noMaps(step, cause.size);
       this.#answered(serial);

@@ -168,7 +168,7 @@ def test_scene_shows_comparison_run(server: TestClient) -> None:
     other = other_run.trace
     assert store.cached(selection.comparison("filter=crossmodal-pf")) is other_run
     assert store.cached(selection.comparison("from=1&to=3&weights=image=0.123")) is None
-    scene = Scene(lambda step: None, dark=False)
+    scene = Scene(dark=False)
     try:
         scene.show(run, 45, other)
         nodes = scene.viser.server.scene._handle_from_node_name

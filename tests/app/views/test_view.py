@@ -1,11 +1,10 @@
-"""Socket of a view: maps and scene updates for cursors, skipped cursors, the scene's slider, invalid messages."""
+"""Socket of a view: maps and scene updates for cursors, skipped cursors, invalid messages."""
 
 from __future__ import annotations
 
 import json
 import threading
 from collections.abc import Iterator
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -184,26 +183,6 @@ def test_internal_errors_are_reported(socket: WebSocketTestSession, monkeypatch:
     assert answer == {"type": "error", "serial": 4, "error": "The server failed: division by zero"}
     socket.send_json(cursor(serial=5))
     assert maps(socket)[0]["serial"] == 5
-
-
-def test_the_slider_moves_the_cursor(client: TestClient, trace_url: str) -> None:
-    views = client.app.state.views  # type: ignore[attr-defined]
-    view = client.post("/api/views", json={"dark": True}).json()
-    with client.websocket_connect(view["socket"]) as socket:
-        socket.send_json(cursor(step=7))
-        maps(socket)
-        assert socket.receive_json()["type"] == "drawn"
-        scene = views[view["view"]].scene
-        assert scene._slider.value == 7  # moved by the server, so no message follows
-        scene._slider_updated(SimpleNamespace(client_id=0, target=SimpleNamespace(value=12)))
-        assert socket.receive_json() == {"type": "cursor", "step": 12, "origin": "scene"}
-        scene._slider_updated(SimpleNamespace(client_id=0, target=SimpleNamespace(value=13)))
-        assert socket.receive_json()["step"] == 13
-        # A delayed cursor of the page does not move the slider back.
-        socket.send_json(cursor(serial=2, step=12))
-        maps(socket)
-        assert socket.receive_json()["type"] == "drawn"
-        assert scene._slider.value == 7
 
 
 def test_unknown_views_are_rejected(client: TestClient) -> None:

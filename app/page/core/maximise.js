@@ -1,0 +1,60 @@
+/** Maximises a panel: it fills the page below the header until Escape, its button or a double click on its bar. */
+
+import { create, html } from './dom.js';
+
+const NAMES = { maximise: 'Maximise', restore: 'Restore' };
+
+/** Adds the buttons to the bars of all panels. */
+export function bindMaximise() {
+  for (const panel of panels()) {
+    const bar = html('.bar', panel);
+    const button = create('button', { type: 'button', className: 'text quiet maximise' });
+    button.addEventListener('click', () => toggle(panel));
+    bar.append(button);
+    bar.addEventListener('dblclick', ({ target }) => {
+      const isControl =
+        target instanceof Element && target.closest('button, select, input, label, a');
+      if (!isControl) toggle(panel);
+    });
+    label(panel);
+  }
+  document.addEventListener('keydown', (event) => {
+    const panel = document.querySelector('.panel.maximised');
+    if (event.key !== 'Escape' || event.defaultPrevented || !(panel instanceof HTMLElement)) return;
+    if (!document.querySelector('dialog[open], :popover-open')) toggle(panel);
+  });
+}
+
+/** Toggles the panel below the pointer, the one with the focus, or the first one. */
+export function toggleMaximised() {
+  const shown = document.querySelector('.panel.maximised');
+  const chosen =
+    shown ?? document.querySelector('.panel:hover') ?? document.activeElement?.closest('.panel');
+  toggle(chosen instanceof HTMLElement ? chosen : panels()[0]);
+}
+
+/** @returns {HTMLElement[]} */
+const panels = () =>
+  [...document.querySelectorAll('main > .panel, body > .panel')].filter(
+    (panel) => panel instanceof HTMLElement,
+  );
+
+/** @param {HTMLElement} panel */
+function toggle(panel) {
+  const isMaximised = panel.classList.toggle('maximised');
+  document.body.classList.toggle('maximised', isMaximised);
+  for (const other of panels()) {
+    if (other !== panel) other.classList.remove('maximised');
+    other.inert = isMaximised && other !== panel;
+    label(other);
+  }
+}
+
+/** @param {HTMLElement} panel */
+function label(panel) {
+  const name = panel.classList.contains('maximised') ? NAMES.restore : NAMES.maximise;
+  const button = html('.maximise', panel);
+  button.textContent = panel.classList.contains('maximised') ? '⤡' : '⤢';
+  button.ariaLabel = `${name}: ${panel.ariaLabel}`;
+  button.title = `${name} (x)`;
+}
