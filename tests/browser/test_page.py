@@ -262,8 +262,8 @@ def test_panels_are_maximised_and_restored(open_page: Any) -> None:
     page.page.keyboard.press("Escape")
     page.until(f"() => ({side})() < {1.1 * before}")
     assert page.page.locator("#timeline").is_visible()
-    page.page.locator("#timeline .bar h2").dblclick()
-    assert page.page.locator("#timeline .maximise").get_attribute("aria-label") == "Restore: Timeline"
+    page.page.locator("#step-summary").dblclick()
+    assert page.page.locator("#step .maximise").get_attribute("aria-label") == "Restore: Current step"
     page.page.keyboard.press("x")
     assert page.page.locator("#maps").is_visible()
 
