@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,11 +31,18 @@ class McapLog:
     timeline: str = ""
 
     def __post_init__(self) -> None:
+        from mcap.exceptions import McapError
         from mcap.reader import make_reader
 
-        summary = make_reader(self.stream).get_summary()
+        try:
+            summary = make_reader(self.stream).get_summary()
+        except (McapError, struct.error) as error:
+            reason = str(error)[:100] or type(error).__name__
+            raise BadInput(
+                f"not a complete MCAP file ({reason:.100}); `mcap recover` repairs a truncated one"
+            ) from None
         if summary is None or not summary.channels:
-            raise BadInput("the file has no summary of its topics; 'mcap recover' writes one with it")
+            raise BadInput("the file has no summary of its topics; `mcap recover` adds it")
         self.topics = tuple(sorted({channel.topic for channel in summary.channels.values()}))
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
