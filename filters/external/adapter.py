@@ -123,6 +123,7 @@ class Units:
         self.inverse = [names.index(name) for name in components]
         self.mean = torch.tensor(adapter.mean or [0.0] * len(names), dtype=torch.float64)[self.order]
         self.std = torch.tensor(adapter.std or [1.0] * len(names), dtype=torch.float64)[self.order]
+        self._same = not adapter.mean and not adapter.std and components == tuple(names)
 
     def from_si(self, belief: Gaussian, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Mean (N, n) and covariance (N, n, n) of a belief in SI units, in the module's units."""
@@ -137,6 +138,8 @@ class Units:
     def _convert(self, name: str, value: Tensor) -> Tensor:
         if name == "ancestors":
             return value.int()
+        if self._same:
+            return value.float()
         value, letters = value.double(), letters_of(name)
         if letters.endswith("nn"):
             value = value[..., self.order, :][..., self.order] * self.std * self.std[:, None]
@@ -241,10 +244,17 @@ def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], 
             raise BadInput(f"{source} returns {name} of shape {shape}, expected ({text})")
         sizes |= dict(zip(letters, shape[len(leading) :], strict=True))
         may_be_infinite, may_be_nan = name.startswith(("log_", "prior_")), name in MEASUREMENTS
+        if _is_finite(value):
+            continue
         if (not may_be_nan and value.isnan().any()) or (not may_be_infinite and value.isinf().any()):
             raise BadInput(f"{source} returns {name} with a number that is not finite")
     sizes.pop("m", None)  # the number of channels may change between steps
     return values
+
+
+def _is_finite(value: Tensor) -> bool:
+    """Whether all numbers are certainly finite: their sum is, which is cheap to compute."""
+    return not value.is_floating_point() or bool(value.sum().isfinite())
 
 
 def derived(values: Values) -> Values:

@@ -117,8 +117,8 @@ class Capture:
             return {}  # called in chunks, or with other states than the particles
         values = {
             "particles": states,
-            "prior_log_weights": torch.log_softmax(prior, dim=-1),
-            "log_weights": torch.log_softmax(prior + fused, dim=-1),
+            "prior_log_weights": prior,  # ``adapter.derived`` normalises both
+            "log_weights": prior + fused,
         }
         models = _modules(model, "measurement_models") or [model]
         outputs = {k: self._calls[part].output for k, part in enumerate(models) if part in self._calls}
@@ -248,14 +248,48 @@ def _copy(value: Any) -> Any:
 def _first_equal(after: Tensor, before: Tensor) -> Tensor:
     """(N, M after): index of the first of the rows ``before`` (N, M, n) that equals each row of ``after``.
 
-    M where there is none. Sorts the rows: O(N M log(N M)) comparisons.
+    M where there is none.
     """
-    n, count = before.shape[:2]
-    rows = torch.cat([before, after], dim=1)
-    owner = torch.arange(n, dtype=rows.dtype).reshape(n, 1, 1).expand(n, rows.shape[1], 1)
-    _, group = torch.unique(torch.cat([owner, rows], dim=-1).flatten(0, 1), dim=0, return_inverse=True)
-    group = group.reshape(n, -1)
-    first = torch.full((int(group.max()) + 1,), count)
-    index = torch.arange(count).expand(n, count)
-    first.scatter_reduce_(0, group[:, :count].flatten(), index.flatten(), "amin")
-    return first[group[:, count:]]
+    return torch.stack([_matches(a, b) for a, b in zip(after, before, strict=True)])
+
+
+def _matches(after: Tensor, before: Tensor) -> Tensor:
+    """As ``_first_equal``, of one trajectory: rows are found in a table by a hash of their bits, and then compared.
+
+    Rows that share an entry with another row are left to the next table, with another hash.
+    """
+    result = torch.full((len(after),), len(before))
+    rows, wanted = torch.arange(len(before)), torch.arange(len(after))
+    salt = 0
+    while len(rows) and len(wanted):
+        salt += 1
+        bits, index = (SLOTS * len(rows)).bit_length(), torch.arange(len(rows))
+        stored, sought = before[rows], after[wanted]
+        slots = _row_hashes(stored, bits, salt)
+        table = torch.full((2**bits,), len(rows)).scatter_reduce_(0, slots, index, "amin")
+        entry = table[_row_hashes(sought, bits, salt)]
+        found = entry < len(rows)
+        found &= (stored[entry.clamp_max(len(rows) - 1)] == sought).all(-1)
+        result[wanted[found]] = rows[entry[found]]
+        first = table[slots]
+        hidden = first != index
+        hidden[hidden.clone()] = (stored[first[hidden]] != stored[hidden]).any(-1)
+        rows, wanted = rows[hidden], wanted[~found]
+    return result
+
+
+SLOTS = 8
+"""Smallest number of entries of the table by row."""
+
+HASH = 0x9E3779B97F4A7C15 - 2**64
+"""Odd multiplier of the hash, as a signed integer: 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4)."""
+
+
+def _row_hashes(rows: Tensor, bits: int, salt: int) -> Tensor:
+    """(M,) hashes of that many bits of rows (M, n); equal rows have equal hashes, also with 0.0 and -0.0."""
+    words = (rows + 0.0).view(torch.int64 if rows.dtype == torch.float64 else torch.int32)
+    result = torch.full((len(rows),), salt)
+    for column in words.unbind(-1):
+        result = (result ^ column).mul_(HASH)
+        result ^= result >> 32
+    return (result * HASH >> (64 - bits)).add_(2 ** (bits - 1))

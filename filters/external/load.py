@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -369,6 +370,7 @@ def _inputs(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tupl
     return {k: v if v.dtype == torch.uint8 else v.to(dtype) for k, v in observations.items()}, controls
 
 
+@lru_cache(maxsize=16)
 def _state_std(task: Task) -> Tensor:
     """(n,) m and rad: standard deviations of the pretrained filters' training states; NaN if there are none."""
     for name in filters_of(task):
