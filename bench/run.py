@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 
 import collect
+import external
 import filters
 import finetune
 import live
@@ -21,6 +22,7 @@ import subject
 PARTS = {
     "collect": collect.measure,
     "filters": filters.measure,
+    "external": external.measure,
     "finetune": finetune.measure,
     "maps": maps.measure,
     "loading": loading.measure,

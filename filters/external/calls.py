@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,7 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task
+from beliefscope.filters.batch import check_shapes
 from beliefscope.filters.external.adapter import Adapter
 
 CPU = torch.device("cpu")
@@ -46,12 +49,14 @@ def dtype_of(filter_: Any) -> torch.dtype:
     return next(types, torch.float32)
 
 
-def call(adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor) -> Any:
-    """The filter's output for inputs on the CPU, (N, ...) or (T, N, ...), in the types that it takes."""
+def call(adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor, device: torch.device) -> Any:
+    """The filter's output for inputs on the CPU, (N, ...) or (T, N, ...), in the types that it takes.
+
+    device: of the filter (``device_of``).
+    """
     filter_ = adapter.module
-    inputs = adapter.inputs(
-        {key: _argument(filter_, value) for key, value in observations.items()}, _argument(filter_, controls)
-    )
+    converted = {key: _argument(filter_, value, device) for key, value in observations.items()}
+    inputs = adapter.inputs(converted, _argument(filter_, controls, device))
     return _function(filter_)(observations=inputs[0], controls=inputs[1])
 
 
@@ -59,7 +64,21 @@ def initialize(filter_: Any, mean: Tensor, covariance: Tensor) -> Any:
     """Starts the filter at a belief (N, n), (N, n, n), or at its own; returns the result of ``initialize_beliefs``."""
     if has_own_start(filter_):
         return filter_.initialize_beliefs()
-    return filter_.initialize_beliefs(mean=_argument(filter_, mean), covariance=_argument(filter_, covariance))
+    device = device_of(filter_)
+    arguments = {"mean": mean, "covariance": covariance}
+    return filter_.initialize_beliefs(**{name: _argument(filter_, v, device) for name, v in arguments.items()})
+
+
+def inputs_of(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tuple[dict[str, Tensor], Tensor]:
+    """Observations (T, N, ...) by key, images as uint8; controls (T, N, c)."""
+    for number, episode in enumerate(episodes):
+        check_shapes(task, episode, f"episode {number}")
+    observations = {
+        key: torch.from_numpy(np.stack([episode.observations[key] for episode in episodes], axis=1))
+        for key in task.observations
+    }
+    controls = torch.from_numpy(np.stack([episode.controls for episode in episodes], axis=1)).to(dtype)
+    return {k: v if v.dtype == torch.uint8 else v.to(dtype) for k, v in observations.items()}, controls
 
 
 def _function(filter_: Any) -> Any:
@@ -67,8 +86,8 @@ def _function(filter_: Any) -> Any:
     return filter_ if isinstance(filter_, nn.Module) else getattr(filter_, "forward", filter_)
 
 
-def _argument(filter_: Any, value: Tensor) -> Any:
-    return value.to(device_of(filter_)) if isinstance(filter_, nn.Module) else value.numpy()
+def _argument(filter_: Any, value: Tensor, device: torch.device) -> Any:
+    return value.to(device) if isinstance(filter_, nn.Module) else value.numpy()
 
 
 def _tensors(filter_: Any) -> Iterator[Tensor]:

@@ -259,37 +259,47 @@ def _matches(after: Tensor, before: Tensor) -> Tensor:
     Rows that share an entry with another row are left to the next table, with another hash.
     """
     result = torch.full((len(after),), len(before))
-    rows, wanted = torch.arange(len(before)), torch.arange(len(after))
+    rows, wanted, stored, sought = torch.arange(len(before)), torch.arange(len(after)), before, after
     salt = 0
     while len(rows) and len(wanted):
         salt += 1
         bits, index = (SLOTS * len(rows)).bit_length(), torch.arange(len(rows))
-        stored, sought = before[rows], after[wanted]
         slots = _row_hashes(stored, bits, salt)
         table = torch.full((2**bits,), len(rows)).scatter_reduce_(0, slots, index, "amin")
-        entry = table[_row_hashes(sought, bits, salt)]
-        found = entry < len(rows)
-        found &= (stored[entry.clamp_max(len(rows) - 1)] == sought).all(-1)
-        result[wanted[found]] = rows[entry[found]]
-        first = table[slots]
-        hidden = first != index
-        hidden[hidden.clone()] = (stored[first[hidden]] != stored[hidden]).any(-1)
-        rows, wanted = rows[hidden], wanted[~found]
+        entry = table.index_select(0, _row_hashes(sought, bits, salt))
+        candidate = entry.clamp(max=len(rows) - 1)
+        found = (entry < len(rows)) & _equal_rows(stored.index_select(0, candidate), sought)
+        result[wanted] = torch.where(found, rows.index_select(0, candidate), len(before))
+        first = table.index_select(0, slots)
+        hidden = (first != index).nonzero().flatten()
+        behind = _equal_rows(stored.index_select(0, first.index_select(0, hidden)), stored.index_select(0, hidden))
+        hidden, missing = hidden[~behind], (~found).nonzero().flatten()
+        rows, stored = rows.index_select(0, hidden), stored.index_select(0, hidden)
+        wanted, sought = wanted.index_select(0, missing), sought.index_select(0, missing)
+    return result
+
+
+def _equal_rows(a: Tensor, b: Tensor) -> Tensor:
+    """(M,): whether rows (M, n) are equal."""
+    result = a[:, 0] == b[:, 0]
+    for x, y in zip(a.unbind(1)[1:], b.unbind(1)[1:], strict=True):
+        result &= x == y
     return result
 
 
 SLOTS = 8
 """Smallest number of entries of the table by row."""
 
-HASH = 0x9E3779B97F4A7C15 - 2**64
-"""Odd multiplier of the hash, as a signed integer: 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4)."""
+HASH = 0x9E3779B97F4A7C15
+"""Odd multiplier of the hash: 2^64 over the golden ratio (Knuth, TAOCP 3, 6.4)."""
 
 
 def _row_hashes(rows: Tensor, bits: int, salt: int) -> Tensor:
     """(M,) hashes of that many bits of rows (M, n); equal rows have equal hashes, also with 0.0 and -0.0."""
     words = (rows + 0.0).view(torch.int64 if rows.dtype == torch.float64 else torch.int32)
-    result = torch.full((len(rows),), salt)
-    for column in words.unbind(-1):
-        result = (result ^ column).mul_(HASH)
-        result ^= result >> 32
-    return (result * HASH >> (64 - bits)).add_(2 ** (bits - 1))
+    factors = torch.tensor([_signed(pow(HASH, salt + i, 2**64)) for i in range(rows.shape[1])])
+    return ((words * factors).sum(-1) >> (64 - bits)).add_(2 ** (bits - 1))
+
+
+def _signed(value: int) -> int:
+    return value - 2**64 if value >= 2**63 else value

@@ -31,7 +31,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io import user_code
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
-from beliefscope.filters.batch import check_shapes, start_offset
+from beliefscope.filters.batch import start_offset
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -47,9 +47,11 @@ from beliefscope.filters.external.adapter import (
 )
 from beliefscope.filters.external.calls import (
     call,
+    device_of,
     dtype_of,
     has_own_start,
     initialize,
+    inputs_of,
     is_stepwise,
     restore,
     seeded,
@@ -174,7 +176,7 @@ class ExternalFilter(Checkpoint):
         self, episodes: Sequence[Episode], seed: int, progress: Callable[[float], None], start: Gaussian
     ) -> tuple[Values, tuple[int, ...]]:
         """One call of a filter of whole sequences, or T calls; values (T, N, ...) in the filter's units."""
-        observations, controls = _inputs(self._task, episodes, dtype_of(self.adapter.module))
+        observations, controls = inputs_of(self._task, episodes, dtype_of(self.adapter.module))
         models: tuple[int, ...] = ()
         with torch.no_grad(), seeded(seed, self.adapter.module):
             if not is_stepwise(self.adapter.module):
@@ -182,10 +184,29 @@ class ExternalFilter(Checkpoint):
                 progress(1.0)
                 return values, models
             steps: list[Values] = []
-            for values, models in self._steps(observations, controls, start):  # noqa: B007
-                steps.append(values)
-                progress(len(steps) / len(controls))
-            return stacked(steps), models
+            try:
+                for values, models in self._steps(observations, controls, start):  # noqa: B007
+                    steps.append(values)
+                    progress(len(steps) / len(controls))
+            except BadInput:
+                self._check_steps(steps, len(episodes))  # an invalid value is the likely cause
+                raise
+            return self._stacked(steps, len(episodes)), models
+
+    def _stacked(self, steps: list[Values], count: int) -> Values:
+        """Values of all steps; checked at once, and step by step only if one of them is invalid."""
+        sizes = {"n": len(self._task.components)}
+        try:
+            return check_values(stacked(steps), (len(steps), count), sizes, f"{self.source} over all steps")
+        except (BadInput, RuntimeError):  # torch.stack refuses different shapes
+            self._check_steps(steps, count)
+            raise
+
+    def _check_steps(self, steps: Sequence[Values], count: int) -> None:
+        """Raises BadInput that names the first step with an invalid value."""
+        sizes = {"n": len(self._task.components)}
+        for t, values in enumerate(steps):
+            check_values(values, (count,), sizes, f"{self.source} at step {t}")
 
     def live(self, episode: Episode, seed: int = 0) -> Iterator[tuple[Values, tuple[str, ...]]]:
         """Like ``run`` for one episode, as an iterator over steps: (N, ...) with N = 1, and the models' names.
@@ -196,9 +217,11 @@ class ExternalFilter(Checkpoint):
             raise BadInput(
                 f"{self.source} has no initialize_beliefs: it processes all steps at once, and cannot run live"
             )
-        observations, controls = _inputs(self._task, [episode], dtype_of(self.adapter.module))
+        observations, controls = inputs_of(self._task, [episode], dtype_of(self.adapter.module))
         with torch.no_grad(), seeded(seed, self.adapter.module):
-            for step, models in self._steps(observations, controls, self.start([episode])):
+            sizes = {"n": len(self._task.components)}
+            for t, (step, models) in enumerate(self._steps(observations, controls, self.start([episode]))):
+                check_values(step, (1,), sizes, f"{self.source} at step {t}")
                 yield self._units.to_si(step), self._names({n: v[None] for n, v in step.items()}, models)
 
     def snapshot(self) -> Any:
@@ -212,18 +235,18 @@ class ExternalFilter(Checkpoint):
     def _steps(
         self, observations: Mapping[str, Tensor], controls: Tensor, start: Gaussian
     ) -> Iterator[tuple[Values, tuple[int, ...]]]:
-        """The values of each step, in the module's units, and the indices of the measurement models that took part."""
+        """The unchecked values of each step, in the filter's units, and the indices of the participating models."""
         self._initialize(start)
-        sizes: dict[str, int] = {"n": len(self._task.components)}
         filter_ = self.adapter.module
         recorded = filter_ if isinstance(filter_, nn.Module) and self.adapter.batched else None
+        device = device_of(filter_)
         with Capture(recorded) as capture:
             for t in range(len(controls)):
                 with self._errors_at(f"step {t}"):
                     inputs = {key: value[t] for key, value in observations.items()}
-                    output = self._call(inputs, controls[t], self.source)
+                    output = self._call(inputs, controls[t], device)
                     values = capture.step(output["estimate_mean"]) | output
-                yield check_values(values, controls.shape[1:2], sizes, f"{self.source} at step {t}"), capture.models
+                yield values, capture.models
 
     def _initialize(self, start: Gaussian) -> None:
         filter_ = self.adapter.module
@@ -242,18 +265,18 @@ class ExternalFilter(Checkpoint):
         with self._errors_at("initialize_beliefs"):
             initialize(filter_, mean, covariance)
 
-    def _call(self, observations: Mapping[str, Tensor], controls: Tensor, source: str) -> Values:
+    def _call(self, observations: Mapping[str, Tensor], controls: Tensor, device: torch.device) -> Values:
         """The filter's output by name, with the axis N, for inputs whose axis N is the last but one of the controls."""
         if self.adapter.batched:
-            return named_values(call(self.adapter, observations, controls), source)
+            return named_values(call(self.adapter, observations, controls, device), self.source)
         axis = controls.ndim - 2
         single = {key: value.select(axis, 0) for key, value in observations.items()}
-        values = named_values(call(self.adapter, single, controls.select(axis, 0)), source)
+        values = named_values(call(self.adapter, single, controls.select(axis, 0), device), self.source)
         return {name: value.unsqueeze(axis) for name, value in values.items()}
 
     def _at_once(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
         with self._errors_at("all steps"):
-            output = self._call(observations, controls, self.source)
+            output = self._call(observations, controls, device_of(self.adapter.module))
         return check_values(
             output, controls.shape[:2], {"n": len(self._task.components)}, f"{self.source} over all steps"
         )
@@ -356,18 +379,6 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
         raise BadInput(f"{source} does not name its task: give it an attribute task, or use --task")
     name = f"{Path(place).stem}-{attribute}" if place.endswith(".py") else source.replace(":", "-")
     return ExternalFilter(adapter, loaded, name, source)
-
-
-def _inputs(task: Task, episodes: Sequence[Episode], dtype: torch.dtype) -> tuple[dict[str, Tensor], Tensor]:
-    """Observations (T, N, ...) by key, images as uint8; controls (T, N, c)."""
-    for number, episode in enumerate(episodes):
-        check_shapes(task, episode, f"episode {number}")
-    observations = {
-        key: torch.from_numpy(np.stack([episode.observations[key] for episode in episodes], axis=1))
-        for key in task.observations
-    }
-    controls = torch.from_numpy(np.stack([episode.controls for episode in episodes], axis=1)).to(dtype)
-    return {k: v if v.dtype == torch.uint8 else v.to(dtype) for k, v in observations.items()}, controls
 
 
 @lru_cache(maxsize=16)
