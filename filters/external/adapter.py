@@ -252,6 +252,14 @@ def check_values(values: Values, leading: Sequence[int], sizes: dict[str, int], 
     return values
 
 
+def _posterior_is_of_one_model(values: Values) -> bool:
+    """Whether the posterior weights are the prior ones times the likelihood of the only model, bit for bit."""
+    likelihood = values["log_likelihood"]
+    if likelihood.shape[-2] != 1:
+        return False
+    return torch.equal(values["log_weights"], values["prior_log_weights"] + likelihood.squeeze(-2))
+
+
 def _is_finite(value: Tensor) -> bool:
     """Whether all numbers are certainly finite: their sum is, which is cheap to compute."""
     return not value.is_floating_point() or bool(value.sum().isfinite())
@@ -262,12 +270,18 @@ def derived(values: Values) -> Values:
     particles = values.get("particles")
     if particles is None:
         return values
+    has_likelihood = {"log_likelihood", "prior_log_weights"} <= values.keys()
+    one = has_likelihood and _posterior_is_of_one_model(values)
     for name in ("log_weights", "prior_log_weights"):
         if name in values:
             values[name] = torch.log_softmax(values[name], dim=-1)
-    if "estimate_covariance" not in values:
-        values["estimate_covariance"] = moments(particles, values["log_weights"]).covariance
-    if {"log_likelihood", "prior_log_weights"} <= values.keys() and "modality_mean" not in values:
+    posterior = moments(particles, values["log_weights"]) if one or "estimate_covariance" not in values else None
+    if posterior is not None:
+        values.setdefault("estimate_covariance", posterior.covariance)
+    if posterior is not None and one:
+        values.setdefault("modality_mean", posterior.mean.unsqueeze(-2))
+        values.setdefault("modality_covariance", posterior.covariance.unsqueeze(-3))
+    elif has_likelihood and "modality_mean" not in values:
         log_weights = torch.log_softmax(values["prior_log_weights"].unsqueeze(-2) + values["log_likelihood"], dim=-1)
         posterior = moments(particles.unsqueeze(-3), log_weights)
         values["modality_mean"], values["modality_covariance"] = posterior.mean, posterior.covariance
