@@ -13,6 +13,7 @@ from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.likelihood import has_likelihood, log_likelihood
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.fusion import mixture
 from beliefscope.filters.models.pf import MixtureParticleFilter
@@ -68,7 +69,8 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quanti
     if trace is not None and (only := trace.settings.get("standalone")):
         return f"a standalone run of {only} {subject}: those of the run with all modalities include {only}"
     if isinstance(checkpoint, ExternalFilter):
-        reasons = [_no_density(trace, each) for each in ((quantity,) if quantity else QUANTITIES)]
+        wanted = (quantity,) if quantity else QUANTITIES
+        reasons = [_no_density(checkpoint, trace, each) for each in wanted]
         if None not in reasons:
             return f"filter {checkpoint.name!r} {subject}: {reasons[-1]}"
     elif not checkpoint.filter.has_covariance:
@@ -85,10 +87,12 @@ def missing_quantities(checkpoint: Checkpoint, trace: Trace) -> dict[Quantity, s
     return {quantity: reason for quantity, reason in reasons.items() if reason is not None}
 
 
-def _no_density(trace: Trace | None, quantity: Quantity) -> str | None:
+def _no_density(checkpoint: ExternalFilter, trace: Trace | None, quantity: Quantity) -> str | None:
     """Reason why an external filter has no density of a quantity, from Gaussians or particles; None if it has."""
     if trace is None or not trace.has_covariance:
         return "it reports no covariance"
+    if quantity == "likelihood" and has_likelihood(checkpoint):
+        return None
     if quantity == "likelihood":
         if trace.observation_mean is None or trace.observation_covariance is None:
             if trace.particles is not None:
@@ -124,6 +128,7 @@ class MapEngine:
         self.task = checkpoint.task
         self.evidence = self._encode()
         self._grid = self._grid_evaluator()
+        self._calls_models = has_likelihood(checkpoint)
         self._planes: dict[tuple[str, ...], Plane] = {}
         self._anchors = trace.anchors
         missing = missing_quantities(checkpoint, trace)
@@ -154,7 +159,7 @@ class MapEngine:
 
     def no_others(self, quantity: Quantity, others: Others) -> str | None:
         """Reason why components off the map cannot be treated this way for a quantity; None if they can."""
-        if others == "marginal" and quantity == "likelihood" and self.evidence is not None:
+        if others == "marginal" and quantity == "likelihood" and (self.evidence is not None or self._calls_models):
             return "the likelihood of a particle filter cannot be integrated over components: choose the posterior"
         return None
 
@@ -239,6 +244,8 @@ class MapEngine:
         """The method that evaluates a quantity: networks, kernel densities of particles, or Gaussians."""
         if self.evidence is not None and others == "fixed":
             return self._networks
+        if quantity == "likelihood" and self._calls_models:
+            return self._measurement_models
         if quantity == "posterior" and has_layer_weights(self.trace):
             return self._kernel_densities
         return self._gaussians
@@ -281,6 +288,20 @@ class MapEngine:
             log_prior = density.log_density(middle, plane.components, x, y).astype(np.float32)
             values = values - evidence_ + torch.from_numpy(log_prior).flatten()
         return values.unflatten(1, (size, size)).numpy()
+
+    def _measurement_models(
+        self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others
+    ) -> Array:
+        """(K + 1, S, S) log-likelihoods of an external filter's own models, called for all cells at once."""
+        assert isinstance(self.checkpoint, ExternalFilter)
+        ix, iy = plane.components
+        x, y = (_offsets(half, size) for half in plane.half_widths)
+        states = np.tile(middle, (size, size, 1))
+        states[..., ix] += x
+        states[..., iy] += y[:, None]
+        cells, count = states.reshape(-1, states.shape[-1]).astype(np.float32), len(self.trace.modalities)
+        values = log_likelihood(self.checkpoint, self.trace.episode, step, cells, count)
+        return values.reshape(-1, size, size)
 
     def _kernel_densities(
         self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others

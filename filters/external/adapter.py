@@ -75,6 +75,8 @@ class Adapter:
         modalities: names of its K measurement models, in order.
         task: its task, by name, ``path/to/file.py:NAME`` or definition; needed by a server if not given elsewhere.
         batched: whether it filters N trajectories at once. Otherwise it runs once per trajectory, without the axis N.
+        log_likelihood: states (C, n) in its units and the inputs of one step, with N = 1 -> (K, C) log-likelihoods of
+            its measurement models, or (K + 1, C) with the fused one last; enables likelihood maps.
         absent: reading of a sensor that an ablation removes: ``mean`` over the episode, or ``nan`` for a filter that
             skips such readings (an image is black).
     """
@@ -88,6 +90,7 @@ class Adapter:
     task: str | Task = ""
     batched: bool = True
     absent: Literal["mean", "nan"] = "mean"
+    log_likelihood: Callable[[Any, Any], Any] | None = None
 
 
 def letters_of(name: str) -> str:
@@ -130,6 +133,10 @@ class Units:
         mean = (belief.mean.double() - self.mean) / self.std
         covariance = belief.covariance.double() / self.std / self.std[:, None]
         return mean[:, self.inverse].to(dtype), covariance[:, self.inverse][:, :, self.inverse].contiguous().to(dtype)
+
+    def states_from_si(self, states: Tensor, dtype: torch.dtype) -> Tensor:
+        """States (C, n) in SI units, in the module's units."""
+        return ((states.double() - self.mean) / self.std)[:, self.inverse].to(dtype)
 
     def to_si(self, values: Values) -> Values:
         """The module's units -> SI; all but indices as float32."""

@@ -60,6 +60,17 @@ def call(adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor,
     return _function(filter_)(observations=inputs[0], controls=inputs[1])
 
 
+def arguments(
+    adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor, states: Tensor
+) -> tuple[Any, Any]:
+    """The filter's observations, and states (C, n) in its units, in the types that it takes."""
+    filter_ = adapter.module
+    inputs = adapter.inputs(
+        {key: _argument(filter_, value) for key, value in observations.items()}, _argument(filter_, controls)
+    )
+    return inputs[0], _argument(filter_, states)
+
+
 def initialize(filter_: Any, mean: Tensor, covariance: Tensor) -> Any:
     """Starts the filter at a belief (N, n), (N, n, n), or at its own; returns the result of ``initialize_beliefs``."""
     if has_own_start(filter_):
@@ -167,3 +178,13 @@ def _shared(filter_: Any) -> dict[int, Any]:
 
 def _values(filter_: Any) -> list[Any]:
     return list(vars(filter_).values()) if hasattr(filter_, "__dict__") else []
+
+
+def step_inputs(
+    task: Task, adapter: Adapter, episode: Episode, step: int, dtype: torch.dtype
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Observations (1, ...) by key and controls (1, c) of a step; without the axis N if the filter takes none."""
+    index = slice(step, step + 1) if adapter.batched else step
+    observations = {key: torch.as_tensor(episode.observations[key][index]) for key in task.observations}
+    typed = {key: v if v.dtype == torch.uint8 else v.to(dtype) for key, v in observations.items()}
+    return typed, torch.as_tensor(episode.controls[index]).to(dtype)

@@ -224,6 +224,10 @@ class ExternalFilter(Checkpoint):
                 check_values(step, (1,), sizes, f"{self.source} at step {t}")
                 yield self._units.to_si(step), self._names({n: v[None] for n, v in step.items()}, models)
 
+    def own_states(self, states: Tensor, dtype: torch.dtype) -> Tensor:
+        """States (C, n) in SI units, in the filter's own."""
+        return self._units.states_from_si(states, dtype)
+
     def snapshot(self) -> Any:
         """The filter's state, for ``restore``. Raises BadInput if it can be neither returned nor copied."""
         return snapshot(self.adapter.module, self.source)

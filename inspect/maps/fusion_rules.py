@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.likelihood import has_likelihood
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.fusion import product_of_experts
@@ -21,6 +22,8 @@ def fusion_rule(checkpoint: Checkpoint, modalities: tuple[str, ...], quantity: Q
     if len(modalities) == 1:
         return f"{quantity} of the only measurement model"
     if isinstance(checkpoint, ExternalFilter):
+        if quantity == "likelihood" and has_likelihood(checkpoint):
+            return "the filter's own measurement model"
         likelihood = "product of likelihoods (the filter's own rule is unknown)"
         return likelihood if quantity == "likelihood" else "posterior reported by the filter"
     architecture = checkpoint.filter.architecture

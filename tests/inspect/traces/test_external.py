@@ -266,20 +266,6 @@ def test_ancestors_and_effective_weights_of_particles(particles: Trace) -> None:
     np.testing.assert_allclose(particles.effective_weights.sum(1), 1.0, atol=1e-5)
 
 
-def test_posterior_maps_of_particles_are_kernel_densities(particles: Trace) -> None:
-    """Each layer has the mean of the particles with the weights of its posterior."""
-    filter_ = external(particle_filter())
-    assert "its measurement model is known only at its particles" in (no_maps(filter_, particles, "likelihood") or "")
-    wide = replace(particles.episode, task=replace(particles.task, map_half_width=2.0))
-    result = MapEngine(filter_, replace(particles, episode=wide)).map(5, size=200, others="marginal")
-    assert (result.quantity, result.layers) == ("posterior", ("image", "haptics", "fused"))
-    p = np.exp(result.log_likelihood.astype(np.float64))
-    p /= p.sum((1, 2), keepdims=True)
-    means = np.stack([p.sum(1) @ result.offsets_x, p.sum(2) @ result.offsets_y], axis=-1)
-    expected = np.concatenate([particles.modality_mean[5], particles.estimate_mean[5][None]])[:, :2] - result.centre
-    np.testing.assert_allclose(means, expected, atol=0.02)  # m, a cell
-
-
 def test_kalman_filters_provide_prediction_observation_and_weights(episode: Episode) -> None:
     result = trace(external(kalman_filters(), modalities=("camera", "touch")), episode)
     assert result.modalities == result.modalities_with_posterior == ("camera", "touch")
