@@ -54,21 +54,25 @@ def call(adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor,
 
     device: of the filter (``device_of``).
     """
-    filter_ = adapter.module
-    converted = {key: _argument(filter_, value, device) for key, value in observations.items()}
-    inputs = adapter.inputs(converted, _argument(filter_, controls, device))
-    return _function(filter_)(observations=inputs[0], controls=inputs[1])
+    inputs = _inputs(adapter, observations, controls, device)
+    return _function(adapter.module)(observations=inputs[0], controls=inputs[1])
 
 
-def arguments(
+def model_arguments(
     adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor, states: Tensor
 ) -> tuple[Any, Any]:
-    """The filter's observations, and states (C, n) in its units, in the types that it takes."""
+    """States (C, n) in the filter's units, and its observations, in the types that its measurement models take."""
+    device = device_of(adapter.module)
+    inputs = _inputs(adapter, observations, controls, device)
+    return _argument(adapter.module, states, device), inputs[0]
+
+
+def _inputs(
+    adapter: Adapter, observations: Mapping[str, Tensor], controls: Tensor, device: torch.device
+) -> tuple[Any, Any]:
     filter_ = adapter.module
-    inputs = adapter.inputs(
-        {key: _argument(filter_, value) for key, value in observations.items()}, _argument(filter_, controls)
-    )
-    return inputs[0], _argument(filter_, states)
+    converted = {key: _argument(filter_, value, device) for key, value in observations.items()}
+    return adapter.inputs(converted, _argument(filter_, controls, device))
 
 
 def initialize(filter_: Any, mean: Tensor, covariance: Tensor) -> Any:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.calls import CPU, arguments, dtype_of, step_inputs
+from beliefscope.filters.external.calls import CPU, dtype_of, model_arguments, step_inputs
 from beliefscope.filters.external.load import ExternalFilter
 
 
@@ -44,7 +44,7 @@ def log_likelihood(
     own = checkpoint.own_states(torch.from_numpy(states), dtype)
     observations, controls = step_inputs(checkpoint.task, adapter, episode, step, dtype)
     try:
-        inputs, own_states = arguments(adapter, observations, controls, own)
+        own_states, inputs = model_arguments(adapter, observations, controls, own)
         if adapter.log_likelihood is not None:
             values = torch.as_tensor(adapter.log_likelihood(own_states, inputs))
         else:
