@@ -29,8 +29,15 @@ from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import check_shapes
 from beliefscope.filters.belief import Evidence, Gaussian, StepTrace
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.external.adapter import MEASUREMENTS, Values, check_values, derived, named_values, stacked
-from beliefscope.filters.external.load import model_names
+from beliefscope.filters.external.adapter import (
+    MEASUREMENTS,
+    Values,
+    check_values,
+    derived,
+    model_names,
+    named_values,
+    stacked,
+)
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter

@@ -293,3 +293,27 @@ def derived(values: Values) -> Values:
         posterior = moments(particles.unsqueeze(-3), log_weights)
         values["modality_mean"], values["modality_covariance"] = posterior.mean, posterior.covariance
     return values
+
+
+def model_names(
+    values: Values, axis: int, names: Sequence[str], task: Task, models: Sequence[int] = (), source: str = "the filter"
+) -> tuple[str, ...]:
+    """Names of the measurement models: as given, or the task's modalities if there are as many, or numbered.
+
+    A single model of a task with several modalities is never named after one that it may not read.
+
+    Args:
+        axis: of the values that indexes the models. models: indices of the participating models, if not all.
+
+    Raises BadInput if the number of given names does not match.
+    """
+    counts = [values[name].shape[axis] for name, shape in SHAPES.items() if shape[0] == "K" and name in values]
+    count, modalities = max(counts, default=0), tuple(task.modalities)
+    for candidates in (tuple(names), modalities):
+        if count and len(candidates) > count == len(models):
+            return tuple(candidates[k] for k in models)
+        if count and len(candidates) == count:
+            return candidates
+    if names and count:
+        raise BadInput(f"{source} names {len(names)} modalities, {', '.join(names)}, but has {count}")
+    return tuple(f"model-{k + 1}" for k in range(count))

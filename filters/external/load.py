@@ -15,7 +15,7 @@ The contract (examples in ``docs/own_filter.md``):
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -42,6 +42,7 @@ from beliefscope.filters.external.adapter import (
     Values,
     check_values,
     derived,
+    model_names,
     named_values,
     stacked,
 )
@@ -208,7 +209,7 @@ class ExternalFilter(Checkpoint):
         for t, values in enumerate(steps):
             check_values(values, (count,), sizes, f"{self.source} at step {t}")
 
-    def live(self, episode: Episode, seed: int = 0) -> Iterator[tuple[Values, tuple[str, ...]]]:
+    def live(self, episode: Episode, seed: int = 0) -> Generator[tuple[Values, tuple[str, ...]]]:
         """Like ``run`` for one episode, as an iterator over steps: (N, ...) with N = 1, and the models' names.
 
         Raises BadInput as ``run``, and for a filter that processes whole sequences.
@@ -227,6 +228,18 @@ class ExternalFilter(Checkpoint):
     def own_states(self, states: Tensor, dtype: torch.dtype) -> Tensor:
         """States (C, n) in SI units, in the filter's own."""
         return self._units.states_from_si(states, dtype)
+
+    def begin(self, episode: Episode) -> None:
+        """Initialises the filter for an episode. Raises BadInput as ``run``."""
+        with torch.no_grad():
+            self._initialize(self.start([episode]))
+
+    def step(self, observations: Mapping[str, Tensor], controls: Tensor) -> Values:
+        """Returned values of one more step from the filter's state, (N, ...), SI units. Raises BadInput as ``run``."""
+        with torch.no_grad(), self._errors_at("one step"):
+            output = self._call(observations, controls, device_of(self.adapter.module))
+        sizes = {"n": len(self._task.components)}
+        return self._units.to_si(check_values(output, (len(controls),), sizes, self.source))
 
     def snapshot(self) -> Any:
         """The filter's state, for ``restore``. Raises BadInput if it can be neither returned nor copied."""
@@ -311,30 +324,6 @@ class UnavailableFilter(ExternalFilter):
     def run(self, *_: Any, **__: Any) -> Any:
         """Raises BadInput."""
         raise BadInput(f"this server has only a live run of filter {self.name!r}; add the filter with --filter")
-
-
-def model_names(
-    values: Values, axis: int, names: Sequence[str], task: Task, models: Sequence[int] = (), source: str = "the filter"
-) -> tuple[str, ...]:
-    """Names of the measurement models: as given, or the task's modalities if there are as many, or numbered.
-
-    A single model of a task with several modalities is never named after one that it may not read.
-
-    Args:
-        axis: of the values that indexes the models. models: indices of the participating models, if not all.
-
-    Raises BadInput if the number of given names does not match.
-    """
-    counts = [values[name].shape[axis] for name, shape in SHAPES.items() if shape[0] == "K" and name in values]
-    count, modalities = max(counts, default=0), tuple(task.modalities)
-    for candidates in (tuple(names), modalities):
-        if count and len(candidates) > count == len(models):
-            return tuple(candidates[k] for k in models)
-        if count and len(candidates) == count:
-            return candidates
-    if names and count:
-        raise BadInput(f"{source} names {len(names)} modalities, {', '.join(names)}, but has {count}")
-    return tuple(f"model-{k + 1}" for k in range(count))
 
 
 def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()) -> ExternalFilter:

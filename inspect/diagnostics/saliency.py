@@ -12,9 +12,11 @@ import torch
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.filters.subsets import input_modalities
+from beliefscope.filters.external.calls import is_stepwise
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnostics.attribution import TOLERANCE, integrate, occlude
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
+from beliefscope.inspect.diagnostics.external_step import ExternalStep
 from beliefscope.inspect.diagnostics.single_step import SingleStep, channel_names
 from beliefscope.inspect.diagnostics.views import Array, ImagePanel, Table, Value
 from beliefscope.inspect.statistics import measures
@@ -102,6 +104,8 @@ class Saliency(Diagnostic):
             if strongest := self._strongest(attribution):
                 sentence += f"; strongest channel {strongest}"
             sentences.append(f"{sentence}.")
+        if not self.attributions:
+            return " ".join([*sentences, self._occlusion_sentence()])
         incomplete = [attribution for attribution in self.attributions if attribution.gap >= TOLERANCE]
         sentences += [
             f"Relative to {attribution.baseline}, the integrated gradients miss {100.0 * attribution.gap:.1f} % of the "
@@ -112,6 +116,12 @@ class Saliency(Diagnostic):
             worst = max(attribution.gap for attribution in self.attributions)
             sentences.append(f"Integrated gradients are complete within {max(100.0 * worst, 0.01):.2f} %.")
         return " ".join(sentences)
+
+    def _occlusion_sentence(self) -> str:
+        """Largest effect of an occluded square or channel of each modality."""
+        largest = {name: values.flat[int(np.abs(values).argmax())] for name, values in self.occlusion.items()}
+        text = ", ".join(f"{name} {self._format(float(value), '+')}" for name, value in largest.items())
+        return f"Largest change by one channel or square: {text}; no integrated gradients of an external filter."
 
     @property
     def _title(self) -> str:
@@ -159,6 +169,7 @@ class Saliency(Diagnostic):
                 tuple(sums),
             )
         ]
+        tables = tables if self.attributions else []
         rows: list[tuple[Value, ...]] = []
         for modality, channels in channel_names(self.task, self.inputs).items():
             for i, channel in enumerate(channels):
@@ -215,12 +226,13 @@ def saliency(
     """
     report = progress or (lambda share: None)
     trace, step = _worst(traces, step)
+    if isinstance(checkpoint, ExternalFilter):
+        return _of_external(checkpoint, trace, target, step, window)
     replay = Replay(checkpoint, trace, lambda share: report(0.2 * share))
     replay.check_step(step)
     single_step = SingleStep(replay, step, at)
     sides = [side for values in single_step.inputs if values.ndim == 3 for side in values.shape[1:]]
-    if not 1 <= window <= min(sides, default=window):
-        raise BadInput(f"window must be 1 to {min(sides)} pixels, the size of the image, not {window}")
+    _check_window(window, sides)
     explained = single_step.target(target or _largest_error(trace, checkpoint, step))
     report(0.2)
     means = single_step.baseline(black=False)
@@ -258,6 +270,42 @@ def saliency(
     )
 
 
+def _of_external(external: ExternalFilter, trace: Trace, target: str | None, step: int, window: int) -> Saliency:
+    """Occlusion only: the steps of an external filter need not be differentiable."""
+    task, single_step = trace.task, ExternalStep(external, trace, step)
+    error = np.abs(measures.errors(trace)[:, -1])
+    relative = error[step] / np.maximum(np.sqrt(np.square(error).mean(0)), 1e-12)
+    component = task.components[int(np.nan_to_num(relative).argmax())] if target is None else None
+    name = target or (component.name if component else "")
+    explained = single_step.component(name)
+    sides = [side for values in single_step.inputs if values.ndim == 3 for side in values.shape[1:]]
+    _check_window(window, sides)
+    index = task.index(name)
+    unit, factor = task.components[index].shown
+    return Saliency(
+        task=task,
+        filter=trace.filter,
+        episode=trace.episode_index,
+        step=step,
+        target=name,
+        unit=unit,
+        factor=factor,
+        value=float(explained(*single_step.inputs)),
+        truth=float(trace.episode.states[step, index]),
+        inputs=single_step.by_modality(single_step.inputs),
+        means=single_step.by_modality(single_step.means),
+        occlusion=single_step.by_modality(occlude(explained, single_step.inputs, single_step.means, window)),
+        window=window,
+        attributions=(),
+    )
+
+
+def _check_window(window: int, sides: Sequence[int]) -> None:
+    """Raise BadInput for a window that is larger than an image."""
+    if not 1 <= window <= min(sides, default=window):
+        raise BadInput(f"window must be 1 to {min(sides)} pixels, the size of the image, not {window}")
+
+
 def _worst(traces: Sequence[Trace], step: int | None) -> tuple[Trace, int]:
     """The trace with the largest position error and its step, or the largest error at a given step."""
     if step is not None:
@@ -279,9 +327,14 @@ def _largest_error(trace: Trace, checkpoint: Checkpoint, step: int) -> str:
 
 
 def why_not(trace: Trace, checkpoint: Checkpoint | None) -> str | None:
-    """None. Raises BadInput for an external filter, whose steps cannot be replayed."""
-    if checkpoint is not None:
-        input_modalities(checkpoint.filter)
+    """One-line reason why the diagnostic does not apply, or None."""
+    if isinstance(checkpoint, ExternalFilter):
+        if not is_stepwise(checkpoint.adapter.module):
+            return f"{trace.filter} processes all steps at once"
+        try:
+            checkpoint.snapshot()
+        except BadInput as error:
+            return str(error)
     return None
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from beliefscope.datasets.catalog import find_task
+from beliefscope.filters.external.adapter import model_names
 from beliefscope.filters.external.hooks import _first_equal
-from beliefscope.filters.external.load import model_names
 
 
 def test_ancestors_equal_those_of_all_pairs() -> None:

@@ -138,3 +138,21 @@ def test_dropping_a_sensor_is_an_undo(door: list[Episode]) -> None:
     assert not other[10:20].all()
     assert drop("sound", setting, {}) is None
     assert replace(setting, affected=frozenset()).episodes == setting.episodes
+
+
+def test_occlusion_of_a_step_equals_the_kalman_gain() -> None:
+    pytest.importorskip("captum", reason="captum is not installed (pip install .[attribution])")
+    filter_, episode = external(vehicle.NumpyKalman()), vehicle.drive(2)
+    run = trace(filter_, episode)
+    for step in (0, 57):
+        result: Any = DIAGNOSTICS["saliency"]([run], filter_, step=step, target="x")
+        assert result.value == pytest.approx(run.estimate_mean[step, 0], abs=1e-5)
+        # The estimate is linear in the reading: its change is the gain times the change of the reading.
+        changed = {key: value.copy() for key, value in episode.observations.items()}
+        changed["gps"][step, 0] = episode.observations["gps"][:, 0].mean()
+        other = trace(filter_, replace(episode, observations=changed)).estimate_mean[step, 0]
+        assert result.occlusion["gps"][0] == pytest.approx(run.estimate_mean[step, 0] - other, abs=1e-5)
+        assert "Largest change by one channel or square" in result.verdict
+        assert result.views()["tables"]
+    with pytest.raises(BadInput, match="target of filter 'mine' 'z' does not exist"):
+        DIAGNOSTICS["saliency"]([run], filter_, target="z")
