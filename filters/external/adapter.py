@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -93,6 +94,7 @@ class Adapter:
     log_likelihood: Callable[[Any, Any], Any] | None = None
 
 
+@cache
 def letters_of(name: str) -> str:
     """Letters of the axes of a value after N. Raises BadInput for an unknown name."""
     if name.startswith(EXTRA):

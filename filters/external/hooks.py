@@ -53,6 +53,7 @@ class Capture:
         named = filter_.named_modules() if filter_ is not None else ()
         self._weight_model = next((part for name, part in named if name.endswith("crossmodal_weight_model")), None)
         self._has_particles = hasattr(filter_, "particle_states") and hasattr(filter_, "particle_log_weights")
+        self._has_values = self._has_particles or self._weight_model is not None or bool(self._kalman())
 
     def __enter__(self) -> Capture:
         with ExitStack() as hooks:
@@ -70,6 +71,8 @@ class Capture:
 
         Shapes are those of a trace, with N in place of T. Values that could not be read are missing.
         """
+        if not self._has_values:
+            return {}
         values = self._particles() if self._has_particles else self._gaussians()
         weights = self._weights(len(mean))
         effective = self._effective_weights(values, weights, mean)
