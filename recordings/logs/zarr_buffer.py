@@ -47,7 +47,7 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
         if ENDS not in arrays:
             raise BadInput(f"the store has no array {ENDS!r}: not a replay buffer")
         ends = _values(path, ENDS, arrays.pop(ENDS), True)
-        if ends.ndim != 1 or ends.dtype.kind not in "iu" or not len(ends) or np.any(np.diff(ends, prepend=0) <= 0):
+        if ends.ndim != 1 or ends.dtype.kind not in "iu" or not len(ends) or not _ascends(ends):
             text = f"{ends.dtype} {ends.ravel()[:9].tolist()}"
             raise BadInput(f"{ENDS} is {text}, expected ascending whole numbers, the first above 0")
         columns = {}
@@ -58,6 +58,11 @@ def read(path: Path, wanted: Wanted) -> dict[str, NDArray[Any]]:
             columns[name] = _values(path, node, array, wanted(name))
     check_size(EPISODE, (ends[-1],), np.int64)
     return {EPISODE: np.repeat(np.arange(len(ends)), np.diff(ends, prepend=0))} | columns
+
+
+def _ascends(ends: NDArray[Any]) -> bool:
+    """Whether whole numbers above 0 ascend; differences of damaged ones could overflow."""
+    return bool(ends[0] > 0 and np.all(ends[1:] > ends[:-1]))
 
 
 def _nodes(path: Path) -> list[str]:

@@ -188,8 +188,12 @@ def test_short_videos_are_refused(lerobot: Path, tmp_path: Path, frames: int, me
         read_columns(lerobot, read_map(map_file(tmp_path, LEROBOT)))
 
 
+OVERFLOWING = [7, 9 - 2**63, 20]
+
+
 @pytest.mark.parametrize(
-    ("ends", "message"), [([7, 5, 20], "ascending"), ([0, 20], "ascending"), ([7, 19], "ends at 19")]
+    ("ends", "message"),
+    [([7, 5, 20], "ascending"), ([0, 20], "ascending"), (OVERFLOWING, "ascending"), ([7, 19], "ends at 19")],
 )
 def test_wrong_ends_of_episodes(tmp_path: Path, ends: list[int], message: str) -> None:
     import zarr
