@@ -26,9 +26,6 @@ FLAGS = [
 ]
 TIMEOUT = 60.0  # s: without a GPU the first image of a 3D view takes long
 
-# The policy blocks a sorter of Gaussian splats that viser's client compiles from a string. The scene does not need it.
-IGNORED_ERROR = "Evaluating a string as JavaScript violates"
-
 
 class Server:
     """``beliefscope serve`` in its own process."""
@@ -125,9 +122,7 @@ class MonitoredPage:
             "});"
         )
         page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
-        page.on(
-            "pageerror", lambda error: IGNORED_ERROR in error.message or self.errors.append(f"{error.stack or error}")
-        )
+        page.on("pageerror", lambda error: self.errors.append(f"{error.stack or error}"))
         page.on("request", lambda request: self._check_host(request.url))
 
     def _check_host(self, url: str) -> None:

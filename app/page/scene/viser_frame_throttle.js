@@ -100,6 +100,11 @@
   const { matchMedia } = window;
   window.matchMedia = (query) =>
     matchMedia.call(window, query.includes('max-width') ? 'not all' : query);
+  // viser loads a module for Gaussian splats, which compiles code from text. The Content Security Policy of the frame
+  // forbids that, and these scenes have no splats.
+  window.addEventListener('unhandledrejection', (event) => {
+    if (event.reason instanceof EvalError) event.preventDefault();
+  });
   /** @type {import('./scene_frame.js').FrameThrottle} */
   const throttle = (window.frameThrottle = { pause, slow: () => cost() > 0, changed: null });
 })();
