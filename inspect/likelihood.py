@@ -102,9 +102,9 @@ def _no_density(checkpoint: ExternalFilter, trace: Trace | None, quantity: Quant
     elif has_layer_weights(trace):
         return None
     else:
-        if trace.modalities and not trace.modalities_with_posterior:
-            return "it reports no single-modality updates"
-        covariances = np.concatenate([trace.modality_covariance, trace.estimate_covariance[:, None]], axis=1)
+        covariances = trace.estimate_covariance[:, None]
+        if trace.modalities_with_posterior:
+            covariances = np.concatenate([trace.modality_covariance, covariances], axis=1)
     degenerate = np.linalg.eigvalsh(covariances.astype(np.float64)).min(axis=(1, 2)) <= 0.0
     return f"a covariance of step {int(degenerate.argmax())} is not positive definite" if degenerate.any() else None
 
@@ -215,13 +215,13 @@ class MapEngine:
         return LikelihoodMap(
             step=step,
             angle=math.nan if fixed is None else float(middle[fixed]),
-            layers=(*trace.modalities, "fused"),
+            layers=(*self._modalities(quantity), "fused"),
             offsets_x=x,
             offsets_y=y,
             centre=anchor[list(plane.components)],
             log_likelihood=values,
             quantity=quantity,
-            rule=fusion_rule(self.checkpoint, trace.modalities, quantity),
+            rule=fusion_rule(self.checkpoint, self._modalities(quantity), quantity),
             components=plane.components,
             others=others,
             note=describe_others(trace, plane, others),
@@ -239,6 +239,12 @@ class MapEngine:
             yield self.map(step, size=size, quantity=quantity)
             if progress is not None:
                 progress(count / len(steps))
+
+    def _modalities(self, quantity: Quantity) -> tuple[str, ...]:
+        """Modalities with a map: none for posteriors of a filter that reports only the fused one."""
+        trace = self.trace
+        known = quantity == "likelihood" or has_layer_weights(trace) or bool(trace.modalities_with_posterior)
+        return trace.modalities if known else ()
 
     def _densities(self, quantity: Quantity, others: Others) -> Callable[..., Array]:
         """The method that evaluates a quantity: networks, kernel densities of particles, or Gaussians."""
@@ -319,8 +325,10 @@ class MapEngine:
         """Means (K + 1, n) and covariances (K + 1, n, n) of the sensors or posteriors, the fused one last."""
         trace = self.trace
         if quantity == "posterior":
-            mean = np.concatenate([trace.modality_mean[step], trace.estimate_mean[step][None]])
-            covariance = np.concatenate([trace.modality_covariance[step], trace.estimate_covariance[step][None]])
+            mean, covariance = trace.estimate_mean[step][None], trace.estimate_covariance[step][None]
+            if trace.modalities_with_posterior:
+                mean = np.concatenate([trace.modality_mean[step], mean])
+                covariance = np.concatenate([trace.modality_covariance[step], covariance])
             floor = 0.0 if trace.particles is None else FLOOR  # the weights may be concentrated on one particle
             return mean.astype(np.float64), covariance.astype(np.float64) + floor * np.eye(mean.shape[-1])
         assert trace.observation_mean is not None

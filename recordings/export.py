@@ -116,7 +116,7 @@ def _topics(trace: Trace) -> Topics:
     arrays: dict[str, list[Column]] = {}
     topics: Topics = []
     for column in columns(trace):
-        if column.group == "observations" and is_image(column.values):
+        if column.group == "observations" and is_image(trace.episode.observations[column.parts[0]]):
             topics.append((f"/observations/{column.parts[0]}", _images(column, trace)))
         else:
             arrays.setdefault(f"/{column.group}/{column.parts[0]}", []).append(column)

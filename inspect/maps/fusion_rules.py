@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 def fusion_rule(checkpoint: Checkpoint, modalities: tuple[str, ...], quantity: Quantity) -> str:
     """Name of the rule that results in the fused layer."""
+    if not modalities:
+        return f"{quantity} reported by the filter"
     if len(modalities) == 1:
         return f"{quantity} of the only measurement model"
     if isinstance(checkpoint, ExternalFilter):

@@ -108,7 +108,7 @@ export class MapPanel {
     this.#panel.classList.toggle('no-expected', maps.expected === null);
     // With a single measurement model the fused map equals that of the model.
     if (rebuild)
-      this.#build(trace.fuses || !trace.modalities.length ? maps.layers : trace.modalities);
+      this.#build(trace.fuses || maps.layers.length === 1 ? maps.layers : trace.modalities);
     const pinned = this.#pinned;
     if (pinned && content(pinned.maps) !== content(maps)) {
       [this.#pinned, this.#requestedPin] = [null, '']; // requested again, with the new quantity and axes

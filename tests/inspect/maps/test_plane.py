@@ -117,6 +117,15 @@ def test_several_components_off_the_map_are_integrated_out_by_default() -> None:
     assert map_.title.startswith("Posterior, heading, vx, vy integrated out. Fused:")
 
 
+def test_without_single_modality_updates_only_the_fused_posterior_is_drawn() -> None:
+    run = make_trace()
+    unknown = {name: np.full_like(getattr(run, name), np.nan) for name in ("modality_mean", "modality_covariance")}
+    map_ = engine(replace(run, **unknown)).map(2, size=9)  # type: ignore[arg-type]
+    assert map_.layers == ("fused",)
+    assert map_.title.endswith("Fused: posterior reported by the filter")
+    np.testing.assert_array_equal(map_.log_likelihood[0], engine(run).map(2, size=9).log_likelihood[2])
+
+
 def test_marginal_of_particles_has_their_moments() -> None:
     """The kernel density has mean and covariance of the particles, so has its marginal; it sums to one."""
     run = make_trace(particles=True)
