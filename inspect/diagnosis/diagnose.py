@@ -182,8 +182,10 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
     """The healthy profile of a filter. Raises BadInput without one."""
     profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
     if profile is None:
+        task, name = checkpoint.task.name, checkpoint.name
         raise BadInput(
-            f"filter {checkpoint.name!r} has no healthy profile, which new checkpoints and shipped ones have"
+            f"filter {name!r} has no healthy profile, which training stores; compare it with healthy episodes: "
+            f"beliefscope diagnose {task} --filter {name} --profile-from DATA"
         )
     return profile
 
