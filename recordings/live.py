@@ -51,6 +51,9 @@ QUEUE_SIZE = 1000
 BLOCK = 100
 """Maximum number of steps written at once."""
 
+MAX_CHANNELS = 16
+"""Channels of innovations for which a file has room, even if the first step has fewer."""
+
 
 @dataclass(frozen=True)
 class _Row:
@@ -141,6 +144,7 @@ class LiveRecorder:
         self._views = LiveViews(self.path) if views else None
         self._writer: LiveFileWriter | None = None
         self._sizes = {"n": len(self._task.components)}
+        self._channels = 0  # of innovations
 
     def step(
         self,
@@ -235,6 +239,9 @@ class LiveRecorder:
         """Create the file with the first step, so that errors are raised immediately."""
         if not isinstance(row.values, StepTrace):
             check_values(row.values, (1,), self._sizes, "the filter")
+            if "innovation" in row.values:  # the first step may lack measurements of later ones
+                largest = min(_largest_vector(self._task), MAX_CHANNELS)
+                self._channels = max(row.values["innovation"].shape[-1], largest)
         elif self._checkpoint is None or row.evidence is None:
             raise BadInput("a StepTrace is recorded with its filter's checkpoint and the step's evidence")
         first = self._part([row])
@@ -311,7 +318,8 @@ class LiveRecorder:
     def _external_part(self, steps: Sequence[Values], episode: Episode, start: Gaussian) -> Trace:
         """Steps of an external filter as a trace, without values that some of the steps lack."""
         n = self._sizes["n"]
-        values = derived({name: _typed(name, value[:, 0]) for name, value in stacked(steps).items()})
+        together = stacked(steps, self._channels)
+        values = derived({name: _typed(name, value[:, 0]) for name, value in together.items()})
         modalities = model_names(values, 1, self._modalities, self._task)
         arrays = {name: np.ascontiguousarray(value.numpy()) for name, value in values.items()}
         fields: dict[str, Any] = {"filter": "own"} | self._fields | fill_missing(arrays, len(modalities))
@@ -352,6 +360,11 @@ def _with_batch_axis(values: Values) -> Values:
 
 def _typed(name: str, value: Tensor) -> Tensor:
     return value.int() if name == "ancestors" else value.float()
+
+
+def _largest_vector(task: Task) -> int:
+    """Number of entries of the largest vector among the observations."""
+    return max((shape[0] for shape in task.observations.values() if len(shape) == 1), default=0)
 
 
 def _stack_evidence(evidence: Sequence[Evidence]) -> Evidence:

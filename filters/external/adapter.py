@@ -219,16 +219,19 @@ def _padded(parts: Sequence[Tensor | None], axes: int, leading: Sequence[int]) -
     return values
 
 
-def stacked(steps: Sequence[Values]) -> Values:
-    """Values of T steps with a leading axis T, without values that some steps lack; measurements of the largest m."""
+def stacked(steps: Sequence[Values], channels: int = 0) -> Values:
+    """Values of T steps with a leading axis T, without values that some steps lack.
+
+    channels: smallest number m of the measurements' channels; they have the largest of all steps if that is larger.
+    """
     common = [name for name in steps[0] if all(name in step for step in steps)]
-    return {name: torch.stack(_of_one_size([step[name] for step in steps], name)) for name in common}
+    return {name: torch.stack(_of_one_size([step[name] for step in steps], name, channels)) for name in common}
 
 
-def _of_one_size(values: list[Tensor], name: str) -> list[Tensor]:
-    """The values of steps with different numbers m of channels, extended by NaN to the largest."""
+def _of_one_size(values: list[Tensor], name: str, channels: int) -> list[Tensor]:
+    """The values of steps with different numbers m of channels, extended by NaN to the largest or ``channels``."""
     axes = letters_of(name).count("m")
-    sizes = {value.shape[-1] for value in values} if axes else set()
+    sizes = {channels, *(value.shape[-1] for value in values)} if axes else set()
     if len(sizes) < 2:
         return values
     ends = [[0, max(sizes) - value.shape[-1]] * axes for value in values]

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
@@ -34,8 +35,10 @@ def test_recording_and_export_contain_measurements(tmp_path: Path) -> None:
     np.testing.assert_array_equal(exported["extra.trace"], result.extra["trace"])
 
 
-def test_live_run_contains_measurements(tmp_path: Path) -> None:
-    filter_, episode = vehicle.NumpyKalman(), vehicle.drive(3, 30, gap=(10, 15))
+@pytest.mark.parametrize("gap", [(10, 15), (0, 8)])
+def test_live_run_contains_measurements(tmp_path: Path, gap: tuple[int, int]) -> None:
+    """Also if the first steps have fewer measurements than later ones."""
+    filter_, episode = vehicle.NumpyKalman(), vehicle.drive(3, 30, gap=gap)
     filter_.initialize_beliefs()
     with LiveRecorder("run", task=vehicle.TASK, folder=tmp_path, views=False) as live:
         for t in range(len(episode)):
