@@ -46,6 +46,7 @@ def columns(trace: Trace) -> tuple[list[dict[str, Any]], bytes]:
         "blackout": measures.blackout(trace) if camera_images(trace) is not None else None,
     }
     arrays |= {key: trace.episode.observations.get(key) for key in SENSORS}
+    arrays |= {f"extra/{name}": values for name, values in trace.extra.items()}
     descriptions: list[dict[str, Any]] = []
     buffers: list[bytes] = []
     offset = 0

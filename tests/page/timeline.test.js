@@ -11,7 +11,7 @@ import {
   parseWindow,
   zoomWindow,
 } from '../../app/page/timeline/step_window.js';
-import { TRACKS, selectedError, tracks } from '../../app/page/timeline/tracks.js';
+import { TRACKS, selectedError, trackOptions, tracks } from '../../app/page/timeline/tracks.js';
 import { FUSION, makeTrace } from './fixtures.js';
 
 const trace = makeTrace(FUSION);
@@ -158,4 +158,16 @@ test('the summary explains an uninformative dominant modality', () => {
     tone: 'none',
     text: 'True state unknown.',
   });
+});
+
+test("a filter's own scalars are charts", () => {
+  const arrays = { ...FUSION, 'extra/gain_norm': { shape: [2], values: [0.5, 0.25] } };
+  const trace = makeTrace(arrays);
+  assert.deepEqual(trackOptions(trace, 'error').at(-1), ['extra/gain_norm', 'gain norm']);
+  const lowest = tracks(trace, { ...state, track: 'extra/gain_norm' })[2];
+  assert.equal(lowest.title, 'gain norm');
+  assert.deepEqual([...lowest.series[0].values], [0.5, 0.25]);
+  const missing = { ...state, track: 'extra/other' };
+  assert.equal(tracks(trace, missing)[2].note, 'None: this filter does not report it.');
+  assert.deepEqual(trackOptions(trace, 'extra/other').at(-1), ['extra/other', 'other']);
 });

@@ -2,7 +2,7 @@
 
 /** @import { Catalog } from '../data/api.js' */
 
-import { TRACKS } from '../timeline/tracks.js';
+import { SCALAR, TRACKS } from '../timeline/tracks.js';
 import { MAP_QUANTITIES, SCENE_CHOICES } from './constants.js';
 import { displayName } from './units.js';
 
@@ -19,7 +19,7 @@ import { displayName } from './units.js';
  * @property {string} tab one of `TABS`
  * @property {string} component state component of the charts
  * @property {string} weights `raw` for the fusion weights beta, or `effective`
- * @property {string} track lowest chart: a key of `TRACKS`
+ * @property {string} track lowest chart: a key of `TRACKS`, or a column of a filter's own scalars
  * @property {string} window visible steps such as 20-60, empty for all
  * @property {string} diagnostic selected diagnostic, empty for the list
  * @property {string} options of the diagnostic, URL-encoded: size=21
@@ -270,7 +270,7 @@ export function parsePermalink(search, catalog) {
   ]);
   const choices = Object.entries(CHOICES).map(([key, options]) => [
     key,
-    link.choice(key, options, options[0]),
+    link.choice(key, key === 'track' ? [...options, ...link.scalar] : options, options[0]),
   ]);
   Object.assign(state, Object.fromEntries([...texts, ...choices]), { window: link.window() });
   return { state: /** @type {State} */ (state), problems: link.problems };
@@ -336,6 +336,12 @@ class LinkReader {
         : 'It must be an integer from 0.',
     );
     return fallback;
+  }
+
+  /** The track if it is one of a filter's own scalars, which only its trace knows. */
+  get scalar() {
+    const track = this.query.get('track') ?? '';
+    return track.startsWith(SCALAR) ? [track] : [];
   }
 
   /** Reads the visible steps. */

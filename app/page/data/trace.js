@@ -90,6 +90,19 @@ export class Trace {
     return added.length > 0;
   }
 
+  /** Columns of the filter's own scalars. */
+  get scalars() {
+    return [...this.#columns.keys()].filter((name) => name.startsWith('extra/'));
+  }
+
+  /**
+   * Returns the values of one of the filter's own scalars.
+   * @param {string} column
+   */
+  scalar(column) {
+    return this.#slice(column);
+  }
+
   /** Names of the estimates: the image-only and haptics-only updates if the filter has them, and the fused one. */
   get sources() {
     return this.fuses && this.has('modality_mean') ? [...this.modalities, FUSED] : [FUSED];

@@ -168,14 +168,14 @@ function drawAxes(context, maps, side, { axes, zoom, textColour, withY }) {
  */
 function ticks(middle, half, side) {
   const smallest = (2 * half * MIN_TICK_DISTANCE) / side;
+  const reach = half * (1 + 1e-6); // a tick at the end may lie beyond it after rounding
   const power = 10 ** Math.floor(Math.log10(smallest));
   const spacings = [1, 2, 5, 10].map((factor) => factor * power);
   const wide = spacings.find((value) => value >= smallest) ?? 10 * power;
-  const spacing = wide > half ? Math.max(...spacings.filter((value) => value <= half)) : wide;
+  const spacing = wide > reach ? Math.max(...spacings.filter((value) => value <= reach)) : wide;
   const digits = Math.max(0, -Math.floor(Math.log10(spacing * 1.001)));
   /** @type {[text: string, place: number, end: 0 | 1 | 2][]} */
   const result = [];
-  const reach = half * (1 + 1e-6); // a tick at the end may lie beyond it after rounding
   const [first, last] = [(middle - reach) / spacing, (middle + reach) / spacing];
   for (let count = Math.ceil(first); count <= last; count++) {
     const place = Math.round(((count * spacing - middle + half) / (2 * half)) * side) + 0.5;

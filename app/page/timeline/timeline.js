@@ -19,7 +19,7 @@ import { layoutKey, noteElement, trackHeights } from './layout.js';
 import { formatValue, legend, updateLegend } from './legend.js';
 import { StandalonePicker } from './standalone_picker.js';
 import { fitWindow, formatWindow, parseWindow, zoomWindow } from './step_window.js';
-import { TRACKS, selectedError, tracks } from './tracks.js';
+import { selectedError, trackOptions, tracks } from './tracks.js';
 
 const MIN_HEIGHT = 60; // px, below which there are no charts
 const CURSOR_MARGIN = 0.25; // share of the visible steps before the cursor when it comes into view
@@ -79,9 +79,6 @@ export class Timeline {
     this.#standalone = new StandalonePicker(store);
     this.#group = new GroupPicker(() => this.redraw());
     this.#trackSelect = element('#track', HTMLSelectElement);
-    this.#trackSelect.replaceChildren(
-      ...Object.entries(TRACKS).map(([key, label]) => new Option(label, key)),
-    );
     this.#trackSelect.addEventListener('change', () =>
       store.set({ track: this.#trackSelect.value }),
     );
@@ -127,6 +124,8 @@ export class Timeline {
     const { state } = this.#store;
     const comparison = this.#activeComparison;
     this.#tracks = tracks(this.#trace, state, comparison);
+    const options = trackOptions(this.#trace, state.track);
+    this.#trackSelect.replaceChildren(...options.map(([key, label]) => new Option(label, key)));
     [this.#trackSelect.value, this.#trackSelect.disabled] = [state.track, false];
     this.#showComparison();
     this.#build();

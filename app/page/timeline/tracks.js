@@ -24,6 +24,8 @@ const LOWEST_TRACKS = {
   innovation: innovationTrack,
   particles: particleTrack,
 };
+/** Start of the keys of an external filter's own scalars. */
+export const SCALAR = 'extra/';
 const NO_TRUTH = 'None: the true state of this run is unknown.';
 
 /**
@@ -38,11 +40,43 @@ export function tracks(trace, state, comparison = null) {
   const builders = [
     (run) => weightTrack(run, state.weights, component),
     (run) => estimateTrack(run, component),
-    (run) => LOWEST_TRACKS[state.track](run, component),
+    (run) => (LOWEST_TRACKS[state.track] ?? scalarTrack(state.track))(run, component),
   ];
   return builders.map((build) =>
     comparison ? overlay(build(trace), build(comparison), comparison.standalone) : build(trace),
   );
+}
+
+/**
+ * Returns the options for the lowest chart: those of every trace, and the filter's own scalars.
+ * @param {Trace} trace
+ * @param {string} selected is an option in any case
+ * @returns {[key: string, label: string][]}
+ */
+export function trackOptions(trace, selected) {
+  const keys = trace.scalars.includes(selected) || selected in TRACKS ? [] : [selected];
+  return [
+    ...Object.entries(TRACKS),
+    ...[...trace.scalars, ...keys].map(
+      (key) => /** @type {[string, string]} */ ([key, scalarName(key)]),
+    ),
+  ];
+}
+
+/** @param {string} key */
+const scalarName = (key) => displayName(key.slice(SCALAR.length));
+
+/**
+ * @param {string} key
+ * @returns {(trace: Trace) => Track}
+ */
+function scalarTrack(key) {
+  return (trace) => {
+    const [title, values] = [scalarName(key), trace.scalar(key)];
+    if (!values) return emptyTrack(title, 'None: this filter does not report it.');
+    const help = `${title}, reported by the filter`;
+    return { title, unit: '', help, series: [{ name: 'fused', values }], digits: 2 };
+  };
 }
 
 /**
