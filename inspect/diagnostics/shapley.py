@@ -68,6 +68,7 @@ class Shapley(Diagnostic):
         modalities: K names.
         trajectories: number of traces.
         offset: initial error of the runs in standard deviations of the initial belief.
+        at_truth: whether the runs start at the true state.
         subsets: 2^K subsets of modalities, the empty one first and the complete one last.
         phases: values by phase.
         position_error: (T, 2^K) position error of each subset.
@@ -82,6 +83,7 @@ class Shapley(Diagnostic):
     modalities: tuple[str, ...]
     trajectories: int
     offset: float
+    at_truth: bool
     subsets: tuple[tuple[str, ...], ...]
     phases: tuple[PhaseValues, ...]
     position_error: Array
@@ -111,7 +113,7 @@ class Shapley(Diagnostic):
             total = 100.0 * self.phases[0].rmse[:, 0]
             without = [f"{total[-1 - 2**k]:.2f} cm without {name}" for k, name in enumerate(self.modalities)]
             sentences.append(f"All steps: {total[-1]:.2f} cm, {', '.join(without)}.")
-        if not self.offset:
+        if self.at_truth:
             sentences.append(f"Runs start at the true state, which favours {self.baseline}.")
         if why := too_few(self.trajectories):
             sentences.append(f"No intervals: {why}.")
@@ -295,6 +297,7 @@ def shapley(
         modalities=modalities,
         trajectories=len(traces),
         offset=offset,
+        at_truth=not offset and all(measures.starts_at_truth(trace) for trace in traces),
         subsets=tuple(tuple(np.array(modalities)[has].tolist()) for has in members(len(modalities))),
         phases=_phases(traces, errors, position, weights),
         position_error=position[0][:keep],

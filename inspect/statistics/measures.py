@@ -67,6 +67,11 @@ def errors(trace: Trace) -> Array:
     return wrapped(trace.task, means(trace) - trace.episode.states[:, None])
 
 
+def starts_at_truth(trace: Trace) -> bool:
+    """Whether the mean of the first belief is the true state of step 0, to float32 precision."""
+    return bool(np.allclose(wrapped(trace.task, trace.start_mean - trace.episode.states[0]), 0.0, atol=1e-5))
+
+
 def position_error(trace: Trace) -> Array:
     """(T, L) m: distance between estimated and true position."""
     where = list(trace.task.map_indices)

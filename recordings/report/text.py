@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 
 
@@ -187,6 +188,8 @@ def _run(trace: Trace) -> Passage:
     start = "Runs start at the true state"
     if task.start_distance:
         start = "Runs start beside the true state, with a covariance that matches the distance"
+    elif not measures.starts_at_truth(trace):
+        start = "Runs start at a belief of the filter or its user"
     elif trace.has_covariance:
         start += ", with covariance 0.1 $I$ in units of the training set's standard deviations"
     excluded = f"exclude the first {task.warmup} steps of each episode, which depend on the start"
