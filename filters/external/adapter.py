@@ -72,6 +72,7 @@ class Adapter:
             parameters, any other object NumPy arrays.
         components: names of its state's components in its own order; by default the task's.
         mean, std: (n,) m and rad, in its order: its states are ``(state - mean) / std``.
+        initial_std: (n,) standard deviations of the first belief, in its units and order; by default the root of 0.1.
         inputs: observations by key and controls, SI units -> arguments of the module.
         modalities: names of its K measurement models, in order.
         task: its task, by name, ``path/to/file.py:NAME`` or definition; needed by a server if not given elsewhere.
@@ -92,6 +93,7 @@ class Adapter:
     batched: bool = True
     absent: Literal["mean", "nan"] = "mean"
     log_likelihood: Callable[[Any, Any], Any] | None = None
+    initial_std: Sequence[float] = ()
 
 
 @cache
@@ -119,15 +121,19 @@ class Units:
             raise BadInput(
                 f"Adapter's components are {', '.join(components)}; task {task.name!r} has {', '.join(names)}"
             )
-        for name, numbers in (("mean", adapter.mean), ("std", adapter.std)):
+        for name, numbers in (("mean", adapter.mean), ("std", adapter.std), ("initial_std", adapter.initial_std)):
             if len(numbers) not in (0, len(names)):
                 raise BadInput(f"Adapter's {name} has {len(numbers)} numbers, expected {len(names)}: one per component")
-        if not all(std > 0 for std in adapter.std):
-            raise BadInput(f"Adapter's std is {tuple(adapter.std)}, expected numbers above 0")
+        for name, deviations in (("std", adapter.std), ("initial_std", adapter.initial_std)):
+            if not all(std > 0 for std in deviations):
+                raise BadInput(f"Adapter's {name} is {tuple(deviations)}, expected numbers above 0")
         self.order = [components.index(name) for name in names]
         self.inverse = [names.index(name) for name in components]
         self.mean = torch.tensor(adapter.mean or [0.0] * len(names), dtype=torch.float64)[self.order]
         self.std = torch.tensor(adapter.std or [1.0] * len(names), dtype=torch.float64)[self.order]
+        self.initial_std = None
+        if adapter.initial_std:
+            self.initial_std = torch.tensor(adapter.initial_std, dtype=torch.float64)[self.order] * self.std
         self._same = not adapter.mean and not adapter.std and components == tuple(names)
 
     def from_si(self, belief: Gaussian, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -112,17 +112,20 @@ class ExternalFilter(Checkpoint):
     def start(self, episodes: Sequence[Episode]) -> Gaussian:
         """The first belief, as in ``rollout.first_belief``: (N, n), (N, n, n), SI units.
 
-        The variance 0.1 of components that start at the truth is in the adapter's standardised units, or in those of
-        the task's pretrained filters. It is NaN if there are neither. A filter with a start of its own is initialised,
-        and its belief is NaN as far as it returns none.
+        The variance of components that start at the truth is ``initial_std`` squared, or else 0.1 in the adapter's
+        standardised units, or in those of the task's pretrained filters. It is NaN if there are neither. A filter with
+        a start of its own is initialised, and its belief is NaN as far as it returns none.
         """
         if has_own_start(self.adapter.module):
             return self._own_start(len(episodes))
         means = [episode.states[0] + start_offset(self._task, episode) for episode in episodes]
         mean = torch.from_numpy(np.stack(means)).float()
-        std = self._units.std if self.adapter.std else _state_std(self._task)
+        if self._units.initial_std is not None:
+            own = self._units.initial_std.float() ** 2
+        else:
+            own = START_VARIANCE * (self._units.std if self.adapter.std else _state_std(self._task)).float() ** 2
         variance = torch.from_numpy(self._task.start_variance()).float()
-        variance = torch.where(variance.isnan(), START_VARIANCE * std.float() ** 2, variance)
+        variance = torch.where(variance.isnan(), own, variance)
         return Gaussian(mean, torch.diag(variance).expand(len(mean), -1, -1))
 
     def _own_start(self, count: int) -> Gaussian:
@@ -274,7 +277,7 @@ class ExternalFilter(Checkpoint):
         if start.covariance.isnan().any():
             raise BadInput(
                 f"{self.source} needs an initial covariance, and task {self._task.name!r} has no pretrained filter to "
-                "take it from: give Adapter(module, mean=..., std=...)"
+                "take it from: give Adapter(module, initial_std=...), or an initialize_beliefs without parameters"
             )
         mean, covariance = self._units.from_si(start, dtype_of(filter_))
         if not self.adapter.batched:

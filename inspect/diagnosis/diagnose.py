@@ -16,6 +16,7 @@ import numpy as np
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.inspect.diagnosis.catalog import CAUSES
 from beliefscope.inspect.diagnosis.cause import Candidate, Cause, Diagnosis, Evidence, Recovery
 from beliefscope.inspect.diagnosis.interventions import ratios, recovery, replay_without
@@ -182,10 +183,10 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
     """The healthy profile of a filter. Raises BadInput without one."""
     profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
     if profile is None:
-        task, name = checkpoint.task.name, checkpoint.name
+        source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
         raise BadInput(
-            f"filter {name!r} has no healthy profile, which training stores; compare it with healthy episodes: "
-            f"beliefscope diagnose {task} --filter {name} --profile-from DATA"
+            f"filter {checkpoint.name!r} has no healthy record; compare it with clean episodes: beliefscope diagnose "
+            f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"
         )
     return profile
 

@@ -89,7 +89,7 @@ class Entry:
         """One-line reason why the diagnostic cannot be computed, or None."""
         if self.needs == "checkpoint":
             if checkpoint is None:
-                return f"{self.name} needs the filter's checkpoint, not only its trace"
+                return f"{self.name} needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
             if checkpoint.hash != trace.checkpoint_hash:
                 return f"the trace is from checkpoint {trace.checkpoint_hash[:12]}, not from {checkpoint.hash[:12]}"
         try:

@@ -117,7 +117,8 @@ class Errors(Diagnostic):
             text += f" ({worst.share:.0%} of the squared error in {steps:.0%} of the steps)"
         parts = [f"{text}."]
         for outage in sorted(self.outages, key=lambda o: -o.share)[:2]:
-            text = f"{outage.count} outages of {outage.modality}, up to {outage.longest:.3g} s, have "
+            noun, verb = ("outage", "has") if outage.count == 1 else ("outages", "have")
+            text = f"{outage.count} {noun} of {outage.modality}, up to {outage.longest:.3g} s, {verb} "
             text += f"{outage.share:.0%} of the squared error in {outage.steps:.0%} of the steps"
             if not math.isnan(outage.recovery):
                 text += f"; recovery takes {outage.recovery:.3g} s" if outage.recovery else "; recovery is immediate"

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import display_name
 from beliefscope.inspect.diagnostics.healthy_profile import Array, HealthyProfile
 from beliefscope.inspect.diagnostics.views import Table
@@ -249,6 +250,11 @@ def with_critical_values(profile: HealthyProfile, comparison: Comparison, signif
     statistic is proportional to its own high quantile, so that a share of healthy samples has an alarm.
     """
     names = [deviation.statistic for deviation in comparison.deviations]
+    if not names:
+        raise BadInput(
+            f"the healthy record of {profile.episodes} episodes has no statistic in common with the "
+            f"{comparison.trajectories} diagnosed ones; measure it from more healthy episodes"
+        )
     values, floor, rising = _scaled(names, np.stack([profile.statistics[name] for name in names], axis=1))
     count = min(comparison.trajectories, profile.episodes // 2)
     t = np.abs(_t_values(values, _divisions(profile.episodes, count, 0), floor, rising)[0])

@@ -193,3 +193,18 @@ def test_module_on_a_gpu_gets_its_inputs_there() -> None:
     assert module.devices == {"cuda"}
     expected = trace(external(vehicle.TorchKalman(), std=STD), episode)
     np.testing.assert_allclose(result.estimate_mean, expected.estimate_mean, atol=1e-5)
+
+
+def test_first_belief_has_the_given_deviations() -> None:
+    """In the filter's units and order: those of SI are multiplied by ``std``."""
+    adapter = Adapter(
+        lambda *, observations, controls: None,
+        components=("vy", "vx", "y", "x"),
+        std=(0.5, 0.5, 2.0, 2.0),
+        initial_std=(1.0, 2.0, 3.0, 4.0),
+    )
+    start = ExternalFilter(adapter, vehicle.TASK, "mine").start([vehicle.drive(0, 5)])
+    deviations = start.covariance[0].diagonal().sqrt()
+    torch.testing.assert_close(deviations, torch.tensor([8.0, 6.0, 1.0, 0.5]))
+    with pytest.raises(BadInput, match=r"initial_std has 2 numbers, expected 4"):
+        ExternalFilter(Adapter(adapter.module, initial_std=(1.0, 1.0)), vehicle.TASK, "mine")

@@ -113,7 +113,7 @@ def test_a_biased_module_is_named_and_its_error_recovered() -> None:
 def test_a_filter_needs_episodes_and_a_healthy_profile() -> None:
     with pytest.raises(BadInput, match="no episodes"):
         diagnose(checkpoint(), {}, profile=profile())
-    with pytest.raises(BadInput, match="no healthy profile"):
+    with pytest.raises(BadInput, match="no healthy record"):
         diagnose(replace(checkpoint(), hash="other", name="crossmodal-ekf"), simulated(100, 1))
 
 

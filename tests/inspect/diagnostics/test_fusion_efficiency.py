@@ -214,6 +214,9 @@ def test_errors_are_those_of_the_separate_runs(doors: tuple[Checkpoint, list[Tra
 
 def test_filter_of_one_modality_is_refused(doors: tuple[Checkpoint, list[Trace]]) -> None:
     entry, single = DIAGNOSTICS["efficiency"], checkpoint("image-ekf")
-    assert entry.refusal(doors[1][0], None) == "efficiency needs the filter's checkpoint, not only its trace"
+    assert (
+        entry.refusal(doors[1][0], None)
+        == "efficiency needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
+    )
     run = plant.real("crossmodal-ekf")
     assert entry.refusal(run, single) == "crossmodal-ekf has one modality: it is the standalone filter"

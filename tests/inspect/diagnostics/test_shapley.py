@@ -298,4 +298,7 @@ def test_too_many_modalities_are_refused() -> None:
     run = builtin("crossmodal-ekf")[1]
     checkpoint: Any = SimpleNamespace(filter=SimpleNamespace(names=tuple("abcdefg")))
     assert shapley.why_not(run, checkpoint) == "crossmodal-ekf has 7 modalities; at most 6 are supported"
-    assert shapley.ENTRY.refusal(run, None) == "shapley needs the filter's checkpoint, not only its trace"
+    assert (
+        shapley.ENTRY.refusal(run, None)
+        == "shapley needs the filter, not only its trace: its checkpoint, or --filter FILE.py:FUNCTION"
+    )
