@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
@@ -25,7 +25,6 @@ from beliefscope.inspect.maps.plane import (
     OTHERS,
     Others,
     Plane,
-    check_others,
     describe_others,
     other_components,
     plane_of,
@@ -187,8 +186,7 @@ class MapEngine:
             BadInput: step, angle, size or components are invalid, or the filter does not have such maps.
         """
         quantity = quantity or self.quantities[0]
-        if quantity not in QUANTITIES:
-            raise unknown_name("quantity of a map", quantity, QUANTITIES)
+        check_name("quantity of a map", quantity, QUANTITIES)
         if quantity not in self.quantities:
             raise BadInput(no_maps(self.checkpoint, self.trace, quantity) or "")
         trace = self.trace
@@ -202,7 +200,7 @@ class MapEngine:
         off_map = other_components(trace, plane)
         if others is None:
             others = "marginal" if len(off_map) > 1 and self.no_others(quantity, "marginal") is None else "fixed"
-        check_others(others)
+        check_name("treatment of the components that are not on the map", others, OTHERS)
         if reason := self.no_others(quantity, others):
             raise BadInput(reason)
         anchor = self._anchors[step]

@@ -72,13 +72,12 @@ class View:
         self._prefetch_center: tuple[Cursor, TracedRun] | None = None
         self._maps_sent = asyncio.Event()
         self._socket: WebSocket | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
 
     async def serve(self, websocket: WebSocket) -> None:
         """Serve the page's socket until it closes. A second page on the same view replaces the first."""
         await websocket.accept()
         previous, self._socket = self._socket, websocket
-        self._loop, self.idle_since = asyncio.get_running_loop(), None
+        self.idle_since = None
         if previous is not None:
             await _ignore_disconnect(previous.close(4000, "The view was opened by another page."))
         loops = (self._answer_cursors(websocket), self._update_scene(websocket), self._prefetch_maps())

@@ -6,8 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beliefscope.datasets.errors import BadInput, unknown_name
-from beliefscope.datasets.faults.fault import Fault, Readings, Span, integer_field, name_field, number_field
+from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.faults.fault import (
+    Fault,
+    GaussianNoise,
+    Readings,
+    Span,
+    integer_field,
+    name_field,
+    number_field,
+)
 from beliefscope.datasets.task import Task
 
 
@@ -18,8 +26,7 @@ class SensorFault(Fault):
     key: str = name_field("force", "an observation of the task, such as image or force")
 
     def keys(self, task: Task) -> tuple[str, ...]:
-        if self.key not in task.observations:
-            raise unknown_name(f"sensor of task {task.name!r}", self.key, task.observations)
+        check_name(f"sensor of task {task.name!r}", self.key, task.observations)
         return (self.key,)
 
 
@@ -46,14 +53,11 @@ class SensorGain(SensorFault):
 
 
 @dataclass(frozen=True)
-class SensorNoise(SensorFault):
+class SensorNoise(SensorFault, GaussianNoise):
     """Independent Gaussian noise is added to every value of a sensor."""
 
     name = "sensor_noise"
     std: float = number_field(1.0, "units of the sensor", "standard deviation", minimum=0)
-
-    def change(self, readings: Readings, span: Span, rng: np.random.Generator) -> Readings:
-        return readings + rng.normal(0.0, self.std, readings.shape)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput
 from beliefscope.inspect.statistics.measures import wrapped
 from beliefscope.inspect.traces.data import Trace
 
@@ -59,12 +59,6 @@ def describe_others(trace: Trace, plane: Plane, others: Others) -> str:
     if not labels or (others == "fixed" and len(labels) == 1):
         return ""
     return f"{', '.join(labels)} {'integrated out' if others == 'marginal' else 'at the true values'}"
-
-
-def check_others(others: str) -> None:
-    """Raise BadInput for an unknown treatment."""
-    if others not in OTHERS:
-        raise unknown_name("treatment of the components that are not on the map", others, OTHERS)
 
 
 def _half_width(trace: Trace, index: int) -> float:
