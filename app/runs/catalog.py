@@ -23,6 +23,7 @@ from beliefscope.datasets.task_json import difference
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.open_filter import is_path
+from beliefscope.inspect.diagnostics.healthy_profile import has_profile
 
 SAMPLE = "sample"
 """Name of the data set that ships with a task."""
@@ -115,7 +116,7 @@ class TaskCatalog:
             "dt": task.dt,
             "map": {"x": x, "y": y, "half_width": task.map_half_width},
             "fault_presets": [{"name": name, "faults": text} for name, text in available_presets(task).items()],
-            "filters": [_filter_json(name, checkpoint) for name, checkpoint in self.filters.items()],
+            "filters": [_filter_json(name, filter_, self.paths.get(name)) for name, filter_ in self.filters.items()],
             "data": [_data_json(name, data) for name, data in self.data.items()],
         }
 
@@ -209,13 +210,14 @@ def _name_parts(path: Path) -> tuple[str, ...]:
     return (valid if valid.is_dir() else valid.with_suffix("")).parts[1:]
 
 
-def _filter_json(name: str, checkpoint: Checkpoint) -> dict[str, Any]:
+def _filter_json(name: str, checkpoint: Checkpoint, path: Path | None) -> dict[str, Any]:
     record = dict(checkpoint.record)
     metrics = record.pop("metrics", {})
     return {
         "name": name,
         "kind": checkpoint.kind,
         "checkpoint_hash": checkpoint.hash,
+        "has_profile": has_profile(checkpoint, path),
         "training": record,
         "metrics": metrics,
     }

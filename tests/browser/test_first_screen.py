@@ -1,4 +1,4 @@
-"""First visit: the example, its finding in words, and the other examples."""
+"""First visit: the finding, examples and tour; separators and layouts of the panels."""
 
 from __future__ import annotations
 
@@ -6,20 +6,100 @@ from typing import Any
 
 EXAMPLES = 5
 
+VISIBLE = """(selectors) => selectors.filter((selector) => {
+  const { left, top, right, bottom } = document.querySelector(selector).getBoundingClientRect();
+  return !(right > left && bottom > top && left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight);
+})"""
 
-def test_a_first_visit_opens_an_example_with_its_finding(open_page: Any) -> None:
+
+def test_a_first_visit_shows_a_finding_with_its_moment_and_evidence(open_page: Any) -> None:
     page = open_page(scene=True, size=(1280, 720))
     assert (page.state["task"], page.state["weights"]) == ("push-field", "effective")
     step = page.state["step"]
-    finding = page.page.locator("#intro .finding")
-    assert f"goes dark at step {step + 1}, in contact; the effective weight of haptics rises" in finding.text_content()
+    finding = page.page.locator("#finding .sentence")
+    assert f"goes dark at step {step + 1}, in contact; haptics takes over" in finding.text_content()
+    assert "The effective weight of haptics rises" in finding.text_content()
+    parts = ["#finding strong", "#finding span", "#heatmaps canvas", "#step-table", "#tracks .cursor", "#intro .chip"]
+    assert page.page.evaluate(VISIBLE, parts) == []
     assert not page.violations()
+    page.page.locator("#finding .moment").click()
+    page.until(f"() => beliefscope.state().step === {step + 1}")
+
+    # The tour explains six parts and returns the focus.
+    start = page.page.locator("#intro .start-tour")
+    start.click()
+    box = page.page.locator("#tour")
+    for number in range(1, 7):
+        assert box.locator("span").text_content() == f"{number} of 6"
+        assert page.page.locator(".toured").count() == 1
+        assert page.page.evaluate(VISIBLE, ["#tour"]) == []
+        if number == 2:
+            assert not page.violations("#tour")
+            page.screenshot("tour")
+        page.page.keyboard.press("Enter")
+    assert not box.is_visible()
+    assert page.page.evaluate("() => document.activeElement.className").endswith("start-tour")
+    assert page.page.locator(".toured").count() == 0
+
     chips = page.page.locator("#intro .chip")
     assert chips.count() == EXAMPLES
     chips.nth(2).click()
-    page.until("() => document.querySelector('#diagnosis').dataset.finding === 'fault'")
+    page.until("() => document.querySelector('#finding').dataset.source === 'fault'")
     assert page.state["faults"].startswith("image_frozen")
-    assert "Image frozen" in page.page.locator("#diagnosis .headline").text_content()
-    assert finding.text_content().startswith("The camera repeats one image")
+    assert finding.text_content().startswith("Image frozen from step 3")
+    page.until("() => document.querySelector('#diagnosis').dataset.finding === 'fault'")
     page.page.get_by_role("button", name="Close the introduction").click()
     assert page.page.locator("#intro").is_hidden()
+    again = open_page()
+    assert again.page.locator("#intro").is_hidden(), "closing the introduction is not remembered"
+
+
+def test_separators_and_layouts_resize_the_panels(open_page: Any) -> None:
+    page = open_page("?step=20", size=(1280, 720))
+
+    def size(selector: str) -> dict[str, float]:
+        return page.page.locator(selector).bounding_box() or {"width": 0.0, "height": 0.0}
+
+    default = size("#maps")
+    handle = size("#split-side")
+    mouse = page.page.mouse
+    mouse.move(handle["x"] + 3, handle["y"] + 200)
+    mouse.down()
+    mouse.move(handle["x"] - 117, handle["y"] + 200)
+    mouse.up()
+    wider = size("#maps")["width"]
+    assert abs(wider - default["width"] - 120) < 10
+    separator = page.page.locator("#split-side")
+    assert abs(int(separator.get_attribute("aria-valuenow")) - 100 * wider / 1268) < 1.5
+    page.page.keyboard.press("ArrowRight")  # the separator has the focus
+    assert size("#maps")["width"] < wider - 15
+    assert page.state["step"] == 20
+    page.page.keyboard.press("Enter")
+    assert not page.page.locator("#maps").is_visible()
+    assert not page.violations("main")
+    page.page.keyboard.press("Enter")
+    narrower = size("#maps")["width"]
+    assert narrower > 500
+
+    page.page.locator("#split-timeline").focus()
+    before = size("#timeline")["height"]
+    page.page.keyboard.press("Shift+ArrowUp")
+    assert abs(size("#timeline")["height"] - before - 72) < 3
+    second = open_page("?step=20", size=(1280, 720))
+    assert second.page.locator("#maps").bounding_box()["width"] == narrower, "sizes are not remembered"
+
+    # Layouts: from the menu at its button; the first one has the default sizes.
+    page.page.locator("#layout").click()
+    assert not page.violations("#layouts")
+    menu, button = size("#layouts"), size("#layout")
+    assert 0 <= menu["y"] - button["y"] - button["height"] < 10
+    page.page.get_by_role("button", name="Compare two runs").click()
+    page.until("() => beliefscope.state().tab === 'compare'")
+    assert size("#timeline")["height"] > 0.45 * 720
+    page.page.locator("#layout").click()
+    page.page.get_by_role("button", name="Maps large").click()
+    assert size("#maps")["width"] > 1.5 * default["width"]
+    page.screenshot("layout-maps")
+    page.page.locator("#layout").click()
+    page.page.get_by_role("button", name="Explore").click()
+    assert size("#maps") == default

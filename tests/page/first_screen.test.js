@@ -2,7 +2,8 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import './browser.js';
-import { outageFinding } from '../../app/page/step/finding.js';
+import { finding, largest, outageFinding } from '../../app/page/step/finding.js';
+import { STEPS as TOUR, placeBeside } from '../../app/page/widgets/tour.js';
 
 const STEPS = 20;
 
@@ -18,22 +19,105 @@ const run = (last, contact = 5) =>
   /** @type {any} */ ({
     steps: STEPS,
     modalities: ['image', 'haptics'],
+    components: [{ name: 'x' }],
+    header: {},
+    weightWidth: 1,
+    fuses: true,
+    has: () => false,
+    hasTruth: () => true,
+    largestDeviation: () => ({ sigmas: 5, component: 'x' }),
     blackout: series((t) => Number(t >= 8 && t <= last)),
     contact: series((t) => Number(t >= contact)),
     weight: () => series((t) => (t >= 8 && t <= last ? 0.9 : 0.25)),
     error: () => series((t) => (t === 10 ? 1.23 : 0.5)),
   });
 
+/** @type {any} */
+const HEALTHY = { state: 'healthy', headline: 'Healthy: all is normal', causes: [] };
+/** @type {any} */
+const FAULT = {
+  state: 'fault',
+  masked: false,
+  headline: 'Image frozen from step 31',
+  causes: [{ steps: [31, 100], evidence: [{ text: 'share of repeated images is 0.7', step: 33 }] }],
+};
+
 test('the finding describes the outage in contact, with weights, error and its end', () => {
-  assert.equal(
-    outageFinding(run(14), 0),
-    'The camera goes dark at step 8, in contact; the effective weight of haptics rises from 25 % to 90 %; ' +
-      'the position error stays below 1.3 cm; the image returns at step 15.',
-  );
-  assert.match(outageFinding(run(STEPS - 1), 0), /; it stays dark\.$/);
+  assert.deepEqual(outageFinding(run(14), 0), {
+    headline:
+      'The camera goes dark at step 8, in contact; haptics takes over until the image returns at step 15.',
+    evidence:
+      'The effective weight of haptics rises from 25 % to 90 %; the position error stays below 1.3 cm.',
+    step: 8,
+  });
+  assert.match(outageFinding(run(STEPS - 1), 0)?.headline ?? '', /takes over to the end\.$/);
+});
+
+test('no modality takes over whose weight stays low', () => {
+  const weak = { ...run(14), weight: () => series((t) => (t >= 8 ? 0.4 : 0.25)) };
+  const result = outageFinding(weak, 0);
+  assert.match(result?.headline ?? '', /in contact, until the image returns at step 15\.$/);
+  assert.match(result?.evidence ?? '', /rises from 25 % to 40 %/);
 });
 
 test('short outages and those in free motion are no finding', () => {
-  assert.equal(outageFinding(run(11), 0), '');
-  assert.equal(outageFinding(run(14, 9), 0), '');
+  assert.equal(outageFinding(run(11), 0), null);
+  assert.equal(outageFinding(run(14, 9), 0), null);
+});
+
+test('a fault comes first, then the outage, then the largest error', () => {
+  const fault = finding(run(14), 0, FAULT);
+  assert.deepEqual(fault, {
+    tone: 'bad',
+    headline: 'Image frozen from step 31.',
+    evidence: 'Share of repeated images is 0.7.',
+    step: 33,
+  });
+  assert.equal(finding(run(14), 0, { ...FAULT, masked: true }).tone, 'warn');
+  assert.equal(finding(run(14), 0, HEALTHY).tone, 'good');
+  assert.equal(finding(run(14), 0, HEALTHY).step, 8);
+  const plain = finding(run(11), 0, null);
+  assert.equal(plain.headline, 'Largest error at step 10.');
+  assert.match(plain.evidence, /error 1\.2 cm; largest deviation 5\.0σ in x: overconfident/);
+  assert.deepEqual([plain.tone, plain.step], ['bad', 10]);
+  const healthy = finding(run(11), 0, HEALTHY);
+  assert.equal(healthy.headline, 'Healthy: all is normal.');
+  assert.match(healthy.evidence, /^Largest error at step 10\. /);
+});
+
+test('a run without truth has no moment', () => {
+  const blind = { ...run(11), error: () => series(() => NaN), hasTruth: () => false };
+  assert.equal(finding(blind, 0, null).step, null);
+  assert.equal(finding(blind, 0, HEALTHY).step, null);
+});
+
+test('the largest number is found, not a missing one', () => {
+  assert.equal(largest([NaN, -2, -1, Infinity, -3]), 2);
+  assert.equal(largest([NaN]), null);
+  assert.equal(largest([]), null);
+});
+
+test('a box of the tour lies in the window and beside its part where there is room', () => {
+  const [box, view] = [
+    { width: 300, height: 150 },
+    { width: 1000, height: 700 },
+  ];
+  /** @param {{left: number, top: number, right: number, bottom: number}} part */
+  const check = (part) => {
+    const { left, top } = placeBeside(part, box, view);
+    assert.ok(left >= 0 && left + box.width <= view.width, JSON.stringify([part, left]));
+    assert.ok(top >= 0 && top + box.height <= view.height, JSON.stringify([part, top]));
+    return (
+      left >= part.right ||
+      left + box.width <= part.left ||
+      top >= part.bottom ||
+      top + box.height <= part.top
+    );
+  };
+  assert.ok(check({ left: 0, top: 0, right: 1000, bottom: 40 }));
+  assert.ok(check({ left: 0, top: 500, right: 1000, bottom: 700 }));
+  assert.ok(check({ left: 0, top: 0, right: 500, bottom: 700 }));
+  assert.ok(check({ left: 600, top: 0, right: 1000, bottom: 700 }));
+  assert.ok(!check({ left: 0, top: 0, right: 1000, bottom: 700 }));
+  assert.equal(TOUR.length, 6);
 });

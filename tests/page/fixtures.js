@@ -18,6 +18,7 @@ export const TASK = {
     name,
     kind: name.slice(-3),
     checkpoint_hash: '',
+    has_profile: false,
     training: {},
     metrics: {},
   })),

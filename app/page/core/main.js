@@ -41,5 +41,4 @@ async function start() {
     });
   messages.show('link', problems.join('\n'));
   new Page(catalog, new Store(state), live, messages);
-  document.body.classList.remove('starting');
 }

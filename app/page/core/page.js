@@ -27,12 +27,14 @@ import { Rerun } from '../tabs/rerun.js';
 import { Study } from '../tabs/study.js';
 import { Timeline } from '../timeline/timeline.js';
 import { FaultDialog } from '../widgets/fault_dialog.js';
+import { FindingBar } from '../widgets/finding_bar.js';
 import { Intro } from '../widgets/intro.js';
 import { Jobs } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { choice, connectPickers } from '../widgets/pickers.js';
 import { ReportDialog } from '../widgets/report_dialog.js';
 import { connectSaveButton } from '../widgets/save_button.js';
+import { Tour } from '../widgets/tour.js';
 import { Clock } from './clock.js';
 import { bindControls } from './controls.js';
 import {
@@ -46,7 +48,9 @@ import {
   useful,
 } from './common_panels.js';
 import { element, html } from './dom.js';
+import { layoutMenu, layoutSetter } from './layouts.js';
 import { assignSpareColours } from './palette.js';
+import { Splitters } from './splitters.js';
 import { parsePermalink } from './state.js';
 import { addLatency, stats } from './stats.js';
 import { tabBar } from './tab_bar.js';
@@ -83,7 +87,12 @@ export class Page {
       catalog.faults,
     );
     const refreshPickers = connectPickers(catalog, store, faultDialog);
-    this.intro = new Intro(html('#intro'), catalog, store);
+    this.finding = new FindingBar(html('#finding'), catalog, store);
+    this.intro = new Intro(html('#intro'), catalog, store, () => this.tour.start());
+    this.tour = new Tour();
+    this.splitters = new Splitters();
+    this.setLayout = layoutSetter(store, this.splitters);
+    layoutMenu(html('#layouts'), html('#layout'), this.setLayout);
     this.undo = new Undo(store);
     this.theme = new Theme((dark) => this.#changeTheme(dark));
     this.clock = new Clock(store);
@@ -298,7 +307,7 @@ export class Page {
     this.diagnostics.show(trace);
     this.failures.show(trace);
     this.report.show(trace);
-    this.intro.show(trace);
+    this.finding.show(trace);
     showProperties(trace);
     this.adaptMapMenu(trace);
     this.sceneMenu.show(trace);

@@ -2,7 +2,7 @@
 
 const STORAGE_KEY = 'beliefscope.theme';
 
-/** Follows the system until the user chooses a theme. */
+/** Follows the system until the user chooses a theme; `early.js` restores it. */
 export class Theme {
   #media = matchMedia('(prefers-color-scheme: dark)');
   #changed;
@@ -10,8 +10,6 @@ export class Theme {
   /** @param {(dark: boolean) => void} changed */
   constructor(changed) {
     this.#changed = changed;
-    const stored = localStorage.getItem(STORAGE_KEY);
-    if (stored === 'light' || stored === 'dark') document.documentElement.dataset.theme = stored;
     this.#media.addEventListener('change', () => changed(this.dark));
   }
 

@@ -1,41 +1,119 @@
-/** The outage of a run in words. */
+/** The finding of a run in words: an outage, the diagnosis, or its largest error. */
 
 /** @import { Trace } from '../data/trace.js' */
+/** @import { Diagnosis } from '../types/server.js' */
 
-import { fixed, percent } from '../core/units.js';
+import { fixed, percent, sentence } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
+import { stepSummary } from './step_summary.js';
 
 const MIN_STEPS = 5; // of an outage
 const BEFORE = 10; // steps that are compared with the outage
 
 /**
- * Describes the first outage of the camera that begins in contact; empty if there is none.
+ * @typedef {object} Finding
+ * @property {'good' | 'bad' | 'warn' | 'none'} tone
+ * @property {string} headline
+ * @property {string} evidence
+ * @property {number | null} step that shows it best
+ */
+
+/**
+ * Describes a run. A fault comes first, then an outage of the camera in contact, then the largest error.
  * @param {Trace} trace
  * @param {number} component whose effective weights are described
+ * @param {Diagnosis | null} diagnosis null without one
+ * @returns {Finding}
+ */
+export function finding(trace, component, diagnosis) {
+  if (diagnosis && diagnosis.state !== 'healthy') return faultFinding(diagnosis);
+  const outage = outageFinding(trace, component);
+  if (outage) return { ...outage, tone: diagnosis ? 'good' : 'none' };
+  const worst = worstFinding(trace, component);
+  if (!diagnosis) return worst;
+  const evidence = `${worst.headline} ${worst.evidence}`.trim();
+  return { tone: 'good', headline: sentence(diagnosis.headline), evidence, step: worst.step };
+}
+
+/**
+ * @param {Diagnosis} diagnosis of a run that is not healthy
+ * @returns {Finding}
+ */
+function faultFinding({ state, masked, headline, causes }) {
+  const [cause] = causes;
+  const evidence = (cause?.evidence ?? []).slice(0, 1);
+  const step = evidence[0]?.step ?? cause?.steps?.[0] ?? null;
+  return {
+    tone: state === 'fault' && !masked ? 'bad' : 'warn',
+    headline: sentence(headline),
+    evidence: evidence.map(({ text }) => sentence(text)).join(' '),
+    step,
+  };
+}
+
+/**
+ * Describes the largest error of the fused estimate; no headline without truth.
+ * @param {Trace} trace
+ * @param {number} component
+ * @returns {Finding}
+ */
+function worstFinding(trace, component) {
+  const step = largest(trace.error('fused', 'position') ?? []);
+  if (step === null) {
+    const headline = 'The true state of this run is unknown.';
+    return { tone: 'none', headline, evidence: '', step };
+  }
+  const { tone, text } = stepSummary(trace, step, component);
+  return { tone, headline: `Largest error at step ${step}.`, evidence: text, step };
+}
+
+/**
+ * Describes the first outage of the camera that begins in contact; null if there is none.
+ * @param {Trace} trace
+ * @param {number} component whose effective weights are described
+ * @returns {Omit<Finding, 'tone'> | null}
  */
 export function outageFinding(trace, component) {
   const outage = intervals(trace.blackout).find(
     ([first, last]) => first && trace.contact[first] && last - first >= MIN_STEPS - 1,
   );
-  if (!outage) return '';
+  if (!outage) return null;
   const [first, last] = outage;
-  const parts = [`The camera goes dark at step ${first}, in contact`];
-  for (const name of trace.modalities.filter((modality) => modality !== 'image')) {
-    const weights = trace.weight('effective', name, component);
-    if (!weights) continue;
-    const before = mean(weights.subarray(Math.max(0, first - BEFORE), first));
-    const during = mean(weights.subarray(first, last + 1));
-    const verb = during > before ? 'rises' : 'falls';
-    parts.push(
-      `the effective weight of ${name} ${verb} from ${percent(before)} to ${percent(during)}`,
-    );
-  }
-  const errors = trace.error('fused', 'position')?.subarray(first, last + 1) ?? [NaN];
-  const worst = Math.max(...errors);
+  const weights = trace.modalities
+    .filter((name) => name !== 'image')
+    .flatMap((name) => {
+      const values = trace.weight('effective', name, component);
+      if (!values) return [];
+      const before = mean(values.subarray(Math.max(0, first - BEFORE), first));
+      return [{ name, before, during: mean(values.subarray(first, last + 1)) }];
+    });
+  const successor = weights.find(({ before, during }) => during > before && during > 0.5);
+  const end = last + 1 < trace.steps ? `until the image returns at step ${last + 1}` : 'to the end';
+  const action = successor ? `; ${successor.name} takes over ${end}` : `, ${end}`;
+  const evidence = weights.map(
+    ({ name, before, during }) =>
+      `the effective weight of ${name} ${during > before ? 'rises' : 'falls'} from ${percent(before)} to ${percent(during)}`,
+  );
+  const worst = Math.max(...(trace.error('fused', 'position')?.subarray(first, last + 1) ?? [NaN]));
   if (worst >= 0)
-    parts.push(`the position error stays below ${fixed(Math.ceil(10 * worst) / 10)} cm`);
-  const end = last + 1 < trace.steps ? `the image returns at step ${last + 1}` : 'it stays dark';
-  return `${parts.join('; ')}; ${end}.`;
+    evidence.push(`the position error stays below ${fixed(Math.ceil(10 * worst) / 10)} cm`);
+  return {
+    headline: `The camera goes dark at step ${first}, in contact${action}.`,
+    evidence: sentence(evidence.join('; ')),
+    step: first,
+  };
+}
+
+/**
+ * Index of the largest number; null without any.
+ * @param {ArrayLike<number>} values
+ */
+export function largest(values) {
+  /** @type {number | null} */
+  let result = null;
+  for (let i = 0; i < values.length; i++)
+    if (Number.isFinite(values[i]) && !(result !== null && values[i] <= values[result])) result = i;
+  return result;
 }
 
 /** @param {ArrayLike<number>} values */

@@ -1,44 +1,47 @@
-/** The introduction of a first visit: the outage of the displayed run in words, and examples to open. */
+/** The introduction of a first visit: what the page is about, examples to open, and a tour. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Trace } from '../data/trace.js' */
 /** @import { Catalog } from '../types/server.js' */
 
 import { create, html } from '../core/dom.js';
 import { parsePermalink } from '../core/state.js';
-import { outageFinding } from '../step/finding.js';
+
+const STORAGE_KEY = 'beliefscope.intro';
 
 export class Intro {
   #host;
-  #store;
-  #help = ''; // of the example that was opened last
 
   /**
-   * @param {HTMLElement} host is shown if the address selects nothing and there are examples
+   * @param {HTMLElement} host is shown if the address selects nothing, it was not closed before and there are examples
    * @param {Catalog} catalog
    * @param {Store} store
+   * @param {() => void} startTour
    */
-  constructor(host, catalog, store) {
+  constructor(host, catalog, store, startTour) {
     this.#host = host;
-    this.#store = store;
     const chips = catalog.examples.map(({ title, help, link }) => {
       const chip = create('button', { type: 'button', className: 'chip', title: help }, title);
-      chip.addEventListener('click', () => {
-        this.#help = help;
-        store.set(parsePermalink(link, catalog).state);
-      });
+      chip.addEventListener('click', () => store.set(parsePermalink(link, catalog).state));
       return chip;
     });
-    host.hidden = Boolean(location.search) || !chips.length;
+    if (!chips.length) this.#isShown = false;
     html('.examples', host).append(...chips);
-    html('.close', host).addEventListener('click', () => (host.hidden = true));
+    html('.start-tour', host).addEventListener('click', startTour);
+    html('.close', host).addEventListener('click', () => {
+      this.#isShown = false;
+      localStorage.setItem(STORAGE_KEY, 'closed');
+    });
   }
 
-  /** @param {Trace} trace */
-  show(trace) {
-    if (this.#host.hidden) return;
-    const { component } = this.#store.state;
-    const index = trace.components.findIndex(({ name }) => name === component);
-    html('.finding', this.#host).textContent = outageFinding(trace, index) || this.#help;
+  /** Shows the introduction again. */
+  show() {
+    this.#isShown = true;
+    localStorage.removeItem(STORAGE_KEY);
+    html('.chip', this.#host).focus();
+  }
+
+  /** `early.js` sets the class before the first paint, so that the layout does not shift. */
+  set #isShown(/** @type {boolean} */ isShown) {
+    document.documentElement.classList.toggle('first-visit', isShown);
   }
 }

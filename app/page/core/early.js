@@ -1,0 +1,19 @@
+/** Runs before the first paint: what it sets would otherwise move or recolour the page while it starts. */
+
+{
+  const root = document.documentElement;
+  const theme = localStorage.getItem('beliefscope.theme');
+  if (theme === 'light' || theme === 'dark') root.dataset.theme = theme;
+  const isClosed = localStorage.getItem('beliefscope.intro') === 'closed';
+  root.classList.toggle('first-visit', !location.search && !isClosed);
+  try {
+    const sizes = JSON.parse(localStorage.getItem('beliefscope.sizes') ?? '{}');
+    for (const [name, share] of Object.entries(sizes))
+      if (/^[a-z]+$/.test(name) && Number.isFinite(share)) {
+        root.style.setProperty(`--${name}-share`, String(share));
+        root.classList.add(`sized-${name}`);
+      }
+  } catch {
+    localStorage.removeItem('beliefscope.sizes');
+  }
+}

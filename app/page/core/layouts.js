@@ -1,0 +1,74 @@
+/** Saved layouts: sizes of the panels and a tab, in a menu. */
+
+/** @import { Splitters } from './splitters.js' */
+/** @import { Store } from './state.js' */
+
+/** @import { Sizes } from './pane_sizes.js' */
+
+import { create, html } from './dom.js';
+
+/** @typedef {{name: string, help: string, sizes: Sizes, tab: string}} Layout */
+
+/** The first has the default sizes. @type {Layout[]} */
+export const LAYOUTS = [
+  { name: 'Explore', help: 'scene, maps and timeline', sizes: {}, tab: 'scene' },
+  {
+    name: 'Maps',
+    help: 'large likelihood maps',
+    sizes: { side: 0.75, step: 0 },
+    tab: 'diagnosis',
+  },
+  {
+    name: 'Rerun',
+    help: 'the viewer over the full width',
+    sizes: { side: 0, timeline: 0.25 },
+    tab: 'rerun',
+  },
+  {
+    name: 'Compare',
+    help: 'two runs, and large charts',
+    sizes: { side: 0.35, timeline: 0.5, step: 0 },
+    tab: 'compare',
+  },
+];
+
+/**
+ * Fills the menu of layouts.
+ * @param {HTMLElement} menu a popover
+ * @param {HTMLElement} button that opens it
+ * @param {(layout: Layout) => void} apply
+ */
+export function layoutMenu(menu, button, apply) {
+  const rows = LAYOUTS.map((layout) => {
+    const help = create('small', { textContent: layout.help });
+    const row = create(
+      'button',
+      { type: 'button' },
+      create('b', { textContent: layout.name }),
+      help,
+    );
+    row.addEventListener('click', () => {
+      apply(layout);
+      menu.hidePopover();
+    });
+    return row;
+  });
+  html('.rows', menu).append(...rows);
+  menu.addEventListener('beforetoggle', () => {
+    const { bottom, right } = button.getBoundingClientRect();
+    menu.style.top = `${bottom + 4}px`;
+    menu.style.right = `${Math.max(0, document.documentElement.clientWidth - right)}px`;
+  });
+}
+
+/**
+ * @param {Store} store
+ * @param {Splitters} splitters
+ * @returns {(layout: Layout) => void}
+ */
+export const layoutSetter =
+  (store, splitters) =>
+  ({ sizes, tab }) => {
+    splitters.set(sizes);
+    store.set({ tab });
+  };

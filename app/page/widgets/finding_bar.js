@@ -1,0 +1,77 @@
+/** The finding of the displayed run at the top of the page, with its moment and its diagnosis one click away. */
+
+/** @import { Store } from '../core/state.js' */
+/** @import { Trace } from '../data/trace.js' */
+/** @import { Catalog, Diagnosis } from '../types/server.js' */
+
+import { useful } from '../core/common_panels.js';
+import { html } from '../core/dom.js';
+import * as api from '../data/api.js';
+import { finding } from '../step/finding.js';
+
+export class FindingBar {
+  #host;
+  #catalog;
+  #store;
+  #loading = new AbortController();
+  /** @type {number | null} */
+  #step = null;
+
+  /**
+   * @param {HTMLElement} host
+   * @param {Catalog} catalog
+   * @param {Store} store
+   */
+  constructor(host, catalog, store) {
+    this.#host = host;
+    this.#catalog = catalog;
+    this.#store = store;
+    html('.moment', host).addEventListener('click', ({ timeStamp }) => {
+      if (this.#step !== null)
+        store.set({ step: this.#step, playing: false }, { inputTime: timeStamp });
+    });
+    html('.why', host).addEventListener('click', () => store.set({ tab: 'diagnosis' }));
+  }
+
+  /**
+   * Shows the finding from the trace alone, and then the preliminary diagnosis.
+   * @param {Trace} trace
+   */
+  async show(trace) {
+    this.#loading.abort();
+    const { signal } = (this.#loading = new AbortController());
+    this.#draw(trace, null);
+    if (trace.live || !this.#isDiagnosable(trace)) return;
+    await useful;
+    if (signal.aborted) return;
+    const reply = await api.diagnosis(trace.selection, 'episode', signal).catch(() => null);
+    const result = reply && 'job' in reply ? reply.preliminary : reply;
+    if (result && !signal.aborted) this.#draw(trace, result);
+  }
+
+  /** @param {Trace} trace */
+  #isDiagnosable({ selection: { task, filter } }) {
+    const { filters = [] } = this.#catalog.tasks.find(({ name }) => name === task) ?? {};
+    return filters.some(({ name, has_profile: has }) => name === filter && has);
+  }
+
+  /**
+   * @param {Trace} trace
+   * @param {Diagnosis | null} diagnosis
+   */
+  #draw(trace, diagnosis) {
+    const { component } = this.#store.state;
+    const index = trace.components.findIndex(({ name }) => name === component);
+    const { tone, headline, evidence, step } = finding(trace, Math.max(index, 0), diagnosis);
+    this.#host.dataset.tone = tone;
+    this.#host.dataset.source = diagnosis?.state ?? 'trace';
+    const line = html('.sentence', this.#host);
+    html('strong', line).textContent = headline;
+    html('span', line).textContent = evidence;
+    line.title = `${headline} ${evidence}`;
+    this.#step = step;
+    const moment = html('.moment', this.#host);
+    moment.classList.toggle('none', step === null);
+    moment.textContent = `Step ${step ?? ''}`;
+  }
+}
