@@ -235,11 +235,13 @@ def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) 
     """Metrics of errors (T, n) and covariances (T, n, n), SI units, of each trajectory."""
     late = [(e[first:], c[first:]) for e, c in trajectories for first in [task.first_counted(len(e))]]
     result = metrics(task, torch.cat([e for e, _ in late]), torch.cat([c for _, c in late]))
-    sums = [[float(len(e)), *(float(values.sum()) for values in _squares(task, e).values())] for e, _ in late]
-    everything = _squares(task, torch.cat([e for e, _ in trajectories]))
+    sums = [[float(len(e)), *(float(values.sum()) for values in squares(task, e).values())] for e, _ in late]
+    everything = squares(task, torch.cat([e for e, _ in trajectories]))
     touched = np.concatenate([np.maximum.accumulate(e.contact)[task.first_counted(len(e)) :] for e in episodes])
-    squares = _squares(task, torch.cat([e for e, _ in late]))
-    before, after = (_root_mean({key: values[mask] for key, values in squares.items()}) for mask in (~touched, touched))
+    late_errors = squares(task, torch.cat([e for e, _ in late]))
+    before, after = (
+        _root_mean({key: values[mask] for key, values in late_errors.items()}) for mask in (~touched, touched)
+    )
     return replace(
         result,
         rmse_from_step_0=_root_mean(everything),
@@ -249,13 +251,11 @@ def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) 
     )
 
 
-def _squares(task: Task, error: Tensor) -> dict[str, Tensor]:
+def squares(task: Task, error: Tensor) -> dict[str, Tensor]:
     """Squares (S,) of errors (S, n) in SI units, by key of ``Metrics.rmse`` and in its units."""
     error = error.double()
-    squares = {}
-    for i, component in enumerate(task.components):
-        squares[component.key] = (component.shown[1] * error[:, i]).square()
-    return squares | {"position_cm": (100.0 * error[:, list(task.map_indices)]).square().sum(-1)}
+    by_component = {c.key: (c.shown[1] * error[:, i]).square() for i, c in enumerate(task.components)}
+    return by_component | {"position_cm": (100.0 * error[:, list(task.map_indices)]).square().sum(-1)}
 
 
 def _root_mean(squares: Mapping[str, Tensor]) -> dict[str, float]:
@@ -265,7 +265,7 @@ def _root_mean(squares: Mapping[str, Tensor]) -> dict[str, float]:
 def metrics(task: Task, error: Tensor, covariance: Tensor) -> Metrics:
     """Metrics of errors (S, n) with covariances (S, n, n), SI units; covariances are all NaN if there are none."""
     error, covariance = error.double(), covariance.double()
-    rmse = _root_mean(_squares(task, error))
+    rmse = _root_mean(squares(task, error))
     if covariance.isnan().all():
         return Metrics(rmse, math.nan, math.nan, math.nan)
     n = error.shape[-1]

@@ -13,12 +13,13 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import one_thread
 from beliefscope.filters.external.likelihood import has_likelihood, log_likelihood
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.fusion import mixture
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.inspect.maps.fusion_rules import fuse_sensors, fusion_rule
-from beliefscope.inspect.maps.grid import GridEvaluator, one_thread
+from beliefscope.inspect.maps.grid import GridEvaluator
 from beliefscope.inspect.maps.likelihood_map import QUANTITIES, Array, LikelihoodMap, Quantity
 from beliefscope.inspect.maps.particle_density import ParticleDensity
 from beliefscope.inspect.maps.plane import (

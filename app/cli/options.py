@@ -41,6 +41,7 @@ def integer(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
 
 
 Quantity = Literal["likelihood", "posterior"]
+Engine = Literal["local", "ray"]
 
 
 def check_output(path: Path | None, *suffixes: str) -> Path | None:
@@ -92,6 +93,8 @@ DATASET = output_file("FILE.h5", "Output HDF5 file.", ".h5", ".hdf5")
 CHECKPOINT = output_file("CHECKPOINT", "Output .safetensors file.", ".safetensors")
 TRACE = output_file("RUN.trace", "Output trace file.", ".trace")
 FIGURE = output_file("FIGURE", "Output figure: .svg, .pdf or .png.")
+ENGINE = option("NAME", "local: processes of this machine. ray: a Ray cluster (pip install 'beliefscope[ray]').")
+WORKERS = option("N", "Processes of this machine; the results do not depend on their number.", parser=integer(1))
 TRACE_FILTER = option(
     "NAME|CHECKPOINT",
     "Filter that produced the traces. Default: the built-in filter with the traces' checkpoint hash.",

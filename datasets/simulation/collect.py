@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import shutil
-import signal
-import threading
 from collections.abc import Callable, Collection, Generator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +17,7 @@ from beliefscope.datasets.dataset import SPLITS
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.io.atomic_write import write_error
+from beliefscope.datasets.parallel import run_in_processes
 from beliefscope.datasets.readers.hdf5_guard import probe
 from beliefscope.datasets.store import open_dataset, write_dataset
 
@@ -140,25 +137,6 @@ def _simulate_all(parts: _PartialCollection, indices: list[int], workers: int) -
             parts.simulate(index)
             yield
         return
-    # Spawn instead of fork: locks held by threads of the caller would stay locked in a fork.
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(indices)), spawn, _exit_with_parent)
-    try:
-        for future in as_completed([pool.submit(parts.simulate, index) for index in indices]):
-            future.result()
+    with closing(run_in_processes(parts.simulate, indices, min(workers, len(indices)))) as results:
+        for _ in results:
             yield
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _exit_with_parent() -> None:
-    """Initialize a worker: ignore Ctrl-C and exit when the parent process ends for any reason."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

@@ -5,13 +5,11 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-import logging
 import math
-import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ from beliefscope.datasets.task_json import difference
 from beliefscope.filters import legacy_names
 from beliefscope.filters.catalog import architecture, filters_of
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
+from beliefscope.filters.engine import Engine, run_all
 from beliefscope.filters.evaluate import metrics
 from beliefscope.filters.filter import Architecture, Filter
 from beliefscope.filters.start_offset import STUDY_OFFSET
@@ -274,45 +273,22 @@ def run_local(
         yield cell, document
 
 
-def run_ray(cells: Sequence[Cell], folder: Path) -> Iterator[tuple[Cell, Document]]:
-    """Runs the cells on a Ray cluster, each with one CPU and, if the cluster has any, one GPU.
+def run_cells(cells: Sequence[Cell], folder: Path, engine: Engine, workers: int) -> Iterator[tuple[Cell, Document]]:
+    """Runs the cells with an engine (``engine.run_all``); yields each when it is done."""
 
-    The cluster is that of ``RAY_ADDRESS``, else one that runs on this machine, else a temporary one. All its machines
-    need this package, and ``folder`` and the data at the same path of a shared file system.
+    def failed(cell: Cell, error: Exception) -> Document:
+        document = _failure(cell, error)
+        cell.path(folder).parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(cell.path(folder), json.dumps(document, indent=1).encode())
+        return document
 
-    Raises:
-        BadInput: Ray is not installed, or its cluster cannot be reached.
-    """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray sends usage statistics by default
-    try:
-        import ray
-    except ImportError:
-        raise BadInput("engine 'ray' needs Ray: pip install 'beliefscope[ray]'") from None
-    started = not ray.is_initialized()
-    if started:
-        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-        try:
-            ray.init("auto", **quiet)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            if address := os.environ.get("RAY_ADDRESS"):
-                raise BadInput(f"engine 'ray' reaches no cluster at RAY_ADDRESS {address!r}: {error}") from None
-            ray.init("local", include_dashboard=False, **quiet)
-    try:
-        run = ray.remote(num_cpus=1, num_gpus=min(1, ray.cluster_resources().get("GPU", 0)), max_retries=2)(run_cell)
-        running = {run.remote(cell, folder): cell for cell in cells}
-        while running:
-            (done, *_), _ = ray.wait(list(running))
-            cell = running.pop(done)
-            try:
-                yield cell, ray.get(done)
-            except ray.exceptions.RayError as error:  # a machine or process failed after all retries
-                document = _failure(cell, error)
-                cell.path(folder).parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(cell.path(folder), json.dumps(document, indent=1).encode())
-                yield cell, document
-    finally:
-        if started:
-            ray.shutdown()
+    return run_all(partial(_run_cell, folder), cells, engine, workers, failed)
+
+
+def _run_cell(folder: Path, cell: Cell) -> Document:
+    document = run_cell(cell, folder)
+    assert document is not None
+    return document
 
 
 def write_tables(folder: Path, cells: Sequence[Cell], preset: str) -> tuple[list[Row], Document]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -126,14 +125,3 @@ def apply_layers(stack: list[tuple[Tensor, ...]], x: Tensor, y: Tensor) -> None:
             torch.addmm(bias, x, first, out=y).clamp_min_(0.0)
             x.add_(second_bias).addmm_(y, second)
         x.clamp_min_(0.0)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch operations in one thread; the chunks are too small for threads to pay off."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     filters=opt.option("NAME", "Repeatable. Default: all filters of each task.", "--filter"),
     seeds=opt.option("K", "Train each filter with seeds 0 to K - 1.", parser=opt.integer(1)),
     data=opt.option("TASK=FILE", "Data of a task. Repeatable. Default: the built-in sample dataset."),
-    engine=opt.option("NAME", "local: one run at a time on this machine. ray: on a Ray cluster."),
+    engine=opt.ENGINE,
+    workers=opt.option("N", "Processes of this machine, each with one thread.", parser=opt.integer(1)),
 )
 def study(
     output: Path,
@@ -29,7 +30,8 @@ def study(
     seeds: int = 3,
     data: list[str] | None = None,
     skip_bad: bool = False,
-    engine: Literal["local", "ray"] = "local",
+    engine: opt.Engine = "local",
+    workers: int = 1,
 ) -> console.Result:
     """Train and compare filters over many conditions.
 
@@ -44,7 +46,7 @@ def study(
       beliefscope study --task door --filter crossmodal-ekf --filter lstm --seeds 5 -o study
       beliefscope study --data push-real=mit_push --data door=door.h5 --preset full --engine ray -o /lab/study
     """
-    from beliefscope.filters.training.study import run_local, run_ray, study_cells
+    from beliefscope.filters.training.study import run_cells, run_local, study_cells
     from beliefscope.filters.training.study_table import to_markdown
     from beliefscope.recordings.study_figures import write_study
 
@@ -76,7 +78,9 @@ def study(
 
         rows, overview = write_study(folder, cells, preset)
         update("Cells", done / total, f"{done} of {total}")
-        for cell, document in run_ray(remaining, folder) if engine == "ray" else run_local(remaining, folder, report):
+        here = engine == "local" and workers == 1
+        results = run_local(remaining, folder, report) if here else run_cells(remaining, folder, engine, workers)
+        for cell, document in results:
             done += 1
             update("Cells", done / total, f"{done} of {total}: {cell}")
             if "error" in document:

@@ -31,7 +31,7 @@ from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
 from beliefscope.filters.training import study
 from beliefscope.filters.training.plan import BLACKOUTS, EVALUATED_BLACKOUTS
-from beliefscope.filters.training.study import Cell, run_cell, run_ray
+from beliefscope.filters.training.study import Cell, run_cell, run_cells
 from beliefscope.filters.training.study_table import OFFSET, TRIVIAL, TRUTH, rows_of, to_markdown
 
 pytestmark = pytest.mark.slow
@@ -379,7 +379,7 @@ def test_cells_on_a_ray_cluster(data: Path, finished: Path, tmp_path: Path, monk
     pytest.importorskip("ray", reason="pip install 'beliefscope[ray]'")
     assert os.environ.get("RAY_ADDRESS") is None
     cells = [cell(data, "haptics-ekf"), cell(data, "lstm", data_hash="0" * 64)]
-    answers = dict(run_ray(cells, tmp_path))
+    answers = dict(run_cells(cells, tmp_path, "ray", 1))
     assert answers[cells[0]] == cells[0].finished(tmp_path)
     assert answers[cells[0]]["metrics"] == document(finished, NAMES[0])["metrics"]
     assert "was changed while the study ran" in answers[cells[1]]["error"]

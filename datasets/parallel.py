@@ -1,0 +1,70 @@
+"""Runs a function over many items in several processes, which survive the loss of one."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+LOSSES = 3
+"""Number of lost processes in a row, without a finished item between them, after which the run fails."""
+
+
+def run_in_processes(
+    function: Callable[[Item], Result], items: Iterable[Item], workers: int
+) -> Generator[tuple[Item, Result]]:
+    """Call ``function`` with each item in ``workers`` processes; yields items and results in the order they finish.
+
+    Function, items and results must be picklable. If a process is killed, for example by lack of memory, its item and
+    those that the pool lost with it run again. The processes end with this one, and when the generator is closed.
+
+    Raises what the function raises, and ``BrokenProcessPool`` after ``LOSSES`` losses in a row.
+    """
+    remaining, losses = iter(items), 0
+    queue: list[Item] = []
+    while True:
+        # Spawn instead of fork: locks held by threads of the caller would stay locked in a fork.
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _exit_with_parent)
+        running: dict[Future[Result], Item] = {}
+        try:
+            while True:
+                # A short queue, because a lost process loses everything in it; items may be many.
+                queue += islice(remaining, max(0, 2 * workers - len(running) - len(queue)))
+                while queue and len(running) < 2 * workers:
+                    running[pool.submit(function, queue[0])] = queue[0]
+                    del queue[0]
+                if not running:
+                    return
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    result = future.result()
+                    losses = 0
+                    yield running.pop(future), result
+        except BrokenProcessPool:
+            losses += 1
+            if losses == LOSSES:
+                raise
+            queue = [*running.values(), *queue]
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _exit_with_parent() -> None:
+    """Initialize a worker: ignore Ctrl-C and exit when the parent process ends for any reason."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,53 @@
+"""Processes: every item exactly once, whatever happens to the processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from beliefscope.datasets.parallel import LOSSES, run_in_processes
+
+pytestmark = pytest.mark.slow
+
+
+def square_once_killed(folder: Path, number: int) -> int:
+    """The square; the process of every fourth number kills itself the first time, as the kernel does without memory."""
+    marker = folder / str(number)
+    if number % 4 == 0 and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2
+
+
+def always_killed(number: int) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def process_of(number: int) -> int:
+    return os.getpid()
+
+
+def test_items_of_killed_processes_run_again(tmp_path: Path) -> None:
+    results = list(run_in_processes(partial(square_once_killed, tmp_path), range(9), workers=2))
+    assert sorted(results) == [(i, i**2) for i in range(9)]
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_fails_if_no_process_survives() -> None:
+    assert LOSSES > 1
+    with pytest.raises(BrokenProcessPool):
+        list(run_in_processes(always_killed, range(3), workers=1))
+
+
+def test_processes_end_with_the_generator() -> None:
+    with closing(run_in_processes(process_of, iter(range(1000)), workers=1)) as results:
+        _, process = next(results)
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, 0)
