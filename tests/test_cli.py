@@ -34,7 +34,9 @@ OPTIONS = {
     "lineage": "--export -o --json",
     "evaluate": "--filter --data --skip-bad --faults --only --particles --seed --json",
     "calibrate": "--filter --data --skip-bad --faults --level --particles --seed -o --json",
-    "study": "--preset --task --filter --seeds --data --skip-bad --engine -o --json",
+    "study": "--preset --task --filter --seeds --data --skip-bad --engine --workers -o --json",
+    "sweep": "--checkpoints --data --faults --seeds --particles --all --block --engine --workers -o --json",
+    "experiments": "--phase --sort --top --sql -o --json",
     "trace": "--filter --data --skip-bad --episode --faults --seed -o --json",
     "record": "--filter --data --skip-bad --episode --maps --map-size --diagnostics --no-diagnostics --faults --seed "
     "-o --json",

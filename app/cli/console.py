@@ -69,6 +69,15 @@ def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int |
     return format_table(title, columns, rows)
 
 
+def arrow(title: str, rows: Any) -> str:
+    """Format an Arrow table; hashes are shortened."""
+
+    def short(value: Any) -> Any:
+        return value[:12] if isinstance(value, str) and len(value) == 64 else value
+
+    return grid(title, rows.column_names, [[short(value) for value in row.values()] for row in rows.to_pylist()])
+
+
 def grids(tables: Iterable[Table]) -> list[str]:
     """Format several tables."""
     return [grid(table.title, table.columns, table.rows) for table in tables]

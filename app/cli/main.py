@@ -20,7 +20,7 @@ from beliefscope.datasets.errors import BadInput
 
 COMMANDS = (
     *("serve", "collect", "convert", "train", "finetune", "modules", "change", "lineage"),
-    *("evaluate", "calibrate", "study", "trace", "record", "live", "import", "export"),
+    *("evaluate", "calibrate", "study", "sweep", "experiments", "trace", "record", "live", "import", "export"),
     *("inspect", "diagnose", "report", "counterfactual", "figure", "failures", "slices", "faults", "doctor"),
 )
 """In the order of the help text. Each is a function of a module in ``commands`` with the same name."""

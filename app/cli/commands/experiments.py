@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from beliefscope.app.cli import console
+from beliefscope.app.cli import options as opt
+from beliefscope.datasets.errors import BadInput
+
+
+@opt.with_options(
+    sweeps=opt.argument("DIR...", "Folders of sweeps; their tables are joined."),
+    phase=opt.option("NAME", "Steps to compare: all, a group such as contact, or blackout."),
+    sort=opt.option("COLUMN", "Column of the overview that ranks the checkpoints, worst first."),
+    top=opt.option("N", "Number of rows.", parser=opt.integer(1)),
+    sql=opt.option("QUERY", "An SQL query (DuckDB) of the tables results, checkpoints and datasets instead."),
+    output=opt.output_file("FILE", "Write all rows to a file: .csv or .parquet.", ".csv", ".parquet"),
+)
+def experiments(
+    sweeps: list[Path],
+    phase: str = "all",
+    sort: str = "error",
+    top: int = 20,
+    sql: str = "",
+    output: Path | None = None,
+) -> console.Result:
+    """Query the results of sweeps.
+
+    Without --sql, compares the checkpoints: pooled RMSE of the position, NEES, coverage and the worst step, by
+    checkpoint and faults, for the steps of one phase. docs/sweep.md lists the columns and ten queries.
+
+    \b
+    Examples:
+      beliefscope experiments sweep --phase contact
+      beliefscope experiments sweep --sort nees --top 5 --json -
+      beliefscope experiments sweep --sql "SELECT phase, avg(coverage95) FROM results GROUP BY phase"
+      beliefscope experiments sweep-a sweep-b -o all.csv
+    """
+    from beliefscope.recordings.sweep_table import Experiments, write_rows
+
+    tables = Experiments(sweeps)
+    rows = tables.query(sql) if sql else tables.overview(phase, sort)
+    if sql == "" and not len(rows):
+        raise BadInput(f"no steps in phase {phase!r}. Available: {', '.join(tables.phases())}")
+    if output is not None:
+        write_rows(rows, output)
+    shown = rows.slice(0, top)
+    more = f"\n{len(rows) - top} more rows: --top {len(rows)}" if len(rows) > top else ""
+    document = {"rows": shown.to_pylist(), "count": len(rows)}
+    title = "Results" if sql else f"Checkpoints, {phase} steps"
+    return console.Result(document, console.arrow(title, shown) + more, output)

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from beliefscope.app.cli import console
+from beliefscope.app.cli import options as opt
+from beliefscope.datasets.errors import BadInput
+
+
+@opt.with_options(
+    checkpoints=opt.option("GLOB", "Checkpoints, such as 'runs/*.safetensors' (quoted). Repeatable.", "--checkpoints"),
+    data=opt.option(
+        "FILE.h5|DIR", "Episodes; each checkpoint runs over those of its task. Repeatable. Default: the sample dataset."
+    ),
+    faults=opt.option("FAULTS", "Sensor faults, such as blackout=0.4; '' is clean data. Repeatable. Default: ''."),
+    seeds=opt.option("K", "Run with seeds 0 to K - 1.", parser=opt.integer(1)),
+    every=opt.flag("Run over all episodes, not only the held-out ones.", "--all"),
+    block=opt.option("N", "Episodes of a cell, the unit of work that is stored.", parser=opt.integer(1)),
+    engine=opt.ENGINE,
+    workers=opt.WORKERS,
+    output=opt.option("DIR", "Folder of the sweep; created if missing.", "-o", "--output"),
+)
+def sweep(
+    checkpoints: list[str],
+    output: Path,
+    data: list[Path] | None = None,
+    faults: list[str] | None = None,
+    seeds: int = 1,
+    particles: int = 300,
+    every: bool = False,
+    block: int = 64,
+    engine: opt.Engine = "local",
+    workers: int = 1,
+) -> console.Result:
+    """Run many checkpoints over many episodes; store a table.
+
+    One row for each checkpoint, data set, faults, seed, episode and phase: errors, NEES, coverage, fusion weights and
+    the provenance of the episode, in DIR/results.parquet; one for each checkpoint in DIR/checkpoints.parquet, with the
+    provenance in a JSON file beside it (runs/a.json for runs/a.safetensors). Finished cells are stored: the same
+    command resumes an interrupted sweep. The table has the same bits with any engine and number of workers. Read it
+    with beliefscope experiments, DuckDB, pandas or Polars (docs/sweep.md).
+
+    \b
+    Examples:
+      beliefscope sweep --checkpoints 'runs/*.safetensors' --data door.h5 -o sweep
+      beliefscope sweep --checkpoints 'runs/*.safetensors' --faults '' --faults blackout=0.8 --workers 8 -o sweep
+      beliefscope sweep --checkpoints '/lab/**/*.safetensors' --data /lab/door.h5 --engine ray -o /lab/sweep
+    """
+    from beliefscope.inspect.sweep import Inputs
+    from beliefscope.recordings.sweep_table import Experiments, run_sweep
+
+    opt.check_folder(output, "output")
+    paths = [path for pattern in checkpoints for path in _matches(pattern)]
+    inputs = Inputs(
+        tuple(dict.fromkeys(paths)),
+        tuple(path.resolve() for path in data or ()),
+        tuple(dict.fromkeys(faults or [""])),
+        tuple(range(seeds)),
+        particles,
+        every,
+    )
+    cells = inputs.cells(block)
+    opt.check_output(output / "results.parquet" if output.is_dir() else output)
+    output.mkdir(exist_ok=True)
+    with console.bars() as update:
+        table = run_sweep(
+            cells,
+            output.resolve(),
+            engine=engine,
+            workers=workers,
+            progress=lambda done, total: update("Episodes", done / total, f"{done} of {total}"),
+        )
+    overview = Experiments([output]).overview()
+    document = {"checkpoints": len(inputs.checkpoints), "cells": len(cells), "rows": len(table)}
+    document |= {"overview": overview.to_pylist()}
+    return console.Result(document, console.arrow("Checkpoints", overview), output / "results.parquet")
+
+
+def _matches(pattern: str) -> list[Path]:
+    """Files of a glob pattern. Raises BadInput if there is none."""
+    from glob import glob
+
+    paths = [Path(text).resolve() for text in sorted(glob(pattern, recursive=True)) if text.endswith(".safetensors")]
+    if not paths:
+        raise BadInput(f"no checkpoint (.safetensors) matches {pattern!r}")
+    return paths

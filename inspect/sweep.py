@@ -1,0 +1,231 @@
+"""A sweep: many checkpoints over many episodes, divided into cells that run anywhere and in any order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.special import chdtri
+
+import beliefscope
+from beliefscope.datasets.dataset import Dataset
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.faults.injection import read_faults
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
+from beliefscope.filters.evaluate import squares
+from beliefscope.inspect.failures.survey import traces_of
+from beliefscope.inspect.statistics import measures
+from beliefscope.inspect.trace import Trace
+
+FORMAT = 1
+"""Version of the rows; rows of other versions are computed again."""
+
+EPISODES = 64
+"""Episodes of a cell: enough to share the start of a run, few enough to lose little when one is interrupted."""
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One filter over some episodes of a data set, and everything its rows depend on.
+
+    Attributes:
+        checkpoint, data: files. checkpoint_hash, data_hash: of their content.
+        faults: as text. particles: of a particle filter. episodes: indices.
+    """
+
+    checkpoint: Path
+    checkpoint_hash: str
+    data: Path
+    data_hash: str
+    faults: str
+    seed: int
+    particles: int
+    episodes: tuple[int, ...]
+
+    @property
+    def key(self) -> str:
+        """Name of the cell: a hash of its inputs, without paths, and of the versions that compute its rows."""
+        inputs = asdict(self) | {"checkpoint": None, "data": None}
+        inputs |= {"format": FORMAT, "beliefscope": beliefscope.__version__, "torch": torch.__version__}
+        return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:24]
+
+    def rows(self) -> list[Row]:
+        """Run the filter: a row for each episode and phase, in this order."""
+        checkpoint = _checkpoint(self.checkpoint)
+        data = _dataset(self.data, checkpoint.task)
+        if checkpoint.hash != self.checkpoint_hash:
+            raise BadInput(f"{self.checkpoint} was changed while the sweep ran")
+        faults = read_faults(self.faults, data.task)
+        runs = traces_of(checkpoint, data, self.episodes, faults=faults, seed=self.seed, particles=self.particles)
+        by_episode = {run.episode_index: list(summary(run)) for run in runs}
+        given = {"checkpoint": self.checkpoint_hash, "data": self.data_hash, "faults": self.faults, "seed": self.seed}
+        return [given | row for index in self.episodes for row in by_episode[index]]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Checkpoints and data sets of a sweep. Each checkpoint runs over the data sets of its task.
+
+    Attributes:
+        checkpoints: files. data: files or folders; empty: the sample data set of each task.
+        faults: texts; an empty one is clean data. seeds, particles: as for ``trace``.
+        all_episodes: whether to run over all episodes instead of the held-out ones.
+    """
+
+    checkpoints: tuple[Path, ...]
+    data: tuple[Path, ...] = ()
+    faults: tuple[str, ...] = ("",)
+    seeds: tuple[int, ...] = (0,)
+    particles: int = 300
+    all_episodes: bool = False
+
+    def cells(self, size: int = EPISODES) -> list[Cell]:
+        """All cells with up to ``size`` episodes, by checkpoint.
+
+        Raises BadInput for unusable files, and for data sets or faults that fit no checkpoint.
+        """
+        cells: list[Cell] = []
+        used: set[Path] = set()
+        for path in self.checkpoints:
+            checkpoint = _checkpoint(path)
+            for data_path in self.data or (sample_path(checkpoint.task),):
+                data = _dataset(data_path, checkpoint.task)
+                if difference(checkpoint.task, data.task):
+                    continue
+                used.add(data_path)
+                episodes = range(len(data)) if self.all_episodes else data.held_out()
+                for faults in self.faults:
+                    text = str(read_faults(faults, data.task))
+                    for seed in self.seeds:
+                        cells += [
+                            Cell(path, checkpoint.hash, data_path, data.hash, text, seed, self.particles, block)
+                            for block in _blocks(episodes, size)
+                        ]
+        if unused := [str(path) for path in self.data if path not in used]:
+            tasks = sorted({_checkpoint(path).task.name for path in self.checkpoints})
+            raise BadInput(f"data {', '.join(unused)} fit no checkpoint; their tasks are {', '.join(tasks)}")
+        return list(dict.fromkeys(cells))
+
+
+def describe_checkpoint(path: Path) -> Row:
+    """The row of a checkpoint: name, task, training and provenance.
+
+    A file beside the checkpoint with the suffix ``.json`` may have further provenance, such as the configuration of
+    the training or the address of a tracker's run. Raises BadInput if it is not a JSON object.
+    """
+    checkpoint = _checkpoint(path)
+    record, beside = dict(checkpoint.record), path.with_suffix(".json")
+    provenance: Any = {}
+    if beside.is_file():
+        try:
+            provenance = json.loads(beside.read_text())
+        except ValueError as error:
+            raise BadInput(f"{beside} is not JSON: {error}") from None
+        if not isinstance(provenance, dict):
+            raise BadInput(f"{beside} contains {type(provenance).__name__}, expected a JSON object of key: value")
+    return {
+        "checkpoint": checkpoint.hash,
+        "name": path.stem,
+        "path": str(path),
+        "task": checkpoint.task.name,
+        "filter": checkpoint.name,
+        "kind": checkpoint.kind,
+        "training": json.dumps(record, sort_keys=True),
+        "provenance": json.dumps(provenance, sort_keys=True),
+    }
+
+
+def describe_data(path: Path, checkpoint: Path) -> Row:
+    """The row of a data set that a checkpoint ran over."""
+    data = _dataset(path, _checkpoint(checkpoint).task)
+    return {"data": data.hash, "name": path.stem, "path": str(path), "task": data.task.name, "episodes": len(data)}
+
+
+def summary(trace: Trace) -> Iterator[Row]:
+    """A row for each phase of a trace that has steps: errors in display units, consistency, weights, particles.
+
+    ``error`` is the root mean square of the position error, ``worst`` its maximum, at ``worst_step``, both in ``unit``;
+    each component has its own column, such as ``hinge_x_cm``. ``beta_image`` and ``weight_image`` are the mean raw and
+    effective fusion weight.
+    ``nll`` in nats, m and rad; ``nees`` over n, 1 if consistent; ``coverage95`` the share of steps with the truth in
+    the 95 % ellipsoid; ``ess`` the effective share of the particles; NaN where a filter lacks the quantity.
+    """
+    error = measures.errors(trace)[:, -1]
+    squared = {key: values.numpy() for key, values in squares(trace.task, torch.from_numpy(error)).items()}
+    *components, main = squared
+    columns = {"nees": measures.nees(trace)[:, -1]} | _probabilities(trace, error.shape[-1])
+    if trace.effective_sample_size is not None and trace.particle_count:
+        columns["ess"] = trace.effective_sample_size / trace.particle_count
+    for kind, weights in (("beta", trace.weights), ("weight", trace.effective_weights)):
+        if weights is not None:
+            columns |= {f"{kind}_{name}": weights[:, k].mean(-1) for k, name in enumerate(trace.modalities)}
+    episode = trace.episode
+    given = {
+        "task": trace.task.name,
+        "episode": trace.episode_index,
+        "episode_hash": trace.data_hash,
+        "split": episode.split,
+        "policy": str(episode.provenance.get("policy", "")),
+        "provenance": json.dumps(dict(episode.provenance), sort_keys=True, default=str),
+        "particles": trace.particle_count,
+    }
+
+    def rmse(key: str, mask: measures.Mask) -> float:
+        return float(np.sqrt(squared[key][mask].mean()))
+
+    for phase, mask in measures.phases(trace).items():
+        if not mask.any():
+            continue
+        steps = np.flatnonzero(mask)
+        at = int(steps[np.argmax(np.nan_to_num(squared[main][steps], nan=-1.0))])
+        yield {
+            **given,
+            "phase": phase,
+            "steps": len(steps),
+            "error": rmse(main, mask),
+            "unit": main.rpartition("_")[2],
+            **{key: rmse(key, mask) for key in components},
+            "worst": float(np.sqrt(squared[main][at])),
+            "worst_step": at,
+            **{key: float(np.mean(values[mask])) for key, values in columns.items()},
+        }
+
+
+def _probabilities(trace: Trace, n: int) -> dict[str, measures.Array]:
+    """(T,) of each step: negative log-likelihood of the truth, and whether it is in the 95 % ellipsoid."""
+    if not trace.has_covariance:
+        missing = np.full(len(trace), math.nan)
+        return {"nll": missing, "coverage95": missing}
+    squared = n * measures.nees(trace)[:, -1]
+    determinant = np.linalg.slogdet(measures.covariances(trace)[:, -1])[1]
+    nll = 0.5 * (squared + determinant + n * math.log(2.0 * math.pi))
+    return {"nll": nll, "coverage95": np.where(np.isnan(squared), np.nan, squared <= chdtri(n, 0.05))}
+
+
+def _blocks(indices: Iterable[int], size: int) -> Iterator[tuple[int, ...]]:
+    every = tuple(indices)
+    return (every[i : i + size] for i in range(0, len(every), size))
+
+
+# A process runs the cells of a checkpoint and of a data set one after the other.
+@lru_cache(maxsize=2)
+def _checkpoint(path: Path) -> Checkpoint:
+    return load_checkpoint(path)
+
+
+@lru_cache(maxsize=16)
+def _dataset(path: Path, task: Task) -> Dataset:
+    return open_dataset(path, task)

@@ -1,0 +1,258 @@
+"""Sweeps on disk: the rows of each finished cell, and the tables joined from them.
+
+A sweep's folder has ``cells/CHECKPOINT/CELL.parquet``, one file for each finished cell, from which an interrupted sweep
+resumes; ``results.parquet``, a row for each checkpoint, data set, faults, seed, episode and phase; and
+``checkpoints.parquet`` and ``datasets.parquet``, which describe them. The results depend on the inputs only, to the
+bit.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pyarrow import csv
+
+from beliefscope.datasets.errors import BadInput, check_name
+from beliefscope.datasets.faults.injection import read_faults
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.store import open_dataset
+from beliefscope.filters.checkpoint import load_checkpoint
+from beliefscope.filters.engine import Engine, run_all
+from beliefscope.inspect.sweep import Cell, Row, describe_checkpoint, describe_data
+from beliefscope.inspect.trace import Trace, trace
+
+TABLES = RESULTS, CHECKPOINTS, DATASETS = "results", "checkpoints", "datasets"
+"""Tables of a sweep."""
+
+TEXTS = frozenset(
+    {"checkpoint", "data", "faults", "task", "episode_hash", "split", "policy", "provenance", "phase", "unit"}
+)
+INTEGERS = frozenset({"seed", "episode", "particles", "steps", "worst_step"})
+"""Columns of the results; all others are numbers."""
+
+METADATA = b"beliefscope"
+
+Progress = Callable[[int, int], None]
+
+
+def run_sweep(
+    cells: Sequence[Cell],
+    folder: Path,
+    *,
+    engine: Engine = "local",
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> pa.Table:
+    """Run the missing cells of a sweep and write its tables; the results.
+
+    An interrupted sweep resumes with the missing cells. The tables have the same bits with any engine, number of
+    workers and interruption.
+
+    Args:
+        progress: called with the numbers of finished episodes and of all, at the start and after each cell.
+
+    Raises BadInput for unusable files, and as ``run_all``.
+    """
+    missing = [cell for cell in cells if not is_finished(cell, folder)]
+    total = sum(len(cell.episodes) for cell in cells)
+    done = total - sum(len(cell.episodes) for cell in missing)
+    report = progress or (lambda done, total: None)
+    report(done, total)
+    with closing(run_all(partial(_run_cell, folder), missing, engine, workers)) as results:
+        for cell, _ in results:
+            done += len(cell.episodes)
+            report(done, total)
+    write_tables(cells, folder)
+    return pq.read_table(folder / f"{RESULTS}.parquet")
+
+
+def is_finished(cell: Cell, folder: Path) -> bool:
+    """Whether the rows of a cell are stored completely."""
+    try:
+        metadata = pq.read_metadata(_file(cell, folder)).metadata
+    except (OSError, pa.ArrowInvalid):
+        return False
+    return bool(metadata) and metadata.get(METADATA) == cell.key.encode()
+
+
+def _file(cell: Cell, folder: Path) -> Path:
+    return folder / "cells" / cell.checkpoint_hash[:16] / f"{cell.key}.parquet"
+
+
+def _run_cell(folder: Path, cell: Cell) -> None:
+    path = _file(cell, folder)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = cell.rows()
+    names = list(dict.fromkeys(name for row in rows for name in row))  # rows may lack columns
+    table = pa.table([pa.array([row.get(name) for row in rows], _type(name)) for name in names], names=names)
+    _write(table.replace_schema_metadata({METADATA: cell.key.encode()}), path)
+
+
+def _write(rows: pa.Table | list[Row], path: Path) -> None:
+    data = io.BytesIO()
+    table = pa.Table.from_pylist(rows) if isinstance(rows, list) else rows
+    pq.write_table(table, data, compression="zstd")
+    write_atomically(path, data.getvalue())
+
+
+def _type(name: str) -> pa.DataType:
+    return pa.string() if name in TEXTS else pa.int32() if name in INTEGERS else pa.float64()
+
+
+def write_tables(cells: Sequence[Cell], folder: Path) -> None:
+    """Join the rows of finished cells in the order of the cells, in constant memory, and describe the checkpoints."""
+    files = [_file(cell, folder) for cell in cells]
+    names = dict.fromkeys(name for file in files for name in pq.read_schema(file).names)
+    schema = pa.schema([(name, _type(name)) for name in names])
+    temporary = folder / f".{RESULTS}.parquet.partial"
+    with pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+        for group in _groups(files):
+            writer.write_table(pa.concat_tables([_aligned(pq.read_table(file), schema) for file in group]))
+    os.replace(temporary, folder / f"{RESULTS}.parquet")
+    checkpoints = [describe_checkpoint(path) for path in dict.fromkeys(cell.checkpoint for cell in cells)]
+    datasets = [describe_data(*pair) for pair in dict.fromkeys((cell.data, cell.checkpoint) for cell in cells)]
+    _write(checkpoints, folder / f"{CHECKPOINTS}.parquet")
+    _write(list({row["data"]: row for row in datasets}.values()), folder / f"{DATASETS}.parquet")
+
+
+def _groups(files: Sequence[Path], rows: int = 100_000) -> Iterator[list[Path]]:
+    """Consecutive files with about so many rows: row groups large enough to compress and to skip."""
+    group: list[Path] = []
+    count = 0
+    for file in files:
+        group.append(file)
+        count += pq.read_metadata(file).num_rows
+        if count >= rows:
+            yield group
+            group, count = [], 0
+    if group:
+        yield group
+
+
+def _aligned(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """The table with the columns of the schema; missing ones are null."""
+    columns = [
+        table.column(field.name) if field.name in table.column_names else pa.nulls(len(table), field.type)
+        for field in schema
+    ]
+    return pa.table(columns, schema=schema)
+
+
+OVERVIEW = {
+    "name": "any_value(c.name)",
+    "filter": "any_value(c.filter)",
+    "task": "any_value(r.task)",
+    "faults": "r.faults",
+    "episodes": "count(DISTINCT r.episode)",
+    "steps": "sum(r.steps)::BIGINT",
+    "error": "sqrt(sum(r.steps * r.error ** 2) / sum(r.steps))",
+    "unit": "any_value(r.unit)",
+    "nees": "sum(r.steps * r.nees) / sum(r.steps)",
+    "coverage95": "sum(r.steps * r.coverage95) / sum(r.steps)",
+    "worst": "max(r.worst)",
+    "worst_episode": "arg_max(r.episode, r.worst)",
+    "worst_step": "arg_max(r.worst_step, r.worst)",
+    "checkpoint": "r.checkpoint",
+    "data": "r.data",
+}
+"""Column of the overview -> its expression."""
+
+_OVERVIEW_QUERY = (
+    f"SELECT {', '.join(f'{expression} AS {name}' for name, expression in OVERVIEW.items())} "
+    f"FROM {RESULTS} r JOIN (SELECT DISTINCT ON (checkpoint) * FROM {CHECKPOINTS}) c USING (checkpoint) "
+    "WHERE r.phase = ? GROUP BY r.checkpoint, r.data, r.faults"
+)
+
+
+def write_rows(rows: pa.Table, path: Path) -> None:
+    """Write a table as ``.csv`` or ``.parquet``."""
+    data = io.BytesIO()
+    if path.suffix == ".csv":
+        csv.write_csv(rows, data)
+    else:
+        pq.write_table(rows, data, compression="zstd")
+    write_atomically(path, data.getvalue())
+
+
+class Experiments:
+    """SQL queries over the ``TABLES`` of one or several sweeps.
+
+    The queries can read the tables of the sweeps, and no other file.
+    """
+
+    def __init__(self, folders: Iterable[Path]) -> None:
+        """Raises BadInput for a folder without results."""
+        self.folders = tuple(Path(folder).resolve() for folder in folders)
+        for folder in self.folders:
+            if not (folder / f"{RESULTS}.parquet").is_file():
+                raise BadInput(f"{folder} has no results of a sweep; write them: beliefscope sweep ... -o {folder}")
+        self._database = duckdb.connect(config={"autoinstall_known_extensions": False})
+        for table in TABLES:
+            files = [str(folder / f"{table}.parquet") for folder in self.folders]
+            relation = self._database.read_parquet(files, union_by_name=True)
+            relation.create_view(table)
+        paths = [str(folder) for folder in self.folders]
+        self._database.execute(f"SET allowed_directories={paths}")
+        self._database.execute("SET enable_external_access=false")
+        self._database.execute("SET lock_configuration=true")
+
+    def query(self, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
+        """The result of a query. Raises BadInput with the message of the database."""
+        try:
+            return self._database.sql(sql, params=list(parameters)).to_arrow_table()
+        except duckdb.Error as error:
+            raise BadInput(f"query {sql!r}: {str(error).strip()}") from None
+
+    def overview(self, phase: str = "all", sort: str = "error") -> pa.Table:
+        """Results of each checkpoint, data set and faults in a phase, highest values of the column ``sort`` first.
+
+        Errors are pooled over steps: ``sqrt(sum(steps error^2) / sum(steps))``; NEES and coverage are averages over
+        steps. Raises BadInput for an unknown column.
+        """
+        check_name("column of the overview", sort, OVERVIEW)
+        order = f"{sort} DESC NULLS LAST, name, checkpoint, data, faults"
+        return self.query(f"{_OVERVIEW_QUERY} ORDER BY {order}", [phase])
+
+    def phases(self) -> list[str]:
+        """Names of the phases of all results."""
+        return [
+            name for (name,) in self._database.execute(f"SELECT DISTINCT phase FROM {RESULTS} ORDER BY 1").fetchall()
+        ]
+
+    def trace(self, row: Mapping[str, Any]) -> Trace:
+        """Run the filter of a row of the results again.
+
+        Args:
+            row: at least ``checkpoint`` and ``data`` (hashes), ``episode``, ``faults`` and ``seed``.
+
+        Raises BadInput if a file is missing or was changed.
+        """
+        checkpoint = load_checkpoint(self._path(CHECKPOINTS, "checkpoint", row["checkpoint"]))
+        if checkpoint.hash != row["checkpoint"]:
+            raise BadInput(f"the checkpoint with hash {row['checkpoint'][:12]} was changed after the sweep")
+        path = self._path(DATASETS, "data", row["data"])
+        with open_dataset(path, checkpoint.task) as data:
+            if data.hash != row["data"]:
+                raise BadInput(f"{path} was changed after the sweep")
+            faults, particles = read_faults(row["faults"], data.task), row.get("particles") or 300
+            return trace(checkpoint, data[row["episode"]], row["episode"], row["seed"], particles, faults)
+
+    def _path(self, table: str, column: str, value: str) -> Path:
+        found = self._database.execute(f"SELECT path FROM {table} WHERE {column} = ?", [value]).fetchone()
+        if found is None:
+            raise BadInput(f"no {column} with hash {value[:12]} in these sweeps")
+        return Path(found[0])
+
+    def columns(self) -> dict[str, str]:
+        """Name and type of each column of the results."""
+        description = self.query(f"DESCRIBE {RESULTS}")
+        return dict(zip(*(description[name].to_pylist() for name in ("column_name", "column_type")), strict=True))

@@ -1,0 +1,196 @@
+"""Sweeps: rows agree with the evaluation and with traces, and depend on the inputs only."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.filters.evaluate import evaluate
+from beliefscope.inspect.sweep import Inputs, summary
+from beliefscope.recordings.sweep_table import RESULTS, Experiments, is_finished, run_sweep
+
+pytestmark = pytest.mark.slow
+
+Run = Callable[..., tuple[int, str, str]]
+FILTERS = ("crossmodal-ekf", "image-pf")
+PARTICLES, EPISODES, BLOCK = 40, 5, 2
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    """Two filters of the door over five short episodes, clean and with blackouts."""
+    folder = tmp_path_factory.mktemp("inputs")
+    with open_dataset(sample_path("door")) as sample:
+        write_dataset(folder / "door.h5", sample.task, [sample[i] for i in sample.held_out()[:EPISODES]])
+    for name in FILTERS:
+        shutil.copyfile(shipped("door", name), folder / f"{name}.safetensors")
+    (folder / f"{FILTERS[0]}.json").write_text('{"run": "https://tracker.example/7", "lr": 0.001}')
+    checkpoints = tuple(folder / f"{name}.safetensors" for name in FILTERS)
+    return Inputs(checkpoints, (folder / "door.h5",), ("", "blackout=0.4"), (0,), PARTICLES)
+
+
+@pytest.fixture(scope="module")
+def sweep(inputs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sweep")
+    reports: list[tuple[int, int]] = []
+    table = run_sweep(inputs.cells(BLOCK), folder, progress=lambda done, total: reports.append((done, total)))
+    assert reports[0] == (0, 20)
+    assert reports[-1] == (20, 20)
+    assert len(table) == len(pq.read_table(folder / f"{RESULTS}.parquet"))
+    return folder
+
+
+def test_pooled_results_equal_the_evaluation(inputs: Inputs, sweep: Path) -> None:
+    overview = Experiments([sweep]).overview().to_pylist()
+    assert len(overview) == 4
+    with open_dataset(inputs.data[0]) as data:
+        expected = evaluate(load_checkpoint(inputs.checkpoints[0]).filter, list(data))
+    (row,) = [row for row in overview if row["name"] == FILTERS[0] and row["faults"] == ""]
+    # The evaluation runs all episodes in one batch of float32; the floors of the covariance are the same.
+    assert row["error"] == pytest.approx(expected.rmse["position_cm"], rel=1e-4)
+    assert row["nees"] == pytest.approx(expected.nees, rel=1e-3)
+    assert row["coverage95"] == pytest.approx(expected.coverage95, abs=2e-3)
+    assert (row["unit"], row["episodes"]) == ("cm", EPISODES)
+    components = Experiments([sweep]).query(
+        "SELECT sqrt(sum(steps * angle_deg ** 2) / sum(steps)) AS angle FROM results "
+        "WHERE phase = 'all' AND faults = '' AND checkpoint = ?",
+        [row["checkpoint"]],
+    )
+    assert components["angle"][0].as_py() == pytest.approx(expected.rmse["angle_deg"], rel=1e-4)
+
+
+def test_phases_partition_the_steps(sweep: Path) -> None:
+    steps = Experiments([sweep]).query(
+        "SELECT phase, sum(steps) AS steps FROM results WHERE faults = '' GROUP BY phase"
+    )
+    by_phase = dict(zip(steps["phase"].to_pylist(), steps["steps"].to_pylist(), strict=True))
+    assert by_phase["contact"] + by_phase["free motion"] == by_phase["all"]
+
+
+def test_a_row_leads_to_its_trace(sweep: Path) -> None:
+    experiments = Experiments([sweep])
+    checkpoint = load_checkpoint(shipped("door", "image-pf")).hash
+    rows = experiments.query(
+        "SELECT * FROM results WHERE checkpoint = ? AND episode = 3 AND faults <> '' ORDER BY phase", [checkpoint]
+    ).to_pylist()
+    again = sorted(summary(experiments.trace(rows[0])), key=lambda row: row["phase"])
+    assert [row["phase"] for row in again] == [row["phase"] for row in rows]
+    for row, stored in zip(again, rows, strict=True):
+        np.testing.assert_equal({key: stored[key] for key in row}, row)  # particle filters run one by one: equal bits
+
+
+def test_results_do_not_depend_on_processes_and_interruptions(inputs: Inputs, sweep: Path, tmp_path: Path) -> None:
+    expected = (sweep / f"{RESULTS}.parquet").read_bytes()
+    cells = inputs.cells(BLOCK)
+    run_sweep(cells, tmp_path, workers=2)
+    assert (tmp_path / f"{RESULTS}.parquet").read_bytes() == expected
+    files = sorted(tmp_path.glob("cells/*/*.parquet"))
+    assert len(files) == len(cells) == 12
+    files[0].unlink()
+    files[1].write_bytes(files[1].read_bytes()[:-30])  # as a disk may leave it after a power failure
+    files[2].write_bytes(files[3].read_bytes())
+    assert sum(is_finished(cell, tmp_path) for cell in cells) == 9
+    run_sweep(cells, tmp_path)
+    assert (tmp_path / f"{RESULTS}.parquet").read_bytes() == expected
+
+
+@pytest.mark.long
+def test_a_killed_sweep_resumes(inputs: Inputs, sweep: Path, tmp_path: Path) -> None:
+    words = ["sweep", "--block", str(BLOCK), "--particles", str(PARTICLES), "-o", str(tmp_path / "sweep")]
+    words += [word for path in inputs.checkpoints for word in ("--checkpoints", str(path))]
+    words += ["--data", str(inputs.data[0]), "--faults", "", "--faults", "blackout=0.4", "--workers", "2"]
+    process = subprocess.Popen([sys.executable, "-m", "beliefscope", *words], stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("sweep/cells/*/*.parquet")):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    assert not (tmp_path / "sweep" / f"{RESULTS}.parquet").exists()
+    subprocess.run([sys.executable, "-m", "beliefscope", *words], check=True, capture_output=True, timeout=120)
+    assert (tmp_path / "sweep" / f"{RESULTS}.parquet").read_bytes() == (sweep / f"{RESULTS}.parquet").read_bytes()
+
+
+def test_provenance_of_checkpoints(sweep: Path) -> None:
+    rows = Experiments([sweep]).query("SELECT name, provenance->>'run' AS run, task FROM checkpoints ORDER BY name")
+    assert rows.to_pylist() == [
+        {"name": "crossmodal-ekf", "run": "https://tracker.example/7", "task": "door"},
+        {"name": "image-pf", "run": None, "task": "door"},
+    ]
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT * FROM read_csv('{file}')",
+        "COPY results TO '{folder}/out.csv'",
+        "SET enable_external_access=true",
+        "ATTACH '{folder}/new.db'",
+        "INSTALL httpfs",
+    ],
+)
+def test_queries_cannot_reach_other_files(sweep: Path, tmp_path: Path, sql: str) -> None:
+    (tmp_path / "secret.csv").write_text("a\n1\n")
+    experiments = Experiments([sweep])
+    with pytest.raises(BadInput):
+        experiments.query(sql.format(file=tmp_path / "secret.csv", folder=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["secret.csv"]
+    assert len(experiments.query("SELECT * FROM results"))
+
+
+def test_commands(run: Run, sweep: Path, tmp_path: Path) -> None:
+    code, out, _ = run("experiments --phase contact --sort nees --json -", sweep)
+    document = json.loads(out)
+    nees = [row["nees"] for row in document["rows"]]
+    assert (code, document["count"]) == (0, 4)
+    assert nees == sorted(nees, reverse=True)
+    code, out, _ = run("experiments --top 1 -o", tmp_path / "all.csv", sweep)
+    assert code == 0
+    assert "3 more rows: --top 4" in out
+    assert len((tmp_path / "all.csv").read_text().splitlines()) == 5
+    for line, message in {
+        "--sql 'SELECT * FROM nowhere'": "nowhere",
+        "--phase asleep": "no steps in phase 'asleep'. Available: all, blackout, contact, free motion",
+        "--sort speed": "column of the overview 'speed' does not exist",
+    }.items():
+        code, _, error = run(f"experiments {line}", sweep)
+        assert code == 2
+        assert message in error
+        assert error.count("\n") == 1
+    assert "has no results of a sweep" in run("experiments", tmp_path)[2]
+
+
+def test_unusable_inputs(inputs: Inputs, run: Run, tmp_path: Path) -> None:
+    code, _, error = run(f"sweep --checkpoints {tmp_path}/*.safetensors -o {tmp_path / 'sweep'}")
+    assert (code, "no checkpoint (.safetensors) matches" in error) == (2, True)
+    push = shipped("push", "image-ekf")
+    code, _, error = run(f"sweep --checkpoints {push} --data {inputs.data[0]} -o {tmp_path / 'sweep'}")
+    assert (code, "fit no checkpoint; their tasks are push" in error) == (2, True)
+    assert not (tmp_path / "sweep").exists()
+
+
+def test_sweeps_of_different_tasks_are_joined(sweep: Path, tmp_path: Path) -> None:
+    with open_dataset(sample_path("push")) as sample:
+        write_dataset(tmp_path / "push.h5", sample.task, [sample[sample.held_out()[0]]])
+    run_sweep(Inputs((shipped("push", "image-ekf"),), (tmp_path / "push.h5",)).cells(), tmp_path / "push")
+    rows = Experiments([sweep, tmp_path / "push"]).query(
+        "SELECT task, max(hinge_x_cm) AS hinge, max(x_cm) AS puck FROM results GROUP BY task ORDER BY task"
+    )
+    assert isinstance(rows, pa.Table)
+    (door, push) = rows.to_pylist()
+    assert (door["puck"], push["hinge"]) == (None, None)
+    assert door["hinge"] > 0.0 < push["puck"]
