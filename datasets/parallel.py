@@ -24,8 +24,9 @@ def run_in_processes(
 ) -> Generator[tuple[Item, Result]]:
     """Call ``function`` with each item in ``workers`` processes; yields items and results in the order they finish.
 
-    Function, items and results must be picklable. If a process is killed, for example by lack of memory, its item and
-    those that the pool lost with it run again. The processes end with this one, and when the generator is closed.
+    Function, items and results must be picklable. If a process is killed, for example by lack of memory, its item runs
+    again, like all others that the pool was working on. The processes end with this one, and when the generator is
+    closed.
 
     Raises what the function raises, and ``BrokenProcessPool`` after ``LOSSES`` losses in a row.
     """
