@@ -121,6 +121,30 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     page.until("() => location.search.includes('track=particles')")
     page.screenshot("timeline-note")
 
+    # Charts are added, moved and resized; the permalink keeps them, and the browser their heights.
+    titles = "() => [...document.querySelectorAll('#tracks h3')].map((title) => title.textContent.split(/[ ,(]/)[0])"
+    page.page.locator("#charts").click()
+    page.page.get_by_label("NEES", exact=True).check()
+    page.page.get_by_role("button", name="Move estimate up").click()
+    assert page.page.evaluate("() => document.activeElement.ariaLabel") == "Move estimate down"
+    assert not page.violations("#chart-menu")
+    page.page.keyboard.press("Escape")
+    page.until(f"() => ({titles})().join() === 'Hinge,Weight,Particles,NEES/n'")
+    heights = "() => [...document.querySelectorAll('#tracks .track')].map((row) => row.offsetHeight)"
+    before = page.page.evaluate(heights)
+    page.page.locator(".track-splitter").nth(1).focus()
+    page.page.keyboard.press("ArrowUp")
+    after = page.page.evaluate(heights)
+    assert np.allclose(np.subtract(after, before), [0, -10, 10, 0], atol=1)
+    assert page.state["step"] == 44
+    page.until("() => location.search.includes('charts=estimate')")
+    third = open_page("?" + page.page.url.partition("?")[2])
+    assert third.page.evaluate(titles) == ["Hinge", "Weight", "Particles", "NEES/n"]
+    assert np.allclose(third.page.evaluate(heights), after, atol=1)
+    third.page.locator("#charts").click()
+    third.page.get_by_role("button", name="Reset charts and heights").click()
+    third.until(f"() => ({titles})().join() === 'Weight,Hinge,Particles'")
+
 
 def test_event_marks_and_comparison_run(open_page: Any) -> None:
     page = open_page(LINK + "&track=signed", theme="dark")

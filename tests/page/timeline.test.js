@@ -15,7 +15,7 @@ import { TRACKS, selectedError, trackOptions, tracks } from '../../app/page/time
 import { FUSION, makeTrace } from './fixtures.js';
 
 const trace = makeTrace(FUSION);
-const state = { component: 'hinge_x', weights: 'effective', track: 'error' };
+const state = { component: 'hinge_x', weights: 'effective', track: 'error', charts: '' };
 
 test('windows fit into the episode', () => {
   assert.deepEqual(fitWindow([-5, 15], [0, 100]), [0, 20]);

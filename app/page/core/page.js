@@ -258,7 +258,7 @@ export class Page {
     if (any('task', 'filter', 'run')) this.finetune.load();
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
-    if (any('component', 'weights', 'track')) this.#showComponent(this.#trace);
+    if (any('component', 'weights', 'track', 'charts')) this.#showComponent(this.#trace);
     if (any('plane', 'others')) this.angleSlider.show(this.#trace);
     if (any('step', 'angle', 'beside', 'map', 'plane', 'others')) this.#move(this.#trace);
   }

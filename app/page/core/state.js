@@ -20,6 +20,7 @@ import { displayName } from './units.js';
  * @property {string} component state component of the charts
  * @property {string} weights `raw` for the fusion weights beta, or `effective`
  * @property {string} track lowest chart: a key of `TRACKS`, or a column of a filter's own scalars
+ * @property {string} charts of the timeline from top to bottom (chart_list.js), empty for the default
  * @property {string} window visible steps such as 20-60, empty for all
  * @property {string} diagnostic selected diagnostic, empty for the list
  * @property {string} options of the diagnostic, URL-encoded: size=21
@@ -90,6 +91,7 @@ const CHOICES = {
 const TEXTS = {
   faults: '',
   against: '',
+  charts: '',
   window: '',
   diagnostic: '',
   options: '',

@@ -2,6 +2,7 @@
 
 import { context2d } from '../core/dom.js';
 import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
+import { drawStack } from './stack.js';
 
 /**
  * @typedef {object} Series
@@ -9,8 +10,10 @@ import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
  * @property {Float32Array} values
  * @property {Float32Array} [sigma] draws a band of ±2 sigma
  * @property {boolean} [comparison] whether it belongs to the comparison run
+ * @property {boolean} [stacked] whether it is an area on those before it
  *
  * @typedef {object} Track
+ * @property {string} [key] of the chart in the timeline
  * @property {string} title
  * @property {string} unit
  * @property {string} [help]
@@ -31,19 +34,19 @@ import { colour, lineStyle, scaled, translucent } from '../core/palette.js';
  * @property {number} height px
  * @property {() => Interval} window visible steps
  * @property {number} steps
- * @property {boolean} withAxis whether the step axis has labels
- * @property {string} stepLabel
+ * @property {boolean} withAxis whether the step axis has numbers
  * @property {boolean} compared whether a comparison run is displayed
  *
  * @typedef {{stroke: string, grid: uPlot.Axis.Grid, ticks: uPlot.Axis.Ticks, font: string}} AxisStyle
  */
 
-/** px beside and below the plot. */
-export const GUTTER = { left: scaled(46), right: scaled(12), axis: scaled(33) };
+/** px beside and below the plot; a label of the step axis needs more. */
+export const GUTTER = { left: scaled(46), right: scaled(12), axis: scaled(19) };
 export const FONT = `${scaled(10)}px system-ui, sans-serif`;
 /** Style of axis labels. */
 export const LABEL = { labelSize: scaled(14), labelGap: 0, labelFont: FONT };
 const BLACKOUT_HEIGHT = scaled(8); // px
+const CONTACT_HEIGHT = scaled(6); // px, of the strip for contact below areas
 const LINE_HEIGHT = 4; // px, of a failure and its repair
 const LOG_MARGIN = 0.1; // share of the lower bound at which a logarithmic axis starts at the latest
 const STEP_INCREMENTS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
@@ -101,7 +104,15 @@ export function chart(parent, track, shading, frame) {
       ],
       ...lines(track, frame.compared),
       hooks: {
-        drawClear: [(plot) => shadeIntervals(plot, shading)],
+        drawClear: [
+          (plot) => drawStack(plot, track),
+          (plot) =>
+            shadeIntervals(
+              plot,
+              shading,
+              track.series.some(({ stacked }) => stacked),
+            ),
+        ],
         drawAxes: [(plot) => void (bounds && shadeBounds(plot, bounds))],
       },
     },
@@ -128,8 +139,10 @@ function lines(track, compared) {
     const fill = translucent(lineStyle(name).stroke, name === 'fused' ? 0.2 : 0.08);
     bands.push({ series: [series.length - 2, series.length - 1], fill });
   }
-  for (const item of track.series)
-    series.push({ ...seriesStyle(item, compared), points: { show: false } });
+  for (const item of track.series) {
+    const paths = item.stacked ? { paths: () => null } : {}; // drawStack draws it
+    series.push({ ...seriesStyle(item, compared), ...paths, points: { show: false } });
+  }
   if (!track.series.length) series.push({}); // uPlot draws an axis only for a line
   return { series, bands };
 }
@@ -176,12 +189,12 @@ function valueAxis({ log, note }, { grid, ticks }) {
 }
 
 /**
- * Returns the step axis. Only the lowest chart labels it; the others have the same grid. (uPlot draws no axis after a hidden one.)
+ * Returns the step axis. Only the lowest chart has its numbers; the others have the same grid. (uPlot draws no axis after a hidden one.)
  * @param {AxisStyle} style
  * @param {Frame} frame
  * @returns {uPlot.Axis}
  */
-function stepAxis(style, { withAxis, stepLabel }) {
+function stepAxis(style, { withAxis }) {
   const axis = { ...style, gap: 2, space: scaled(60), incrs: STEP_INCREMENTS };
   if (!withAxis)
     return {
@@ -190,7 +203,7 @@ function stepAxis(style, { withAxis, stepLabel }) {
       ticks: { show: false },
       values: (_, splits) => splits.map(() => ''),
     };
-  return { ...axis, size: GUTTER.axis - LABEL.labelSize, label: stepLabel, ...LABEL };
+  return { ...axis, size: GUTTER.axis };
 }
 
 /**
@@ -247,8 +260,10 @@ function extremesOf({ name, values, sigma }, first, last) {
  * Shades contact and interventions, hatches blackouts along the top edge, and underlines a failure and its repair.
  * @param {uPlot} plot
  * @param {Shading} shading
+ * @param {boolean} [hasAreas] whether areas fill the chart, whose colours a band for contact would change: it is a strip
  */
-export function shadeIntervals(plot, { contact, blackout, edits, failure = [], repair = [] }) {
+export function shadeIntervals(plot, shading, hasAreas = false) {
+  const { contact, blackout, edits, failure = [], repair = [] } = shading;
   const { ctx, bbox } = plot;
   /** @param {Interval[]} intervals @param {string | CanvasPattern | null} fill @param {number} [height] @param {number} [top] */
   const shade = (intervals, fill, height = bbox.height, top = bbox.top) => {
@@ -260,7 +275,9 @@ export function shadeIntervals(plot, { contact, blackout, edits, failure = [], r
     }
   };
   ctx.save();
-  shade(contact, colour('contact-band'));
+  const strip = CONTACT_HEIGHT * devicePixelRatio;
+  if (hasAreas) shade(contact, colour('contact'), strip, bbox.top + bbox.height - strip);
+  else shade(contact, colour('contact-band'));
   shade(edits, translucent(colour('accent'), 0.12));
   shade(blackout, hatching(ctx), BLACKOUT_HEIGHT * devicePixelRatio);
   const line = LINE_HEIGHT * devicePixelRatio;

@@ -6,7 +6,8 @@ import { create } from '../core/dom.js';
 import { scaled } from '../core/palette.js';
 
 const NOTE_HEIGHT = scaled(26); // px of a note in place of a chart
-const LINE_HEIGHT = scaled(14); // px of a line of a legend
+const LINE_HEIGHT = scaled(12); // px of a line of a legend
+const STACKED_WEIGHT = 2; // share of the remaining height, relative to a chart of lines
 
 /**
  * Returns the properties of tracks that require new charts when they change.
@@ -18,13 +19,18 @@ export const layoutKey = (tracks) =>
       title,
       note,
       unit,
-      series.map(({ name, sigma, comparison }) => [name, Boolean(sigma), comparison]),
+      series.map(({ name, sigma, comparison, stacked }) => [
+        name,
+        Boolean(sigma),
+        comparison,
+        stacked,
+      ]),
     ]),
   );
 
 /**
- * Returns the height of each track in px: the height of its legend, and an equal share of the remaining height.
- * The lowest track always has a chart, because of the axis.
+ * Returns the height of each track in px. Each has room for its legend, stacked ones get most of the rest, and in a low
+ * timeline all shrink. The lowest track always has a chart, because of the axis.
  * @param {Track[]} tracks
  * @param {number} height px
  */
@@ -35,9 +41,14 @@ export function trackHeights(tracks, height) {
     const names = new Set(series.map(({ name }) => name));
     return 3 + LINE_HEIGHT * (1 + Math.max(names.size, 2));
   });
-  const remaining = height - minimum.reduce((a, b) => a + b, 0);
-  const share = remaining / noteOnly.filter((value) => !value).length;
-  return minimum.map((value, i) => Math.floor(value + (noteOnly[i] ? 0 : share)));
+  const sum = minimum.reduce((a, b) => a + b, 0);
+  if (sum >= height) return minimum.map((value) => Math.floor((value / sum) * height));
+  /** @type {number[]} */
+  const weights = tracks.map(({ series }, i) =>
+    noteOnly[i] ? 0 : series.some(({ stacked }) => stacked) ? STACKED_WEIGHT : 1,
+  );
+  const share = (height - sum) / weights.reduce((a, b) => a + b, 0);
+  return minimum.map((value, i) => Math.floor(value + weights[i] * share));
 }
 
 /**

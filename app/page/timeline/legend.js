@@ -7,6 +7,7 @@ import { create } from '../core/dom.js';
 import { cssVariable, lineSample } from '../core/palette.js';
 import { fixed, significant } from '../core/units.js';
 import { seriesStyle } from './chart.js';
+import { areaSample } from './stack.js';
 
 /** @typedef {{text: Text, track: Track, index: number}} ValueCell index of the series in the track */
 
@@ -25,9 +26,12 @@ export function legend(track, trace, compared) {
   /** @type {ValueCell[]} */
   const cells = [];
   for (const name of new Set(series.map((item) => item.name))) {
-    const first = series.find((item) => item.name === name) ?? { name };
+    const index = series.findIndex((item) => item.name === name);
+    const first = series[index];
     const { dash, width } = seriesStyle(first, compared);
-    const sample = lineSample(cssVariable(name), dash, width);
+    const sample = first.stacked
+      ? areaSample(name, index)
+      : lineSample(cssVariable(name), dash, width);
     const label = track.ofModalities ? name : trace.label(name);
     list.append(create('dt', { title: label }, sample, label));
     for (const comparison of compared ? [false, true] : [false]) {

@@ -12,6 +12,7 @@ import { create, element, html } from '../core/dom.js';
 import { fixed } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { GUTTER, chart, chartData } from './chart.js';
+import { ChartMenu } from './chart_menu.js';
 import { EventMarks } from './event_marks.js';
 import { Gestures } from './gestures.js';
 import { GroupPicker } from './group_picker.js';
@@ -19,6 +20,7 @@ import { layoutKey, noteElement, trackHeights } from './layout.js';
 import { formatValue, legend, updateLegend } from './legend.js';
 import { StandalonePicker } from './standalone_picker.js';
 import { fitWindow, formatWindow, parseWindow, zoomWindow } from './step_window.js';
+import { TrackSizes } from './track_sizes.js';
 import { selectedError, trackOptions, tracks } from './tracks.js';
 
 const MIN_HEIGHT = 60; // px, below which there are no charts
@@ -58,9 +60,12 @@ export class Timeline {
   #levelText = create('span');
   #level = overlayMark('level');
   #selection = overlayMark('selection');
+  #stepLabel = create('p', { className: 'step-label' });
   #marks;
   #standalone;
   #group;
+  #menu;
+  #sizes = new TrackSizes(() => this.#build());
   #readout;
   #resetButton = element('#reset-zoom', HTMLButtonElement);
   #legendWidth = 0;
@@ -74,10 +79,13 @@ export class Timeline {
     this.#host = html('#tracks', body);
     this.#readout = html('#timeline-readout', body);
     this.#level.append(this.#levelText);
-    this.#host.append(this.#cursor, this.#pointer, this.#level, this.#selection);
+    this.#host.append(this.#stepLabel, this.#cursor, this.#pointer, this.#level, this.#selection);
     this.#marks = new EventMarks(html('#marks', body), store);
     this.#standalone = new StandalonePicker(store);
     this.#group = new GroupPicker(() => this.redraw());
+    this.#menu = new ChartMenu(html('#chart-menu'), html('#charts'), store, () =>
+      this.#sizes.reset(),
+    );
     this.#trackSelect = element('#track', HTMLSelectElement);
     this.#trackSelect.addEventListener('change', () =>
       store.set({ track: this.#trackSelect.value }),
@@ -114,6 +122,8 @@ export class Timeline {
     this.showRepair(null);
     this.#standalone.show(trace);
     this.#group.show(trace.groups);
+    this.#menu.show(trace);
+    this.#stepLabel.textContent = `step, ${fixed(trace.dt, 2)} s each`;
     this.redraw();
     this.#setWindow(this.#window);
   }
@@ -301,8 +311,12 @@ export class Timeline {
     this.#plot = { left, width: clientWidth - left - GUTTER.right };
     this.#measure();
     this.#updateShading();
-    const heights = trackHeights(this.#tracks, clientHeight - GUTTER.axis);
-    this.#tracks.forEach((track, i) => this.#buildTrack(track, heights[i]));
+    const keys = this.#tracks.map(({ key = '' }) => key);
+    const heights = this.#sizes.apply(keys, trackHeights(this.#tracks, clientHeight - GUTTER.axis));
+    this.#tracks.forEach((track, i) => {
+      const row = this.#buildTrack(track, heights[i]);
+      if (i + 1 < keys.length) row?.append(this.#sizes.separator(keys, heights, i));
+    });
     this.#updateCursor();
   }
 
@@ -312,25 +326,26 @@ export class Timeline {
    */
   #buildTrack(track, height) {
     const trace = this.#trace;
-    if (!trace) return;
+    if (!trace) return null;
     const compared = Boolean(this.#activeComparison);
     const { element: legendElement, cells } = legend(track, trace, compared);
     this.#cells.push(...cells);
     const row = create('div', { className: 'track' }, legendElement);
     this.#host.append(row);
     const lowest = track === this.#tracks.at(-1);
+    row.style.height = `${height}px`;
     if (track.note) row.append(noteElement(track.note, height));
-    if (track.note && !lowest) return;
+    if (track.note && !lowest) return row;
     const plot = chart(row, track, this.#shading, {
       width: this.#host.clientWidth - this.#legendWidth,
       height: height + (lowest ? GUTTER.axis - 4 : 0),
       window: () => this.#window,
       steps: trace.steps,
       withAxis: lowest,
-      stepLabel: `step (${fixed(trace.dt, 2)} s each)`,
       compared,
     });
     this.#charts.push({ plot, track, top: row.offsetTop, height });
+    return row;
   }
 
   #updateCursor() {

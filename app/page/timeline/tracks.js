@@ -6,6 +6,8 @@
 /** @import { Series, Track } from './chart.js' */
 
 import { displayName, fixed } from '../core/units.js';
+import { chartKeys } from './chart_list.js';
+import { areShares } from './stack.js';
 
 /** Options for the lowest chart, and their labels. */
 export const TRACKS = {
@@ -30,22 +32,45 @@ const NO_TRUTH = 'None: the true state of this run is unknown.';
 
 /**
  * @param {Trace} trace
- * @param {Pick<State, 'component' | 'weights' | 'track'>} state
+ * @param {Pick<State, 'component' | 'weights' | 'track' | 'charts'>} state
  * @param {Trace | null} [comparison] drawn over the trace
- * @returns {Track[]}
+ * @returns {Track[]} from top to bottom
  */
 export function tracks(trace, state, comparison = null) {
   const component = trace.components.findIndex((c) => c.name === state.component);
-  /** @type {((trace: Trace) => Track)[]} */
-  const builders = [
-    (run) => weightTrack(run, state.weights, component),
-    (run) => estimateTrack(run, component),
-    (run) => (LOWEST_TRACKS[state.track] ?? scalarTrack(state.track))(run, component),
-  ];
-  return builders.map((build) =>
-    comparison ? overlay(build(trace), build(comparison), comparison.standalone) : build(trace),
-  );
+  return shownCharts(trace, state).map((key) => {
+    /** @param {Trace} run */
+    const build = (run) => ({ ...chartOf(key, run, state, component), key });
+    return comparison
+      ? overlay(build(trace), build(comparison), comparison.standalone)
+      : build(trace);
+  });
 }
+
+/**
+ * @param {string} key
+ * @param {Trace} run
+ * @param {Pick<State, 'weights' | 'track'>} state
+ * @param {number} component
+ * @returns {Track}
+ */
+function chartOf(key, run, { weights, track }, component) {
+  if (key === 'weights') return weightTrack(run, weights, component);
+  if (key === 'estimate') return estimateTrack(run, component);
+  const quantity = key === 'track' ? track : key;
+  return (LOWEST_TRACKS[quantity] ?? scalarTrack(quantity))(run, component);
+}
+
+/**
+ * Returns the keys of the displayed charts.
+ * @param {Trace} trace
+ * @param {Pick<State, 'track' | 'charts'>} state
+ */
+const shownCharts = (trace, state) =>
+  chartKeys(
+    state,
+    trackOptions(trace, state.track).map(([key]) => key),
+  );
 
 /**
  * Returns the options for the lowest chart: those of every trace, and the filter's own scalars.
@@ -90,9 +115,10 @@ function overlay(track, other, standalone) {
   if (other.note) return track;
   const lines = other.series
     .filter(({ name }) => name !== 'truth')
-    .map(({ name, values }) => ({
+    .map(({ name, values, stacked }) => ({
       name: name === 'fused' && standalone ? `${standalone} standalone` : name,
       values,
+      stacked,
       comparison: true,
     }));
   if (track.note) return { ...other, series: lines };
@@ -129,13 +155,14 @@ function weightTrack(trace, selected, component) {
   if (!series.length) return emptyTrack('Weights', missingWeights(trace));
   const scope = trace.weightWidth > 1 ? `, ${displayName(trace.components[component].name)}` : '';
   const title = kind === 'raw' ? `Weight β${scope}` : `Effective weight${scope}`;
+  const stacked = areShares(series);
   const max = Math.max(1, ...series.map(({ values }) => maximum(values)));
   return {
     title,
     unit: '',
-    series,
+    series: series.map((item) => ({ ...item, stacked })),
     ofModalities: true,
-    limits: [-0.04 * max, 1.06 * max],
+    limits: stacked ? [0, 1] : [-0.04 * max, 1.06 * max],
     digits: 2,
   };
 }
