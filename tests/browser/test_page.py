@@ -57,6 +57,39 @@ def test_keys_change_the_step_and_the_theme_and_open_the_help(open_page: Any) ->
     page.page.keyboard.press("Escape")
     assert not page.page.locator("#keys").is_visible()
 
+    # The command palette: tabs, filters, faults and steps, with the keyboard alone.
+    field, options = page.page.get_by_role("combobox", name="Find a command"), page.page.locator("#command-list > *")
+
+    def find(text: str) -> str:
+        page.page.keyboard.press("Control+k")
+        page.page.keyboard.type(text)
+        active = field.get_attribute("aria-activedescendant")
+        return page.page.locator(f"#{active}[aria-selected=true]").text_content()
+
+    assert find("fail").startswith("TabFailures")
+    assert not page.violations("#commands")
+    page.screenshot("commands-dark")
+    page.page.keyboard.press("ArrowUp")
+    assert options.last.get_attribute("aria-selected") == "true"
+    page.page.keyboard.press("ArrowDown")
+    page.page.keyboard.press("Enter")
+    page.until("() => beliefscope.state().tab === 'failures'")
+    assert find("15") == "Go toStep 15"
+    page.page.keyboard.press("Enter")
+    page.until("() => beliefscope.state().step === 15")
+    assert find("ekf filter cross") == "Filtercrossmodal-ekf"
+    options.first.click()
+    page.until("() => beliefscope.state().filter === 'crossmodal-ekf'")
+    find("image frozen faults")
+    page.page.keyboard.press("Enter")
+    page.until("() => beliefscope.state().faults.startsWith('image_frozen')")
+    page.page.keyboard.press("Control+k")
+    page.page.keyboard.type("no such thing")
+    assert options.count() == 0
+    page.page.keyboard.press("Escape")
+    assert not page.page.locator("#commands").is_visible()
+    assert page.state["step"] == 15, "keys of the palette reached the page"
+
 
 CAMERA_IMAGE = "() => document.querySelector('#camera canvas').toDataURL()"
 

@@ -27,6 +27,7 @@ export function bindControls(page) {
     '>': () => clock.changeSpeed(1),
     '[': () => page.markIntervention('from'),
     ']': () => page.markIntervention('last'),
+    'ctrl+k': () => page.commands.toggle(),
     'ctrl+z': () => undo.undo(),
     'ctrl+shift+z': () => undo.redo(),
     'ctrl+y': () => undo.redo(),
@@ -72,6 +73,7 @@ function bindButtons(page, showHelp) {
     ['#forward', ({ timeStamp }) => page.stepBy(1, timeStamp)],
     ['#theme', () => page.theme.toggle()],
     ['#help', showHelp],
+    ['#find', () => page.commands.toggle()],
     ['#reset-zoom', () => page.timeline.showAll()],
     ['#largest-error', () => page.goToLargestError()],
   ];

@@ -8,6 +8,9 @@ const CONTROL_KEYS = {
   'button, a': /^ $/,
 };
 
+/** Key of the command palette, also in text fields. */
+const FIND = 'ctrl+k';
+
 /**
  * Calls an action when its key is pressed, except in text fields, in dialogs and in controls that use the key.
  * @param {Record<string, (event: KeyboardEvent) => void>} actions by `KeyboardEvent.key`, with Ctrl or ⌘ as `ctrl+shift+z`
@@ -38,7 +41,7 @@ export function bindKeys(actions) {
  * @param {string} key
  */
 function isHandledBy(target, key) {
-  if (!(target instanceof HTMLElement)) return false;
+  if (!(target instanceof HTMLElement) || key === FIND) return false;
   for (const [selector, pattern] of Object.entries(CONTROL_KEYS))
     if (target.closest(selector)) return pattern.test(key);
   return target.matches('input, textarea, [contenteditable]');

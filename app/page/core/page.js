@@ -26,6 +26,7 @@ import { Recordings } from '../tabs/recordings.js';
 import { Rerun } from '../tabs/rerun.js';
 import { Study } from '../tabs/study.js';
 import { Timeline } from '../timeline/timeline.js';
+import { CommandPalette } from '../widgets/command_palette.js';
 import { FaultDialog } from '../widgets/fault_dialog.js';
 import { FindingBar } from '../widgets/finding_bar.js';
 import { Intro } from '../widgets/intro.js';
@@ -36,6 +37,7 @@ import { ReportDialog } from '../widgets/report_dialog.js';
 import { connectSaveButton } from '../widgets/save_button.js';
 import { Tour } from '../widgets/tour.js';
 import { Clock } from './clock.js';
+import { commands, stepCommand } from './commands.js';
 import { bindControls } from './controls.js';
 import {
   markUseful,
@@ -144,6 +146,11 @@ export class Page {
       () => ({ step: store.state.step, pinned: this.maps.pinned }),
       (/** @type {Trace} */ trace, /** @type {api.ReportOptions} */ options) =>
         this.#createReport(trace.selection, options),
+    );
+    this.commands = new CommandPalette(
+      element('#commands', HTMLDialogElement),
+      () => commands(this),
+      (/** @type {string} */ query) => stepCommand(this, query),
     );
     this.#start();
   }
@@ -436,15 +443,19 @@ export class Page {
     this.#store.set({ step, playing: false }, { inputTime });
   }
 
+  /** @param {number} step */
+  goTo(step) {
+    const inputTime = performance.now();
+    this.#store.set({ step: this.#clamp(step), playing: false }, { inputTime });
+  }
+
   /** @param {string} tab */
   openTab(tab) {
     this.#store.set({ tab });
   }
 
   goToLargestError() {
-    if (!this.#trace) return;
-    const inputTime = performance.now();
-    this.#store.set({ step: this.timeline.largestError, playing: false }, { inputTime });
+    if (this.#trace) this.goTo(this.timeline.largestError);
   }
 
   /**

@@ -26,10 +26,7 @@ export class FindingBar {
     this.#host = host;
     this.#catalog = catalog;
     this.#store = store;
-    html('.moment', host).addEventListener('click', ({ timeStamp }) => {
-      if (this.#step !== null)
-        store.set({ step: this.#step, playing: false }, { inputTime: timeStamp });
-    });
+    html('.moment', host).addEventListener('click', ({ timeStamp }) => this.goToMoment(timeStamp));
     html('.why', host).addEventListener('click', () => store.set({ tab: 'diagnosis' }));
   }
 
@@ -47,6 +44,11 @@ export class FindingBar {
     const reply = await api.diagnosis(trace.selection, 'episode', signal).catch(() => null);
     const result = reply && 'job' in reply ? reply.preliminary : reply;
     if (result && !signal.aborted) this.#draw(trace, result);
+  }
+
+  /** @param {number} inputTime */
+  goToMoment(inputTime) {
+    if (this.#step !== null) this.#store.set({ step: this.#step, playing: false }, { inputTime });
   }
 
   /** @param {Trace} trace */

@@ -1,0 +1,156 @@
+/** All commands of the page: its tabs, buttons and choices, read from the page itself, and layouts and examples. */
+
+/** @import { Page } from './page.js' */
+
+import { LAYOUTS } from './layouts.js';
+
+/**
+ * @typedef {object} Command
+ * @property {string} group
+ * @property {string} title
+ * @property {string} [keys] shortcut
+ * @property {() => void} run
+ */
+
+/** Choices whose options are commands. @type {[selector: string, group: string][]} */
+const SELECTS = [
+  ['#filter', 'Filter'],
+  ['#task', 'Task'],
+  ['#faults', 'Faults'],
+  ['#data', 'Data'],
+  ['#track', 'Chart'],
+  ['#standalone', 'Standalone'],
+  ['#speed', 'Speed'],
+  ['#episode', 'Episode'],
+];
+/** @type {[selector: string, group: string][]} */
+const RADIOS = [
+  ['#components', 'Component'],
+  ['#weights', 'Weights'],
+  ['#maps-map', 'Maps'],
+];
+
+/**
+ * Returns the commands that are available now.
+ * @param {Page} page
+ * @returns {Command[]}
+ */
+export function commands(page) {
+  return [
+    ...tabCommands(page),
+    ...actionCommands(page),
+    ...LAYOUTS.map((layout) => ({
+      group: 'Layout',
+      title: `${layout.name}: ${layout.help}`,
+      run: () => page.setLayout(layout),
+    })),
+    ...clickable('#intro .chip', 'Example'),
+    ...RADIOS.flatMap(([selector, group]) => radioCommands(selector, group)),
+    ...SELECTS.flatMap(([selector, group]) => selectCommands(selector, group)),
+  ];
+}
+
+/**
+ * Returns the command that a number as query stands for.
+ * @param {Page} page
+ * @param {string} query
+ * @returns {Command[]}
+ */
+export function stepCommand(page, query) {
+  if (!/^\d+$/.test(query.trim())) return [];
+  const step = Number(query);
+  return [{ group: 'Go to', title: `Step ${step}`, run: () => page.goTo(step) }];
+}
+
+/** @param {Page} page */
+function tabCommands(page) {
+  return [...document.querySelectorAll('[role=tab]')].map((tab) => ({
+    group: 'Tab',
+    title: tab.textContent ?? '',
+    keys: tab instanceof HTMLElement ? tab.title : '',
+    run: () => page.openTab(tab.id.replace('tab-', '')),
+  }));
+}
+
+/**
+ * @param {Page} page
+ * @returns {Command[]}
+ */
+function actionCommands(page) {
+  /** @type {[title: string, keys: string, run: () => void, control?: string][]} */
+  const actions = [
+    ['Play or pause', 'space', () => page.clock.toggle()],
+    ['Go to the finding', '', () => page.finding.goToMoment(performance.now())],
+    ['Go to the largest visible error', 'e', () => page.goToLargestError()],
+    ['Next failure', 'n', () => page.failures.go(1, performance.now())],
+    ['Previous failure', 'b', () => page.failures.go(-1, performance.now())],
+    ['Whole episode in the timeline', '0', () => page.timeline.showAll()],
+    ['Change of the maps from this step', 'm', () => page.maps.togglePin()],
+    ['Save .rrd', 's', () => page.save(), '#save'],
+    ['Undo the selection', 'ctrl z', () => page.undo.undo()],
+    ['Redo the selection', 'ctrl shift z', () => page.undo.redo()],
+    ['Jobs', 'j', () => page.jobs.toggle()],
+    ['Light or dark', 'd', () => page.theme.toggle()],
+    ['Introduction and examples', '', () => page.intro.show()],
+    ['Tour', '', () => page.tour.start()],
+  ];
+  const enabled = actions.filter(([, , , control]) => !control || isEnabled(control));
+  const listed = enabled.map(([title, keys, run]) => ({ group: 'Action', title, keys, run }));
+  return [
+    ...listed,
+    ...clickable('#report', 'Action'),
+    ...clickable('#help', 'Action', 'Keyboard shortcuts', '?'),
+  ];
+}
+
+/** @param {string} selector */
+function isEnabled(selector) {
+  const control = document.querySelector(selector);
+  return control instanceof HTMLButtonElement && !control.disabled;
+}
+
+/**
+ * @param {string} selector of buttons
+ * @param {string} group
+ * @param {string} [title] the button's text by default
+ * @param {string} [keys]
+ * @returns {Command[]}
+ */
+function clickable(selector, group, title, keys = '') {
+  return [...document.querySelectorAll(selector)].flatMap((button) =>
+    button instanceof HTMLButtonElement && !button.disabled
+      ? [{ group, title: title ?? button.textContent ?? '', keys, run: () => button.click() }]
+      : [],
+  );
+}
+
+/**
+ * @param {string} selector of a group
+ * @param {string} group
+ * @returns {Command[]}
+ */
+function radioCommands(selector, group) {
+  return [...document.querySelectorAll(`${selector} label`)].flatMap((label) => {
+    const input = label.querySelector('input');
+    const title = label.textContent?.trim() ?? '';
+    return input && !input.disabled ? [{ group, title, run: () => input.click() }] : [];
+  });
+}
+
+/**
+ * @param {string} selector
+ * @param {string} group
+ * @returns {Command[]}
+ */
+function selectCommands(selector, group) {
+  const select = document.querySelector(selector);
+  if (!(select instanceof HTMLSelectElement) || select.disabled || select.length < 2) return [];
+  return [...select.options].map(({ value, text }) => ({
+    group,
+    title: text,
+    run: () => {
+      select.value = value;
+      select.dispatchEvent(new Event('change', { bubbles: true }));
+    },
+  }));
+}

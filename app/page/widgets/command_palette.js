@@ -1,0 +1,112 @@
+/** The command palette: a search field over all commands, with a list that the arrow keys move through. */
+
+/** @import { Command } from '../core/commands.js' */
+
+import { create, element, html } from '../core/dom.js';
+import { search } from '../core/search.js';
+
+const MAX_OPTIONS = 60;
+
+export class CommandPalette {
+  #dialog;
+  #input;
+  #list;
+  #none;
+  #source;
+  #byQuery;
+  /** @type {Command[]} */
+  #all = [];
+  /** @type {Command[]} */
+  #shown = [];
+  #active = 0;
+
+  /**
+   * @param {HTMLDialogElement} dialog
+   * @param {() => Command[]} source commands that are available when it opens
+   * @param {(query: string) => Command[]} byQuery commands that the query itself stands for
+   */
+  constructor(dialog, source, byQuery) {
+    this.#dialog = dialog;
+    this.#source = source;
+    this.#byQuery = byQuery;
+    this.#input = element('input', HTMLInputElement, dialog);
+    this.#list = html('[role=listbox]', dialog);
+    this.#none = html('.none', dialog);
+    this.#input.addEventListener('input', () => this.#draw());
+    this.#input.addEventListener('keydown', (event) => this.#press(event));
+    this.#list.addEventListener('pointerdown', (event) => event.preventDefault()); // keeps the focus
+    this.#list.addEventListener('click', ({ target }) => {
+      const option = target instanceof Element ? target.closest('[role=option]') : null;
+      if (option) this.#run([...this.#list.children].indexOf(option));
+    });
+    dialog.addEventListener('click', ({ target }) => {
+      if (target === dialog) dialog.close(); // the backdrop
+    });
+  }
+
+  toggle() {
+    if (this.#dialog.open) return this.#dialog.close();
+    this.#all = this.#source();
+    this.#input.value = '';
+    this.#draw();
+    this.#dialog.showModal();
+  }
+
+  #draw() {
+    const query = this.#input.value;
+    const found = search(query, this.#all, ({ group, title }) => `${title} ${group}`);
+    this.#shown = [...this.#byQuery(query), ...found].slice(0, MAX_OPTIONS);
+    this.#list.replaceChildren(...this.#shown.map(option));
+    this.#list.hidden = !this.#shown.length;
+    this.#none.textContent = this.#shown.length ? '' : 'No command has these words.';
+    this.#input.ariaExpanded = String(this.#shown.length > 0);
+    this.#activate(0);
+  }
+
+  /** @param {KeyboardEvent} event */
+  #press(event) {
+    const last = this.#shown.length - 1;
+    /** @type {Record<string, number>} */
+    const targets = {
+      ArrowDown: this.#active === last ? 0 : this.#active + 1,
+      ArrowUp: this.#active === 0 ? last : this.#active - 1,
+      PageDown: Math.min(this.#active + 10, last),
+      PageUp: Math.max(this.#active - 10, 0),
+    };
+    const isToggle = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === 'k';
+    if (isToggle) this.#dialog.close();
+    else if (event.key === 'Enter') this.#run(this.#active);
+    else if (event.key in targets) this.#activate(targets[event.key]);
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
+  /** @param {number} index */
+  #activate(index) {
+    this.#active = index;
+    [...this.#list.children].forEach((row, i) => (row.ariaSelected = String(i === index)));
+    const row = this.#list.children[index];
+    this.#input.setAttribute('aria-activedescendant', row?.id ?? '');
+    row?.scrollIntoView({ block: 'nearest' });
+  }
+
+  /** @param {number} index */
+  #run(index) {
+    const command = this.#shown[index];
+    if (!command) return;
+    this.#dialog.close();
+    command.run();
+  }
+}
+
+/**
+ * @param {Command} command
+ * @param {number} index
+ */
+function option({ group, title, keys }, index) {
+  const row = create('div', { id: `command-${index}`, role: 'option' });
+  row.append(create('small', { textContent: group }), create('span', { textContent: title }));
+  if (keys) row.append(create('kbd', { textContent: keys }));
+  return row;
+}
