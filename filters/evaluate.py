@@ -16,6 +16,7 @@ from torch import Tensor
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.html import html_table
 from beliefscope.datasets.task import Task
 from beliefscope.filters.batch import Batch, Steps
 from beliefscope.filters.belief import Gaussian
@@ -87,6 +88,13 @@ class Metrics:
             if by_modality:
                 document[key] = {name: result._errors() for name, result in by_modality.items()}
         return document
+
+    def _repr_html_(self) -> str:
+        """Errors beside those of the baselines, and the measures of consistency, in a notebook."""
+        columns = {FILTER: self, **self.baselines}
+        rows = [[f"RMSE {key}", *(m and m.rmse.get(key) for m in columns.values())] for key in self.rmse]
+        rows += [[name, getattr(self, name), *([None] * len(self.baselines))] for name in ("nll", "nees", "coverage95")]
+        return html_table("", ["measure", *columns], rows)
 
     def _errors(self) -> dict[str, Any]:
         return {"rmse": self.rmse, "rmse_from_step_0": self.rmse_from_step_0}

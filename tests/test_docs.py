@@ -12,11 +12,17 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from beliefscope import __version__
 from beliefscope.filters.checkpoint import shipped
 from beliefscope.inspect.palette import COLOURS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def test_citation_has_the_version() -> None:
+    (version,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert version == __version__
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

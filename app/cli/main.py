@@ -19,7 +19,7 @@ from beliefscope.app.cli import console
 from beliefscope.datasets.errors import BadInput
 
 COMMANDS = (
-    *("serve", "collect", "convert", "train", "finetune", "modules", "change", "lineage"),
+    *("demo", "serve", "collect", "convert", "train", "finetune", "modules", "change", "lineage"),
     *("evaluate", "calibrate", "study", "sweep", "experiments", "trace", "record", "live", "import", "export"),
     *("inspect", "diagnose", "report", "counterfactual", "figure", "failures", "slices", "faults", "doctor"),
 )
@@ -74,7 +74,8 @@ def beliefscope(
 
     \b
     Start here:
-      beliefscope serve          open the dashboard with the built-in filters and episodes
+      beliefscope demo           open the dashboard on the included example in a browser
+      beliefscope serve          serve the included filters and episodes, and your own
 
     \b
     From a simulator to a recording:

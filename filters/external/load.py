@@ -356,7 +356,21 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
                 result = build()
         except Exception as error:
             raise BadInput(f"{source} fails when called: {type(error).__name__}: {error}") from error
-    adapter = result if isinstance(result, Adapter) else Adapter(result)
+    name = f"{Path(place).stem}-{attribute}" if place.endswith(".py") else source.replace(":", "-")
+    return as_external(result, source, task, given, name)
+
+
+def as_external(
+    filter_: object, source: str, task: str | Task = "", given: Sequence[Task] = (), name: str = ""
+) -> ExternalFilter:
+    """A filter of another project, or an ``Adapter`` of one, as a checkpoint.
+
+    Args:
+        source: its origin, for messages and the hash. task, given: as for ``load_external``. name: default: the source.
+
+    Raises BadInput if it is not a filter, or if it does not fit the task.
+    """
+    adapter = filter_ if isinstance(filter_, Adapter) else Adapter(filter_)
     if not callable(adapter.module) and not hasattr(adapter.module, "forward"):
         raise BadInput(
             f"{source} returns a {type(adapter.module).__name__}, expected a filter, which can be called or has "
@@ -373,8 +387,7 @@ def load_external(source: str, task: str | Task = "", given: Sequence[Task] = ()
         loaded = given[0]
     if loaded is None:
         raise BadInput(f"{source} does not name its task: give it an attribute task, or use --task")
-    name = f"{Path(place).stem}-{attribute}" if place.endswith(".py") else source.replace(":", "-")
-    return ExternalFilter(adapter, loaded, name, source)
+    return ExternalFilter(adapter, loaded, name or source, source)
 
 
 @lru_cache(maxsize=16)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any, Literal
 
-from beliefscope.inspect.diagnostics.views import Table
+from beliefscope.inspect.diagnostics.views import Table, html_result
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,10 @@ class Diagnosis:
     headline: str
     causes: tuple[Candidate, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        """Headline and tables in a notebook."""
+        return html_result(self.headline, self.tables())
 
     def to_json(self) -> dict[str, Any]:
         """JSON values, except that numbers may be NaN."""

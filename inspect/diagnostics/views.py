@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.html import html_paragraph, html_table
 from beliefscope.datasets.task import Task
 
 Array = NDArray[np.float64]
@@ -123,9 +124,19 @@ class Views(ABC):
         values = {f.name: as_json(getattr(self, f.name)) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
         return {"verdict": self.verdict, **values}
 
+    def _repr_html_(self) -> str:
+        """Verdict and tables in a notebook."""
+        return html_result(self.verdict, self.tables())
+
     def views(self) -> dict[str, Any]:
         """Verdict and all ``VIEWS`` as JSON values."""
         return {"verdict": self.verdict, **{name: as_json(getattr(self, name)()) for name in VIEWS}}
+
+
+def html_result(headline: str, tables: Sequence[Table]) -> str:
+    """A sentence and tables as HTML for notebooks."""
+    parts = (html_table(table.title, table.columns, table.rows) for table in tables)
+    return "".join([html_paragraph(headline, strong=True), *parts])
 
 
 def format_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Value]]) -> str:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from dataclasses import dataclass
+from html import escape
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beliefscope.datasets.html import html_paragraph
 from beliefscope.inspect.maps.plane import Others
 
 Array = NDArray[np.float32]
@@ -67,6 +71,20 @@ class LikelihoodMap:
     def title(self) -> str:
         """Quantity and fusion rule: ``Posterior. Fused: product of posteriors (unimodal)``."""
         return f"{self.quantity.capitalize()}{self.note and f', {self.note}'}. Fused: {self.rule}"
+
+    def _repr_html_(self) -> str:
+        """Title, and an image of each layer with the offset of its maximum, in a notebook."""
+        from matplotlib import colormaps, image  # slow to import
+
+        figures = []
+        for name, values, (x, y) in zip(self.layers, self.normalised(), self.peaks(), strict=True):
+            png = io.BytesIO()
+            image.imsave(png, colormaps["viridis"](values, bytes=True), format="png", origin="lower")
+            source = f"data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}"
+            picture = f'<img src="{source}" width="200" height="200" style="image-rendering:pixelated">'
+            caption = f"<figcaption>{escape(name)}: maximum at {x:+.3g}, {y:+.3g}</figcaption>"
+            figures.append(f'<figure style="display:inline-block;margin:4px">{picture}{caption}</figure>')
+        return html_paragraph(f"Step {self.step}. {self.title}", strong=True) + "".join(figures)
 
     def normalised(self) -> NDArray[np.uint8]:
         """(L, S, S) uint8: value relative to the maximum of its layer, times 255."""

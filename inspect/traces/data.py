@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
+from beliefscope.datasets.html import html_paragraph, html_table
 from beliefscope.datasets.task import Task
 from beliefscope.filters.models.resampling import effective_sample_size
 
@@ -98,6 +99,18 @@ class Trace:
 
     def __len__(self) -> int:
         return len(self.estimate_mean)
+
+    def __repr__(self) -> str:
+        """One line; the arrays have millions of values."""
+        faults = f", {self.faults}" if self.faults else ""
+        run = f"{self.filter} over {len(self)} steps of {self.task.name} episode {self.episode_index}"
+        return f"<Trace: {run}, seed {self.seed}{faults}>"
+
+    def _repr_html_(self) -> str:
+        """The run, and name, shape and type of each array that it has, in a notebook."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self)} | {"states": self.episode.states}
+        rows = [(k, " x ".join(map(str, v.shape)), v.dtype) for k, v in arrays.items() if isinstance(v, np.ndarray)]
+        return html_paragraph(repr(self)[1:-1], strong=True) + html_table("", ["array", "shape", "type"], rows)
 
     @property
     def task(self) -> Task:

@@ -11,6 +11,8 @@ from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
 
 if TYPE_CHECKING:
+    from beliefscope.app.runs.settings import Settings
+    from beliefscope.app.server.auth import Access
     from beliefscope.filters.checkpoint import Checkpoint
 
 
@@ -71,8 +73,7 @@ def serve(
     from beliefscope.app.runs.catalog import SAMPLE, short_names
     from beliefscope.app.runs.settings import Settings
     from beliefscope.app.server import logs
-    from beliefscope.app.server.auth import LOOPBACK, Access, host_names, token_for
-    from beliefscope.app.server.main import serve as serve_until_signal
+    from beliefscope.app.server.auth import Access, host_names, token_for
     from beliefscope.app.workspace.studies import SHIPPED, Study
 
     opt.check_workspace(workspace)
@@ -90,7 +91,18 @@ def serve(
     )
     for name, folder in settings.studies.items():
         Study(name, folder, has_checkpoints=True).read()  # raises BadInput early
-    with _browser_opener(workspace, bool(access.token)) as open_in_browser:
+    serve_page(settings, port, open_page, host, access)
+
+
+def serve_page(
+    settings: Settings, port: int, open_page: bool, host: str = "127.0.0.1", access: Access | None = None
+) -> None:
+    """Serve until a signal; prints the address once the server listens, and opens it in a browser if requested."""
+    from beliefscope.app.server.auth import LOOPBACK, OPEN
+    from beliefscope.app.server.main import serve as serve_until_signal
+
+    access = access or OPEN
+    with _browser_opener(settings.workspace, bool(access.token)) as open_in_browser:
 
         def listening(url: str) -> None:
             if host not in LOOPBACK:

@@ -1,0 +1,30 @@
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from beliefscope.app.cli import options as opt
+
+
+@opt.with_options(
+    port=opt.option("N", "Port; 0 selects a free one.", parser=opt.integer(0, 65535)),
+    open_page=opt.flag("Open the dashboard in a browser.", "--open/--no-open"),
+)
+def demo(port: int = 0, open_page: bool = True) -> None:
+    """Open the dashboard on the included example.
+
+    Serves the included filters and episodes from a temporary workspace, which is deleted at the end, and opens the page
+    in a browser: the camera goes dark while a robot pushes a puck. Stop it with Ctrl-C. Your own filters and
+    data: beliefscope serve.
+
+    \b
+    Example:
+      beliefscope demo --no-open --port 8000
+    """
+    from beliefscope.app.cli.commands.serve import serve_page
+    from beliefscope.app.runs.settings import Settings
+    from beliefscope.app.server import logs
+
+    logs.configure("warning", "text", "")
+    with tempfile.TemporaryDirectory(prefix="beliefscope-") as workspace:
+        serve_page(Settings(Path(workspace)), port=port, open_page=open_page)

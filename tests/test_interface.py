@@ -1,0 +1,94 @@
+"""The public Python interface: lazily imported, complete, documented."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import beliefscope as bs
+from beliefscope.filters.evaluate import evaluate
+from beliefscope.inspect.trace import trace
+
+DOCS = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def run() -> bs.Trace:
+    return bs.trace("door/crossmodal-ekf", "door", 9, faults="blackout=0.4")
+
+
+def test_import_is_light() -> None:
+    loaded = "sorted(name for name in sys.modules if name.startswith('beliefscope'))"
+    code = f"import sys, beliefscope; print(*{loaded}, 'numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.split() == ["beliefscope", "False"]
+
+
+def test_every_public_name_exists_and_is_documented() -> None:
+    for name in bs.__all__:
+        assert getattr(bs, name) is not None
+        assert name == "__version__" or re.search(rf"`{name}[`(]", DOCS), name
+    assert dir(bs) == bs.__all__
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        bs.nothing  # noqa: B018
+
+
+def test_documented_code_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    names: dict[str, Any] = {}
+    blocks = re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL)
+    assert len(blocks) == 3
+    exec(compile("\n".join(blocks), "python.md", "exec"), names)
+    assert names["mine"].task.name == "push"
+
+
+def test_functions_agree_with_those_of_the_modules(run: bs.Trace) -> None:
+    filter_, data = bs.load_filter("door/crossmodal-ekf"), bs.open_dataset("door")
+    direct = trace(filter_, data[9], 9, faults=bs.Faults.parse("blackout=0.4"))
+    np.testing.assert_array_equal(run.estimate_mean, direct.estimate_mean)
+    metrics = bs.evaluate(filter_, data, [9])
+    assert metrics.rmse == evaluate(filter_.filter, [data[9]]).rmse
+    assert set(metrics.baselines) == {"stay", "dynamics"}
+    assert [m.step for m in bs.maps(filter_, run, [3, 50])] == [3, 50]
+    first = bs.trace(filter_, data)
+    assert first.episode_index == data.held_out()[0]
+
+
+def test_record(run: bs.Trace, tmp_path: Path) -> None:
+    path = bs.record(run, tmp_path / "run.rrd", "door/crossmodal-ekf", map_stride=50)
+    assert path.stat().st_size > 10_000
+
+
+def test_representations(run: bs.Trace) -> None:
+    assert repr(run) == "<Trace: crossmodal-ekf over 100 steps of door episode 9, seed 0, blackout=0.4>"
+    diagnosis = bs.diagnose("door/crossmodal-ekf", "door", [9, 19, 29], faults="image_frozen:from=40")
+    (map_,) = bs.maps("door/crossmodal-ekf", run, 40)
+    results = [run, map_, diagnosis, bs.evaluate("door/crossmodal-ekf", "door", [9])]
+    results += bs.inspect_run(run, "door/crossmodal-ekf").values()
+    for result in results:
+        html = result._repr_html_()
+        assert len(html) < 50_000
+        assert html.count("<table>") == html.count("</table>")
+        assert re.search(r"<table>|<img", html)
+    assert diagnosis.headline in diagnosis._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("crossmodal-pf", "neither TASK/NAME"),
+        ("door/nosuch", "filter 'nosuch' does not exist"),
+        ("missing.safetensors", "does not exist"),
+        (3, "expected a filter"),
+    ],
+)
+def test_unusable_filters(source: object, message: str) -> None:
+    with pytest.raises(bs.BadInput, match=message):
+        bs.load_filter(source, task="door")
