@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -117,9 +118,10 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
             f"{expected.get(key, 'no such tensor')}"
         )
     for key, value in tensors.items():
-        if not (value.is_floating_point() and bool(torch.isfinite(value).all())):
+        if not (value.is_floating_point() and _is_finite(value)):
             raise BadInput(f"{str(path)!r}: tensor {key!r} contains values that are not finite numbers ({value.dtype})")
-    filter_ = build(architecture)
+    with _Uninitialised():  # all weights follow
+        filter_ = build(architecture)
     filter_.load_state_dict(tensors)
     filter_.eval().requires_grad_(False)
     return Checkpoint(
@@ -131,8 +133,15 @@ def load_checkpoint(path: Path, given: Iterable[Task] = ()) -> Checkpoint:
     )
 
 
+def _is_finite(value: torch.Tensor) -> bool:
+    """Whether all values are finite. PyTorch would wake all its threads for each tensor, NumPy does not."""
+    if value.dtype in (torch.float32, torch.float64):
+        return bool(np.isfinite(value.numpy()).all())
+    return bool(torch.isfinite(value).all())
+
+
 class _Uninitialised(TorchFunctionMode):
-    """Skips weight initialisation, which on the meta device would import PyTorch's compiler and take seconds."""
+    """Skips weight initialisation. On the meta device it would import PyTorch's compiler and take seconds."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from urllib.parse import parse_qs
 
@@ -59,10 +59,9 @@ EXAMPLES = (
 """The first is what an address without a selection opens."""
 
 
-def available(catalogs: Mapping[str, TaskCatalog]) -> list[Example]:
-    """The examples whose task and filter can be displayed."""
-    return [
-        example
-        for example in EXAMPLES
-        if (catalog := catalogs.get(example.task)) and not catalog.problem and example.filter in catalog.filters
-    ]
+def available(catalogs: Mapping[str, TaskCatalog]) -> Iterator[Example]:
+    """The examples whose task and filter can be displayed. Each loads the filters of its task."""
+    for example in EXAMPLES:
+        catalog = catalogs.get(example.task)
+        if catalog and not catalog.problem and example.filter in catalog.filters:
+            yield example

@@ -6,7 +6,7 @@ import hashlib
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -100,8 +100,8 @@ class TraceStore:
         """The first example; without one, the first task and filter. Raises BadInput if no task can be displayed."""
         with self._lock:
             catalogs, problems = self._catalogs
-            if examples := self._examples():
-                catalog, filter_ = catalogs[examples[0].task], examples[0].filter
+            if example := next(self._examples(), None):
+                catalog, filter_ = catalogs[example.task], example.filter
             else:
                 first = next((catalog for catalog in catalogs.values() if not catalog.problem), None)
                 if first is None:
@@ -110,10 +110,11 @@ class TraceStore:
             data, episodes = next(iter(catalog.data.items()))
             return Selection(catalog.task.name, filter_, first_moment(episodes)[0], data=data)
 
-    def _examples(self) -> list[Example]:
+    def _examples(self) -> Iterator[Example]:
         """None for a server with filters, data sets or tasks of the user."""
         settings = self.settings
-        return [] if settings.data or settings.checkpoints or settings.tasks else available(self._catalogs[0])
+        has_own = settings.data or settings.checkpoints or settings.tasks
+        return iter(()) if has_own else available(self._catalogs[0])
 
     def request(self, selection: Selection) -> TracedRun:
         """The selected run; its computation is started if necessary.

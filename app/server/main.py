@@ -242,8 +242,7 @@ def _add_files(app: FastAPI, viewer: WebViewer) -> None:
 def _warm(store: TraceStore, viewer: WebViewer, stopping: threading.Event) -> None:
     """Prepare what the first page requests. Errors are only logged; the page's own request reports them."""
     for prepare in (
-        lambda: store.request(store.default_selection()),  # starts the run in another thread
-        store.catalog,
+        store.catalog,  # the page's first request; a run at the same time would delay it
         lambda: store.request(store.default_selection()).encoded_maps(0, MAP_SIZES[0]),
         lambda: viewer.prepare(stopping.is_set),
         freeze_heap,

@@ -119,7 +119,13 @@ def test_edited_file_has_a_new_address(tmp_path: Path) -> None:
     names = [set(re.findall(rb"/static/(\w+)/", page)) for page in (before, after)]
     assert [len(hashes) for hashes in names] == [1, 1]
     assert names[0] != names[1]
-    assert files.file(request("br"), f"{names[1].pop().decode()}/a.js").body == b"export const a = 12;"
+    address = f"{names[1].pop().decode()}/a.js"
+    assert files.file(request("br"), address).body == b"export const a = 12;"
+    (tmp_path / "a.js").write_text("export const a = 123;")
+    answer = files.file(request("br"), address)
+    assert answer.body == b"export const a = 12;", "a browser would cache the new content under the old address"
+    assert "immutable" in answer.headers["cache-control"]
+    assert files.file(request("br"), "a.js").body == b"export const a = 123;"
 
 
 @pytest.mark.parametrize("path", ["/static/../server.py", "/static/..%2fserver.py", "/static/x/..%2f__init__.py"])
