@@ -61,7 +61,7 @@ def table_of(task: str, field: Path) -> Table:
     path = field / task.removesuffix("-field") / "outages.h5" if task.endswith("-field") else sample_path(task)
     with open_dataset(path) as data:
         traces = list(trace_all(checkpoint, data, data.held_out()))
-    error = np.concatenate([measures.position_error(t)[measures.counted(t), -1] for t in traces])
+    error = np.concatenate([measures.main_error(t)[measures.counted(t), -1] for t in traces])
     number = np.repeat(np.arange(len(traces)), [measures.counted(t).sum() for t in traces])
     return Table(error, number, covariates_of(traces))
 

@@ -16,12 +16,20 @@ from beliefscope.datasets.simulation.camera import Camera
 DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
 """SI unit -> unit for display, and the factor."""
 
+LENGTHS = ("m", "km", "dm", "cm", "mm", "um", "nm", "px")
+"""Units of a position."""
+
 Array = NDArray[np.float64]
 
 
 def display_unit(unit: str) -> tuple[str, float]:
     """Unit for display, and the factor from the SI unit: cm, degrees, else the unit itself."""
     return DISPLAY_UNITS.get(unit, (unit, 1.0))
+
+
+def with_unit(title: str, unit: str) -> str:
+    """A title followed by its unit: ``speed (m/s)``; the title itself without a unit."""
+    return f"{title} ({unit})" if unit else title
 
 
 def display_name(name: str) -> str:
@@ -58,6 +66,50 @@ class Component:
     def label(self) -> str:
         """Display name, such as ``hinge x``."""
         return display_name(self.name)
+
+
+@dataclass(frozen=True)
+class MainError:
+    """The one error that a run is summarised by: that of the position, or of another map component.
+
+    Attributes:
+        name: ``position``, or the labels of the components.
+        unit, factor: for display, and the factor from the unit of the components.
+        indices: of the components in the state: those of the map if they share a unit, else the first one.
+    """
+
+    name: str
+    unit: str
+    factor: float
+    indices: tuple[int, ...]
+
+    @property
+    def key(self) -> str:
+        """Name in metrics, such as ``position_cm``."""
+        return f"{self.name.replace(' ', '_')}_{self.unit}".rstrip("_")
+
+    @property
+    def label(self) -> str:
+        """Title with the unit, such as ``position (cm)``."""
+        return with_unit(self.name, self.unit)
+
+    def norm(self, difference: NDArray[Any]) -> NDArray[Any]:
+        """(...) length of differences of states (..., n), not in units for display."""
+        return np.asarray(np.linalg.norm(difference[..., list(self.indices)], axis=-1))
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """Unit for display, and its factor."""
+        return self.unit, self.factor
+
+    @property
+    def title(self) -> str:
+        """Name at the start of a sentence."""
+        return self.name[0].upper() + self.name[1:]
+
+    def text(self, value: float, digits: int = 2) -> str:
+        """A value as displayed: ``1.25 cm``."""
+        return f"{self.factor * value:.{digits}f} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -102,8 +154,9 @@ class Task:
         modalities: modality -> its observation keys. The built-in networks take one grey image, or vectors.
         control_size: length of the control vector.
         dt: seconds per step.
-        map_components: the two components of the likelihood map (x to the right, y up).
-        map_half_width: half the side length of the map, m.
+        map_components: the two components of the likelihood map (x to the right, y up), or one, whose map is a curve.
+            ``main_error`` is the error in them.
+        map_half_width: half the extent of the map, in the unit of the first of them.
         positions: observation key or ``control`` -> its two channels that are x and y in the frame of the map
             components. Shifting them together with the map components leaves all other readings unchanged.
         replay: builds the ``mujoco.MjModel`` for the ``qpos`` of an episode; None without replay.
@@ -130,7 +183,7 @@ class Task:
     modalities: Mapping[str, tuple[str, ...]]
     control_size: int
     dt: float
-    map_components: tuple[str, str]
+    map_components: tuple[str, ...]
     map_half_width: float
     positions: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     replay: Callable[[Any], Any] | None = None
@@ -173,6 +226,24 @@ class Task:
         return min(self.warmup, steps - 1)
 
     @property
-    def map_indices(self) -> tuple[int, int]:
-        """Indices of the two map components in the state vector."""
-        return self.index(self.map_components[0]), self.index(self.map_components[1])
+    def map_indices(self) -> tuple[int, ...]:
+        """Indices of the map components in the state vector."""
+        return tuple(map(self.index, self.map_components))
+
+    @property
+    def main_error(self) -> MainError:
+        """The error that runs are summarised by."""
+        parts = [self.components[i] for i in self.map_indices]
+        if any((c.unit, c.shown) != (parts[0].unit, parts[0].shown) for c in parts):
+            parts = parts[:1]
+        is_position = len(parts) == 2 and parts[0].unit in LENGTHS
+        name = "position" if is_position else " and ".join(c.label for c in parts)
+        return MainError(name, *parts[0].shown, self.map_indices[: len(parts)])
+
+    @property
+    def floor(self) -> tuple[int, int] | None:
+        """Indices of the map components if they are a position in m, which a view of the world can contain."""
+        if [self.components[i].unit for i in self.map_indices] != ["m", "m"]:
+            return None
+        x, y = self.map_indices
+        return x, y

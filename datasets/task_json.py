@@ -39,7 +39,7 @@ def task_from_json(values: Any) -> Task:
             modalities=_tuples(values["modalities"]),
             control_size=values["control_size"],
             dt=values["dt"],
-            map_components=(values["map_components"][0], values["map_components"][1]),
+            map_components=tuple(values["map_components"]),
             map_half_width=values["map_half_width"],
             positions=_tuples(values["positions"]),
             camera=None if values["camera"] is None else _camera(values["camera"]),
@@ -126,9 +126,8 @@ def check_definition(task: Task, where: str = "") -> None:
         unit, factor = component.shown
         if not isinstance(unit, str) or not _positive(factor) or (component.display and component.unit == "rad"):
             raise BadInput(f"{about} has display {component.display!r:.200}, expected a unit and a factor above 0.")
-    for name in task.map_components:
-        if (unit := task.components[task.index(name)].unit) != "m":
-            raise BadInput(f"{place}: map component {name!r} has unit {unit!r}, expected m.")
+    if len(set(task.map_indices)) != len(task.map_components) or len(task.map_components) not in (1, 2):
+        raise BadInput(f"{place}: map components are {list(task.map_components)!r:.200}, expected one or two names.")
     for key, shape in task.observations.items():
         if not shape or not all(_whole(size, 1) for size in shape):
             raise BadInput(f"{place}: observation {key!r} has shape {shape!r:.200}, expected whole numbers above 0.")
@@ -150,8 +149,10 @@ def check_definition(task: Task, where: str = "") -> None:
             raise BadInput(f"{place}: {name} is {value!r:.200}, expected a whole number.")
     if not (_positive(task.dt) and _positive(task.map_half_width)):
         raise BadInput(
-            f"{place}: dt is {task.dt!r} s and map_half_width {task.map_half_width!r} m, expected more than 0."
+            f"{place}: dt is {task.dt!r} s and map_half_width {task.map_half_width!r}, expected more than 0."
         )
+    if task.positions and len(task.main_error.indices) != 2:
+        raise BadInput(f"{place}: positions {list(task.positions)!r:.200} need two map components of one unit.")
     for key, channels in task.positions.items():
         if len(channels) != 2 or not all(_whole(channel, 0) for channel in channels):
             raise BadInput(f"{place}: positions of {key!r} are {channels!r:.200}, expected two channels.")

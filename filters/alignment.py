@@ -106,11 +106,11 @@ def _nearer(checkpoint: Checkpoint, episodes: Sequence[Episode], offset: Array, 
 
 
 def _mean_errors(checkpoint: Checkpoint, episodes: Sequence[Episode], particles: int, seed: int) -> Array:
-    """(R, 2) mean error of the estimate on the map in each episode, m, without the first steps."""
+    """(R, map components) mean error of the estimate on the map in each episode, m, without the first steps."""
     filter_ = checkpoint.filter
     steps = Steps.from_episodes(filter_.task, episodes)
     lengths = steps.length.numpy()
-    errors = np.zeros((len(episodes), 2))
+    errors = np.zeros((len(episodes), len(filter_.task.map_indices)))
     for length in np.unique(lengths):
         members = np.flatnonzero(lengths == length)
         error, _ = run(filter_, steps.windows(steps.first[members], int(length)), None, particles, seed)

@@ -285,7 +285,7 @@ def shift_positions(batch: Batch, task: Task, scale: Tensor, generator: torch.Ge
         scale: (n,) standard deviations of the state; only the map components are used. generator: on the CPU.
     """
     on_map = list(task.map_indices)
-    offset = torch.randn(batch.states.shape[1], 2, generator=generator).to(scale) * scale[on_map]
+    offset = torch.randn(batch.states.shape[1], len(on_map), generator=generator).to(scale) * scale[on_map]
 
     def shifted(values: Tensor, channels: Sequence[int]) -> Tensor:
         values = values.clone()

@@ -48,7 +48,7 @@ class Metrics:
     """Metrics over the evaluated steps of all episodes: those from ``Task.warmup`` on, unless stated otherwise.
 
     Attributes:
-        rmse: ``hinge_x_cm``, ``angle_deg``, ... and ``position_cm``, the root mean square distance on the map.
+        rmse: ``hinge_x_cm``, ``angle_deg``, ... and that of ``Task.main_error``, such as ``position_cm``.
         nll: mean negative log-likelihood of the true state under the posterior Gaussian, in nats, m and rad.
         nees: mean normalised estimation error squared over n: 1 if consistent, more if overconfident.
         coverage95: share of steps whose true state lies in the 95 % ellipsoid.
@@ -263,7 +263,8 @@ def squares(task: Task, error: Tensor) -> dict[str, Tensor]:
     """Squares (S,) of errors (S, n) in SI units, by key of ``Metrics.rmse`` and in its units."""
     error = error.double()
     by_component = {c.key: (c.shown[1] * error[:, i]).square() for i, c in enumerate(task.components)}
-    return by_component | {"position_cm": (100.0 * error[:, list(task.map_indices)]).square().sum(-1)}
+    main = task.main_error
+    return by_component | {main.key: (main.factor * error[:, list(main.indices)]).square().sum(-1)}
 
 
 def _root_mean(squares: Mapping[str, Tensor]) -> dict[str, float]:

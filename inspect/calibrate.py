@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import display_name, display_unit
+from beliefscope.datasets.task import display_name
 from beliefscope.filters.calibration import Calibration, Layer, conformal_radius
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table
@@ -44,13 +44,14 @@ class CalibrationReport(Diagnostic):
     """A calibration, and the coverage of its regions over other episodes than those it was fitted to.
 
     Attributes:
-        fitted, tested: indices of the episodes.
+        fitted, tested: indices of the episodes. units: region of distances -> unit for display, and its factor.
     """
 
     calibration: Calibration
     fitted: tuple[int, ...]
     tested: tuple[int, ...]
     coverage: tuple[Coverage, ...]
+    units: Mapping[str, tuple[str, float]]
 
     @property
     def verdict(self) -> str:
@@ -68,12 +69,17 @@ class CalibrationReport(Diagnostic):
     def tables(self) -> list[Table]:
         """Factors and radii of each layer; and coverage, one row per layer and phase."""
         names = tuple(self.calibration.layers["fused"].distances)
-        units = {name: display_unit("m" if name == "position" else "rad") for name in names}
+        units = self.units
         rows = [
             (layer, c.scale, c.ellipsoid, *(units[name][1] * c.distances[name] for name in names))
             for layer, c in self.calibration.layers.items()
         ]
-        columns = ("layer", "covariance x", "ellipsoid sigma", *(f"{display_name(n)} {units[n][0]}" for n in names))
+        columns = (
+            "layer",
+            "covariance x",
+            "ellipsoid sigma",
+            *(f"{display_name(n)} {units[n][0]}".rstrip() for n in names),
+        )
         regions = tuple(dict.fromkeys(c.region for c in self.coverage))
         cells = {(c.layer, c.phase, c.region): f"{100 * c.share:.1f}{_interval(c)}" for c in self.coverage}
         keys = dict.fromkeys((c.layer, c.phase, c.episodes) for c in self.coverage)
@@ -123,11 +129,13 @@ def calibrate(fitted: Sequence[Trace], tested: Sequence[Trace], level: float, da
     )
     coverage = _coverage(calibration, tested, [_scores(trace, layers) for trace in tested])
     indices, others = (tuple(trace.episode_index for trace in traces) for traces in (fitted, tested))
-    return CalibrationReport(calibration, indices, others, coverage)
+    task = first.task
+    units = {c.name: c.shown for c in task.components} | {task.main_error.name: task.main_error.shown}
+    return CalibrationReport(calibration, indices, others, coverage, units)
 
 
 Scores = dict[tuple[str, str], Array]
-"""Layer and ``nees`` (e^T S^-1 e / n), ``position`` or an angle -> (T,) at all steps; m and rad."""
+"""Layer and ``nees`` (e^T S^-1 e / n), the main error or an angle -> (T,) at all steps; SI units."""
 
 
 def _layers(trace: Trace) -> tuple[str, ...]:
@@ -136,15 +144,15 @@ def _layers(trace: Trace) -> tuple[str, ...]:
 
 
 def _scores(trace: Trace, layers: Sequence[str]) -> Scores:
-    error, distance, nees = np.abs(measures.errors(trace)), measures.position_error(trace), measures.nees(trace)
+    error, distance, nees = np.abs(measures.errors(trace)), measures.main_error(trace), measures.nees(trace)
     result: Scores = {}
     for name in layers:
         index = measures.layers(trace).index(name)
         if np.isfinite(nees[:, index]).all():
             result[name, "nees"] = nees[:, index]
-        result[name, "position"] = distance[:, index]
+        result[name, trace.task.main_error.name] = distance[:, index]
         for i, component in enumerate(trace.task.components):
-            if component.unit == "rad":
+            if component.unit == "rad" and (i,) != trace.task.main_error.indices:
                 result[name, component.name] = error[:, index, i]
     counted = measures.counted(trace)
     return {key: np.where(counted, values, np.nan) for key, values in result.items()}

@@ -1,4 +1,4 @@
-"""Likelihood maps: likelihood or posterior over two state components, by modality, at one step."""
+"""Likelihood maps: likelihood or posterior over one or two state components, by modality, at one step."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quanti
             particles.
         quantity: by default either.
     """
-    task, subject = checkpoint.task, "has no likelihood maps" if quantity != "posterior" else "has no posterior maps"
+    subject = "has no likelihood maps" if quantity != "posterior" else "has no posterior maps"
     if trace is not None and (only := trace.settings.get("standalone")):
         return f"a standalone run of {only} {subject}: those of the run with all modalities include {only}"
     if isinstance(checkpoint, ExternalFilter):
@@ -76,8 +76,6 @@ def no_maps(checkpoint: Checkpoint, trace: Trace | None = None, quantity: Quanti
     elif not checkpoint.filter.has_covariance:
         kind = {"lstm": "an LSTM"}.get(checkpoint.kind, f"a {checkpoint.kind}")
         return f"filter {checkpoint.name!r} {subject}: {kind} has no likelihood and no covariance"
-    if len(task.components) < 2:
-        return f"task {task.name!r} {subject}: a map shows two components, and its state has one"
     return None
 
 
@@ -152,7 +150,7 @@ class MapEngine:
         return GridEvaluator(models, filter_.statistics.mean_std("state")[1])
 
     def plane(self, components: tuple[str, ...] = ()) -> Plane:
-        """The plane of two components, by default of the task's map. Raises BadInput (``plane_of``)."""
+        """The plane of one or two components, by default of the task's map. Raises BadInput (``plane_of``)."""
         if components not in self._planes:
             self._planes[components] = plane_of(self.trace, components)
         return self._planes[components]
@@ -179,7 +177,7 @@ class MapEngine:
             angle: SI, value of the component off the map if it is the only one and fixed; by default the true value.
             size: cells per side, S.
             quantity: by default the likelihood, or the posterior for a filter that reports only that (``quantities``).
-            components: names of the x and the y axis; by default those of the task's map.
+            components: names of the x and the y axis, or one for a curve; by default those of the task's map.
             others: treatment of the components off the map. Default: one is fixed; several are integrated out if
                 possible (``no_others``), because a map at fixed values of all of them shows little of the belief.
 
@@ -210,7 +208,7 @@ class MapEngine:
             middle[fixed] = angle
         with one_thread():
             values = self._densities(quantity, others)(step, size, middle, plane, quantity, others)
-        x, y = (_offsets(half, size).astype(np.float32) for half in plane.half_widths)
+        x, y = (offsets.astype(np.float32) for offsets in plane.offsets(size))
         return LikelihoodMap(
             step=step,
             angle=math.nan if fixed is None else float(middle[fixed]),
@@ -258,7 +256,7 @@ class MapEngine:
     def _networks(
         self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others
     ) -> Array:
-        """(K + 1, S, S) log-likelihoods of the measurement models and of the fused mixture, or log posteriors.
+        """(K + 1, R, S) log-likelihoods of the measurement models and of the fused mixture, or log posteriors.
 
         The posterior is ``p(x) p(z | x) / p(z)``: the prior p(x) is the density of the predicted particles, and the
         evidence p(z) the mean likelihood of the particles under their prior weights.
@@ -268,9 +266,9 @@ class MapEngine:
         assert self.evidence is not None
         evidence = self.evidence[step]
         assert self._grid is not None
-        x, y = (_offsets(half, size) for half in plane.half_widths)
+        x, y = plane.offsets(size)
         unimodal = self._grid.log_likelihood(
-            plane.components,
+            plane.along,
             torch.from_numpy(x.astype(np.float32)),
             torch.from_numpy(y.astype(np.float32)),
             filter_.statistics.standardise("state", torch.from_numpy(middle)),
@@ -290,35 +288,35 @@ class MapEngine:
             at_particles = torch.cat([at_particles, mixture(at_particles - scale, log_weights).unsqueeze(0)])
             evidence_ = torch.logsumexp(torch.from_numpy(prior) + at_particles, dim=1, keepdim=True)
             density = ParticleDensity(self.task, trace.particles[step], prior)
-            log_prior = density.log_density(middle, plane.components, x, y).astype(np.float32)
+            log_prior = density.log_density(middle, plane.along, x, y).astype(np.float32)
             values = values - evidence_ + torch.from_numpy(log_prior).flatten()
-        return values.unflatten(1, (size, size)).numpy()
+        return values.unflatten(1, (len(y), size)).numpy()
 
     def _measurement_models(
         self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others
     ) -> Array:
-        """(K + 1, S, S) log-likelihoods of an external filter's own models, called for all cells at once."""
+        """(K + 1, R, S) log-likelihoods of an external filter's own models, called for all cells at once."""
         assert isinstance(self.checkpoint, ExternalFilter)
-        ix, iy = plane.components
-        x, y = (_offsets(half, size) for half in plane.half_widths)
-        states = np.tile(middle, (size, size, 1))
+        ix, iy = plane.along
+        x, y = plane.offsets(size)
+        states = np.tile(middle, (len(y), size, 1))
         states[..., ix] += x
         states[..., iy] += y[:, None]
         cells, count = states.reshape(-1, states.shape[-1]).astype(np.float32), len(self.trace.modalities)
         values = log_likelihood(self.checkpoint, self.trace.episode, step, cells, count)
-        return values.reshape(-1, size, size)
+        return values.reshape(-1, len(y), size)
 
     def _kernel_densities(
         self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others
     ) -> Array:
-        """(K + 1, S, S) log densities of the particles with the weights of each posterior."""
+        """(K + 1, R, S) log densities of the particles with the weights of each posterior."""
         particles, weights = self.trace.particles, layer_weights(self.trace, step)
         assert particles is not None
-        x, y = (_offsets(half, size) for half in plane.half_widths)
+        x, y = plane.offsets(size)
         components = plane.components if others == "marginal" else None
         with np.errstate(divide="ignore"):
             densities = [ParticleDensity(self.task, particles[step], np.log(layer), components) for layer in weights]
-        return np.stack([d.log_density(middle, plane.components, x, y) for d in densities]).astype(np.float32)
+        return np.stack([d.log_density(middle, plane.along, x, y) for d in densities]).astype(np.float32)
 
     def _moments(self, step: int, quantity: Quantity) -> tuple[Doubles, Doubles]:
         """Means (K + 1, n) and covariances (K + 1, n, n) of the sensors or posteriors, the fused one last."""
@@ -340,21 +338,22 @@ class MapEngine:
     def _gaussians(
         self, step: int, size: int, middle: Doubles, plane: Plane, quantity: Quantity, others: Others
     ) -> Array:
-        """(K + 1, S, S) log densities of the modalities' Gaussians and of the fused Gaussian (``_moments``).
+        """(K + 1, R, S) log densities of the modalities' Gaussians and of the fused Gaussian (``_moments``).
 
         The squared Mahalanobis distance is a sum of a term by column, a term by row and their product. The marginal of
         a Gaussian has the mean and the covariance of the remaining components.
         """
-        ix, iy = plane.components
+        ix, iy = plane.along
         mean, covariance = self._moments(step, quantity)
         from_mean = wrapped(self.task, middle - mean)
         if others == "marginal":
-            from_mean, covariance = from_mean[:, [ix, iy]], covariance[:, [ix, iy]][:, :, [ix, iy]]
-            ix, iy = 0, 1
+            kept = list(plane.components)
+            from_mean, covariance = from_mean[:, kept], covariance[:, kept][:, :, kept]
+            ix, iy = 0, len(kept) - 1
         factor = np.linalg.cholesky(covariance)
         whiten = np.linalg.inv(factor)
         precision = whiten.swapaxes(-1, -2) @ whiten
-        x, y = (_offsets(half, size) for half in plane.half_widths)
+        x, y = plane.offsets(size)
         slope = (precision @ from_mean[..., None])[..., 0]
         along_x, along_y = (
             precision[:, i, i, None] * d**2 + 2.0 * slope[:, i, None] * d for i, d in ((ix, x), (iy, y))
@@ -365,8 +364,3 @@ class MapEngine:
         log_det = np.log(np.einsum("lnn->ln", factor)).sum(-1)[:, None, None]
         constant = 0.5 * from_mean.shape[-1] * math.log(2.0 * math.pi)
         return (-0.5 * squared - log_det - constant).astype(np.float32)
-
-
-def _offsets(half_width: float, size: int) -> Doubles:
-    """(S,) SI, cell centres of an axis."""
-    return ((np.arange(size) + 0.5) / size * 2.0 - 1.0) * half_width

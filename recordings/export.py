@@ -121,7 +121,7 @@ def _topics(trace: Trace) -> Topics:
         else:
             arrays.setdefault(f"/{column.group}/{column.parts[0]}", []).append(column)
     topics += [(topic, _numbers(topic, group)) for topic, group in arrays.items()]
-    if trace.particles is not None and trace.log_weights is not None:
+    if trace.particles is not None and trace.log_weights is not None and trace.task.floor is not None:
         topics.append(("/particles", _particles(trace)))
     return topics
 
@@ -178,7 +178,8 @@ def _particles(trace: Trace) -> tuple[dict[str, Any], Callable[[int], dict[str, 
     assert trace.particles is not None
     assert trace.log_weights is not None
     task = trace.task
-    places = trace.particles[..., list(task.map_indices)]
+    assert task.floor is not None
+    places = trace.particles[..., list(task.floor)]
     height = np.full_like(places[..., :1], plane_height(trace, task))
     points = np.concatenate([places, height, np.exp(trace.log_weights)[..., None]], axis=-1, dtype=np.float32)
     fields = [{"name": name, "offset": 4 * i, "type": FLOAT32} for i, name in enumerate(("x", "y", "z", "weight"))]

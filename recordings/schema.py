@@ -143,7 +143,7 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("states/{component}/truth", "Scalars", "()", "cm or deg", "always", "true value"),
     Entity("states/{component}/{source}", "Scalars", "()", "cm or deg", "always", "estimated value"),
     Entity("states/{component}/two_sigma", "Scalars", "(2,)", "cm or deg", "covariance", "fused mean - and + 2 sigma"),
-    Entity("errors/position/{source}", "Scalars", "()", "cm", "always", "distance from the true position"),
+    Entity("errors/position/{source}", "Scalars", "()", "cm or other", "always", "main error of the task"),
     Entity("errors/{angle}/{source}", "Scalars", "()", "deg", "always", "absolute error of each angle"),
     Entity("weights/{modality}", "Scalars", "(W,)", "1", "weights", "beta, one series per column"),
     Entity(
@@ -207,7 +207,14 @@ SCHEMA: tuple[Entity, ...] = (
     ),
     # Likelihood maps, at the steps for which they were computed.
     Entity("maps/title", "TextDocument", "static", "text", "maps", "likelihood or posterior, and the fusion rule"),
-    Entity("maps/{layer}", "DepthImage", "(S, S)", "u8", "maps", "255 x quantity / its maximum; top row: largest y"),
+    Entity(
+        "maps/{layer}",
+        "DepthImage or LineStrips2D",
+        "(S, S)",
+        "u8",
+        "maps",
+        "255 x quantity / its maximum",
+    ),
     Entity("maps/{layer}/log_peak", "Scalars", "()", "log", "maps", "log of the quantity at the maximum"),
     Entity("maps/{layer}/truth", "Boxes2D", "(1, 2)", "cells", "maps", "true position on the map"),
     Entity("maps/{layer}/estimate", "Boxes2D", "(1, 2)", "cells", "maps", "estimate of the layer on the map"),

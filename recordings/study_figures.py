@@ -113,8 +113,9 @@ def reference(rows: Sequence[Row], key: str) -> tuple[str, float | None]:
 def panels_of(task: Task) -> list[tuple[str, str]]:
     """Keys and titles of the panels of a task: the position on the map, and each other component."""
     position = task.map_components[0].rpartition("_")[0] or "position"
-    others = [c for c in task.components if c.name not in task.map_components]
-    return [("position_cm", position), *((c.key, c.name) for c in others)]
+    main = task.main_error
+    others = [c for i, c in enumerate(task.components) if i not in main.indices]
+    return [(main.key, position if main.name == "position" else main.name), *((c.key, c.name) for c in others)]
 
 
 def bar_styles(filters: Sequence[str]) -> dict[str, dict[str, Any]]:

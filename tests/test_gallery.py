@@ -38,7 +38,7 @@ def test_recurrent_gain_learns(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.manual_seed(0)
         adapter = Adapter(example["train"](steps, episodes=16, length=40))
         run = trace(ExternalFilter(adapter, data["TASK"], "gain"), data["drive"](5, 40))
-        errors.append(measures.position_error(run)[:, -1].mean())
+        errors.append(measures.main_error(run)[:, -1].mean())
         assert set(quick(run)) == {"errors"}
         assert "gain" in run.extra
     assert errors[1] < errors[0]

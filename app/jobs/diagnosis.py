@@ -46,5 +46,6 @@ def search_repair(arguments: Mapping[str, Any], report: Report) -> Any:
     if repair is None:
         text = f"Episode {selection.episode} has no failure: its errors are within twice the healthy ones"
         none = dict.fromkeys(("failure", "error", "repaired", "repair"))
-        return {"sentence": f"{text}, {100 * bound:.2f} cm.", "bound": bound, "replays": 0, **none}
+        limit = run.checkpoint.task.main_error.text(bound)
+        return {"sentence": f"{text}, {limit}.", "bound": bound, "replays": 0, **none}
     return as_json({"sentence": repair.sentence, **repair.to_json()})

@@ -39,7 +39,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         base = store.checkpoint(arguments["task"], arguments["filter"])
         data_name, data = store.dataset(arguments["task"], arguments["data"])
         with log_curves(folder / "log") as write:
-            log = ProgressLog(folder / "progress.json", tuning.steps)
+            log = ProgressLog(folder / "progress.json", tuning.steps, base.task.main_error)
 
             def on_validation(validation: Validation) -> None:
                 log.add_validation(validation)

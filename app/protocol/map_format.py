@@ -75,9 +75,9 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
     cloud = particle_cloud(trace, index, maps.components)
     axes = [
         _axis_json(task, k, offsets)
-        for k, offsets in zip(maps.components, (maps.offsets_x, maps.offsets_y), strict=True)
+        for k, offsets in zip(maps.components, (maps.offsets_x, maps.offsets_y), strict=False)
     ]
-    is_default, same_unit = maps.components == task.map_indices, axes[0]["unit"] == axes[1]["unit"]
+    on_floor, same_unit = maps.components == task.floor, len(axes) == 2 and axes[0]["unit"] == axes[1]["unit"]
     statistics = measure_maps([replace(maps, step=index)], trace)
     # Without a true state the maps are centered on the estimate, whose log-likelihood is not the one at the truth.
     unknown = {"truth": [None] * len(maps.layers)} if np.isnan(trace.episode.states[index]).any() else {}
@@ -86,6 +86,7 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
     description = {
         "step": maps.step,
         "size": len(maps.offsets_x),
+        "rows": len(maps.offsets_y),
         "quantity": maps.quantity,
         "rule": maps.rule,
         "angle": None if math.isnan(maps.angle) else float(maps.angle),
@@ -99,7 +100,7 @@ def encode_maps(task: Task, trace: Trace, index: int, maps: LikelihoodMap) -> En
         "log_max": _json(log_max),
         "log_range": _json(log_range),
         "peak": maps.peaks().tolist(),
-        "effector": effector[index, :2].tolist() if effector is not None and is_default else None,
+        "effector": effector[index, :2].tolist() if effector is not None and on_floor else None,
         "expected": _json(statistics.expected[0]),
         "shape": [SHAPES[shape] if same_unit else None for shape in statistics.shape[0]],
         "numbers": {name: _json(getattr(statistics, name)[0]) for name in NUMBERS} | unknown,
@@ -117,10 +118,10 @@ def _axis_json(task: Task, index: int, offsets: NDArray[np.float32]) -> dict[str
 
 
 def quantise(log: NDArray[np.float32]) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:
-    """Layers (L, S, S) of log-likelihood as q, with ``log = log_max + log_range * (q / 65535 - 1)``.
+    """Layers (L, R, S) of log-likelihood as q, with ``log = log_max + log_range * (q / 65535 - 1)``.
 
     Returns:
-        q (L, S, S), log_max (L,), log_range (L,) at most ``LOG_RANGE``: there q = 0 stands for all lower values.
+        q (L, R, S), log_max (L,), log_range (L,) at most ``LOG_RANGE``: there q = 0 stands for all lower values.
     """
     top = log.max(axis=(1, 2), keepdims=True)
     span = np.clip(top - log.min(axis=(1, 2), keepdims=True), 1e-6, LOG_RANGE)

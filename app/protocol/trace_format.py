@@ -101,14 +101,15 @@ def _names(trace: Trace) -> str:
 
 def scene_layers(task: Task, trace: Trace, no_maps: str | None) -> list[SceneLayer]:
     """The layers that the 3D scene of a trace has."""
+    on_floor = task.floor is not None
     present = {
         "replay": task.replay is not None and trace.episode.qpos.shape[1] > 0,
         "objects": task.outline is not None,
-        "estimates": True,
-        "contours": trace.has_covariance,
-        "particles": trace.particles is not None and trace.log_weights is not None,
+        "estimates": on_floor or task.outline is not None,
+        "contours": on_floor and trace.has_covariance,
+        "particles": on_floor and trace.particles is not None and trace.log_weights is not None,
         "force": trace.episode.observations.keys() >= set(SENSORS),
-        "map": no_maps is None,
+        "map": on_floor and no_maps is None,
         "camera": task.camera is not None and camera_images(trace) is not None,
     }
     return [layer for layer in LAYERS if present[layer]]

@@ -108,13 +108,20 @@ class TaskCatalog:
 
     def to_json(self) -> dict[str, Any]:
         """The task's entry in the page's catalog."""
-        task, (x, y) = self.task, self.task.map_components
+        task, main = self.task, self.task.main_error
         return {
             "name": task.name,
             "components": [component_json(c) for c in task.components],
             "modalities": list(task.modalities),
             "dt": task.dt,
-            "map": {"x": x, "y": y, "half_width": task.map_half_width},
+            "map": {"components": list(task.map_components), "half_width": task.map_half_width},
+            "main": {
+                "name": main.name,
+                "key": main.key,
+                "unit": main.unit,
+                "scale": main.factor,
+                "indices": main.indices,
+            },
             "fault_presets": [{"name": name, "faults": text} for name, text in available_presets(task).items()],
             "filters": [_filter_json(name, filter_, self.paths.get(name)) for name, filter_ in self.filters.items()],
             "data": [_data_json(name, data) for name, data in self.data.items()],

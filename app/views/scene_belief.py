@@ -80,13 +80,16 @@ class BeliefScene:
         if self._replay is not None:
             self._robot = RobotScene(server, self._replay)
             self._roots["replay"].append(self._robot.fixed_bodies)
-        else:
+        elif self._task.floor is not None:
             add_grid(server, self._task, trace)
-        self._poles = [self._add_pole(i, name) for i, name in enumerate(self._belief.names)]
+        available: set[str] = set(scene_layers(self._task, trace, no_maps(run.checkpoint, trace)))
+        poles = self._belief.names if "estimates" in available else ()
+        self._poles = [self._add_pole(i, name) for i, name in enumerate(poles)]
         self._outline_frames = [] if self._belief.outline is None else self._add_outlines(self._belief.outline)
-        self._add_layers(set(scene_layers(self._task, trace, no_maps(run.checkpoint, trace))))
+        self._add_layers(available)
         if np.isnan(trace.episode.states).any():  # unknown true state
-            self._poles[0].hide()
+            for pole in self._poles[:1]:
+                pole.hide()
             for frame in self._outline_frames[:1]:
                 frame.visible = False
         self.set_layers(layers)

@@ -145,7 +145,7 @@ class View:
             encoded = await self._maps(cursor, run)
             await websocket.send_bytes(encoded.message(cursor.serial))
             # The floor of the scene shows positions only.
-            maps = encoded.maps if encoded.maps.components == run.checkpoint.task.map_indices else None
+            maps = encoded.maps if encoded.maps.components == run.checkpoint.task.floor else None
             if not run.growing:
                 self._prefetch_center = cursor, run
                 self._maps_sent.set()

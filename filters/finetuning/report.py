@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from beliefscope.datasets.task import MainError
 from beliefscope.filters.finetuning.loop import Validation
 from beliefscope.filters.finetuning.settings import FineTune
 
@@ -18,12 +19,13 @@ def curve_values(validation: Validation) -> dict[str, float]:
     return values
 
 
-def error_summary(first: Validation, last: Validation) -> str:
-    """Position error by slice: ``clean 0.34 cm, blackout 0.95 3.14 -> 1.20 cm``."""
+def error_summary(main: MainError, first: Validation, last: Validation) -> str:
+    """Main error by slice: ``clean 0.34 cm, blackout 0.95 3.14 -> 1.20 cm``."""
     parts = []
+    key, unit = main.key, f" {main.unit}".rstrip()
     for name, metrics in last.slices.items():
-        before, after = first.slices[name]["rmse"]["position_cm"], metrics["rmse"]["position_cm"]
-        parts.append(f"{name} {before:.2f} cm" if before == after else f"{name} {before:.2f} -> {after:.2f} cm")
+        before, after = first.slices[name]["rmse"][key], metrics["rmse"][key]
+        parts.append(f"{name} {before:.2f}{unit}" if before == after else f"{name} {before:.2f} -> {after:.2f}{unit}")
     return ", ".join(parts)
 
 

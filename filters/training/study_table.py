@@ -60,6 +60,7 @@ class Row:
             filters of several models only. by_seed: seed -> quantity -> value.
         from_step_0: mean RMSE over the seeds without omitting the first steps. baselines: name in ``BASELINES`` -> mean
             RMSE over the seeds from the same starts. Both empty for studies of earlier versions.
+        main: key of the task's main error.
     """
 
     task: str
@@ -77,6 +78,7 @@ class Row:
     start: str = ""
     from_step_0: Numbers = field(default_factory=dict)
     baselines: Mapping[str, Numbers] = field(default_factory=dict)
+    main: str = "position_cm"
 
 
 def rows_of(documents: Mapping[Any, Document | None]) -> list[Row]:
@@ -99,7 +101,7 @@ def rows_of(documents: Mapping[Any, Document | None]) -> list[Row]:
             for name, members in requested.items():
                 rows += [_row(definition, name, key, blackout, members) for blackout in blackouts]
         if finished:
-            rows.append(Row(task, TRIVIAL, None, 0, 0, 0, finished[0]["trivial"], {}))
+            rows.append(Row(task, TRIVIAL, None, 0, 0, 0, finished[0]["trivial"], {}, main=definition.main_error.key))
     return rows
 
 
@@ -129,6 +131,7 @@ def _row(task: Task, name: str, key: str, blackout: float, requested: Sequence[D
         start=str(STUDY_OFFSET.of(task)) if key == OFFSET else "",
         from_step_0=_over_seeds([m.get("rmse_from_step_0", {}) for m in fused])[0],
         baselines=_rmse_by_name([{k: m for k, m in f.get("baselines", {}).items() if m} for f in fused]),
+        main=task.main_error.key,
     )
 
 
@@ -224,9 +227,9 @@ def start_label(start: str) -> str:
     return f"start offset {start}" if start else "start at the truth"
 
 
-def headline_keys(rmse: Iterable[str]) -> list[str]:
-    """Keys of the RMSE of the position and of each angle, of all keys."""
-    return ["position_cm", *(key for key in rmse if key.endswith("_deg"))]
+def headline_keys(rmse: Iterable[str], main: str = "position_cm") -> list[str]:
+    """Keys of the RMSE of the main error and of each angle, of all keys."""
+    return [main, *(key for key in rmse if key.endswith("_deg") and key != main)]
 
 
 def _baseline_table(rows: Sequence[Row]) -> str:
@@ -234,7 +237,7 @@ def _baseline_table(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
         parts = [row.mean, row.from_step_0, *(row.baselines.get(name, {}) for name in BASELINES)]
-        for key in headline_keys(row.mean) if row.baselines else ():
+        for key in headline_keys(row.mean, row.main) if row.baselines else ():
             values = ["" if (value := part.get(key)) is None else f"{value:.2f}" for part in parts]
             lines.append(f"| {row.filter} | {row.blackout:.0%} | {label(key)} | {' | '.join(values)} |")
     if not lines:
@@ -246,23 +249,22 @@ def _baseline_table(rows: Sequence[Row]) -> str:
 
 
 def _modality_table(rows: Sequence[Row]) -> str:
-    """Position RMSE of the updates and of the standalone filter of every modality; empty without any."""
+    """Main RMSE of the updates and of the standalone filter of every modality; empty without any."""
     names = dict.fromkeys(name for row in rows for name in row.standalone)
     if not names:
         return ""
     heads = [head for name in names for head in (f"{name}-only update", f"{name} standalone")]
+    title = label(rows[0].main)
     lines = [
-        "\nPosition (cm) by modality: an update starts at every step from the fused prior, a standalone filter never "
-        "uses the other modalities.\n",
+        f"\n{title[0].upper()}{title[1:]} by modality: an update starts at every step from the fused prior, a "
+        "standalone filter never uses the other modalities.\n",
         f"| filter | image blackout | fused | {' | '.join(heads)} |",
         "| --- |" + " ---: |" * (len(heads) + 2),
     ]
     for row in rows:
         if row.standalone:
-            by_modality = (
-                part.get(name, {}).get("position_cm") for name in names for part in (row.updates, row.standalone)
-            )
-            values = ["" if v is None else f"{v:.2f}" for v in (row.mean.get("position_cm"), *by_modality)]
+            by_modality = (part.get(name, {}).get(row.main) for name in names for part in (row.updates, row.standalone))
+            values = ["" if v is None else f"{v:.2f}" for v in (row.mean.get(row.main), *by_modality)]
             lines.append(f"| {row.filter} | {row.blackout:.0%} | {' | '.join(values)} |")
     return "\n".join(lines) + "\n"
 

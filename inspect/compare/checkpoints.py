@@ -15,6 +15,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.task import with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.filter import Filter
@@ -81,6 +82,7 @@ class CheckpointComparison(Diagnostic):
     differences: tuple[Difference, ...]
     levels: Array
     calibration: Array
+    error_shown: tuple[str, float]
     events: tuple[Regression, ...]
     modules: tuple[ModuleChange, ...]
 
@@ -156,7 +158,9 @@ class CheckpointComparison(Diagnostic):
 
     def event_table(self) -> Table:
         """One row per regressed event."""
-        columns = ("slice", "episode", "step", "from", "to", "contact", "before cm", "after cm", "increase cm")
+        columns: tuple[str, ...] = ("slice", "episode", "step", "from", "to", "contact")
+        unit, factor = self.error_shown
+        columns += tuple(f"{name} {unit}".rstrip() for name in ("before", "after", "increase"))
         rows = tuple(
             (
                 m.slice,
@@ -165,22 +169,25 @@ class CheckpointComparison(Diagnostic):
                 m.first,
                 m.last,
                 "yes" if m.contact else "no",
-                100 * m.before,
-                100 * m.after,
-                100 * (m.after - m.before),
+                factor * m.before,
+                factor * m.after,
+                factor * (m.after - m.before),
             )
             for m in self.events
         )
         return Table("Regressed events", columns, rows)
 
     def plots(self) -> list[Plot]:
-        """Position error by slice; calibration of the first slice and of the slice that changed most."""
-        position = [d for d in self.differences if d.measure == "position"]
+        """Main error by slice; calibration of the first slice and of the slice that changed most."""
+        main = self.differences[0].measure
+        position = [d for d in self.differences if d.measure == main]
         names = tuple(d.slice for d in position)
         x = np.arange(len(position), dtype=np.float64)
         before, after = (np.array(values) for values in zip(*(d.display[:2] for d in position), strict=True))
         bars = (Line("before", x, before), Line("after", x, after, "fused"))
-        plots = [Plot("Position by slice", "", "RMSE (cm)", bars, "bars", names=names)]
+        plots = [
+            Plot(f"{main.capitalize()} by slice", "", with_unit("RMSE", self.error_shown[0]), bars, "bars", names=names)
+        ]
         if np.isnan(self.calibration).all():
             return plots
         changes = np.nan_to_num(np.abs(self.calibration[:, 1] - self.calibration[:, 0]).mean(-1))
@@ -248,6 +255,7 @@ def compare_checkpoints(
         differences=differences(sums.sums, [slice_.name for slice_ in selected], measures_of(task)),
         levels=LEVELS,
         calibration=calibration(sums.sums.sum(0)).swapaxes(0, 1),
+        error_shown=task.main_error.shown,
         events=find_regressions(sums, selected, indices, members, task),
         modules=module_changes(
             *filters, sample_steps(members, task, OUTPUT_STEPS), after.record.get("parts") if finetuned else None

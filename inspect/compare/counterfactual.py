@@ -17,8 +17,8 @@ from beliefscope.inspect.statistics.measures import (
     display_units,
     errors,
     layer_label,
+    main_error,
     means,
-    position_error,
     wrapped,
 )
 from beliefscope.inspect.trace import Trace
@@ -92,13 +92,14 @@ class Counterfactual(Diagnostic):
         if not self.distance.any() and not self.sigmas.any():
             return f"{_sentence(self.edit)} changed nothing."
         peak = int(self.distance.argmax())
-        text = f"{self.edit} moved the estimate by up to {100 * self.distance[peak]:.2f} cm (step {peak})"
+        text = f"{self.edit} moved the estimate by up to {self.task.main_error.text(self.distance[peak])} (step {peak})"
         for name, (largest, step, unit) in self._peaks().items():
-            if name not in self._mapped():
+            if name not in self._main():
                 text += f" and the {name} by up to {largest:.1f} {unit} (step {step})"
         text = f"{_sentence(text)}: {self._recovery()}. "
-        before, after = (float(100 * error[self.during].mean()) for error in (self.error, self.edited_error))
-        text += f"Mean position error over the edited steps: {before:.2f} -> {after:.2f} cm"
+        main = self.task.main_error
+        before, after = (main.factor * float(error[self.during].mean()) for error in (self.error, self.edited_error))
+        text += f"Mean {main.name} error over the edited steps: {before:.2f} -> {after:.2f} {main.unit}".rstrip()
         return f"{text}{self._weight_text()}."
 
     def _recovery(self) -> str:
@@ -124,9 +125,9 @@ class Counterfactual(Diagnostic):
             return f"; {name} remained dominant ({change})"
         return f"; {name} {'became dominant' if before[k] < 0.5 <= after[k] else 'gained weight'} ({change})"
 
-    def _mapped(self) -> tuple[str, ...]:
+    def _main(self) -> tuple[str, ...]:
         task = self.task
-        return tuple(task.components[i].label for i in task.map_indices)
+        return tuple(task.components[i].label for i in task.main_error.indices)
 
     def _peaks(self) -> dict[str, tuple[float, int, str]]:
         """Component -> largest difference in display units, step, unit."""
@@ -140,18 +141,20 @@ class Counterfactual(Diagnostic):
         }
 
     def tables(self) -> list[Table]:
+        main = self.task.main_error
         spans = {"edited steps": self.during, "after": slice(self.to, None), "all": slice(None)}
         rows: list[tuple[Value, ...]] = []
         for name, span in spans.items():
             if not len(self.error[span]):
                 continue
             values = (
-                100 * self.error[span].mean(),
-                100 * self.edited_error[span].mean(),
-                100 * self.distance[span].mean(),
+                main.factor * self.error[span].mean(),
+                main.factor * self.edited_error[span].mean(),
+                main.factor * self.distance[span].mean(),
             )
             rows.append((name, *map(float, values), _number(self.divergence[span].mean())))
-        columns = ("steps", "error, cm", "error edited, cm", "distance, cm", "divergence, nats")
+        names = (f"{name}, {main.unit}" for name in ("error", "error edited", "distance"))
+        columns = ("steps", *names, "divergence, nats")
         tables = [Table("Mean over steps", columns, tuple(rows))]
         peaks = tuple((name, largest, unit, step) for name, (largest, step, unit) in self._peaks().items())
         tables.append(Table("Largest difference of the estimates", ("component", "difference", "unit", "step"), peaks))
@@ -160,8 +163,9 @@ class Counterfactual(Diagnostic):
         return tables
 
     def _modality_table(self) -> Table:
-        columns: tuple[str, ...] = ("modality", "change of its update, cm")
-        change = 100 * self.modality_distance[self.during].mean(0)
+        main = self.task.main_error
+        columns: tuple[str, ...] = ("modality", f"change of its update, {main.unit}")
+        change = main.factor * self.modality_distance[self.during].mean(0)
         rows: list[tuple[Value, ...]] = [(m, float(change[k])) for k, m in enumerate(self.modalities)]
         if self.effective_weights is not None and self.edited_weights is not None:
             columns = (*columns, "effective weight", "effective weight edited")
@@ -171,16 +175,18 @@ class Counterfactual(Diagnostic):
 
     def curves(self) -> list[Curve]:
         chart = "Distance between original and edited estimates"
-        curves = [Curve("fused", 100 * self.distance, chart, "cm", "fused")]
+        main = self.task.main_error
+        scale, unit = main.factor, main.unit
+        curves = [Curve("fused", scale * self.distance, chart, unit, "fused")]
         for k, m in enumerate(self.modalities if len(self.modalities) > 1 else ()):
-            curves.append(Curve(layer_label(m), 100 * self.modality_distance[:, k], chart, "cm", m))
+            curves.append(Curve(layer_label(m), scale * self.modality_distance[:, k], chart, unit, m))
         curves.append(
             Curve(
                 "fused", self.sigmas, "Distance in standard deviations of the original", "", "fused", (0.0, RECOVERED)
             )
         )
         for layer_error, name in ((self.error, "original"), (self.edited_error, "edited")):
-            curves.append(Curve(name, 100 * layer_error, "Error", "cm", "fused"))
+            curves.append(Curve(name, scale * layer_error, "Error", unit, "fused"))
         if self.effective_weights is not None and self.edited_weights is not None:
             for k, m in enumerate(self.modalities):
                 for weights, name in ((self.effective_weights, m), (self.edited_weights, f"{m} edited")):
@@ -207,7 +213,7 @@ def compare(original: Trace, edited: Trace, edit: Edit) -> Counterfactual:
         raise BadInput(f"traces of {len(original)} and {len(edited)} steps are not from one episode")
     task = original.task
     difference = wrapped(task, means(edited) - means(original))
-    on_map = np.linalg.norm(difference[..., list(task.map_indices)], axis=-1)
+    on_map = task.main_error.norm(difference)
     fused = difference[:, -1]
     weights = [
         None if trace.effective_weights is None else trace.effective_weights.mean(-1, dtype=np.float64)
@@ -228,8 +234,8 @@ def compare(original: Trace, edited: Trace, edit: Edit) -> Counterfactual:
         modality_distance=on_map[:, :-1],
         sigmas=sigmas,
         divergence=_divergence(original, edited, fused),
-        error=position_error(original)[:, -1],
-        edited_error=position_error(edited)[:, -1],
+        error=main_error(original)[:, -1],
+        edited_error=main_error(edited)[:, -1],
         effective_weights=weights[0],
         edited_weights=weights[1],
         contact=original.episode.contact.astype(bool),

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.task import Task, display_unit
+from beliefscope.datasets.task import Task
 from beliefscope.filters.finetuning.slices import Slice
 from beliefscope.inspect.failures.events import event_spans
 from beliefscope.inspect.failures.step_scores import RECENT
@@ -24,8 +24,8 @@ HIGH = 0.95
 MAX_EVENTS = 20
 """Maximum number of regression events."""
 
-MIN_INCREASE = 1e-3
-"""m, minimum error increase of a regression event."""
+MIN_INCREASE = 0.1
+"""Minimum error increase of a regression event, in the unit for display."""
 
 LEVEL = 0.02
 """Minimum relative change that counts as improved or regressed."""
@@ -37,7 +37,7 @@ class Difference:
 
     Attributes:
         slice, measure: names.
-        unit: unit of before and after: of the component, nats or none.
+        unit, factor: for display: of the component, nats or none; and the factor of before and after.
         before, after: values.
         effect: natural logarithm of the factor of deterioration; negative is better. Errors: log ratio. NLL: increase
             over n, equivalent to scaling all errors and standard deviations. NEES: factor by which standard deviations
@@ -48,6 +48,7 @@ class Difference:
     slice: str
     measure: str
     unit: str
+    factor: float
     before: float
     after: float
     effect: float
@@ -71,8 +72,7 @@ class Difference:
     @property
     def display(self) -> tuple[float, float, str]:
         """Before and after in display units, and the unit."""
-        unit, factor = display_unit(self.unit)
-        return factor * self.before, factor * self.after, unit
+        return self.factor * self.before, self.factor * self.after, self.unit
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Regression:
         episode: index in the data set.
         first, last, step: first and last step, and the step of the largest increase (peak).
         contact: whether there is contact at the peak.
-        before, after: m, position error at the peak.
+        before, after: main error at the peak, in the unit of its components.
     """
 
     slice: str
@@ -117,7 +117,7 @@ def differences(sums: Array, slices: Sequence[str], measures: Sequence[Measure])
             if not (math.isfinite(before) and math.isfinite(after)):
                 continue
             effect, low, high = map(float, jackknife(with_steps, partial(_effect, measure)))
-            rows.append(Difference(name, measure.name, measure.unit, before, after, effect, low, high))
+            rows.append(Difference(name, measure.name, measure.unit, measure.factor, before, after, effect, low, high))
     return tuple(rows)
 
 
@@ -131,7 +131,7 @@ def _effect(measure: Measure, sums: Array) -> Array:
 def find_regressions(
     sums: EpisodeSums, slices: Sequence[Slice], indices: Sequence[int], episodes: Sequence[Episode], task: Task
 ) -> tuple[Regression, ...]:
-    """Find intervals of steps with a larger position error, largest increase first."""
+    """Find intervals of steps with a larger main error, largest increase first."""
     episode = np.concatenate([np.full(len(e), i) for i, e in enumerate(episodes)])
     step = np.concatenate([np.arange(len(e)) for e in episodes])
     first = np.concatenate([np.full(len(e), task.first_counted(len(e))) for e in episodes])
@@ -142,7 +142,7 @@ def find_regressions(
     for (faults, only), distance in sums.distance.items():
         before, after = np.concatenate(distance, axis=1)
         increase = np.where(counted, after - before, -np.inf)
-        high = increase > max(MIN_INCREASE, float(np.quantile(increase[counted], HIGH)))
+        high = increase > max(MIN_INCREASE / task.main_error.factor, float(np.quantile(increase[counted], HIGH)))
         name = next(slice_.name for slice_ in slices if condition(slice_) == (faults, only))
         for a, b in event_spans(high, episode, gap):
             at = a + int(np.argmax(increase[a : b + 1]))

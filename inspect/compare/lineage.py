@@ -67,6 +67,7 @@ class Ancestor:
     settings: Mapping[str, Any]
     metrics: Mapping[str, Any]
     record: Mapping[str, Any]
+    main: str
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint, path: Path) -> Ancestor:
@@ -82,15 +83,16 @@ class Ancestor:
             settings=base.get("settings") or {},
             metrics=record.get("metrics") or {},
             record=record,
+            main=checkpoint.task.main_error.key,
         )
 
     @property
     def rmse(self) -> Mapping[str, float]:
-        """RMSE of the fused estimate with clean sensors in cm and deg, position first; empty if not recorded."""
+        """RMSE of the fused estimate with clean sensors as displayed, the main error first; empty if not recorded."""
         rmse = (self.metrics.get("0") or {}).get("fused", {}).get("rmse")
         if not isinstance(rmse, Mapping):
             return {}
-        return {name: rmse[name] for name in sorted(rmse, key=lambda name: name != "position_cm")}
+        return {name: rmse[name] for name in sorted(rmse, key=lambda name: name != self.main)}
 
     @property
     def summary(self) -> list[str]:

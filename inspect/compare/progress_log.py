@@ -9,6 +9,7 @@ from pathlib import Path
 
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
+from beliefscope.datasets.task import MainError
 from beliefscope.filters.finetuning.loop import Validation
 from beliefscope.filters.finetuning.report import error_summary
 from beliefscope.inspect.diagnostics.views import as_json
@@ -19,8 +20,8 @@ WRITE_INTERVAL = 0.3  # s between writes
 class ProgressLog:
     """Writes the loss of each step and all validations to a JSON file; continues that of an interrupted run."""
 
-    def __init__(self, path: Path, steps: int) -> None:
-        self._path, self._steps, self._written = path, steps, 0.0
+    def __init__(self, path: Path, steps: int, main: MainError) -> None:
+        self._path, self._steps, self._main, self._written = path, steps, main, 0.0
         self._interrupted_losses = []
         with suppress(OSError, ValueError, KeyError):
             self._interrupted_losses = read_json(path.read_bytes())["losses"]
@@ -30,7 +31,7 @@ class ProgressLog:
     @property
     def errors(self) -> str:
         """Summary of the errors in the first and the last validation."""
-        return error_summary(self._validations[0], self._validations[-1]) if self._validations else ""
+        return error_summary(self._main, self._validations[0], self._validations[-1]) if self._validations else ""
 
     def resume(self, step: int) -> None:
         """Keep the losses up to this step of the interrupted run."""

@@ -24,10 +24,10 @@ from beliefscope.inspect.statistics.measures import (
     display_units,
     errors,
     layer_label,
+    main_error,
     means,
     nees,
     phases,
-    position_error,
     wrapped,
 )
 from beliefscope.inspect.trace import Trace
@@ -91,31 +91,32 @@ class Comparison(Diagnostic):
     def verdict(self) -> str:
         if not self.distance.any() and np.array_equal(*np.moveaxis(self.component_error, -1, 0)):
             return f"The estimates of {self.names[0]} and {self.names[1]} are identical."
-        first, second = (100 * float(value) for value in self.position[0])
+        main = self.task.main_error
+        first, second = map(float, self.position[0])
         change = second / first - 1.0 if first else math.inf
-        text = f"RMSE over {self.steps[0]} steps: {self.names[0]} {first:.2f} cm, {self.names[1]} {second:.2f} cm"
+        text = (
+            f"RMSE over {self.steps[0]} steps: {self.names[0]} {main.text(first)}, {self.names[1]} {main.text(second)}"
+        )
         parts = [f"{text} ({_change(change)}){self._other_components()}."]
         if abs(change) >= LEVEL and (phase := self._dominant_phase()) is not None:
-            before, after = (100 * float(value) for value in self.position[phase])
+            before, after = map(float, self.position[phase])
             parts.append(
-                f"Largest contribution in phase {self.phases[phase]}: {before:.2f} -> {after:.2f} cm "
+                f"Largest contribution in phase {self.phases[phase]}: {main.factor * before:.2f} -> {main.text(after)} "
                 f"over {self.steps[phase]} steps."
             )
         parts.append(self._consistency())
         farthest = int(self.distance.argmax())
-        parts.append(
-            f"Largest distance between the estimates {100 * self.distance[farthest]:.2f} cm (step {farthest})."
-        )
+        parts.append(f"Largest distance between the estimates {main.text(self.distance[farthest])} (step {farthest}).")
         return " ".join(filter(None, parts))
 
     def _other_components(self) -> str:
-        """Errors of components that are not on the map."""
+        """Errors of components that are not part of the main error."""
         task = self.task
         units, factors = display_units(task)
         return "".join(
             f"; {c.label} {factors[i] * self.rmse[0, i, 0]:.2f} -> {factors[i] * self.rmse[0, i, 1]:.2f} {units[i]}"
             for i, c in enumerate(task.components)
-            if i not in task.map_indices
+            if i not in task.main_error.indices
         )
 
     def _dominant_phase(self) -> int | None:
@@ -141,14 +142,16 @@ class Comparison(Diagnostic):
     def tables(self) -> list[Table]:
         task = self.task
         units, factors = display_units(task)
+        main = task.main_error
         rows: list[tuple[Value, ...]] = []
         for s, phase in enumerate(self.phases):
             label = f"{phase} ({self.steps[s]})"
             rows += [
-                _row(label, "position RMSE (cm)", 100 * self.position[s], relative=True),
+                _row(label, f"{main.name} RMSE ({main.unit})", main.factor * self.position[s], relative=True),
                 *(
                     _row(label, f"{c.label} RMSE ({units[i]})", factors[i] * self.rmse[s, i], relative=True)
                     for i, c in enumerate(task.components)
+                    if (i,) != main.indices
                 ),
                 _row(label, "NEES/n", self.nees[s]),
                 _row(label, "NLL (nats)", self.nll[s]),
@@ -165,10 +168,11 @@ class Comparison(Diagnostic):
         task = self.task
         units, factors = display_units(task)
         chart = "Distance between the estimates"
-        curves = [Curve("fused", 100 * self.distance, chart, "cm", "fused")]
+        main = task.main_error
+        curves = [Curve("fused", main.factor * self.distance, chart, main.unit, "fused")]
         if len(self.modalities) > 1:
             curves += [
-                Curve(layer_label(m), 100 * self.modality_distance[:, k], chart, "cm", m)
+                Curve(layer_label(m), main.factor * self.modality_distance[:, k], chart, main.unit, m)
                 for k, m in enumerate(self.modalities)
             ]
 
@@ -178,9 +182,9 @@ class Comparison(Diagnostic):
                 Curve(f"{prefix}{name}", values[:, i], chart, unit, layer, bounds) for i, name in enumerate(self.names)
             ]
 
-        curves += both(100 * self.error, "Position error", "cm")
+        curves += both(main.factor * self.error, f"{main.title} error", main.unit)
         for i, component in enumerate(task.components):
-            if i not in task.map_indices:
+            if i not in task.main_error.indices:
                 curves += both(factors[i] * np.abs(self.component_error[:, i]), f"{component.label} error", units[i])
         if np.isfinite(self.nees_at).any():
             curves += both(np.sqrt(self.nees_at), CONSISTENCY, "standard deviations")
@@ -227,9 +231,9 @@ def compare_runs(this: Trace, other: Trace, names: tuple[str, str] | None = None
         else tuple(name for name in this.modalities_with_posterior if name in other.modalities_with_posterior)
     )
     layers = np.stack([_layers(run, shared) for run in runs], axis=-1)  # (T, K + 1, n, 2)
-    distance = np.linalg.norm(wrapped(task, layers[..., 1] - layers[..., 0])[..., list(task.map_indices)], axis=-1)
+    distance = task.main_error.norm(wrapped(task, layers[..., 1] - layers[..., 0]))
     error = np.stack([errors(run)[:, -1] for run in runs], axis=-1)
-    on_map = np.stack([position_error(run)[:, -1] for run in runs], axis=-1)
+    on_map = np.stack([main_error(run)[:, -1] for run in runs], axis=-1)
     nees_at = np.stack([nees(run)[:, -1] for run in runs], axis=-1)
     nll = np.stack([_nll(run) for run in runs], axis=-1)
     share = None

@@ -77,7 +77,7 @@ def _gaussian_nll(error: Array, covariance: Array) -> Array:
 
 def _squared_error(trace: Trace) -> float:
     """m^2: sum over the counted steps."""
-    return float(np.square(measures.position_error(trace)[measures.counted(trace), -1]).sum())
+    return float(np.square(measures.main_error(trace)[measures.counted(trace), -1]).sum())
 
 
 def _removed(sums: Array) -> Array:

@@ -17,12 +17,13 @@ from torch import Tensor
 
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import MainError
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.belief import Evidence
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.subsets import input_modalities
-from beliefscope.inspect.statistics.measures import Array, position_error
+from beliefscope.inspect.statistics.measures import Array, main_error, wrapped
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.replay import Replay, repeat_belief
 
@@ -63,8 +64,8 @@ class Repair:
     """Result of ``smallest_repair``.
 
     Attributes:
-        failure: first and last step of the failure. bound: m.
-        error: m, RMS position error over the failure. repaired: the same with the repair; NaN without any.
+        failure: first and last step of the failure. bound: in the unit of the main error's components.
+        error: RMS main error over the failure. repaired: the same with the repair; NaN without any.
         candidate: the repair; None if no candidate keeps the error below the bound.
         replays: number of replays.
     """
@@ -75,16 +76,17 @@ class Repair:
     repaired: float
     candidate: Candidate | None
     replays: int
+    main: MainError
 
     @property
     def sentence(self) -> str:
         """The repair and its effect."""
         first, last = self.failure
-        failure = f"The error of {100 * self.error:.2f} cm in steps {first} to {last}"
+        failure = f"The error of {self.main.text(self.error)} in steps {first} to {last}"
         if self.candidate is None:
             return f"{failure} is not repaired by any sensor: check the dynamics and the weights."
         unit = "step" if self.candidate.steps == 1 else "steps"
-        effect = f"becomes {100 * self.repaired:.2f} cm (bound {100 * self.bound:.2f} cm)"
+        effect = f"becomes {self.main.text(self.repaired)} (bound {self.main.text(self.bound)})"
         return f"{failure} {effect} by {self.candidate}, {self.candidate.steps} {unit}."
 
     def to_json(self) -> dict[str, Any]:
@@ -132,10 +134,9 @@ class Candidates:
         evidence, generator = self._evidence(candidates)[start:end], self.replay.generator(start, Common)
         means = [step.estimate.mean for step in self.filter.steps(belief, evidence, generator)]
         estimates = self.filter.statistics.state_to_si(torch.stack(means)).numpy()  # (t, N, n)
-        where = list(self.trace.task.map_indices)
-        difference = (estimates - self.trace.episode.states[start:end, None])[..., where]
-        squared = np.square(np.linalg.norm(difference, axis=-1))
-        unchanged = position_error(self.trace)[self.failure[0] : max(start, self.failure[0]), -1]
+        difference = wrapped(self.trace.task, estimates - self.trace.episode.states[start:end, None])
+        squared = np.square(self.trace.task.main_error.norm(difference))
+        unchanged = main_error(self.trace)[self.failure[0] : max(start, self.failure[0]), -1]
         total = np.square(unchanged).sum() + squared[max(0, self.failure[0] - start) :].sum(0)
         return np.asarray(np.sqrt(total / (self.failure[1] + 1 - self.failure[0])))
 
@@ -195,7 +196,7 @@ def smallest_repair(
     search = Candidates(checkpoint, trace, failure, clean)
     if len(search.filter.names) < 2 and clean is None:
         raise BadInput(f"filter {checkpoint.name!r} has one measurement model: without it nothing is measured")
-    error = float(np.sqrt(np.square(position_error(trace)[failure[0] : failure[1] + 1, -1]).mean()))
+    error = float(np.sqrt(np.square(main_error(trace)[failure[0] : failure[1] + 1, -1]).mean()))
     for count in range(1, len(search.modalities) + 1):
         candidates = search.longest(count)
         errors = search.errors(candidates)
@@ -205,13 +206,13 @@ def smallest_repair(
             best = min(shortened, key=lambda candidate: candidate.steps)
             best = _elsewhere(search, best, bound, max_replays)
             repaired = float(search.errors([best])[0])
-            return Repair(failure, bound, error, repaired, best, search.replays)
-    return Repair(failure, bound, error, np.nan, None, search.replays)
+            return Repair(failure, bound, error, repaired, best, search.replays, trace.task.main_error)
+    return Repair(failure, bound, error, np.nan, None, search.replays, trace.task.main_error)
 
 
 def largest_failure(trace: Trace, bound: float) -> tuple[int, int] | None:
     """First and last step of the stretch with errors above the bound (m) around the largest one of a counted step."""
-    error = position_error(trace)[:, -1]
+    error = main_error(trace)[:, -1]
     first = trace.task.first_counted(len(trace))
     peak = first + int(np.argmax(error[first:]))
     if not error[peak] > bound:

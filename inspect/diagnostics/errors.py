@@ -31,7 +31,7 @@ class GroupErrors:
 
     Attributes:
         name, steps: group (``measures.phases``) and number of steps.
-        position: root mean square distance over the map components. rmse, bias: (n,) of the components.
+        position: root mean square of the main error (``Task.main_error``). rmse, bias: (n,) of the components.
         share: of the sum of squared distances of all counted steps.
     """
 
@@ -108,7 +108,7 @@ class Errors(Diagnostic):
     def verdict(self) -> str:
         unit, scale = self._unit
         total = self.groups[0]
-        text = f"Position RMSE {scale * total.position:.3g} {unit}"
+        text = f"{self.task.main_error.title} RMSE {scale * total.position:.3g} {unit}"
         others = [group for group in self.groups[1:] if measures.MIN_STEPS <= group.steps < total.steps]
         if others:
             worst = max(others, key=lambda group: group.position)
@@ -133,7 +133,8 @@ class Errors(Diagnostic):
     @property
     def _unit(self) -> tuple[str, float]:
         """Display unit of distances, and its factor."""
-        return self.task.components[self.task.map_indices[0]].shown
+        main = self.task.main_error
+        return main.unit, main.factor
 
     def tables(self) -> list[Table]:
         units, factors = measures.display_units(self.task)
@@ -147,7 +148,7 @@ class Errors(Diagnostic):
             )
             for g in self.groups
         ]
-        columns = ("group", "steps", f"position RMSE ({unit})", "squared error (%)", *heads)
+        columns = ("group", "steps", f"{self.task.main_error.name} RMSE ({unit})", "squared error (%)", *heads)
         tables = [Table("Errors by group", columns, tuple(rows))]
         if self.outages:
             columns = (
@@ -171,7 +172,8 @@ class Errors(Diagnostic):
 
     def curves(self) -> list[Curve]:
         unit, scale = self._unit
-        return [Curve("fused", scale * self.distance, "Position error", unit, "fused")] if len(self.distance) else []
+        chart = f"{self.task.main_error.title} error"
+        return [Curve("fused", scale * self.distance, chart, unit, "fused")] if len(self.distance) else []
 
     def bands(self) -> dict[str, Mask]:
         return {"outage": np.any(list(self.missing.values()), axis=0)} if self.missing else {}
@@ -194,9 +196,8 @@ def _known_steps(trace: Trace) -> Mask:
 def errors_of(traces: Sequence[Trace]) -> Errors:
     """Evaluate the errors of one estimator over one or more trajectories."""
     first, single = traces[0], len(traces) == 1
-    where = list(first.task.map_indices)
     error = [measures.errors(trace)[:, -1] for trace in traces]
-    distance = [np.linalg.norm(e[:, where], axis=1) for e in error]
+    distance = [first.task.main_error.norm(e) for e in error]
     missing = [missing_steps(trace) for trace in traces]
     return Errors(
         task=first.task,

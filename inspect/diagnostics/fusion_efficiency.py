@@ -88,10 +88,11 @@ class FusionEfficiency(Diagnostic):
     @property
     def verdict(self) -> str:
         total = self.phases[0]
-        alone = [f"{name} {100.0 * x:.2f} cm" for name, x in zip(self.modalities, total.standalone[:, 0], strict=True)]
+        main = self.task.main_error
+        alone = [f"{name} {main.text(x)}" for name, x in zip(self.modalities, total.standalone[:, 0], strict=True)]
         sentence = (
-            f"Position RMSE {100.0 * total.fused[0]:.2f} cm; the standalone errors ({', '.join(alone)}; correlation "
-            f"{total.correlation[0]:.2f}) allow {100.0 * total.best[0]:.2f} cm: efficiency {total.efficiency[0]:.2f}"
+            f"{main.title} RMSE {main.text(total.fused[0])}; the standalone errors ({', '.join(alone)}; correlation "
+            f"{total.correlation[0]:.2f}) allow {main.text(total.best[0])}: efficiency {total.efficiency[0]:.2f}"
         )
         if math.isnan(total.low[0]):
             return f"{sentence}. No interval and no reasons: {too_few(self.trajectories)}."
@@ -104,17 +105,14 @@ class FusionEfficiency(Diagnostic):
         return f"{sentence} Reasons: {'; '.join(texts)}."
 
     def tables(self) -> list[Table]:
-        task = self.task
-        units, scale = measures.display_units(task)
-        names = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
         rows: list[tuple[Value, ...]] = []
         for entry in self.phases:
-            for q, (name, unit, factor) in enumerate(names):
+            for q, name, factor in measures.quantities(self.task):
                 lengths = (entry.fused[q], *entry.standalone[:, q], entry.best[q], entry.independent[q])
                 ratios = (entry.correlation[q], entry.efficiency[q], entry.low[q], entry.high[q])
                 values = [*(float(factor * length) for length in lengths), *map(float, ratios)]
                 numbers = [value if math.isfinite(value) else None for value in values]
-                rows.append((entry.phase, entry.steps, f"{name} ({unit})", *numbers))
+                rows.append((entry.phase, entry.steps, name, *numbers))
         heads = ["fused", *(f"{name} standalone" for name in self.modalities), "best combination", "if uncorrelated"]
         columns = ("phase", "steps", "quantity", *heads, "correlation", "efficiency", "95 % from", "to")
         tables = [Table("Errors of fusion and of the best combination", columns, tuple(rows))]
@@ -131,13 +129,14 @@ class FusionEfficiency(Diagnostic):
     def curves(self) -> list[Curve]:
         if not len(self.fused):
             return []
-        chart = "Position error"
+        main = self.task.main_error
+        chart = f"{main.title} error"
         alone = [
-            Curve(f"{name} standalone", 100.0 * self.standalone[:, k], chart, "cm", name)
+            Curve(f"{name} standalone", main.factor * self.standalone[:, k], chart, main.unit, name)
             for k, name in enumerate(self.modalities)
         ]
-        best = Curve("best combination", 100.0 * self.best, chart, "cm", "truth")
-        return [Curve("fused", 100.0 * self.fused, chart, "cm", "fused"), *alone, best]
+        best = Curve("best combination", main.factor * self.best, chart, main.unit, "truth")
+        return [Curve("fused", main.factor * self.fused, chart, main.unit, "fused"), *alone, best]
 
     def bands(self) -> dict[str, Mask]:
         return {"contact": self.contact, "blackout": self.blackout} if len(self.fused) else {}
@@ -152,7 +151,7 @@ def fusion_efficiency(
 
 def efficiency_of(traces: Sequence[Trace], checkpoint: Checkpoint, alone: Sequence[Array]) -> FusionEfficiency:
     """The result, given the errors (T, K, n) of the standalone filters by trace."""
-    first, where = traces[0], list(traces[0].task.map_indices)
+    first, where = traces[0], list(traces[0].task.main_error.indices)
     errors = [
         np.concatenate([measures.errors(trace)[:, -1:], e], axis=1) for trace, e in zip(traces, alone, strict=True)
     ]

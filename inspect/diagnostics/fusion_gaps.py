@@ -231,7 +231,7 @@ def _weighted_sums(trace: Trace, of_sensors: bool) -> tuple[Array, Array]:
     """
     assert trace.effective_weights is not None
     task = trace.task
-    where = list(task.map_indices)
+    where = list(task.main_error.indices)
     estimates = trace.observation_mean if of_sensors else trace.modality_mean
     assert estimates is not None
     error = measures.wrapped(task, estimates - trace.episode.states[:, None])[..., where]  # (T, K, 2)

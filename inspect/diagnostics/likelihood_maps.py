@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic, Entry
 from beliefscope.inspect.diagnostics.views import Curve, Table, Value
 from beliefscope.inspect.likelihood import COARSE, MapEngine, Quantity, no_maps
+from beliefscope.inspect.maps.plane import area_unit
 from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.maps.statistics import MapStatistics, measure_maps
 from beliefscope.inspect.statistics.measures import blackout, pooled_phases, trace_indices
@@ -43,6 +45,7 @@ class MapSurvey(Diagnostic):
         phases: phase -> mask (B,) without warm-up steps.
         trajectories: number of traces. trajectory: (B,) index of each step's trace.
         size: cells per side.
+        task, components: of the maps.
         contact, blackout: (B,) masks including warm-up steps.
     """
 
@@ -53,8 +56,15 @@ class MapSurvey(Diagnostic):
     trajectories: int
     trajectory: NDArray[np.int64]
     size: int
+    task: Task
+    components: tuple[int, ...]
     contact: Mask
     blackout: Mask
+
+    @property
+    def _length(self) -> tuple[str, float]:
+        """Unit for display of distances on the map, and its factor."""
+        return self.task.components[self.components[0]].shown
 
     @property
     def quantity(self) -> str:
@@ -83,7 +93,8 @@ class MapSurvey(Diagnostic):
         of_shape = mask & (n.shape[:, i] == SHAPES.index(shape))
         if shape == "ring":
             radius, coverage = (float(np.median(a[of_shape, i])) for a in (n.ring_radius, n.ring_coverage))
-            return f"{text}, median radius {100.0 * radius:.1f} cm, over {100.0 * coverage:.0f} % of the circle."
+            unit, factor = self._length
+            return f"{text}, median radius {factor * radius:.1f} {unit}, over {100.0 * coverage:.0f} % of the circle."
         if shape != "ridge":
             return f"{text}."
         text += f", median elongation {np.median(n.elongation[of_shape, i]):.1f}"
@@ -100,7 +111,7 @@ class MapSurvey(Diagnostic):
         return f"{median:.1f}° (95 % interval {low:.1f}° to {high:.1f}°)"
 
     def tables(self) -> list[Table]:
-        n = self.numbers
+        n, length, (area, factor) = self.numbers, self._length, area_unit(self.task, self.components)
         rows: list[tuple[Value, ...]] = []
         fused = len(n.layers) - 1
         for i, layer in enumerate(n.layers):
@@ -111,10 +122,10 @@ class MapSurvey(Diagnostic):
                     np.degrees(n.deviation[:, i]),
                     n.elongation[:, i],
                     *(100.0 * (n.shape[:, i] == k) for k in range(len(SHAPES))),
-                    100.0 * np.where(n.shape[:, i] == SHAPES.index("ring"), n.ring_radius[:, i], np.nan),
-                    1e4 * n.area50[:, i],
-                    1e4 * n.area95[:, i],
-                    n.entropy[:, i] + np.log(1e4),
+                    length[1] * np.where(n.shape[:, i] == SHAPES.index("ring"), n.ring_radius[:, i], np.nan),
+                    factor * n.area50[:, i],
+                    factor * n.area95[:, i],
+                    n.entropy[:, i] + np.log(factor),
                     n.truth[:, i],
                     n.divergence[:, i, fused],
                     n.overlap[:, i, fused],
@@ -125,23 +136,24 @@ class MapSurvey(Diagnostic):
                     round(float((np.mean if k in parts else _median)(value[mask])), 3) for k, value in enumerate(values)
                 ]
                 rows.append((layer, phase, int(mask.sum()), *(v if np.isfinite(v) else None for v in medians)))
-        shapes = (*(f"{shape} (% of steps)" for shape in SHAPES), "ring radius (cm)")
+        shapes = (*(f"{shape} (% of steps)" for shape in SHAPES), with_unit("ring radius", length[0]))
         columns = ("map", "phase", "steps", "off expected ridge (deg)", "elongation", *shapes)
-        more = ("50 % area (cm²)", "95 % area (cm²)", "entropy (nats, per cm²)", "ln p(true position) / max")
+        regions = (with_unit(f"{share} % area", area) for share in (50, 95))
+        more = (*regions, f"entropy (nats, per {area or 'unit'})", "ln p(true state) / max")
         last = ("KL to fused (nats)", "overlap with fused")
         return [Table(f"{self.title}. Medians over steps", (*columns, *more, *last), tuple(rows))]
 
     def curves(self) -> list[Curve]:
         if self.trajectories > 1:
             return []
-        n, curves = self.numbers, []
+        n, curves, (area, factor) = self.numbers, [], area_unit(self.task, self.components)
         for layer in self.ridge_layers if np.isfinite(n.expected).any() else ():
             angle = np.degrees(n.deviation[:, n.layers.index(layer)])
             curves.append(
                 Curve(layer, angle, "Angle between principal axis and expected ridge", "°", layer, (0.0, 45.0))
             )
         for i, layer in enumerate(n.layers):
-            curves.append(Curve(layer, 1e4 * n.area95[:, i], "95 % area", "cm²", layer))
+            curves.append(Curve(layer, factor * n.area95[:, i], "95 % area", area, layer))
         for i, layer in enumerate(n.layers[:-1]):
             curves.append(Curve(layer, n.divergence[:, i, -1], "KL divergence to the fused map", "nats", layer))
         return curves
@@ -219,6 +231,8 @@ def maps(
         trajectories=len(traces),
         trajectory=trace_indices(traces),
         size=size,
+        task=checkpoint.task,
+        components=checkpoint.task.map_indices,
         contact=contact,
         blackout=blackouts,
     )

@@ -265,14 +265,15 @@ def measure_steps(trace: Trace) -> ParticleSteps:
         evidence = np.logaddexp.reduce(prior[:, None] + trace.log_likelihood, axis=-1)
     indices = np.arange(count)
     ancestors = np.broadcast_to(indices, (steps, count)) if trace.ancestors is None else trace.ancestors
-    where = list(task.map_indices)
+    points = trace.particles[..., list(task.map_indices)].astype(np.float64)
+    points = np.pad(points, ((0, 0), (0, 0), (0, 2 - points.shape[-1])))  # a map of one component has no second
     return ParticleSteps(
         effective=1.0 / np.square(weights).sum(1),
         largest=weights.max(1),
         ancestors=1 + (np.diff(np.sort(ancestors, axis=1), axis=1) != 0).sum(1),
         resampled=(ancestors != indices).any(1),
         evidence=evidence,
-        modes=modes(trace.particles[..., where].astype(np.float64), weights),
+        modes=modes(points, weights),
         farther=_farther(trace, np.exp(prior)),
         contact=trace.episode.contact.astype(bool),
         blackout=measures.blackout(trace),

@@ -313,8 +313,8 @@ def _worst(traces: Sequence[Trace], step: int | None) -> tuple[Trace, int]:
         if not candidates:
             longest = max(map(len, traces))
             raise BadInput(f"step {step} is not in this trace: it has steps 0 to {longest - 1}")
-        return max(candidates, key=lambda trace: measures.position_error(trace)[step, -1]), step
-    scores = [np.where(measures.counted(trace), measures.position_error(trace)[:, -1], -1.0) for trace in traces]
+        return max(candidates, key=lambda trace: measures.main_error(trace)[step, -1]), step
+    scores = [np.where(measures.counted(trace), measures.main_error(trace)[:, -1], -1.0) for trace in traces]
     worst = int(np.argmax([score.max() for score in scores]))
     return traces[worst], int(scores[worst].argmax())
 

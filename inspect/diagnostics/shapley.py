@@ -94,25 +94,26 @@ class Shapley(Diagnostic):
 
     @property
     def verdict(self) -> str:
+        main = self.task.main_error
         by_name = {values.phase: values for values in self.phases}
         phases = [by_name[phase] for phase in PHASE_NAMES if phase in by_name] or [self.phases[0]]
         sentences = []
         for values in phases:
             changes = [
-                f"{name} {'lowers' if value < 0 else 'raises'} {{}} by {abs(value):.2f} cm"
-                for name, value in zip(self.modalities, 100.0 * values.shapley[:, 0], strict=True)
+                f"{name} {'lowers' if value < 0 else 'raises'} {{}} by {main.text(abs(value))}"
+                for name, value in zip(self.modalities, values.shapley[:, 0], strict=True)
             ]
-            parts = changes[0].format("the position RMSE"), *(change.format("it") for change in changes[1:])
-            empty, complete = 100.0 * values.rmse[0, 0], 100.0 * values.rmse[-1, 0]
+            parts = changes[0].format(f"the {main.name} RMSE"), *(change.format("it") for change in changes[1:])
+            empty, complete = main.text(values.rmse[0, 0]), main.text(values.rmse[-1, 0])
             sentences.append(
                 f"{PHASE_NAMES.get(values.phase, 'Over all steps')} {', '.join(parts)} "
-                f"({empty:.2f} cm with {self.baseline}, {complete:.2f} cm with "
+                f"({empty} with {self.baseline}, {complete} with "
                 f"{'all modalities' if len(self.modalities) > 1 else self.modalities[0]})."
             )
         if len(self.modalities) > 1:
-            total = 100.0 * self.phases[0].rmse[:, 0]
-            without = [f"{total[-1 - 2**k]:.2f} cm without {name}" for k, name in enumerate(self.modalities)]
-            sentences.append(f"All steps: {total[-1]:.2f} cm, {', '.join(without)}.")
+            total = self.phases[0].rmse[:, 0]
+            without = [f"{main.text(total[-1 - 2**k])} without {name}" for k, name in enumerate(self.modalities)]
+            sentences.append(f"All steps: {main.text(total[-1])}, {', '.join(without)}.")
         if self.at_truth:
             sentences.append(f"Runs start at the true state, which favours {self.baseline}.")
         if why := too_few(self.trajectories):
@@ -128,11 +129,6 @@ class Shapley(Diagnostic):
         return " + ".join(subset) or self.baseline
 
     def tables(self) -> list[Table]:
-        task = self.task
-        units, scale = measures.display_units(task)
-        names = ["position", *(component.label for component in task.components)]
-        titles = [f"{name} ({unit})" for name, unit in zip(names, ("cm", *units), strict=True)]
-        factors = np.array([100.0, *scale])
         # With many modalities, list single modalities and leave-one-out subsets only.
         listed = [
             i
@@ -142,9 +138,9 @@ class Shapley(Diagnostic):
         value_rows: list[tuple[Value, ...]] = []
         subset_rows: list[tuple[Value, ...]] = []
         for phase in self.phases:
-            for q, title in enumerate(titles):
+            for q, title, factor in measures.quantities(self.task):
                 rmse, phi, low, high = (
-                    factors[q] * getattr(phase, name)[:, q] for name in ("rmse", "shapley", "low", "high")
+                    factor * getattr(phase, name)[:, q] for name in ("rmse", "shapley", "low", "high")
                 )
                 ends = [number for pair in zip(low, high, strict=True) for number in pair if self._has_intervals]
                 numbers = [None if math.isnan(v) else float(v) for v in (rmse[0], *phi, rmse[-1], *ends)]
@@ -173,15 +169,19 @@ class Shapley(Diagnostic):
         if not len(self.position_values):
             return []
         task = self.task
+        main = task.main_error
+        chart = f"Shapley values of the {main.name} error"
         curves = [
-            Curve(name, 100.0 * self.position_values[:, k], "Shapley values of the position error", "cm", name)
+            Curve(name, main.factor * self.position_values[:, k], chart, main.unit, name)
             for k, name in enumerate(self.modalities)
         ]
         for i, subset in enumerate(self.subsets):
             if len(subset) <= 1 or i == len(self.subsets) - 1:
                 layer = subset[0] if len(subset) == 1 else "fused" if subset else ""
-                chart = "Position error by subset"
-                curves.append(Curve(self._title(subset), 100.0 * self.position_error[:, i], chart, "cm", layer))
+                chart = f"{main.title} error by subset"
+                curves.append(
+                    Curve(self._title(subset), main.factor * self.position_error[:, i], chart, main.unit, layer)
+                )
         for c, (component, unit, factor) in enumerate(zip(task.components, *measures.display_units(task), strict=True)):
             chart = f"Shapley values of the estimate: {component.label}"
             curves += [
@@ -288,7 +288,7 @@ def shapley(
 
         estimates = run_subsets(checkpoint, trace, offset, share)
         errors.append(measures.wrapped(task, estimates - trace.episode.states[:, None]))
-    position = [np.linalg.norm(error[..., list(task.map_indices)], axis=-1) for error in errors]
+    position = [task.main_error.norm(error) for error in errors]
     keep = len(first) if len(traces) == 1 else 0
     return Shapley(
         task=task,

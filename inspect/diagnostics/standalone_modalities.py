@@ -76,13 +76,13 @@ class StandaloneModalities(Diagnostic):
 
     @property
     def verdict(self) -> str:
-        total = self.phases[0]
+        total, main = self.phases[0], self.task.main_error
         numbers = []
         for name, update, alone in zip(self.modalities, total.updates[:, 0], total.standalone[:, 0], strict=True):
-            parts = [] if math.isnan(update) else [f"{100.0 * update:.2f} cm for the {measures.layer_label(name)}"]
-            numbers.append(" and ".join([*parts, f"{100.0 * alone:.2f} cm for {name} standalone"]))
+            parts = [] if math.isnan(update) else [f"{main.text(update)} for the {measures.layer_label(name)}"]
+            numbers.append(" and ".join([*parts, f"{main.text(alone)} for {name} standalone"]))
         k = int(total.standalone[:, 0].argmin())
-        sentences = [f"Position RMSE {100.0 * total.fused[0]:.2f} cm fused; {'; '.join(numbers)}."]
+        sentences = [f"{main.title} RMSE {main.text(total.fused[0])} fused; {'; '.join(numbers)}."]
         ratio = f"fused / {self.modalities[k]} standalone {total.ratio[k]:.2f}"
         if math.isnan(total.low[k]):
             sentences.append(f"Ratio {ratio}; no interval: {too_few(total.trajectories)}.")
@@ -99,16 +99,13 @@ class StandaloneModalities(Diagnostic):
         return " ".join(sentences)
 
     def tables(self) -> list[Table]:
-        task = self.task
-        units, scale = measures.display_units(task)
-        names = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
         rows: list[tuple[Value, ...]] = []
         for entry in self.phases:
-            for q, (name, unit, factor) in enumerate(names):
+            for q, name, factor in measures.quantities(self.task):
                 pairs = zip(entry.updates[:, q], entry.standalone[:, q], strict=True)
                 values = [float(factor * value) for value in (entry.fused[q], *(v for pair in pairs for v in pair))]
                 numbers = [None if math.isnan(value) else value for value in values]
-                rows.append((entry.phase, entry.steps, f"{name} ({unit})", *numbers))
+                rows.append((entry.phase, entry.steps, name, *numbers))
         heads = [head for name in self.modalities for head in (measures.layer_label(name), f"{name} standalone")]
         ratios: list[tuple[Value, ...]] = [
             (entry.phase, entry.steps, name, *(None if math.isnan(v) else float(v) for v in values))
@@ -120,7 +117,7 @@ class StandaloneModalities(Diagnostic):
                 "RMSE of updates and standalone filters", ("phase", "steps", "quantity", "fused", *heads), tuple(rows)
             ),
             Table(
-                "Fused / standalone, position RMSE",
+                f"Fused / standalone, {self.task.main_error.name} RMSE",
                 ("phase", "steps", "standalone modality", "ratio", "95 % from", "to"),
                 tuple(ratios),
             ),
@@ -129,12 +126,13 @@ class StandaloneModalities(Diagnostic):
     def curves(self) -> list[Curve]:
         if not len(self.fused):
             return []
-        chart = "Position error"
-        curves = [Curve("fused", 100.0 * self.fused, chart, "cm", "fused")]
+        main = self.task.main_error
+        chart, scale, unit = f"{main.title} error", main.factor, main.unit
+        curves = [Curve("fused", scale * self.fused, chart, unit, "fused")]
         for k, name in enumerate(self.modalities):
             if np.isfinite(self.updates[:, k]).any():
-                curves.append(Curve(measures.layer_label(name), 100.0 * self.updates[:, k], chart, "cm", name))
-            curves.append(Curve(f"{name} standalone", 100.0 * self.standalone[:, k], chart, "cm", name))
+                curves.append(Curve(measures.layer_label(name), scale * self.updates[:, k], chart, unit, name))
+            curves.append(Curve(f"{name} standalone", scale * self.standalone[:, k], chart, unit, name))
         return curves
 
     def bands(self) -> dict[str, Mask]:
@@ -181,8 +179,7 @@ def _with_position(trace: Trace, modalities: Sequence[str], alone: Array) -> Arr
         if modality in trace.modalities_with_posterior:
             updates[:, k] = error[:, trace.modalities.index(modality)]
     both = np.concatenate([error[:, -1:], updates, alone], axis=1)
-    where = list(trace.task.map_indices)
-    return np.concatenate([np.linalg.norm(both[..., where], axis=-1, keepdims=True), np.abs(both)], axis=-1)
+    return np.abs(measures.with_main(trace.task, both))
 
 
 def _phases(traces: Sequence[Trace], errors: Sequence[Array], count: int) -> tuple[PhaseErrors, ...]:

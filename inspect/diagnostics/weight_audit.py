@@ -152,15 +152,15 @@ class WeightAudit(Diagnostic):
             texts = [f"{getattr(entry, source)[k].mean():.2f} in {entry.phase}" for entry in phases]
             return ", ".join(texts) or f"{getattr(total, source)[k].mean():.2f}"
 
-        fused, best, unimodal = 100.0 * total.fused[0], 100.0 * total.hindsight[0], 100.0 * total.unimodal[:, 0]
+        main, unimodal = self.task.main_error, total.unimodal[:, 0]
         strongest = int(unimodal.argmin())
         parts = [NO_RECORD if self.healthy is None else self.healthy.sentence]
         parts += [
             f"The posterior is dominated by {name}: effective weight {mean_weights('effective_weights')}"
             f"{' (mean over components)' if len(self._columns) > 1 else ''}; oracle: {mean_weights('oracle')}.",
-            f"Position RMSE {fused:.3f} cm, {unimodal[strongest]:.3f} cm for the "
-            f"{measures.layer_label(self.modalities[strongest])}, {best:.3f} cm with the oracle's weights, which no "
-            f"filter can reach. {measures.UPDATES_NOTE}",
+            f"{main.title} RMSE {main.text(total.fused[0], 3)}, {main.text(unimodal[strongest], 3)} for the "
+            f"{measures.layer_label(self.modalities[strongest])}, {main.text(total.hindsight[0], 3)} with the oracle's "
+            f"weights, which no filter can reach. {measures.UPDATES_NOTE}",
             self._comparison_with_constant_weights(),
         ]
         source = "beta" if self.beta_is_effective else "effective_weights"
@@ -173,10 +173,11 @@ class WeightAudit(Diagnostic):
         if why := too_few(self.trajectories):
             return f"Comparison with the best constant weights: {why}."
         value, low, high = (100.0 * x for x in self.excess)
+        best = self.task.main_error.text(self.phases[0].constant[0], 3)
         effect = "would" if low > 100.0 * MIN_REGRET else "might" if high > 100.0 * MIN_REGRET else "would hardly"
         return (
-            f"The best constant weights by phase {effect} reduce the error: {100.0 * self.phases[0].constant[0]:.3f} "
-            f"cm with them, {value:+.1f} % without (95 % interval {low:+.1f} to {high:+.1f} %)."
+            f"The best constant weights by phase {effect} reduce the error: {best} "
+            f"with them, {value:+.1f} % without (95 % interval {low:+.1f} to {high:+.1f} %)."
         )
 
     @property
@@ -197,19 +198,16 @@ class WeightAudit(Diagnostic):
         return self.modalities[:1] if len(self.modalities) == 2 else self.modalities
 
     def tables(self) -> list[Table]:
-        task = self.task
-        units, scale = measures.display_units(task)
-        quantities = [("position", "cm", 100.0), *zip([c.label for c in task.components], units, scale, strict=True)]
         means: list[tuple[Value, ...]] = []
         errors: list[tuple[Value, ...]] = []
         for entry in self.phases:
             for w, column in enumerate(self._columns):
                 weights = [getattr(entry, s)[k, w] for k in range(len(self.modalities)) for s in self._sources]
                 means.append((entry.phase, entry.steps, column or "all", *map(float, weights)))
-            for q, (name, unit, factor) in enumerate(quantities):
+            for q, name, factor in measures.quantities(self.task):
                 values = (entry.fused[q], entry.hindsight[q], entry.regret[q], entry.constant[q], *entry.unimodal[:, q])
                 numbers = (None if math.isnan(value) else float(factor * value) for value in values)
-                errors.append((entry.phase, f"{name} ({unit})", *numbers))
+                errors.append((entry.phase, name, *numbers))
         heads = [f"{modality}: {LABELS[source]}" for modality in self.modalities for source in self._sources]
         unimodal = [measures.layer_label(modality) for modality in self.modalities]
         tables = [
@@ -252,8 +250,8 @@ class WeightAudit(Diagnostic):
                 for k, modality in enumerate(self._independent):
                     name = f"{modality} {LABELS[source]}" + (f" {column}" if column else "")
                     curves.append(Curve(name, values[:, k, w], chart, "", modality))
-            unit, factor = (units[w], scale[w]) if column else ("cm", 100.0)
-            name = f"regret {column or 'position'}"
+            unit, factor = (units[w], scale[w]) if column else (task.main_error.unit, task.main_error.factor)
+            name = f"regret {column or task.main_error.name}"
             regrets.append(Curve(name, factor * self.regret[:, w], f"Regret ({unit})", unit))
         # Curves of one chart must be consecutive: components with equal units share a chart.
         return curves + sorted(regrets, key=lambda curve: curve.unit)

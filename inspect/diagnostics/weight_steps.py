@@ -16,8 +16,9 @@ from beliefscope.inspect.trace import Trace
 
 Array = NDArray[np.float64]
 
-NEGLIGIBLE = 1e-8
-"""m^2, added to mean squared errors in ratios: errors below 0.1 mm are not compared."""
+NEGLIGIBLE = 0.01
+"""In the unit for display: its square is added to mean squared errors in ratios, so that errors below 0.1 mm are not
+compared."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ def trajectory_statistics(trace: Trace) -> dict[str, float]:
     """Statistics of a healthy profile: mean weights by phase, and the error relative to that with the oracle's."""
     steps = weight_steps(trace)
     task, count = trace.task, len(trace.modalities)
+    negligible = (NEGLIGIBLE / task.main_error.factor) ** 2
     columns = [c.name for c in task.components] if steps["oracle"].shape[-1] == len(task.components) else [""]
     sources = {"weight": "effective_weights"}
     if "beta" in steps and not np.allclose(steps["beta"], steps["effective_weights"], atol=1e-3):
@@ -57,12 +59,12 @@ def trajectory_statistics(trace: Trace) -> dict[str, float]:
                     name = f"{kind}/{trace.modalities[k]} {column}".rstrip()
                     values[f"{name}/{phase}"] = float(steps[source][mask, k, w].mean())
         fused, oracle = (np.square(steps[name][mask, 0]).mean() for name in ("fused", "hindsight"))
-        values[f"regret//{phase}"] = float(np.sqrt((fused + NEGLIGIBLE) / (oracle + NEGLIGIBLE)))
+        values[f"regret//{phase}"] = float(np.sqrt((fused + negligible) / (oracle + negligible)))
     return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
-def position_regret(trace: Trace) -> Array:
-    """(T,) m: fused position error minus the error with the oracle's weights.
+def main_regret(trace: Trace) -> Array:
+    """(T,) SI: fused main error minus the error with the oracle's weights.
 
     Negative if the filter is better than any convex combination, which is possible for a product of experts.
     """
@@ -74,26 +76,27 @@ def weight_steps(trace: Trace) -> dict[str, Array]:
     """By step: weights (T, K, W), regret (T, W), position and component errors (T, 1 + n), unimodal (T, K, 1 + n)."""
     assert trace.effective_weights is not None
     effective_weights = trace.effective_weights.astype(np.float64)
-    error, where = measures.errors(trace), list(trace.task.map_indices)
+    task, error = trace.task, measures.errors(trace)
+    main = task.main_error
     unimodal, fused = error[:, :-1], error[:, -1]
     per_component = effective_weights.shape[-1] == error.shape[-1]
     if per_component:
         near = np.swapaxes(effective_weights, 1, 2)
         oracle = np.swapaxes(oracle_weights(np.swapaxes(unimodal, 1, 2)[:, :, None], near), 1, 2)
-    else:  # a scalar weight minimises the position error
-        oracle = oracle_weights(np.swapaxes(unimodal[..., where], 1, 2), effective_weights[..., 0])[..., None]
+    else:  # a scalar weight minimises the main error
+        oracle = oracle_weights(np.swapaxes(unimodal[..., list(main.indices)], 1, 2), effective_weights[..., 0])[
+            ..., None
+        ]
     hindsight = (oracle * unimodal).sum(1)
-    distances = [
-        np.abs(e) if per_component else np.linalg.norm(e[:, where], axis=-1, keepdims=True) for e in (fused, hindsight)
-    ]
+    distances = [np.abs(e) if per_component else main.norm(e)[:, None] for e in (fused, hindsight)]
     steps = {
         "effective_weights": effective_weights,
         "oracle": oracle,
         # A product of experts may be better than any convex weights; the regret is zero then.
         "regret": np.maximum(distances[0] - distances[1], 0.0),
-        "fused": _with_position(fused, where),
-        "hindsight": _with_position(hindsight, where),
-        "unimodal": _with_position(unimodal, where),
+        "fused": measures.with_main(task, fused),
+        "hindsight": measures.with_main(task, hindsight),
+        "unimodal": measures.with_main(task, unimodal),
     }
     return steps if trace.weights is None else {"beta": trace.weights.astype(np.float64), **steps}
 
@@ -102,7 +105,8 @@ def add_constant(step_values: list[dict[str, Array]], traces: Sequence[Trace]) -
     """Add ``constant``, errors (T, 1 + n) with the best constant weights by phase; NaN for one trajectory."""
     if len(traces) == 1:
         return [steps | {"constant": np.full_like(steps["fused"], np.nan)} for steps in step_values]
-    where = list(traces[0].task.map_indices)
+    task = traces[0].task
+    where = list(task.main_error.indices)
     errors = [np.swapaxes(measures.errors(trace)[:, :-1], 1, 2) for trace in traces]  # (T, n, K)
     scalar = step_values[0]["oracle"].shape[-1] == 1
     # Blackout, contact, free motion; the warm-up is not used.
@@ -116,7 +120,7 @@ def add_constant(step_values: list[dict[str, Array]], traces: Sequence[Trace]) -
         [np.swapaxes(steps["effective_weights"], 1, 2) for steps in step_values],
     )
     return [
-        steps | {"constant": _with_position((w * e).sum(-1), where)}
+        steps | {"constant": measures.with_main(task, (w * e).sum(-1))}
         for steps, w, e in zip(step_values, weights, errors, strict=True)
     ]
 
@@ -131,11 +135,6 @@ def excess_error(traces: Sequence[Trace], step_values: Sequence[dict[str, Array]
     logs = jackknife(np.array(squares), lambda sums: 0.5 * np.log(sums[..., 0] / sums[..., 1]))
     value, low, high = (math.expm1(float(x)) for x in logs)
     return value, low, high
-
-
-def _with_position(error: Array, where: list[int]) -> Array:
-    """(..., 1 + n): position error followed by the component errors (..., n)."""
-    return np.concatenate([np.linalg.norm(error[..., where], axis=-1, keepdims=True), error], axis=-1)
 
 
 def weight_correlations(traces: Sequence[Trace], step_values: Sequence[dict[str, Array]]) -> list[Correlation]:

@@ -13,7 +13,7 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.task import display_name, display_unit
+from beliefscope.datasets.task import display_name, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
@@ -47,7 +47,7 @@ class Event:
         phase: phase of the peak.
         other_phases: other phases that apply to the peak.
         scores: all scores at the peak by name.
-        error: (L,) m, position error by layer.
+        error: (L,) main error by layer.
         angle_error: (L, A) rad.
         nees: (L,) NEES / n.
         ess: effective sample size, or None.
@@ -101,7 +101,8 @@ class Failures(Diagnostic):
     Attributes:
         task, filter, checkpoint_hash, faults, seed, particles: of the runs.
         by: name of the score.
-        title, unit: display name and unit of the score: m, rad, sigma, x (ratio) or none.
+        title, unit: display name and unit of the score: of a component, sigma, x (ratio) or none.
+        shown, error_shown: units for display of the score and of the main error, and their factors.
         threshold: minimum score of an event.
         episodes, steps: numbers of episodes and steps.
         layers: L names: the K modalities, then ``fused``.
@@ -120,6 +121,8 @@ class Failures(Diagnostic):
     by: str
     title: str
     unit: str
+    shown: tuple[str, float]
+    error_shown: tuple[str, float]
     threshold: float
     episodes: int
     steps: int
@@ -161,7 +164,7 @@ class Failures(Diagnostic):
 
     def format(self, value: float) -> str:
         """A score in its display unit."""
-        unit, factor = self._display
+        unit, factor = self.shown
         return f"{value * factor:.3g} {unit}".rstrip()
 
     def tables(self) -> list[Table]:
@@ -169,7 +172,7 @@ class Failures(Diagnostic):
 
     def phase_table(self) -> Table:
         """One row per phase."""
-        factor = self._display[1]
+        factor = self.shown[1]
         columns = ("phase", "steps %", "events", "events %", "lift x", "p-value", "mean inside", "mean outside")
         rows = [
             (
@@ -189,28 +192,23 @@ class Failures(Diagnostic):
     def event_table(self, events: Sequence[Event]) -> Table:
         """One row per event with the values at its peak."""
         columns: tuple[str, ...] = ("episode", "step", "from", "to", self._label, "phase")
-        columns += tuple(f"{layer_label(layer)} cm" for layer in self.layers)
+        columns += tuple(f"{layer_label(layer)} {self.error_shown[0]}".rstrip() for layer in self.layers)
         columns += tuple(f"{display_name(name)} deg" for name in self.angles)
         columns += ("NEES", *(("ESS",) if self.particles else ()))
         columns += tuple(f"{layer} effective weight %" for layer in self.layers[:-1] if len(self.layers) > 2)
         return Table("Worst events", columns, tuple(map(self._row, events)))
 
     def _row(self, event: Event) -> tuple[Value, ...]:
-        numbers = [*(100.0 * event.error), *np.degrees(event.angle_error[-1]), event.nees[-1]]
+        numbers = [*(self.error_shown[1] * event.error), *np.degrees(event.angle_error[-1]), event.nees[-1]]
         numbers += [event.ess] if self.particles else []
         numbers += [] if event.effective_weights is None else [*(100.0 * event.effective_weights)]
         values = (float(value) if np.isfinite(value) else None for value in numbers)
-        score = self._display[1] * event.score
+        score = self.shown[1] * event.score
         return (event.episode, event.step, event.first, event.last, score, event.phase, *values)
 
     @property
-    def _display(self) -> tuple[str, float]:
-        """Display unit of the score and the conversion factor."""
-        return display_unit(self.unit)
-
-    @property
     def _label(self) -> str:
-        return f"{self.title} ({self._display[0]})" if self.unit else self.title
+        return with_unit(self.title, self.shown[0])
 
     def plots(self) -> list[Plot]:
         """Distribution of the score over all steps and over the phases with the highest lift."""
@@ -219,7 +217,7 @@ class Failures(Diagnostic):
         lines = tuple(
             Line(
                 name,
-                self._display[1] * self.quantiles[key],
+                self.shown[1] * self.quantiles[key],
                 100.0 * (1.0 - PROBABILITIES),
                 "fused" if key == "all" else key,
             )
@@ -283,6 +281,8 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
         by=by,
         title=definition.title,
         unit=definition.unit,
+        shown=definition.shown,
+        error_shown=survey.task.main_error.shown,
         threshold=threshold,
         episodes=len(np.unique(survey.episode)),
         steps=len(score),

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task, display_name
-from beliefscope.inspect.diagnostics.weight_steps import position_regret
+from beliefscope.datasets.task import Component, Task
+from beliefscope.inspect.diagnostics.weight_steps import main_regret
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.measures import Array, Mask
 from beliefscope.inspect.trace import Trace
@@ -33,13 +33,14 @@ class Score:
 
     Attributes:
         title: display name.
-        unit: SI unit.
+        unit: of the values. shown: unit for display, and its factor.
         values: trace -> (T,), higher is worse.
         why_not: trace -> reason why the score does not apply, or None.
     """
 
     title: str
     unit: str
+    shown: tuple[str, float]
     values: Callable[[Trace], Array]
     why_not: Callable[[Trace], str | None] = lambda trace: None
 
@@ -55,7 +56,7 @@ class Survey:
         episode, step: (S,) indices in the data set and in the episode.
         scores: name -> (S,), for available scores; NaN at steps without a score.
         refused: name -> reason, for scores that do not apply.
-        error: (S, L) m, position error.
+        error: (S, L) main error (``Task.main_error``), in the unit of its components.
         angle_error: (S, L, A) rad.
         nees: (S, L) NEES / n.
         ess: (S,) effective sample size, or None.
@@ -133,8 +134,17 @@ class Survey:
 
 def scores_of(task: Task) -> dict[str, Score]:
     """Scores of a task by name, including one for each angle."""
-    angles = {c.name: _angle(task.index(c.name), c.name) for c in task.components if c.unit == "rad"}
-    return {"error": SCORES["error"], **angles, **SCORES}
+    main = task.main_error
+    unit, shown = task.components[main.indices[0]].unit, main.shown
+    angles = {c.name: _angle(i, c) for i, c in enumerate(task.components) if c.unit == "rad" and (i,) != main.indices}
+    return {
+        "error": Score(f"{main.name} error", unit, shown, lambda trace: measures.main_error(trace)[:, -1]),
+        **angles,
+        "nees": Score("NEES", "", ("", 1.0), lambda trace: measures.nees(trace)[:, -1], _no_covariance),
+        "ess": Score("particles per effective particle", "x", ("x", 1.0), _degeneracy, _no_particles),
+        "disagreement": Score("disagreement of modalities", "sigma", ("sigma", 1.0), disagreement, _no_fusion),
+        "regret": Score("regret of the weights", unit, shown, _regret, _no_fusion),
+    }
 
 
 def disagreement(trace: Trace) -> Array:
@@ -149,8 +159,9 @@ def disagreement(trace: Trace) -> Array:
     return np.sqrt((difference * white).sum(-1) / difference.shape[-1]).max(axis=1)
 
 
-def _angle(index: int, name: str) -> Score:
-    return Score(f"{display_name(name)} error", "rad", lambda trace: np.abs(measures.errors(trace)[:, -1, index]))
+def _angle(index: int, component: Component) -> Score:
+    title, shown = f"{component.label} error", component.shown
+    return Score(title, "rad", shown, lambda trace: np.abs(measures.errors(trace)[:, -1, index]))
 
 
 def _degeneracy(trace: Trace) -> Array:
@@ -161,7 +172,7 @@ def _degeneracy(trace: Trace) -> Array:
 
 def _regret(trace: Trace) -> Array:
     """NaN in the warm-up: the belief starts at the truth, so the oracle's error is zero there with any weights."""
-    return np.where(measures.counted(trace), position_regret(trace), np.nan)
+    return np.where(measures.counted(trace), main_regret(trace), np.nan)
 
 
 def _no_covariance(trace: Trace) -> str | None:
@@ -174,16 +185,6 @@ def _no_particles(trace: Trace) -> str | None:
 
 def _no_fusion(trace: Trace) -> str | None:
     return None if trace.effective_weights is not None else "this filter does not fuse several modalities"
-
-
-SCORES: dict[str, Score] = {
-    "error": Score("position error", "m", lambda trace: measures.position_error(trace)[:, -1]),
-    "nees": Score("NEES", "", lambda trace: measures.nees(trace)[:, -1], _no_covariance),
-    "ess": Score("particles per effective particle", "x", _degeneracy, _no_particles),
-    "disagreement": Score("disagreement of modalities", "sigma", disagreement, _no_fusion),
-    "regret": Score("regret of the weights", "m", _regret, _no_fusion),
-}
-"""Scores by name; scores of angles follow ``error``."""
 
 
 def _check_same_run(first: Trace, other: Trace) -> None:
@@ -204,7 +205,7 @@ def _columns(trace: Trace) -> dict[str, NDArray[Any]]:
         **scores,
         "episode": np.full(len(trace), trace.episode_index),
         "step": steps,
-        "error": measures.position_error(trace),
+        "error": measures.main_error(trace),
         "angle_error": np.abs(measures.errors(trace)[..., angles]),
         "nees": measures.nees(trace),
         "contact": contact,

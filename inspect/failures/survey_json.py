@@ -24,7 +24,14 @@ def survey_document(survey: Survey, link: Callable[[Event, str], str]) -> dict[s
     """
     scores: list[dict[str, Any]] = []
     for name, score in scores_of(survey.task).items():
-        info = {"name": name, "title": score.title, "unit": score.unit, "why_not": survey.refused.get(name)}
+        info = {
+            "name": name,
+            "title": score.title,
+            "unit": score.unit,
+            "shown": score.shown[0],
+            "scale": score.shown[1],
+        }
+        info |= {"why_not": survey.refused.get(name)}
         scores.append(info | ({} if info["why_not"] else _ranking(failures_of(survey, name), link)))
     document: dict[str, Any] = as_json(
         {

@@ -15,11 +15,12 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import Task, display_name
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics import weight_audit
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
 from beliefscope.inspect.likelihood import FINE, LikelihoodMap, MapEngine, Quantity
+from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -107,6 +108,9 @@ def maps_figure(
     engine = MapEngine(checkpoint, trace)
     quantity = quantity or engine.quantities[0]
     maps = {state: engine.map(step, size=size, quantity=quantity) for state, step in steps.items()}
+    if len(checkpoint.task.map_components) == 1:
+        raise BadInput(f"the maps of task {checkpoint.task.name!r} are curves over one component: see its reports")
+    titles = [title for title, _ in axis_titles(checkpoint.task, checkpoint.task.map_indices)]
     layout = panels(checkpoint.task, trace.modalities, steps)
     if not layout:
         raise BadInput(f"filter {checkpoint.name!r} has no map of a modality: it has no separate modalities")
@@ -124,10 +128,10 @@ def maps_figure(
                 f"{letter}{panel.modality} {quantity}\n{STATES[panel.contact]}, step {panel.step}", fontsize=7.5
             )
             if i + columns >= len(layout):
-                axes.set_xlabel(f"{display_name(checkpoint.task.map_components[0])} offset (cm)")
+                axes.set_xlabel(titles[0])
                 axes.tick_params(labelbottom=True)
             if i % columns == 0:
-                axes.set_ylabel(f"{display_name(checkpoint.task.map_components[1])} offset (cm)")
+                axes.set_ylabel(titles[1])
         for axes in grid.flat[len(layout) :]:
             axes.set_visible(False)
         figure.colorbar(image, ax=list(grid.flat), label=f"{quantity} / maximum", shrink=0.8, aspect=25)
@@ -136,23 +140,27 @@ def maps_figure(
 
 def _draw_map(axes: Axes, task: Task, trace: Trace, panel: Panel, map_: LikelihoodMap) -> AxesImage:
     log = map_.log_likelihood[map_.layers.index(panel.modality)]
-    half = 100.0 * task.map_half_width
+    half_x, half_y = (
+        factor * half
+        for (_, factor), half in zip(axis_titles(task, task.map_indices), plane_of(trace).half_widths, strict=True)
+    )
     image = axes.imshow(
         np.exp(log - log.max()),
         cmap="viridis",
         vmin=0.0,
         vmax=1.0,
         origin="lower",
-        extent=(-half, half, -half, half),
+        extent=(-half_x, half_x, -half_y, half_y),
+        aspect="equal" if len(task.main_error.indices) == 2 else "auto",
         interpolation="nearest",
     )
     if panel.contact and panel.modality in _effector_modalities(task, trace.modalities):
         _draw_expected_ridge(axes, task, trace, panel.step)
-        _draw_effector(axes, 100.0 * (_effector(task, trace, panel.step) - map_.centre))
+        _draw_effector(axes, task.main_error.factor * (_effector(task, trace, panel.step) - map_.centre))
         style = {"labelcolor": "white", "facecolor": "black", "framealpha": 0.5, "edgecolor": "none"}
         axes.legend(loc="best", fontsize=6, **style)
-    _draw_crosshairs(axes, half)
-    axes.set(xlim=(-half, half), ylim=(-half, half))
+    _draw_crosshairs(axes, half_x, half_y)
+    axes.set(xlim=(-half_x, half_x), ylim=(-half_y, half_y))
     return image
 
 
@@ -175,10 +183,10 @@ def _effector(task: Task, trace: Trace, step: int) -> NDArray[np.float32]:
     return np.asarray(trace.episode.observations[key][step, list(task.positions[key])], dtype=np.float32)
 
 
-def _draw_crosshairs(axes: Axes, half: float) -> None:
+def _draw_crosshairs(axes: Axes, half_x: float, half_y: float) -> None:
     """Draw crosshairs at the true position with a gap that keeps narrow peaks visible."""
-    hair = [-half, -0.15 * half, np.nan, 0.15 * half, half]
-    for x, y in ((hair, [0.0] * 5), ([0.0] * 5, hair)):
+    hair = np.array([-1.0, -0.15, np.nan, 0.15, 1.0])
+    for x, y in ((half_x * hair, [0.0] * 5), ([0.0] * 5, half_y * hair)):
         axes.plot(x, y, color="white", lw=0.5, alpha=0.7)
 
 
@@ -192,7 +200,7 @@ def _draw_expected_ridge(axes: Axes, task: Task, trace: Trace, step: int) -> Non
 
 
 def _draw_effector(axes: Axes, effector: NDArray[np.float32]) -> None:
-    """Mark the end effector (2,) cm, which may be outside of the map."""
+    """Mark the end effector (2,), in units for display, which may be outside of the map."""
     axes.plot(*map(float, effector), marker="o", ms=4, ls="", color="white", path_effects=EDGE, label="end effector")
 
 
@@ -208,32 +216,33 @@ def weights_figure(trace: Trace) -> Figure:
     component_wise = trace.effective_weights.shape[-1] > 1
     columns = task.map_indices if component_wise else (0,)
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.35 * (2 + len(columns)) + 0.4), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 1.35 * (len(task.map_indices) + len(columns)) + 0.4), layout="constrained")
         FigureCanvasAgg(figure)
-        charts = figure.subplots(2 + len(columns), 1, sharex=True)
+        charts = figure.subplots(len(task.map_indices) + len(columns), 1, sharex=True)
         for axes, i in zip(charts, task.map_indices, strict=False):
             _draw_estimates(axes, trace, i)
-            axes.set_ylabel(f"{display_name(task.components[i].name)} (cm)")
-        for axes, i in zip(charts[2:], columns, strict=True):
+            axes.set_ylabel(with_unit(task.components[i].label, task.components[i].shown[0]))
+        for axes, i in zip(charts[len(task.map_indices) :], columns, strict=True):
             _draw_weights(axes, trace, i)
-            axes.set_ylabel(f"weight, {display_name(task.components[i].name)}" if component_wise else "weight")
+            axes.set_ylabel(f"weight, {task.components[i].label}" if component_wise else "weight")
         for axes in charts:
             _shade_phases(axes, trace)
         charts[-1].set_xlabel("step")
-        for axes in (charts[0], charts[2]):
+        for axes in (charts[0], charts[len(task.map_indices)]):
             axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0)
     return figure
 
 
 def _draw_estimates(axes: Axes, trace: Trace, component: int) -> None:
     steps = np.arange(len(trace))
-    *unimodal, fused = 100.0 * measures.means(trace)[..., component].T
+    factor = trace.task.components[component].shown[1]
+    *unimodal, fused = factor * measures.means(trace)[..., component].T
     axes.plot(
         steps, fused, label="fused", color=COLOURS["fused"], lw=2.4
     )  # wide, so that a dominant modality on top leaves it visible
     for modality, values in zip(trace.modalities, unimodal, strict=True):
         axes.plot(steps, values, label=measures.layer_label(modality), color=colour(modality, trace.modalities), lw=0.9)
-    truth = 100.0 * trace.episode.states[:, component].astype(np.float64)
+    truth = factor * trace.episode.states[:, component].astype(np.float64)
     axes.plot(steps, truth, label="truth", color=COLOURS["truth"], lw=1.4, ls="--")
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.replay import Replay
 from beliefscope.datasets.task import Task
-from beliefscope.inspect.figures.scene_shapes import RGB, grid
+from beliefscope.inspect.figures.scene_shapes import RGB, grid, on_floor
 from beliefscope.inspect.maps.particles import modality_shares
 from beliefscope.inspect.palette import colour
 from beliefscope.inspect.statistics.measures import contours
@@ -49,15 +49,15 @@ class DrawnBelief:
     """
 
     def __init__(self, task: Task, trace: Trace) -> None:
-        self._task, self._trace, self._plane = task, trace, list(task.map_indices)
+        self._task, self._trace = task, trace
         estimates = list(_estimates(trace))
         self.names = [name for name, _, _ in estimates]
         states = np.stack([mean for _, mean, _ in estimates], axis=1)  # (T, S, n)
-        self._means = states[:, 1:, self._plane]
+        self._means = on_floor(task, states[:, 1:])
         covariances = np.stack([covariance for _, _, covariance in estimates[1:]], axis=1)
-        self._covariances = covariances[..., self._plane, :][..., self._plane]
+        self._covariances = on_floor(task, on_floor(task, covariances).swapaxes(-1, -2))
         self.outline = None if task.outline is None else task.outline(states)
-        flat = np.concatenate([states[..., self._plane], np.zeros_like(states[..., :1])], axis=-1)
+        flat = np.concatenate([on_floor(task, states), np.zeros_like(states[..., :1])], axis=-1)
         self.anchors: Array = flat if self.outline is None else self.outline.anchor
         self.above = 0.0 if self.outline is None else BELIEF_HEIGHT
         self.level = float(self.anchors[0, 0, 2]) + self.above
@@ -84,7 +84,7 @@ class DrawnBelief:
         assert trace.particles is not None
         assert trace.log_weights is not None
         points = np.full((trace.particles.shape[1], 3), self.level, np.float32)
-        points[:, :2] = trace.particles[step][:, self._plane]
+        points[:, :2] = on_floor(self._task, trace.particles[step])
         weights = trace.log_weights[step]
         strength = np.sqrt(np.exp(weights - weights.max()))[:, None]
         color = np.array(rgb("fused", trace), np.float32)

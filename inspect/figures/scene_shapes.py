@@ -90,10 +90,15 @@ class Grid:
     axes: Array
 
 
+def on_floor(task: Task, values: Array) -> Array:
+    """(..., 2) m: x and y of values (..., n); zeros for a task whose map is no position (``Task.floor``)."""
+    return np.zeros((*values.shape[:-1], 2)) if task.floor is None else values[..., list(task.floor)]
+
+
 def grid(task: Task, trace: Trace) -> Grid:
     """The grid of whole cells that contains the truth and its maps."""
-    truth = trace.anchors[:, list(task.map_indices)]
-    low, high = truth.min(axis=0) - task.map_half_width, truth.max(axis=0) + task.map_half_width
+    truth, margin = on_floor(task, trace.anchors), 1.0 if task.floor is None else task.map_half_width
+    low, high = truth.min(axis=0) - margin, truth.max(axis=0) + margin
     cell = next((size for size in GRID_CELLS if (high - low).max() <= MAX_GRID_CELLS * size), GRID_CELLS[-1])
     low, high = np.floor(low / cell) * cell, np.ceil(high / cell) * cell
     x, y = (np.arange(a, b + cell / 2, cell) for a, b in zip(low, high, strict=True))

@@ -55,7 +55,7 @@ def draw_step(trace: Trace, step: int, map_: LikelihoodMap | None = None) -> Fig
     """Draw the scene from above at a step, if the episode can be replayed, and the belief on the fused map.
 
     Shows robot and object, true and estimated object, estimates with 2 sigma contours, particles by weight, and the
-    contact force.
+    contact force. Only for tasks whose map is a position (``Task.floor``).
     """
     task = trace.task
     footprints = scene_footprints(trace, task, step)

@@ -18,7 +18,7 @@ CACHED_GRIDS, CACHED_CELLS = 2, 20_000
 
 
 class GridEvaluator:
-    """Evaluates K measurement models on S x S states that differ in two components.
+    """Evaluates K measurement models on R x S states that differ in one or two components.
 
     The first layer is linear, ``W s + b = (W_x dx) + (W_y dy + W s_0 + b)`` for the cell at offsets dx, dy from the
     centre state s_0, so it is evaluated for S columns and S rows instead of S x S cells. The other layers run in
@@ -40,23 +40,23 @@ class GridEvaluator:
     def log_likelihood(
         self, along: tuple[int, int], x: Tensor, y: Tensor, state: Tensor, key: tuple[float, ...], observation: Tensor
     ) -> Tensor:
-        """(K, S^2) log-likelihoods in row order, not normalised.
+        """(K, R S) log-likelihoods in row order, not normalised.
 
         Args:
-            along: state components of the axes. x, y: (S,) SI, offsets of columns and rows from the centre.
+            along: state components of the axes. x, y: (S,) and (R,) SI, offsets of columns and rows from the centre.
             state: (n,) centre, standardised.
             key: identifies centre and axes of the grid in the cache.
             observation: (K, units) observation features of each model.
         """
         size = len(x)
-        cached, part = self._cached_part(size, key)
-        values = torch.empty(len(self._models), size * size)
+        cached, part = self._cached_part(size, len(y), key)
+        values = torch.empty(len(self._models), size * len(y))
         for k, (model, features) in enumerate(zip(self._models, observation, strict=True)):
             columns, rows = self._first(model, along, x, y, state)
             *inner, last = model.head
             assert isinstance(last, nn.Linear)
             encoder, join, head = layers([*model.state_encoder][1:]), model.join_state.weight.T, layers(inner)
-            for begin, end in chunks(size):
+            for begin, end in chunks(size, len(y)):
                 activation, scratch = self._buffers.narrow(1, 0, (end - begin) * size)
                 rows_slice = slice(begin * size, end * size)
                 if not cached:
@@ -72,10 +72,10 @@ class GridEvaluator:
                 torch.addmv(last.bias, scratch, last.weight[0], out=values[k, rows_slice])
         return values
 
-    def _cached_part(self, size: int, key: tuple[float, ...]) -> tuple[bool, Tensor | None]:
+    def _cached_part(self, size: int, rows: int, key: tuple[float, ...]) -> tuple[bool, Tensor | None]:
         """Whether the grid's state branch is cached, and its cache entry; None until a grid is requested again."""
         before = self._grids.pop(size, None)
-        if size * size > CACHED_CELLS:
+        if size * rows > CACHED_CELLS:
             return False, None
         self._grids[size] = key
         if len(self._grids) > CACHED_GRIDS:
@@ -86,7 +86,7 @@ class GridEvaluator:
             return False, None
         cached = size in self._parts
         if not cached:
-            self._parts[size] = torch.empty(len(self._models), size * size, self._units)
+            self._parts[size] = torch.empty(len(self._models), size * rows, self._units)
         return cached, self._parts[size]
 
     def _first(
@@ -99,10 +99,10 @@ class GridEvaluator:
         return x[:, None] * by_x, y[:, None] * by_y + layer(state)
 
 
-def chunks(size: int) -> Iterator[tuple[int, int]]:
-    """First row and row after the last of each chunk of a grid with ``size`` cells per side."""
-    rows = max(1, CELLS_AT_ONCE // size)
-    return ((row, min(row + rows, size)) for row in range(0, size, rows))
+def chunks(columns: int, rows: int) -> Iterator[tuple[int, int]]:
+    """First row and row after the last of each chunk of a grid."""
+    step = max(1, CELLS_AT_ONCE // columns)
+    return ((row, min(row + step, rows)) for row in range(0, rows, step))
 
 
 def layers(stack: Sequence[nn.Module]) -> list[tuple[Tensor, ...]]:

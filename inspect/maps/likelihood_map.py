@@ -1,4 +1,4 @@
-"""Maps of one step: a grid of two state components around the true state."""
+"""Maps of one step: a grid of one or two state components around the true state."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class MapOptions:
 
 @dataclass(frozen=True)
 class LikelihoodMap:
-    """One map per modality and one fused map, over offsets of two state components from the true state.
+    """One map per modality and one fused map, over offsets of one or two state components from the true state.
 
     Likelihood: of the observation given the state. EKF, UKF: ``N(z_k; x, R_k)`` of each virtual sensor; PF: each
     measurement model, up to a factor. Posterior: density of the state. EKF, UKF: posterior of the update with one
@@ -44,14 +44,15 @@ class LikelihoodMap:
         angle: fixed value of the only state component that is not on the map (SI); NaN if there is none or there are
             several, or if it is integrated out.
         layers: L names: the trace's modalities, then ``fused``.
-        offsets_x, offsets_y: (S,) SI, cell centres relative to ``centre``, increasing.
-        centre: (2,) SI, the true values, or those of the fused estimate where they are unknown.
-        log_likelihood: (L, S, S) natural log of the quantity, likelihoods not normalised; [l, iy, ix] is at
+        offsets_x, offsets_y: (S,) and (R,) SI, cell centres relative to ``centre``, increasing. R is S, or 1 for a
+            curve over one component, at offset 0.
+        centre: (2,) or (1,) SI, the true values, or those of the fused estimate where they are unknown.
+        log_likelihood: (L, R, S) natural log of the quantity, likelihoods not normalised; [l, iy, ix] is at
             offsets_y[iy], offsets_x[ix].
         quantity: of all layers.
         rule: how the fused layer results from the modalities.
-        components: indices of the state components of the x and the y axis. others: treatment of the others; note: the
-            same in words.
+        components: indices of the state components of the x and the y axis, or of a curve. others: treatment of
+            the others; note: the same in words.
     """
 
     step: int
@@ -63,9 +64,14 @@ class LikelihoodMap:
     log_likelihood: Array
     quantity: Quantity = "likelihood"
     rule: str = ""
-    components: tuple[int, int] = (0, 1)
+    components: tuple[int, ...] = (0, 1)
     others: Others = "fixed"
     note: str = ""
+
+    @property
+    def is_curve(self) -> bool:
+        """Whether it shows one component."""
+        return len(self.components) == 1
 
     @property
     def title(self) -> str:
@@ -87,12 +93,12 @@ class LikelihoodMap:
         return html_paragraph(f"Step {self.step}. {self.title}", strong=True) + "".join(figures)
 
     def normalised(self) -> NDArray[np.uint8]:
-        """(L, S, S) uint8: value relative to the maximum of its layer, times 255."""
+        """(L, R, S) uint8: value relative to the maximum of its layer, times 255."""
         peak = self.log_likelihood.max(axis=(1, 2), keepdims=True)
         return np.rint(255.0 * np.exp(self.log_likelihood - peak)).astype(np.uint8)
 
     def peaks(self) -> Array:
-        """(L, 2) m: offset (x, y) of each layer's maximum."""
+        """(L, 2) SI: offset (x, y) of each layer's maximum."""
         flat = self.log_likelihood.reshape(len(self.layers), -1).argmax(axis=1)
         iy, ix = np.unravel_index(flat, self.log_likelihood.shape[1:])
         return np.stack([self.offsets_x[ix], self.offsets_y[iy]], axis=1)

@@ -58,13 +58,13 @@ class ParticleDensity:
             self._log_weights = np.log(weights) + constant
 
     def log_density(self, middle: Array, along: tuple[int, int], x: Array, y: Array) -> Array:
-        """(S, S) log density at the cells [iy, ix] of a grid.
+        """(R, S) log density at the cells [iy, ix] of a grid.
 
         The exponent of a kernel is a term by column, a term by row, and their product, which all kernels share.
 
         Args:
-            middle: (n,) SI, centre of the grid. along: state components of its axes. x, y: (S,) SI, offsets of its
-                columns and rows.
+            middle: (n,) SI, centre of the grid. along: state components of its axes. x, y: (S,) and (R,) SI, offsets of
+                its columns and rows.
         """
         along_x, along_y = (self._whiten[:, self._components.index(k)] for k in along)
         from_centre = wrap_angles(middle[self._components] - self._centres, self._angles) @ self._whiten.T

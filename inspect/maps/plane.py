@@ -1,15 +1,20 @@
-"""The plane of a map: two state components and their extents; the other components are fixed or integrated out."""
+"""The plane of a map: one or two state components and their extents; the others are fixed or integrated out."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.inspect.statistics.measures import wrapped
 from beliefscope.inspect.traces.data import Trace
+
+Array = NDArray[np.float64]
 
 Others = Literal["fixed", "marginal"]
 OTHERS: tuple[Others, ...] = get_args(Others)
@@ -21,31 +26,61 @@ DEVIATIONS, MARGIN = 3.0, 2.0
 
 @dataclass(frozen=True)
 class Plane:
-    """Attributes: components: indices of the x and the y axis. half_widths: SI, half the extent of each axis."""
+    """The axes of a map.
 
-    components: tuple[int, int]
-    half_widths: tuple[float, float]
+    Attributes:
+        components: indices of the x and the y axis; of one only, for a map that is a curve.
+        half_widths: SI, half the extent of each axis.
+    """
+
+    components: tuple[int, ...]
+    half_widths: tuple[float, ...]
+
+    @property
+    def along(self) -> tuple[int, int]:
+        """Components of columns and rows; the same for a curve, which has a single row at offset 0."""
+        return self.components[0], self.components[-1]
+
+    def offsets(self, size: int) -> tuple[Array, Array]:
+        """(S,) offsets of the columns and (S,) or (1,) of the rows from the centre, SI: centres of the cells."""
+        axes = [((np.arange(size) + 0.5) / size * 2.0 - 1.0) * half for half in self.half_widths]
+        return axes[0], axes[1] if len(axes) == 2 else np.zeros(1)
 
 
 def plane_of(trace: Trace, components: tuple[str, ...] = ()) -> Plane:
-    """The plane of two components of a trace's task; by default the task's own map.
+    """The plane of one or two components of a trace's task; by default the task's own map.
 
     The components of the task's map have its extent. That of others covers errors and deviations of the estimates of
     all steps, as a round number in units for display. Two components of one unit share an extent, so that directions
     and distances on the map are those of the state.
 
     Raises:
-        BadInput: unknown components, or not two different ones.
+        BadInput: unknown components, or not one or two different ones.
     """
     task = trace.task
     names = components or task.map_components
-    if len(names) != 2 or names[0] == names[1]:
-        raise BadInput(f"a map shows two different components, not {' and '.join(names) or 'none'}")
-    x, y = (task.index(name) for name in names)
-    widths = [_half_width(trace, index) for index in (x, y)]
-    if task.components[x].unit == task.components[y].unit:
-        widths = 2 * [max(widths)]
-    return Plane((x, y), (widths[0], widths[1]))
+    if len(names) > 2 or len(set(names)) < len(names):
+        raise BadInput(f"a map shows one component or two different ones, not {' and '.join(names)}")
+    indices = tuple(task.index(name) for name in names)
+    widths = [_half_width(trace, index) for index in indices]
+    if len({task.components[index].unit for index in indices}) == 1:
+        widths = len(widths) * [max(widths)]
+    return Plane(indices, tuple(widths))
+
+
+def axis_titles(task: Task, components: Sequence[int]) -> list[tuple[str, float]]:
+    """Title of each axis of a map, such as ``hinge x offset (cm)``, and the factor of its values."""
+    parts = [task.components[i] for i in components]
+    return [(with_unit(f"{c.label} offset", c.shown[0]), c.shown[1]) for c in parts]
+
+
+def area_unit(task: Task, components: Sequence[int]) -> tuple[str, float]:
+    """Unit for display of areas on a map, or of lengths on a curve, and its factor: ``cm²``, ``m·deg``."""
+    units = [task.components[i].shown for i in components]
+    factor = float(np.prod([factor for _, factor in units]))
+    if len(units) == 2 and units[0] == units[1] and units[0][0]:
+        return f"{units[0][0]}²", factor
+    return "·".join(unit for unit, _ in units if unit), factor
 
 
 def other_components(trace: Trace, plane: Plane) -> list[int]:
@@ -63,7 +98,7 @@ def describe_others(trace: Trace, plane: Plane, others: Others) -> str:
 
 def _half_width(trace: Trace, index: int) -> float:
     task = trace.task
-    if index in task.map_indices:
+    if index in task.main_error.indices:
         return task.map_half_width
     error = np.abs(wrapped(task, trace.estimate_mean - trace.anchors)[:, index])
     deviation = np.sqrt(np.maximum(trace.estimate_covariance[:, index, index].astype(np.float64), 0.0))

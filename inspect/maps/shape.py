@@ -49,7 +49,7 @@ def fit_rings(share: Array, region: NDArray[np.bool_], x: Array, y: Array) -> Ri
     once. It is restricted to the 50 % region, since a low background would dominate the third moments.
 
     Args:
-        share: (B, L, S, S) p per cell. region: same shape, cells of the 50 % region. x, y: (S,) offsets.
+        share: (B, L, R, S) p per cell. region: same shape, cells of the 50 % region. x, y: (S,), (R,) offsets.
     """
     scale = float(x[-1] - x[0]) / 2.0
     inside = np.where(region, share, 0.0)

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 class MapStatistics:
     """Statistics of the maps of B steps with L layers. p is the likelihood normalised to a density over the map.
 
-    Units are those of a map over positions. Axis, elongation, shape and ring are of interest only if both components of
-    the map have the same unit.
+    Units are those of a map over positions; of a curve, areas are lengths. Axis, elongation, shape and ring are of
+    interest only if the map has two components of the same unit.
 
     Attributes:
         steps: (B,) steps of the trace.
@@ -68,15 +68,16 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
     """Compute the statistics of maps of equal size."""
     log = np.stack([m.log_likelihood for m in maps]).astype(np.float64)
     x, y = (offsets.astype(np.float64) for offsets in (maps[0].offsets_x, maps[0].offsets_y))
-    size, cell = len(x), float(x[-1] - x[0]) * float(y[-1] - y[0]) / (len(x) - 1) ** 2
+    size, cell = len(x), float(np.prod([(q[-1] - q[0]) / (len(q) - 1) for q in (x, y) if len(q) > 1]))
     log_peak = log.max(axis=(2, 3))
     share = np.exp(log - log_peak[..., None, None])
     total = share.sum(axis=(2, 3), keepdims=True)
     share /= total
     log_share = log - log_peak[..., None, None] - np.log(total)
     flat, flat_log = share.reshape(*share.shape[:2], -1), log_share.reshape(*share.shape[:2], -1)
-    middle = [(size - 1) // 2, size // 2]  # one cell, or the four around the true position for an even size
-    at_truth = log[:, :, middle][..., middle].mean(axis=(2, 3))
+    # One cell, or the two or four around the true position for an even size.
+    rows, columns = ([(len(q) - 1) // 2, len(q) // 2] for q in (y, x))
+    at_truth = log[:, :, rows][..., columns].mean(axis=(2, 3))
     best = flat.argmax(axis=-1)
     axis, elongation = _principal(share, x, y)
     expected = _expected(maps, trace) if maps[0].components == trace.task.map_indices else np.full(len(maps), np.nan)
@@ -98,7 +99,7 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
         elongation=elongation,
         expected=expected,
         deviation=deviation,
-        shape=classify(area50, size * size, elongation, rings),
+        shape=classify(area50, size * len(y), elongation, rings),
         ring_centre=rings.centre,
         ring_radius=rings.radius,
         ring_spread=rings.spread,
@@ -157,7 +158,7 @@ def layer_weights(trace: Trace, step: int) -> NDArray[np.float32]:
 
 
 def particle_cloud(
-    trace: Trace, step: int, components: tuple[int, int]
+    trace: Trace, step: int, components: tuple[int, ...]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
     """Components (M, 2) of the predicted particles, SI, and their weights (L, M) by layer (``layer_weights``).
 
@@ -165,4 +166,6 @@ def particle_cloud(
     """
     if trace.particles is None or not has_layer_weights(trace):
         return None
-    return trace.particles[step][:, list(components)], layer_weights(trace, step)
+    points = trace.particles[step][:, list(components)]
+    points = np.pad(points, ((0, 0), (0, 2 - points.shape[1])))  # a curve has no second one
+    return points, layer_weights(trace, step)

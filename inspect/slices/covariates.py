@@ -93,7 +93,9 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
     yield "blackout", "", outage
     yield "outage length", "s", _duration(outage) * dt
     change = measures.wrapped(task, np.diff(episode.states, axis=0, prepend=episode.states[:1]))
-    yield "object speed", "m/s", np.linalg.norm(change[:, list(task.map_indices)], axis=1) / dt
+    main = task.main_error
+    if main.name == "position":
+        yield "object speed", f"{task.components[main.indices[0]].unit}/s", main.norm(change) / dt
     for i, component in enumerate(task.components):
         yield f"true {component.label}", component.unit, episode.states[:, i]
         if component.unit == "rad":

@@ -12,7 +12,6 @@ from beliefscope.datasets.dataset import Dataset
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
-from beliefscope.datasets.task import display_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
@@ -60,7 +59,7 @@ class ErrorSlices(Diagnostic):
 
     Attributes:
         task, filter, checkpoint_hash, faults, seed, particles: of the runs.
-        by, title, unit: name of the score, its display name and SI unit.
+        by, title, unit: name of the score, its display name and unit. shown: unit for display, and its factor.
         alpha: probability of any slice if no covariate is related to the score.
         episodes, steps: numbers of episodes, and of steps with a score.
         covariates: names of the covariates that were searched.
@@ -76,6 +75,7 @@ class ErrorSlices(Diagnostic):
     by: str
     title: str
     unit: str
+    shown: tuple[str, float]
     alpha: float
     episodes: int
     steps: int
@@ -105,7 +105,7 @@ class ErrorSlices(Diagnostic):
 
     def tables(self) -> list[Table]:
         """One row per slice; scores in display units."""
-        unit, factor = display_unit(self.unit)
+        unit, factor = self.shown
         label = f" {unit}".rstrip()
         columns: tuple[str, ...] = ("slice", "ratio x", "from", "to", f"inside{label}", f"outside{label}")
         columns += ("episodes", "steps", "steps %", "p-value")
@@ -196,6 +196,7 @@ def slices_of(
         by=by,
         title=definition.title,
         unit=definition.unit,
+        shown=definition.shown,
         alpha=alpha,
         episodes=len(traces),
         steps=len(score),

@@ -35,14 +35,15 @@ class Measure:
     """A measure of errors or beliefs.
 
     Attributes:
-        name: ``position``, a component, ``nll``, ``nees``, ``coverage95`` or ``miscalibration``.
-        unit: of the state component, else nats or none.
+        name: that of ``Task.main_error``, a component, ``nll``, ``nees``, ``coverage95`` or ``miscalibration``.
+        unit, factor: for display, and the factor of the values.
         value: sums (..., Q) -> values (...).
         loss: values -> loss on a natural logarithmic scale, on which differences are relative changes.
     """
 
     name: str
     unit: str
+    factor: float
     value: Callable[[Array], Array]
     loss: Callable[[Array], Array]
 
@@ -82,16 +83,21 @@ def measures_of(task: Task) -> tuple[Measure, ...]:
     def logarithm(values: Array) -> Array:
         return np.log(np.maximum(values, SMALLEST))
 
-    components = [Measure(c.name, c.unit, root(1 + i), logarithm) for i, c in enumerate(task.components)]
+    main = task.main_error
+    components = [
+        Measure(c.name, *c.shown, root(1 + i), logarithm) for i, c in enumerate(task.components) if (i,) != main.indices
+    ]
     return (
-        Measure("position", "m", root(n + 1), logarithm),
+        Measure(main.name, main.unit, main.factor, root(n + 1), logarithm),
         *components,
         # If errors and standard deviations grow by r, the NLL grows by n ln r.
-        Measure("nll", "nats", lambda sums: _mean(sums, n + 2), lambda values: values / n),
+        Measure("nll", "nats", 1.0, lambda sums: _mean(sums, n + 2), lambda values: values / n),
         # If standard deviations are too small by r, NEES is r^2.
-        Measure("nees", "", lambda sums: _mean(sums, n + 3) / n, lambda values: np.abs(logarithm(values)) / 2.0),
-        Measure("coverage95", "", lambda sums: _mean(sums, -1), lambda values: np.abs(values - LEVELS[-1])),
-        Measure("miscalibration", "", lambda sums: np.abs(calibration(sums) - LEVELS).mean(-1), lambda values: values),
+        Measure("nees", "", 1.0, lambda sums: _mean(sums, n + 3) / n, lambda values: np.abs(logarithm(values)) / 2.0),
+        Measure("coverage95", "", 1.0, lambda sums: _mean(sums, -1), lambda values: np.abs(values - LEVELS[-1])),
+        Measure(
+            "miscalibration", "", 1.0, lambda sums: np.abs(calibration(sums) - LEVELS).mean(-1), lambda values: values
+        ),
     )
 
 
@@ -176,7 +182,7 @@ def _columns(task: Task, error: Tensor, covariance: Tensor) -> Array:
     with np.errstate(invalid="ignore"):  # filter without a covariance
         nll = 0.5 * (squared + np.linalg.slogdet(s)[1] + n * math.log(2.0 * math.pi))
     inside = np.where(np.isnan(squared)[..., None], np.nan, gaussian_level(squared, n)[..., None] <= LEVELS)
-    on_map = np.square(e[..., list(task.map_indices)]).sum(-1)
+    on_map = np.square(task.main_error.norm(e))
     singles = [np.ones_like(on_map), *np.moveaxis(np.square(e), -1, 0), on_map, nll, squared]
     return np.concatenate([np.stack(singles, -1), inside], -1)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.episode import is_image, lost_images
-from beliefscope.datasets.task import Task
+from beliefscope.datasets.task import Task, with_unit
 from beliefscope.inspect.traces.data import Trace
 
 Array = NDArray[np.float64]
@@ -72,10 +72,24 @@ def starts_at_truth(trace: Trace) -> bool:
     return bool(np.allclose(wrapped(trace.task, trace.start_mean - trace.episode.states[0]), 0.0, atol=1e-5))
 
 
-def position_error(trace: Trace) -> Array:
-    """(T, L) m: distance between estimated and true position."""
-    where = list(trace.task.map_indices)
-    return np.linalg.norm(errors(trace)[..., where], axis=-1)
+def main_error(trace: Trace) -> Array:
+    """(T, L) SI: the error that runs are summarised by (``Task.main_error``), such as the distance of the position."""
+    return np.asarray(trace.task.main_error.norm(errors(trace)), dtype=np.float64)
+
+
+def with_main(task: Task, error: NDArray[Any]) -> Array:
+    """(..., 1 + n): length of the main error, followed by the errors (..., n) of the components."""
+    return np.concatenate([task.main_error.norm(error)[..., None], error], axis=-1)
+
+
+def quantities(task: Task) -> list[tuple[int, str, float]]:
+    """Column of ``with_main``, title with unit, and factor for display, of the main error and the other errors."""
+    main = task.main_error
+    others = [(1 + i, c) for i, c in enumerate(task.components) if (i,) != main.indices]
+    return [
+        (0, main.label, main.factor),
+        *((k, with_unit(c.label, c.shown[0]), c.shown[1]) for k, c in others),
+    ]
 
 
 def nees(trace: Trace) -> Array:

@@ -170,7 +170,7 @@ class Writer:
     def summary(self) -> Section:
         """Accuracy over all traces, and the error over time with marked events."""
         traces = self.report.traces
-        rmse = [float(np.sqrt(np.mean(measures.position_error(t)[measures.counted(t), -1] ** 2))) for t in traces]
+        rmse = [float(np.sqrt(np.mean(measures.main_error(t)[measures.counted(t), -1] ** 2))) for t in traces]
         charts = sorted(sorted(range(len(traces)), key=lambda i: -rmse[i])[:MAX_CHARTS])
         marks: dict[int, list[tuple[int, str]]] = {}
         for number, event in enumerate(self.report.events, start=1):
@@ -180,8 +180,8 @@ class Writer:
             f" The {MAX_CHARTS} of {len(traces)} traces with the largest errors." if len(charts) < len(traces) else ""
         )
         caption = (
-            "Position error of the single-modality updates of the fused filter's prior, which are not standalone "
-            "filters, and of the fused estimate. Shaded: contact; gray: image "
+            f"{traces[0].task.main_error.title} error of the single-modality updates of the fused filter's prior, "
+            "which are not standalone filters, and of the fused estimate. Shaded: contact; gray: image "
             f"blackout. Dotted: the events below.{omitted}"
         )
         items = [
@@ -249,8 +249,9 @@ class Writer:
                 zoomed = self._engine(event.trace).map(step, size=FINE * zoom, quantity=quantity)
         else:
             caption = f"Inputs of the filter, and estimates as offsets from the true position. No maps: {self.no_maps}."
+        scene = [] if trace.task.floor is None else [draw_step(trace, step, zoomed)]
         items = (
-            self.figure(f"{name}-scene", SCENE_CAPTION, draw_step(trace, step, zoomed)),
+            *(self.figure(f"{name}-scene", SCENE_CAPTION, figure) for figure in scene),
             self.figure(name, caption, event_figure(trace, step, zoomed, zoom), *data),
             self.table(name, event_table(trace, step, map_)),
         )

@@ -12,9 +12,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from beliefscope.datasets.episode import is_image
-from beliefscope.datasets.task import display_name
+from beliefscope.datasets.task import with_unit
 from beliefscope.inspect.diagnostics.plotting import STYLE, WIDTH, draw_bands
 from beliefscope.inspect.likelihood import LikelihoodMap
+from beliefscope.inspect.maps.plane import axis_titles, plane_of
 from beliefscope.inspect.palette import COLOURS, colour
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
@@ -34,7 +35,7 @@ def zoom_of(map_: LikelihoodMap) -> int:
     share = np.exp(map_.log_likelihood - map_.log_likelihood.max(axis=(1, 2), keepdims=True)).astype(np.float64)
     share /= share.sum(axis=(1, 2), keepdims=True)
     for zoom in ZOOMS:
-        x, y = (np.abs(offsets) <= np.abs(map_.offsets_x).max() / zoom for offsets in (map_.offsets_x, map_.offsets_y))
+        x, y = (np.abs(o) <= np.abs(o).max() / zoom for o in (map_.offsets_x, map_.offsets_y))
         if (share[:, y][:, :, x].sum(axis=(1, 2)) >= MIN_SHARE).all():
             return zoom
     return 1
@@ -51,7 +52,8 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
         FigureCanvasAgg(figure)
         charts = figure.subplots(len(traces), 1, squeeze=False)[:, 0]
         for index, (axes, trace) in enumerate(zip(charts, traces, strict=True)):
-            error = 100.0 * measures.position_error(trace)
+            main = trace.task.main_error
+            error = main.factor * measures.main_error(trace)
             for layer, values in zip(measures.layers(trace), error.T, strict=True):
                 if layer == "fused" or layer in trace.modalities_with_posterior:
                     style = {"lw": 1.5, "zorder": 2.5} if layer == "fused" else {"lw": 0.9}
@@ -63,7 +65,7 @@ def error_figure(traces: Sequence[Trace], marks: Mapping[int, Sequence[tuple[int
                 place = {"xytext": (2, -1), "textcoords": "offset points", "va": "top", "fontsize": 7}
                 axes.annotate(name, (step, 1.0), xycoords=axes.get_xaxis_transform(), **place)
             axes.set_title(f"episode {trace.episode_index}", loc="left")
-            axes.set_ylabel("position error (cm)")
+            axes.set_ylabel(with_unit(f"{main.name} error", main.unit))
             axes.set_xlim(-0.5, len(trace) - 0.5)
             axes.set_ylim(0.0, 1.15 * float(np.nanmax(error)) or 1.0)
             axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.97), borderaxespad=0.0)
@@ -104,11 +106,14 @@ def event_figure(trace: Trace, step: int, map_: LikelihoodMap | None, zoom: int 
 def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None, layer: str, zoom: int) -> None:
     """Draw a layer's map with its estimate, or without a map the estimates of all layers."""
     task = trace.task
-    half = 100.0 * task.map_half_width
-    centre = trace.episode.states[step][list(task.map_indices)]
-    offsets = 100.0 * (measures.means(trace)[step][:, list(task.map_indices)] - centre)
+    where = list(task.map_indices)
+    titles, factors = zip(*axis_titles(task, where), strict=True)
+    half = np.array(plane_of(trace).half_widths) * factors
+    offsets = measures.wrapped(task, measures.means(trace)[step] - trace.anchors[step])[:, where] * factors
     positions = dict(zip(measures.layers(trace), offsets, strict=True))
-    if map_ is None:
+    if len(where) == 1:
+        _draw_curve(axes, trace, positions, map_, layer, factors[0])
+    elif map_ is None:
         axes.axhline(0.0, color=COLOURS["truth"], lw=0.6)
         axes.axvline(0.0, color=COLOURS["truth"], lw=0.6)
         for name in (*trace.modalities_with_posterior, "fused"):
@@ -121,18 +126,34 @@ def _draw_layer(axes: Axes, trace: Trace, step: int, map_: LikelihoodMap | None,
             "vmin": 0.0,
             "vmax": 1.0,
             "origin": "lower",
-            "extent": (-half, half, -half, half),
+            "extent": (-half[0], half[0], -half[1], half[1]),
+            "aspect": "auto",
         }
         axes.imshow(np.exp(log - log.max()), interpolation="nearest", **style)
-        cross = [-half, -0.15 * half / zoom, np.nan, 0.15 * half / zoom, half]
-        for x, y in ((cross, [0.0] * 5), ([0.0] * 5, cross)):
+        hair = np.array([-1.0, -0.15 / zoom, np.nan, 0.15 / zoom, 1.0])
+        for x, y in ((half[0] * hair, [0.0] * 5), ([0.0] * 5, half[1] * hair)):
             axes.plot(x, y, color="white", lw=0.5, alpha=0.7)
         if layer == "fused" or layer in trace.modalities_with_posterior:
             _draw_estimate(axes, positions[layer], colour(layer, trace.modalities), layer)
-    axes.set(xlim=(-half / zoom, half / zoom), ylim=(-half / zoom, half / zoom), aspect="equal")
+    axes.set(xlim=(-half[0] / zoom, half[0] / zoom), xlabel=titles[0])
+    if len(where) == 2:
+        same = task.components[where[0]].unit == task.components[where[1]].unit
+        axes.set(ylim=(-half[1] / zoom, half[1] / zoom), ylabel=titles[1], aspect="equal" if same else "auto")
     axes.set_title(layer if map_ is None else f"{layer} {map_.quantity}", loc="left", fontsize=7.5)
-    axes.set_xlabel(f"{display_name(task.map_components[0])} offset (cm)")
-    axes.set_ylabel(f"{display_name(task.map_components[1])} offset (cm)")
+
+
+def _draw_curve(
+    axes: Axes, trace: Trace, positions: Mapping[str, Any], map_: LikelihoodMap | None, layer: str, factor: float
+) -> None:
+    """Draw a layer's map over one component relative to its maximum, and lines at the truth and the estimates."""
+    axes.axvline(0.0, color=COLOURS["truth"], lw=0.8)
+    if map_ is not None:
+        log = map_.log_likelihood[map_.layers.index(layer), 0]
+        axes.plot(factor * map_.offsets_x, np.exp(log - log.max()), color=colour(layer, trace.modalities), lw=1.2)
+    known = (*trace.modalities_with_posterior, "fused")
+    for name in known if map_ is None else {layer} & {*known}:
+        axes.axvline(positions[name][0], color=colour(name, trace.modalities), lw=0.8, ls="--")
+    axes.set(ylim=(0.0, 1.05), yticks=[])
 
 
 def _draw_estimate(axes: Axes, position: np.ndarray, hue: str, name: str) -> None:

@@ -103,11 +103,12 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
     }
     if first.particles is not None:
         facts["Particles"] = str(first.particles.shape[1])
+    main = first.task.main_error
     table = next(item.table for item in summary.items if item.table is not None)
-    column = table.columns.index("position (cm)")
-    errors = "; ".join(f"{row[0]} {_number(row[column])} cm" for row in reversed(table.rows))
+    column = table.columns.index(first.task.main_error.label)
+    errors = "; ".join(f"{row[0]} {_number(row[column])} {main.unit}".rstrip() for row in reversed(table.rows))
     counted = sum(int(measures.counted(trace).sum()) for trace in report.traces)
-    return facts | {"Position RMSE": f"{errors} over {counted} counted steps"}
+    return facts | {f"{main.title} RMSE": f"{errors} over {counted} counted steps"}
 
 
 def _provenance(report: Report) -> dict[str, str]:

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from beliefscope.datasets.task import with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.evaluate import metrics
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Table, Value
 from beliefscope.inspect.likelihood import LikelihoodMap, Quantity
+from beliefscope.inspect.maps.plane import area_unit
 from beliefscope.inspect.maps.shape import SHAPES
 from beliefscope.inspect.maps.statistics import measure_maps
 from beliefscope.inspect.statistics import measures
@@ -102,7 +104,7 @@ class Report:
 
 def worst_events(traces: Sequence[Trace], count: int = DEFAULT_EVENTS) -> list[Event]:
     """Steps with the largest fused position error in descending order, at least ``MIN_DISTANCE`` apart per trace."""
-    errors = [np.where(measures.counted(t), measures.position_error(t)[:, -1], -np.inf) for t in traces]
+    errors = [np.where(measures.counted(t), measures.main_error(t)[:, -1], -np.inf) for t in traces]
     events: list[Event] = []
     while len(events) < count:
         index = int(np.argmax([error.max() for error in errors]))
@@ -141,8 +143,9 @@ def _accuracy(traces: Sequence[Trace]) -> Table:
         if layer != "fused" and layer not in first.modalities_with_posterior:
             continue
         result = metrics(task, error[:, i], covariance[:, i])
-        names = [*(f"{c.label} ({c.shown[0]})" for c in task.components), "position (cm)"]
-        values: dict[str, Value] = dict(zip(names, result.rmse.values(), strict=True))
+        titles = {c.key: with_unit(c.label, c.shown[0]) for c in task.components}
+        titles[task.main_error.key] = task.main_error.label
+        values: dict[str, Value] = {titles[key]: value for key, value in result.rmse.items()}
         if first.has_covariance:
             values |= {"NEES/n": result.nees, "95 % coverage": result.coverage95, "NLL (nats)": result.nll}
         columns = ["estimate", *values]
@@ -155,15 +158,22 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
     task = trace.task
     units, factors = measures.display_units(task)
     error, nees = measures.errors(trace)[step] * factors, measures.nees(trace)[step]
-    distance = 100.0 * measures.position_error(trace)[step]
+    main = task.main_error
+    distance = main.factor * measures.main_error(trace)[step]
     statistics = None if map_ is None else measure_maps([map_], trace)
-    columns = ["estimate", *(f"{c.label} error ({u})" for c, u in zip(task.components, units, strict=True))]
-    columns += ["position error (cm)"]
+    columns = ["estimate", *(with_unit(f"{c.label} error", u) for c, u in zip(task.components, units, strict=True))]
+    columns += [with_unit(f"{main.name} error", main.unit)]
     columns += ["NEES/n"] if trace.has_covariance else []
     for name, weights in (("beta", trace.weights), ("effective weight", trace.effective_weights)):
         if weights is not None:
             columns.append(name if weights.shape[-1] == 1 else f"{name} (mean)")
-    columns += ["map: peak to truth (cm)", "map: 95 % region (cm²)", "map: shape"] if statistics is not None else []
+    where = task.map_indices
+    same_unit = len({task.components[i].unit for i in where}) == 1
+    area, factor = area_unit(task, where)
+    if statistics is not None:
+        columns += [with_unit("map: peak to truth", main.unit)] if same_unit else []
+        columns += [with_unit("map: 95 % region", area)]
+        columns += ["map: shape"] if same_unit and len(where) == 2 else []
     rows: list[tuple[Value, ...]] = []
     for i, layer in enumerate(measures.layers(trace)):
         has_estimate = layer == "fused" or layer in trace.modalities_with_posterior
@@ -174,8 +184,9 @@ def event_table(trace: Trace, step: int, map_: LikelihoodMap | None) -> Table:
             if weights is not None:
                 row.append(float(weights[step, i].mean()) if i < weights.shape[1] else None)
         if statistics is not None:
-            row += [100.0 * float(np.hypot(*statistics.peak[0, i])), 1e4 * float(statistics.area95[0, i])]
-            row += [SHAPES[statistics.shape[0, i]]]
+            row += [main.factor * float(np.hypot(*statistics.peak[0, i]))] if same_unit else []
+            row += [factor * float(statistics.area95[0, i])]
+            row += [SHAPES[statistics.shape[0, i]]] if same_unit and len(where) == 2 else []
         rows.append(tuple(row))
     title = f"Step {step} of episode {trace.episode_index}" + ("" if map_ is None else f". Maps: {map_.title}")
     return Table(title, tuple(columns), tuple(rows))

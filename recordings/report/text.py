@@ -200,14 +200,16 @@ def _run(trace: Trace) -> Passage:
 def definitions(task: Task, trace: Trace) -> list[Passage]:
     """Definitions of the metrics in a report, with $T$ counted steps and $n$ components of the state."""
     angles = any(component.unit == "rad" for component in task.components)
-    x, y = task.map_components
+    main = task.main_error
+    names = " and ".join(task.components[i].name for i in main.indices)
+    meaning = "distance over" if len(main.indices) > 1 else "absolute value in"
     passages = [
         Passage(
             "Error",
             "Estimate minus truth"
             + (", angles wrapped to ±180°." if angles else ".")
             + " RMSE is its root mean square "
-            f"over the counted steps of all traces. The position error is the distance over {x} and {y}.",
+            f"over the counted steps of all traces. The {main.name} error is the {meaning} {names}.",
             (r"e_t = m_t - x_t , \quad \text{RMSE} = \sqrt{ \frac{1}{T} \sum_t e_t^2 }",),
         )
     ]

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import Component, Task, display_name
+from beliefscope.datasets.task import Component, Task, display_name, with_unit
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
@@ -39,7 +39,7 @@ def blueprint(
         diagnostics: by name; each has a tab next to the time series.
         growing: whether the run is in progress: the cursor and axes follow its end.
     """
-    observed = [_camera(key) for key in task.observations if task.dtype(key) is np.uint8]
+    observed: list[rrb.View] = [_camera(key) for key in task.observations if task.dtype(key) is np.uint8]
     if first is not None:
         observed += [_map(layer, first) for layer in first.layers]
     scene = rrb.Vertical(
@@ -63,7 +63,10 @@ def blueprint(
 
 def _scene(trace: Trace, task: Task) -> rrb.Container:
     """The scene from behind the robot, and the belief from above, as on the maps."""
-    x, y = task.map_indices
+    about = rrb.TextDocumentView(origin="about", name="About")
+    if task.floor is None:
+        return rrb.Tabs(about)
+    x, y = task.floor
     anchor = np.array([*positions(trace)[:, [x, y]].mean(axis=0), plane_height(trace, task)])
     effector = trace.episode.observations.get("effector_position")
     middle = anchor if effector is None else 0.5 * (anchor + effector.mean(axis=0))
@@ -88,7 +91,6 @@ def _scene(trace: Trace, task: Task) -> rrb.Container:
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
     )
-    about = rrb.TextDocumentView(origin="about", name="About")
     return rrb.Horizontal(rrb.Tabs(scene, about, active_tab=0), above, column_shares=[5, 4])
 
 
@@ -100,7 +102,7 @@ def _camera(key: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=f"observations/{key}", name="Camera")
 
 
-def _map(layer: str, first: LikelihoodMap) -> rrb.Spatial2DView:
+def _map(layer: str, first: LikelihoodMap) -> rrb.View:
     side = len(first.offsets_x)
     name = f"{layer} {first.quantity}" + (f": {first.rule}" if layer == "fused" and first.rule else "")
     # Without bounds, the view would zoom out to include estimates outside the map.
@@ -122,8 +124,13 @@ def _time_series(trace: Trace, task: Task, growing: bool) -> rrb.Container:
     for component in task.components:
         rows.append(_estimate(trace, task, component, growing))
         shares.append(2.5)
-    errors = [_plot("errors/position", "Position error (cm)")]
-    errors += [_plot(f"errors/{c.name}", f"Error of {c.name} (deg)") for c in angles(task)]
+    main = task.main_error
+    errors = [_plot("errors/position", with_unit(f"{main.title} error", main.unit))]
+    errors += [
+        _plot(f"errors/{c.name}", f"Error of {c.name} (deg)")
+        for c in angles(task)
+        if (task.index(c.name),) != main.indices
+    ]
     rows.append(rrb.Tabs(*errors, active_tab=0))
     shares.append(2.5)
     if trace.log_weights is not None:
@@ -143,7 +150,7 @@ def _estimate(trace: Trace, task: Task, component: Component, growing: bool) -> 
         low, high = (float(limit) * scale for limit in np.nanpercentile(values, [0.5, 99.5]))
         margin = 0.1 * (high - low) or 1.0
         limits = (low - margin, high + margin)
-    name = f"{component.label} ({component.shown[0]}): truth green, fused red"
+    name = f"{with_unit(component.label, component.shown[0])}: truth green, fused red"
     name += ", thin lines 2 sigma" if trace.has_covariance else ""
     return _plot(f"states/{component.name}", name, limits, legend=False)
 

@@ -9,9 +9,9 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from beliefscope.datasets.task import DISPLAY_UNITS, Component, Outline, Task, display_name
+from beliefscope.datasets.task import Component, Outline, Task, with_unit
 from beliefscope.inspect.palette import colour
-from beliefscope.inspect.statistics.measures import contours, layer_label
+from beliefscope.inspect.statistics.measures import contours, layer_label, wrapped
 from beliefscope.inspect.trace import Trace
 from beliefscope.recordings.schema import STEP, TIME
 
@@ -93,9 +93,11 @@ def time_columns(steps: NDArray[np.int64], dt: float) -> list[rr.TimeColumn]:
 def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     """Static properties: names, colours and widths of every series and marker."""
     yield "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP
-    yield "world/plane", rr.Transform3D(translation=[0.0, 0.0, plane_height(trace, task)])
+    on_floor = task.floor is not None
     yield "world/effector", _marker(ROBOT_COLOUR, 3.0)
-    yield "world/plane/truth", _marker(_hex("truth", trace), 4.0)
+    if on_floor:
+        yield "world/plane", rr.Transform3D(translation=[0.0, 0.0, plane_height(trace, task)])
+        yield "world/plane/truth", _marker(_hex("truth", trace), 4.0)
     if task.outline is not None:
         outline = task.outline(positions(trace)[0])
         for name in ("truth", "fused") if has_truth(trace) else ("fused",):
@@ -105,15 +107,16 @@ def style(trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
         yield "contact", rr.StateConfiguration(values=CONTACT_NAMES, colors=colours, visible=[False, True])
     for source in sources(trace):
         hue, width, label = _hex(source, trace), 2.5 if source == "fused" else 1.2, layer_label(source)
-        yield f"world/plane/{source}/mean", _marker(hue, 3.5 if source == "fused" else 2.5)
-        if trace.has_covariance:
+        if on_floor:
+            yield f"world/plane/{source}/mean", _marker(hue, 3.5 if source == "fused" else 2.5)
+        if on_floor and trace.has_covariance:
             yield (
                 f"world/plane/{source}/ellipse",
                 rr.Ellipsoids3D.from_fields(
                     colors=rgba(hue), line_radii=rr.Radius.ui_points(width), fill_mode="MajorWireframe"
                 ),
             )
-        yield f"errors/position/{source}", line(hue, width, f"{label} (cm)")
+        yield f"errors/position/{source}", line(hue, width, with_unit(label, task.main_error.unit))
         for component in angles(task):
             yield f"errors/{component.name}/{source}", line(hue, width, f"{label} (deg)")
         for component in task.components:
@@ -152,14 +155,14 @@ def contact_changes(trace: Trace, span: slice) -> tuple[NDArray[np.int64], Any]:
 
 
 def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
-    plane = list(task.map_indices)
+    plane = list(task.floor or ())
     truth = has_truth(trace, steps)
-    if truth:
+    if truth and plane:
         yield "world/plane/truth", rr.Points3D.columns(positions=_lift(trace.episode.states[steps][:, plane]))
     effector = trace.episode.observations.get("effector_position")
     if effector is not None:
         yield "world/effector", rr.Points3D.columns(positions=effector[steps])
-    for source, mean, covariance in _estimates(trace, steps):
+    for source, mean, covariance in _estimates(trace, steps) if plane else ():
         centre = mean[:, plane]
         yield f"world/plane/{source}/mean", rr.Points3D.columns(positions=_lift(centre))
         if trace.has_covariance:
@@ -175,7 +178,7 @@ def _world(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
             archetype = rr.Cylinders3D if outline.shape == "cylinder" else rr.Boxes3D
             quaternions = np.roll(outline.wxyz, -1, axis=-1)
             yield f"world/object/{name}", archetype.columns(centers=outline.position, quaternions=quaternions)
-    if trace.particles is not None and trace.log_weights is not None:
+    if plane and trace.particles is not None and trace.log_weights is not None:
         points = _lift(np.round(trace.particles[steps][:, :, plane] / PARTICLE_GRID) * PARTICLE_GRID)
         rows, count = points.shape[:2]
         shades = _shades(trace.log_weights[steps], _hex("fused", trace))
@@ -196,15 +199,13 @@ def _states(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]
 
 
 def _errors(trace: Trace, task: Task, steps: slice) -> Iterator[tuple[str, Any]]:
-    plane = list(task.map_indices)
+    main = task.main_error
     for source, mean, _ in _estimates(trace, steps):
-        error = mean - trace.episode.states[steps]
-        distance = np.linalg.norm(error[:, plane], axis=1)
-        yield f"errors/position/{source}", series(distance * DISPLAY_UNITS["m"][1])
+        error = wrapped(task, mean - trace.episode.states[steps])
+        yield f"errors/position/{source}", series(main.norm(error) * main.factor)
         for component in angles(task):
-            angle = error[:, task.index(component.name)]
-            shortest = np.abs(np.arctan2(np.sin(angle), np.cos(angle)))
-            yield f"errors/{component.name}/{source}", series(shortest * DISPLAY_UNITS["rad"][1])
+            angle = np.abs(error[:, task.index(component.name)])
+            yield f"errors/{component.name}/{source}", series(angle * component.shown[1])
 
 
 def _estimates(trace: Trace, steps: slice) -> Iterator[tuple[str, Array, Array]]:
@@ -276,7 +277,11 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
     modalities = " and ".join(task.modalities if not trace.modalities else trace.modalities).replace("+", " with ")
     weighted = ". It weights its modalities at every step" if trace.weights is not None else ""
     components = ", ".join(component.label for component in task.components)
-    x, y = map(display_name, task.map_components)
+    main = task.main_error
+    shown = [task.components[i] for i in task.map_indices]
+    extent = " and ".join(f"{c.label} {main.text(2 * task.map_half_width, 0)}" for c in shown[: len(main.indices)])
+    units = ", ".join(with_unit(c.label, c.shown[0]) for c in task.components)
+    contours_of = " and ".join(c.label for c in shown)
     names = ("truth", "fused", *trace.modalities, "contact")
     legend = "\n".join(f"| {name} | {_hex(name, trace)} | {MEANINGS.get(name, MODALITY)} |" for name in names)
     length = f"{steps} steps" if steps >= 0 else "a live run, in steps"
@@ -292,13 +297,12 @@ def about(trace: Trace, task: Task, steps: int) -> rr.TextDocument:
 {legend}
 
 * **Scene**: the true and the estimated pose of the object. Contours are 2 sigma in
-  {x} and {y}. Brighter particles have larger weights. Gray: the end
+  {contours_of}. Brighter particles have larger weights. Gray: the end
   effector and its recent path.
-* **Likelihood maps**: likelihood or posterior (see the titles) of positions around the true one, relative to the
-  maximum of each map;
-  {200 * task.map_half_width:g} cm per side, {x} to the right. Squares
-  frame the true position (large) and the estimate (small).
-* **Plots**: in centimetres and degrees. Thin lines around the fused estimate are the 2 sigma band.
+* **Likelihood maps**: likelihood or posterior (see the titles) of states around the true one, relative to the
+  maximum of each map; {shown[0].label} to the right. Extent: {extent}. Squares
+  frame the true state (large) and the estimate (small).
+* **Plots**: {units}. Thin lines around the fused estimate are the 2 sigma band.
 
 * checkpoint `{trace.checkpoint_hash or "unknown"}`
 * data `{trace.data_hash or "unknown"}`

@@ -22,12 +22,20 @@ PLANE_CELLS = 80  # maximum per side of the map in the scene; the image view has
 def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
     """Static properties of all maps of a recording: quantity, size, colour map, markers."""
     yield "maps/title", rr.TextDocument(first.title)
+    if first.is_curve:
+        for layer in first.layers:
+            for path, source in (("", layer), ("/estimate", layer), ("/truth", "truth")):
+                hue = rgba(colour(source, trace.modalities), 1.0 if path != "/estimate" else 0.6)
+                yield f"maps/{layer}{path}", rr.LineStrips2D.from_fields(colors=hue, radii=rr.Radius.ui_points(1.2))
+        return
     side = len(first.offsets_x)
     depth = rr.components.ImageFormat(width=side, height=side, channel_datatype="U8")
     for layer in first.layers:
         yield (f"maps/{layer}", rr.DepthImage.from_fields(format=depth, colormap="Inferno", depth_range=[0.0, 255.0]))
         yield f"maps/{layer}/truth", _frame(colour("truth", trace.modalities), side / 18)
         yield f"maps/{layer}/estimate", _frame(colour(layer, trace.modalities), side / 30)
+    if first.components != trace.task.floor:
+        return
     cells = first.offsets_x[:: _stride(first)]
     gray = rr.components.ImageFormat(width=len(cells), height=len(cells), channel_datatype="U8", color_model="L")
     yield (
@@ -38,19 +46,25 @@ def map_style(first: LikelihoodMap, trace: Trace) -> Iterator[tuple[str, Any]]:
 
 def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iterator[tuple[str, Any]]:
     """Columns of maps of one size, flipped so that y points up."""
-    x, y = task.map_indices
     steps = [m.step for m in maps]
     shares = np.stack([m.normalised() for m in maps])
-    pixels = shares[:, :, ::-1]
     peaks = np.stack([m.log_likelihood.max(axis=(1, 2)) for m in maps])
-    means = np.concatenate([trace.estimate_mean[steps, None], trace.modality_mean[steps]], axis=1)[..., [x, y]]
+    for index, layer in enumerate(maps[0].layers):
+        yield f"maps/{layer}/log_peak", series(peaks[:, index])
+    means = np.concatenate([trace.estimate_mean[steps, None], trace.modality_mean[steps]], axis=1)
+    if maps[0].is_curve:
+        yield from _curve_columns(maps, shares, means, trace)
+        return
+    x, y = task.map_indices
+    pixels = shares[:, :, ::-1]
     for index, layer in enumerate(maps[0].layers):
         yield f"maps/{layer}", rr.DepthImage.columns(buffer=list(pixels[:, index].reshape(len(maps), -1)))
-        yield f"maps/{layer}/log_peak", series(peaks[:, index])
-        mean = means[:, sources(trace).index(layer)]
+        mean = means[:, sources(trace).index(layer)][:, [x, y]]
         yield f"maps/{layer}/estimate", rr.Boxes2D.columns(centers=_cells(maps, mean))
         truth = trace.episode.states[steps][:, [x, y]]
         yield f"maps/{layer}/truth", rr.Boxes2D.columns(centers=_cells(maps, truth))
+    if maps[0].components != task.floor:
+        return
     first, stride = maps[0], _stride(maps[0])
     cells = shares[:, first.layers.index("fused"), ::stride, ::stride][:, ::-1].reshape(len(maps), -1)
     half_cell = (first.offsets_x[stride] - first.offsets_x[0]) / 2.0
@@ -58,6 +72,32 @@ def map_columns(maps: Sequence[LikelihoodMap], trace: Trace, task: Task) -> Iter
     corner = np.array([[m.centre[0] + m.offsets_x[0], m.centre[1] + m.offsets_y[0], below] for m in maps])
     corner[:, :2] -= half_cell
     yield "world/plane/map", rr.GridMap.columns(data=list(cells), translation=corner)
+
+
+def _curve_columns(
+    maps: Sequence[LikelihoodMap], shares: Array, means: Array, trace: Trace
+) -> Iterator[tuple[str, Any]]:
+    """Columns of maps over one component: a curve in the coordinates of an image of S x S cells, and upright lines."""
+    side, component = len(maps[0].offsets_x), maps[0].components[0]
+    steps = [m.step for m in maps]
+    x = np.arange(side) + 0.5
+    for index, layer in enumerate(maps[0].layers):
+        heights = side * (1.0 - 0.95 * shares[:, index, 0] / 255.0)
+        strips = [np.stack([x, height], axis=1) for height in heights]
+        yield f"maps/{layer}", rr.LineStrips2D.columns(strips=strips)
+        for name, values in (
+            ("estimate", means[:, sources(trace).index(layer), component]),
+            ("truth", trace.episode.states[steps][:, component]),
+        ):
+            places = [_column(m, value) for m, value in zip(maps, values, strict=True)]
+            lines = [np.array([[at, 0.0], [at, side]]) for at in places]
+            yield f"maps/{layer}/{name}", rr.LineStrips2D.columns(strips=lines)
+
+
+def _column(map_: LikelihoodMap, value: float) -> float:
+    """A value of the component in columns of its map."""
+    spacing = map_.offsets_x[1] - map_.offsets_x[0]
+    return float((value - map_.centre[0] - map_.offsets_x[0]) / spacing + 0.5)
 
 
 def _stride(map_: LikelihoodMap) -> int:

@@ -99,7 +99,6 @@ def test_recording_report_and_page(runs: list[Trace], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("component", "message"),
     [
-        (Component("x", "km"), "map component 'x' has unit 'km', expected m"),
         (Component("x", "m", display=("km", 0.0)), "has display .*'km', 0.0.*, expected a unit and a factor above 0"),
         (Component("x", "rad", display=("turns", 0.2)), "has display"),
     ],

@@ -126,7 +126,7 @@ def test_haptics_update_of_the_door_is_not_the_haptics_filter(name: str) -> None
         runs = [trace(checkpoint, data[i], i, particles=100) for i in data.held_out()[:4]]
 
     def rmse(traces: list[Trace], layer: int) -> float:
-        squares = [np.square(measures.position_error(run)[measures.counted(run), layer]) for run in traces]
+        squares = [np.square(measures.main_error(run)[measures.counted(run), layer]) for run in traces]
         return float(100.0 * np.sqrt(np.concatenate(squares).mean()))
 
     update, alone = rmse(runs, 1), rmse([standalone(checkpoint, run, "haptics") for run in runs], -1)

@@ -17,6 +17,8 @@ const series = (value) => Float32Array.from({ length: STEPS }, (_, t) => value(t
  */
 const run = (last, contact = 5) =>
   /** @type {any} */ ({
+    task: { main: { name: 'position' } },
+    mainUnit: 'cm',
     steps: STEPS,
     modalities: ['image', 'haptics'],
     components: [{ name: 'x' }],

@@ -12,7 +12,8 @@ export const TASK = {
   ],
   modalities: ['image', 'haptics'],
   dt: 0.1,
-  map: { x: 'hinge_x', y: 'hinge_y', half_width: 0.2 },
+  map: { components: ['hinge_x', 'hinge_y'], half_width: 0.2 },
+  main: { name: 'position', key: 'position_cm', unit: 'cm', scale: 100, indices: [0, 1] },
   fault_presets: [],
   filters: ['crossmodal-pf', 'crossmodal-ekf'].map((name) => ({
     name,

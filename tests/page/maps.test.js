@@ -6,9 +6,11 @@ import {
   layerMeasures,
   mapTitle,
   pairwiseMeasures,
+  positionText,
   valuesAt,
 } from '../../app/page/maps/map_summary.js';
 import {
+  areaUnit,
   borders,
   cellAt,
   rangeDigits,
@@ -25,6 +27,7 @@ const HEADER = {
   other: false,
   step: 2,
   size: 3,
+  rows: 3,
   quantity: 'likelihood',
   rule: 'sum of likelihoods (unimodal)',
   angle: null,
@@ -75,18 +78,23 @@ const HEADER = {
   },
 };
 
-/** Maps as the server encodes them: the middle cell of each layer is the peak, all others are at the lowest value. */
-function encodedMaps() {
-  const text = new TextEncoder().encode(JSON.stringify(HEADER));
+/**
+ * Maps as the server encodes them: the middle cell of each layer is the peak, all others are at the lowest value.
+ * @param {object} [changes] of the header
+ */
+function encodedMaps(changes = {}) {
+  const header = { ...HEADER, ...changes };
+  const text = new TextEncoder().encode(JSON.stringify(header));
   const start = 4 + Math.ceil(text.length / 4) * 4;
-  const { particles, layers, size } = HEADER;
+  const { particles, layers, size, rows } = header;
+  const count = size * rows;
   const floats = 2 * particles + layers.length * particles;
-  const buffer = new ArrayBuffer(start + 4 * floats + 2 * layers.length * size * size);
+  const buffer = new ArrayBuffer(start + 4 * floats + 2 * layers.length * count);
   new DataView(buffer).setUint32(0, text.length, true);
   new Uint8Array(buffer).set(text, 4);
   new Float32Array(buffer, start, floats).set([1, 2, 1.1, 2.1, 0.25, 0.75, 0.5, 0.5, 1, 0]);
   const cells = new Uint16Array(buffer, start + 4 * floats);
-  layers.forEach((_, layer) => (cells[9 * layer + 4] = CELL_STEPS));
+  layers.forEach((_, layer) => (cells[count * layer + (count - 1) / 2] = CELL_STEPS));
   return buffer;
 }
 
@@ -97,6 +105,18 @@ test('maps are decoded', () => {
   assert.equal(maps.positions.length, 4);
   assert.deepEqual([...maps.weights[0]], [0.25, 0.75]);
   assert.deepEqual([...maps.cells[2]], [0, 0, 0, 0, CELL_STEPS, 0, 0, 0, 0]);
+});
+
+test('a map over one component is a curve with lengths instead of areas', () => {
+  const axes = [{ name: 'level', index: 0, unit: 'K', shown: 'mK', scale: 1000, half_width: 2 }];
+  const layers = ['image', 'haptics', 'fused'];
+  const curve = readMaps(
+    encodedMaps({ axes, rows: 1, centre: [5], peak: layers.map(() => [0, 0]) }),
+  );
+  assert.deepEqual([...curve.cells[0]], [0, CELL_STEPS, 0]);
+  assert.deepEqual(areaUnit(axes), { unit: 'mK', scale: 1000 });
+  assert.equal(cellAt(curve, [1.9]), 2);
+  assert.equal(positionText(curve, curve.peak[0], true), '5000.0 mK');
 });
 
 test('colours span each layer or all layers', () => {

@@ -98,7 +98,7 @@ test('a standalone run adds its estimate under its own name and in the colour of
 });
 
 test('the error of the selected component', () => {
-  assert.equal(selectedError(trace, state), trace.error('fused', 'position'));
+  assert.equal(selectedError(trace, state), trace.error('fused', 'main'));
   assert.equal(selectedError(trace, { component: 'angle' }), trace.error('fused', 2));
 });
 

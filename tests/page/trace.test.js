@@ -29,11 +29,11 @@ test('columns are decoded to cm and degrees', () => {
 
 test('errors are distances, and angles are wrapped', () => {
   const trace = makeTrace(FUSION);
-  assertClose(trace.error('fused', 'position'), [5, 0]);
-  assertClose(trace.error('haptics', 'position'), [30, 10]);
+  assertClose(trace.error('fused', 'main'), [5, 0]);
+  assertClose(trace.error('haptics', 'main'), [30, 10]);
   const wrapped = 360 - (6.2 * 180) / Math.PI;
   assertClose(trace.error('fused', 2), [0, wrapped]);
-  assertClose(trace.positionSigma('fused'), [Math.hypot(1, 2), 5]);
+  assertClose(trace.mainSigma('fused'), [Math.hypot(1, 2), 5]);
   assert.deepEqual(trace.largestDeviation(0)?.component, 'hinge_x');
   assert.ok(Math.abs((trace.largestDeviation(0)?.sigmas ?? 0) - 3) < 1e-4);
 });

@@ -89,11 +89,20 @@ class Health(Reply):
 
 
 class MapArea(Reply):
-    """Components on the axes of the likelihood maps, and half the side length (m)."""
+    """Components on the axes of the likelihood maps, one or two, and half the extent (in the unit of the first)."""
 
-    x: str
-    y: str
+    components: list[str]
     half_width: float
+
+
+class MainError(Reply):
+    """The error that runs are summarised by. indices: of the components; scale: factor to the unit for display."""
+
+    name: str
+    key: str
+    unit: str
+    scale: float
+    indices: list[int]
 
 
 class FilterInfo(Reply):
@@ -140,6 +149,7 @@ class TaskInfo(Reply):
     modalities: list[str]
     dt: float
     map: MapArea
+    main: MainError
     fault_presets: list[FaultPreset]
     filters: list[FilterInfo]
     data: list[DataInfo]

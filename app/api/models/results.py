@@ -104,6 +104,8 @@ class FailureScore(Reply):
     name: str
     title: str
     unit: str
+    shown: str
+    scale: float
     why_not: str | None
     verdict: str | None = None
     threshold: Number = None

@@ -171,7 +171,8 @@ def _run(
             write(validation.step, {**curve_values(validation), "score": validation.score})
 
         def report(step: int, count: int, loss: float) -> None:
-            update("Fine-tuning", step / count, f"loss {loss:.3g}; {error_summary(validations[0], validations[-1])}")
+            errors = error_summary(base.task.main_error, validations[0], validations[-1])
+            update("Fine-tuning", step / count, f"loss {loss:.3g}; {errors}")
 
         tuned = tune(
             base,

@@ -260,7 +260,7 @@ export function parsePermalink(search, catalog) {
     component: link.choice(
       'component',
       task.components.map(({ name }) => name),
-      task.map.x,
+      task.map.components[0],
     ),
     playing: false,
     speed: 1,

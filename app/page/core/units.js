@@ -1,20 +1,50 @@
-/** Number formats, and the conversion from the server's m and rad to the page's cm and degrees. */
+/** Number formats, and the conversion from the server's units to those of the page, such as cm and degrees. */
+
+/** @import { Task } from '../types/server.js' */
 
 /** @typedef {{unit: string, scale: number}} DisplayUnit scale: factor from the server's unit */
-
-/** @type {Record<'m' | 'rad', DisplayUnit>} */
-export const DISPLAY_UNITS = {
-  m: { unit: 'cm', scale: 100 },
-  rad: { unit: '°', scale: 180 / Math.PI },
-};
 
 /**
  * Returns the display unit of a state component, with the degree sign for angles.
  * @param {{unit: string, shown: string, scale: number}} component
  * @returns {DisplayUnit}
  */
-export const displayUnit = ({ unit, shown, scale }) =>
-  unit === 'rad' ? DISPLAY_UNITS.rad : { unit: shown, scale };
+export const displayUnit = ({ unit, shown, scale }) => ({
+  unit: unit === 'rad' ? '°' : shown,
+  scale,
+});
+
+/**
+ * Returns the unit of a task's main error.
+ * @param {Task} task
+ */
+export const mainUnit = ({ components, main }) => displayUnit(components[main.indices[0]]);
+
+/**
+ * Formats a value of the main error with its unit.
+ * @param {Task} task
+ * @param {number | null | undefined} value in units of the server
+ */
+export function mainText(task, value) {
+  const { unit, scale } = mainUnit(task);
+  return withUnit(fixed(value === null ? null : Number(value) * scale, 2), unit);
+}
+
+/**
+ * Names what the main error is about: the object whose position it is, such as hinge, or the component.
+ * @param {Task} task
+ */
+export function mainName({ main, map }) {
+  if (main.name !== 'position') return main.name;
+  return displayName(map.components[0]).replace(/(^| )x$/, '') || 'position';
+}
+
+/**
+ * Joins a text and a unit, which may be empty.
+ * @param {string} text
+ * @param {string} unit
+ */
+export const withUnit = (text, unit) => `${text} ${unit}`.trim();
 
 /**
  * Replaces the underscores of a name such as hinge_x by spaces.

@@ -1,10 +1,10 @@
-/** A trace as the page displays it: columns over time, in cm and degrees. */
+/** A trace as the page displays it: columns over time, in units for display. */
 
 /** @import { LiveRun, Selection, Task, TraceHeader } from './api.js' */
 /** @import { Column, Series } from './arrays.js' */
 /** @import { Block, LiveStream } from './live_stream.js' */
 
-import { displayUnit, wrapDegrees } from '../core/units.js';
+import { displayUnit, mainUnit, wrapDegrees } from '../core/units.js';
 import { append, norm, slice, stride } from './arrays.js';
 
 const FUSED = 'fused';
@@ -45,10 +45,9 @@ export class Trace {
       const size = shape.reduce((a, b) => a * b, 1);
       this.#columns.set(name, { data: new Float32Array(buffer, offset, size), shape });
     }
-    /** @param {string} name */
-    const index = (name) => this.components.findIndex((c) => c.name === name);
-    /** Indices of the two state components that the maps show. */
-    this.position = [index(task.map.x), index(task.map.y)];
+    /** Indices of the state components of the main error. */
+    this.main = task.main.indices;
+    this.mainUnit = mainUnit(task).unit;
     this.angles = this.components.map((c, i) => (c.unit === 'rad' ? i : -1)).filter((i) => i >= 0);
     /** Whether each step is in contact. @type {Series} */
     this.contact = new Float32Array();
@@ -109,11 +108,11 @@ export class Trace {
   }
 
   /**
-   * Returns whether the true position is known.
+   * Returns whether the true value of the main error is known.
    * @param {number} step
    */
   hasTruth(step) {
-    return this.position.every((i) => Number.isFinite(this.truth(i)[step]));
+    return this.main.every((i) => Number.isFinite(this.truth(i)[step]));
   }
 
   /** Names of the groups of steps by covariate, such as contact. */
@@ -284,24 +283,24 @@ export class Trace {
   }
 
   /**
-   * Returns the absolute error of an estimate: the distance in cm, or an angle in degrees.
+   * Returns the absolute error of an estimate, such as the distance of the position.
    * @param {string} source
-   * @param {number | 'position'} quantity a state component or the position
+   * @param {number | 'main'} quantity a state component or the main error
    */
   error(source, quantity) {
     return this.#cached(`error ${source} ${quantity}`, () => {
-      if (quantity !== 'position') return this.offset(source, quantity)?.map(Math.abs);
-      return norm(this.position.map((i) => this.offset(source, i)));
+      if (quantity !== 'main') return this.offset(source, quantity)?.map(Math.abs);
+      return norm(this.main.map((i) => this.offset(source, i)));
     });
   }
 
   /**
-   * Returns the predicted standard deviation of the position: the root of the summed variances, in cm.
+   * Returns the predicted standard deviation of the main error: the root of the summed variances.
    * @param {string} source
    */
-  positionSigma(source) {
-    return this.#cached(`position sigma ${source}`, () =>
-      norm(this.position.map((i) => this.sigma(source, i))),
+  mainSigma(source) {
+    return this.#cached(`main sigma ${source}`, () =>
+      norm(this.main.map((i) => this.sigma(source, i))),
     );
   }
 

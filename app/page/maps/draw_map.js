@@ -115,22 +115,59 @@ export function drawMap(context, layer, side, options) {
  * @param {MapOptions} options
  */
 function drawAxes(context, maps, side, { axes, zoom, textColour, withY }) {
-  const world = axes === 'world';
-  const [x, y] = maps.axes.map((axis, i) => {
-    const { unit, scale } = displayUnit(axis);
-    const half = (scale * axis.half_width) / zoom;
-    const name = displayName(axis.name);
-    const label = world ? name : `Δ${name.length > 1 ? ' ' : ''}${name}`;
-    return {
-      label: unit ? `${label} (${unit})` : label,
-      ticks: ticks(world ? scale * maps.centre[i] : 0, half, side),
-    };
-  });
+  const x = mapAxis(maps, 0, side, axes, zoom);
+  const y = withY ? mapAxis(maps, 1, side, axes, zoom) : null;
+  drawXAxis(context, x, side, textColour);
+  if (!y) return;
+  context.beginPath();
+  context.textAlign = 'right';
+  for (const [text, place, end] of y.ticks) {
+    context.textBaseline = BASELINE[end];
+    context.moveTo(0, side - place);
+    context.lineTo(-3, side - place);
+    context.fillText(text, -5, side - place);
+  }
+  context.stroke();
+  context.textAlign = 'center';
+  context.textBaseline = 'top';
+  context.save();
+  context.translate(-MARGIN.left + 1, side / 2);
+  context.rotate(-Math.PI / 2);
+  context.fillText(y.label, 0, 0);
+  context.restore();
+}
+
+/**
+ * Returns the label and the ticks of an axis.
+ * @param {Maps} maps
+ * @param {number} i
+ * @param {number} side px
+ * @param {string} axes `offset` or `world`
+ * @param {number} zoom
+ */
+export function mapAxis(maps, i, side, axes, zoom) {
+  const [axis, world] = [maps.axes[i], axes === 'world'];
+  const { unit, scale } = displayUnit(axis);
+  const half = (scale * axis.half_width) / zoom;
+  const name = displayName(axis.name);
+  const label = world ? name : `Δ${name.length > 1 ? ' ' : ''}${name}`;
+  return {
+    label: unit ? `${label} (${unit})` : label,
+    ticks: ticks(world ? scale * maps.centre[i] : 0, half, side),
+  };
+}
+
+/**
+ * @param {Context} context
+ * @param {ReturnType<typeof mapAxis>} x
+ * @param {number} side px
+ * @param {string} textColour
+ */
+export function drawXAxis(context, x, side, textColour) {
   context.font = FONT;
   context.fillStyle = context.strokeStyle = textColour;
   context.lineWidth = 1;
   context.textBaseline = 'top';
-  context.textAlign = 'center';
   context.beginPath();
   for (const [text, place, end] of x.ticks) {
     context.textAlign = ALIGN[end];
@@ -138,25 +175,9 @@ function drawAxes(context, maps, side, { axes, zoom, textColour, withY }) {
     context.lineTo(place, side + 3);
     context.fillText(text, place, side + scaled(5));
   }
-  if (withY) {
-    context.textAlign = 'right';
-    for (const [text, place, end] of y.ticks) {
-      context.textBaseline = BASELINE[end];
-      context.moveTo(0, side - place);
-      context.lineTo(-3, side - place);
-      context.fillText(text, -5, side - place);
-    }
-  }
   context.stroke();
   context.textAlign = 'center';
-  context.textBaseline = 'top';
   context.fillText(x.label, side / 2, side + scaled(18));
-  if (!withY) return;
-  context.save();
-  context.translate(-MARGIN.left + 1, side / 2);
-  context.rotate(-Math.PI / 2);
-  context.fillText(y.label, 0, 0);
-  context.restore();
 }
 
 /**

@@ -6,9 +6,10 @@
 import { context2d, create, element, html, messageOf } from '../core/dom.js';
 import { COLOUR_TABLES } from '../core/palette.js';
 import { fixed, sentence } from '../core/units.js';
+import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap } from './draw_map.js';
 import { mapTitle } from './map_summary.js';
-import { logLikelihood, rangeDigits, rangeLabels } from './map_values.js';
+import { isCurve, logLikelihood, rangeDigits, rangeLabels } from './map_values.js';
 import { SvgContext } from './svg_context.js';
 
 const SIDE = 300; // px of a map's square
@@ -85,7 +86,7 @@ function caption({ trace, maps }) {
 export function csv(sheet) {
   const { maps, layers } = sheet;
   const logs = layers.map(({ index }) => logLikelihood(maps, index));
-  const { size, axes, centre } = maps;
+  const { size, rows: height, axes, centre } = maps;
   /** @param {number} index @param {number} axis */
   const offset = (index, axis) => (((index + 0.5) / size) * 2 - 1) * axes[axis].half_width;
   const lowest = layers.map(
@@ -104,10 +105,10 @@ export function csv(sheet) {
       ...names,
     ].join(','),
   ];
-  for (let i = 0; i < size * size; i++) {
-    const offsets = [offset(i % size, 0), offset(Math.floor(i / size), 1)];
+  for (let i = 0; i < size * height; i++) {
+    const offsets = axes.map((_, axis) => offset(axis ? Math.floor(i / size) : i % size, axis));
     const positions = [...offsets, ...offsets.map((d, axis) => d + centre[axis])];
-    const numbers = positions.map((value, k) => (value * axes[k % 2].scale).toFixed(3));
+    const numbers = positions.map((value, k) => (value * axes[k % axes.length].scale).toFixed(3));
     rows.push([...numbers, ...logs.map((values) => values[i].toFixed(4))].join(','));
   }
   return `${rows.join('\n')}\n`;
@@ -174,9 +175,10 @@ function drawSheet(context, sheet, width, height) {
     context.font = '600 13px system-ui, sans-serif';
     [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
     context.fillText(`${layer.name} ${sheet.maps.quantity}`, 0, -8);
-    drawColourBar(context, layer);
+    if (!isCurve(sheet.maps)) drawColourBar(context, layer);
     const options = { ...sheet.options, textColour: INK, withY: true, hover: null };
-    drawMap(context, layer, SIDE, options);
+    const draw = isCurve(sheet.maps) ? drawCurve : drawMap;
+    draw(context, layer, SIDE, options);
     context.restore();
   });
   context.fillStyle = INK;

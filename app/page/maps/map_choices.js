@@ -1,4 +1,4 @@
-/** What the maps show: the quantity, the two components of their axes, and the treatment of the other components. */
+/** What the maps show: the quantity, the components of their axes, and the treatment of the other components. */
 
 /** @import { State } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
@@ -16,7 +16,7 @@ export function mapPlane({ plane }, trace) {
   const known = names.every((name) =>
     trace.components.some((component) => component.name === name),
   );
-  return known && new Set(names).size === 2 ? names : [trace.task.map.x, trace.task.map.y];
+  return known && new Set(names).size === 2 ? names : trace.task.map.components;
 }
 
 /**

@@ -114,12 +114,14 @@ export function mapMenu(menu, button, store, maps) {
     setLayers(maps.displayed?.layers.map(({ name }) => name) ?? []);
   });
   return (trace) => {
+    const isCurve = mapPlane(store.state, trace).length === 1;
     OPTIONS.forEach(({ key }, i) => {
-      if (key === 'cloud') rows[i].hidden = !trace.header.scene.includes('particles');
+      if (key === 'cloud') rows[i].hidden = !trace.has('effective_sample_size') || isCurve;
+      if (['range', 'colours', 'regions'].includes(key)) rows[i].hidden = isCurve;
       if (key === 'others') rows[i].hidden = trace.components.length < 3;
     });
-    planeRow.hidden = trace.components.length < 3;
     plane.replaceChildren(...planeOptions(trace));
+    planeRow.hidden = plane.options.length < 2;
     plane.value = mapPlane(store.state, trace).join();
   };
 }
@@ -132,8 +134,10 @@ function planeOptions({ components, task }) {
   const pairs = components.flatMap(({ name }, i) =>
     components.slice(i + 1).map((other) => [name, other.name]),
   );
-  const map = [task.map.x, task.map.y];
-  const others = pairs.filter((pair) => !map.every((name) => pair.includes(name)));
+  const map = task.map.components;
+  const others = pairs.filter(
+    (pair) => pair.join() !== map.join() && [...pair].reverse().join() !== map.join(),
+  );
   return [map, ...others].map((pair) => new Option(pair.map(displayName).join(', '), pair.join()));
 }
 

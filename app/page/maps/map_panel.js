@@ -12,8 +12,9 @@
 import { MAP_QUANTITIES } from '../core/constants.js';
 import { context2d, html } from '../core/dom.js';
 import { colour } from '../core/palette.js';
-import { displayName, sentence } from '../core/units.js';
+import { displayName, mainName, sentence } from '../core/units.js';
 import { choice } from '../widgets/pickers.js';
+import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap, paintCells } from './draw_map.js';
 import { createFigure, updateColourBar } from './map_figure.js';
 import {
@@ -24,7 +25,7 @@ import {
   positionText,
   valuesAt,
 } from './map_summary.js';
-import { borders, shades } from './map_values.js';
+import { borders, isCurve, shades } from './map_values.js';
 import { formatPin, parsePin } from './pin.js';
 import { mapChoices } from './map_choices.js';
 
@@ -232,8 +233,10 @@ export class MapPanel {
     this.#figures.forEach((figure, layer) => {
       figure.shade = layers[layer];
       figure.colourMap = reference ? 'diverging' : /** @type {ColourMap} */ (colours);
-      figure.borders = regions === 'shown' ? borders(maps, layer, REGION_SHARES) : [];
-      paintCells(figure.cells, figure.shade, maps.size, figure.colourMap);
+      figure.borders =
+        regions === 'shown' && !isCurve(maps) ? borders(maps, layer, REGION_SHARES) : [];
+      if (!isCurve(maps)) paintCells(figure.cells, figure.shade, maps.size, figure.colourMap);
+      figure.bar.element.hidden = isCurve(maps);
       updateColourBar(figure, this.#title());
     });
     this.#showTitle(reference);
@@ -260,12 +263,11 @@ export class MapPanel {
 
   /** Names the state components of the axes. */
   #subject() {
-    const { map } = this.#trace?.task ?? {};
-    const axes = this.#maps?.axes ?? [];
+    const task = this.#trace?.task;
+    const names = this.#maps?.axes.map(({ name }) => name) ?? [];
     const isPosition =
-      axes[0]?.name === map?.x && axes[1]?.name === map?.y && axes[0]?.unit === 'm';
-    if (!isPosition) return axes.map(({ name }) => displayName(name)).join(', ');
-    return displayName(axes[0].name).replace(/(^| )x$/, '') || 'position';
+      task?.main.name === 'position' && names.join() === task.map.components.join();
+    return isPosition ? mainName(task) : names.map(displayName).join(', ');
   }
 
   /** Describes what the colours show. */
@@ -389,7 +391,8 @@ export class MapPanel {
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);
     context.translate(left, MARGIN.top);
-    drawMap(context, { ...figure, index, maps, trace }, side, this.#options(index));
+    const draw = isCurve(maps) ? drawCurve : drawMap;
+    draw(context, { ...figure, index, maps, trace }, side, this.#options(index));
     const { lines, description } = layerMeasures(maps, index, this.#world);
     canvas.ariaLabel = `${name}: ${this.#title()}; ${description}. Arrow keys read values.`;
     figure.caption.title = description;
@@ -417,7 +420,8 @@ export class MapPanel {
     const x = (event.offsetX - this.#leftMargin(layer)) / this.#side;
     const y = (event.offsetY - MARGIN.top) / this.#side;
     const inside = x >= 0 && x <= 1 && y >= 0 && y <= 1;
-    this.#setHover(inside ? [(2 * x - 1) * halfX, (1 - 2 * y) * halfY] : null);
+    const offset = [(2 * x - 1) * halfX, (1 - 2 * y) * halfY];
+    this.#setHover(inside ? offset.slice(0, this.#maps.axes.length) : null);
   }
 
   /**
@@ -431,7 +435,7 @@ export class MapPanel {
     if (!direction || !maps) return;
     event.preventDefault();
     const from = this.#hover ?? [0, 0];
-    const offset = direction.map((d, i) => {
+    const offset = direction.slice(0, maps.axes.length).map((d, i) => {
       const { half_width: half } = maps.axes[i];
       const cell = (2 * half) / maps.size;
       const limit = half / this.#zoom - cell / 2;
@@ -477,6 +481,10 @@ const comparable = (a, b) =>
  */
 function fitsCloseUp({ axes, peak, numbers }) {
   const [halfX, halfY] = axes.map(({ half_width: half }) => half);
+  if (axes.length === 1)
+    return peak.every(
+      ([offset], layer) => Math.abs(offset) + numbers.area95[layer] / 2 <= halfX / CLOSE_UP,
+    );
   return peak.every((offset, layer) => {
     const area = numbers.area95[layer] / (halfX * halfY);
     const radius = Math.sqrt((area / Math.PI) * (numbers.elongation[layer] ?? 1));

@@ -24,11 +24,12 @@ const short = (value) => fixed(value, value !== null && value < 10 ? 1 : 0);
  */
 export function positionText({ axes, centre }, offset, world) {
   const units = axes.map(displayUnit);
-  const texts = offset.map((d, i) => {
-    const { scale } = units[i];
+  const texts = units.map(({ scale }, i) => {
+    const d = offset[i];
     return world ? fixed(scale * (d + centre[i])) : signed(scale * d);
   });
-  if (units[0].unit === units[1].unit) return `${texts.join(', ')} ${units[0].unit}`.trim();
+  if (units.every(({ unit }) => unit === units[0].unit))
+    return `${texts.join(', ')} ${units[0].unit}`.trim();
   return texts.map((text, i) => `${text} ${units[i].unit}`.trim()).join(', ');
 }
 

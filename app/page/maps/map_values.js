@@ -26,13 +26,14 @@ import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
  * @property {Maps | null} beside maps of the comparison run at the same step
  * @property {number} step
  * @property {number} size S, cells along a side
+ * @property {number} rows S, or 1 for a curve over one component
  * @property {'likelihood' | 'posterior'} quantity
  * @property {string} rule of the fused layer
  * @property {number | null} angle SI, value of the only component off the map; null if there is none or it is integrated out
  * @property {number | null} expected rad, direction of the ridge that the task expects
  * @property {('flat' | 'round' | 'ridge' | 'ring' | null)[]} shape of each layer; null where the axes have different units
  * @property {string[]} layers L names
- * @property {MapAxis[]} axes x and y
+ * @property {MapAxis[]} axes x and y, or one of a curve
  * @property {'fixed' | 'marginal'} others treatment of the components off the map
  * @property {string} note the same in words, empty if only one component is fixed
  * @property {number[]} centre
@@ -46,7 +47,7 @@ import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
  * @property {number} particles M
  * @property {Float32Array} positions M x 2, of the particles
  * @property {Float32Array[]} weights L x M
- * @property {Uint16Array[]} cells L x S x S; row 0 has the smallest y offset
+ * @property {Uint16Array[]} cells L x rows x S; row 0 has the smallest y offset
  *
  * @typedef {object} MapAxis a state component
  * @property {string} name
@@ -73,7 +74,7 @@ const decoder = new TextDecoder();
 export function readMaps(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const maps = JSON.parse(decoder.decode(new Uint8Array(buffer, 4, length)));
-  const { particles, layers, size } = maps;
+  const { particles, layers, size, rows } = maps;
   let offset = 4 + Math.ceil(length / 4) * 4;
   /** @param {number} count */
   const floats = (count) => {
@@ -86,7 +87,7 @@ export function readMaps(buffer) {
   /** @type {Uint16Array[]} */
   const cells = layers.map(
     (/** @type {string} */ _, /** @type {number} */ layer) =>
-      new Uint16Array(buffer, offset + 2 * layer * size * size, size * size),
+      new Uint16Array(buffer, offset + 2 * layer * size * rows, size * rows),
   );
   return { ...maps, positions, weights, cells, beside: null };
 }
@@ -139,12 +140,10 @@ function ratios(maps, reference, range) {
     const referenceLogs = logLikelihood(reference, layer);
     const constant =
       Math.log(mass(referenceLogs)) -
-      2 * Math.log(reference.size) -
+      Math.log(referenceLogs.length) -
       Math.log(mass(logs)) +
-      2 * Math.log(maps.size);
-    return logs.map(
-      (v, i) => v - referenceLogs[matchingCell(i, maps.size, reference.size)] + constant,
-    );
+      Math.log(logs.length);
+    return logs.map((v, i) => v - referenceLogs[matchingCell(i, maps, reference)] + constant);
   });
   const extremes = layers.map((values) =>
     values.reduce((max, v) => Math.max(max, Math.abs(v)), 1e-3),
@@ -162,13 +161,14 @@ const mass = (logs) => logs.reduce((sum, v) => sum + Math.exp(v), 0);
 /**
  * Returns the cell at the same place of a map of another size.
  * @param {number} cell
- * @param {number} size
- * @param {number} otherSize
+ * @param {Maps} maps
+ * @param {Maps} other
  */
-function matchingCell(cell, size, otherSize) {
-  /** @param {number} index */
-  const match = (index) => Math.min(Math.floor(((index + 0.5) / size) * otherSize), otherSize - 1);
-  return match(Math.floor(cell / size)) * otherSize + match(cell % size);
+function matchingCell(cell, { size, rows }, other) {
+  /** @param {number} index @param {number} from @param {number} to */
+  const match = (index, from, to) => Math.min(Math.floor(((index + 0.5) / from) * to), to - 1);
+  const row = match(Math.floor(cell / size), rows, other.rows);
+  return row * other.size + match(cell % size, size, other.size);
 }
 
 /**
@@ -177,7 +177,7 @@ function matchingCell(cell, size, otherSize) {
  * @param {number[]} offset
  */
 export function cellAt({ size, axes }, offset) {
-  const [column, row] = offset.map((d, i) => {
+  const [column, row = 0] = offset.map((d, i) => {
     const { half_width: half } = axes[i];
     return Math.min(Math.max(Math.floor(((d + half) / (2 * half)) * size), 0), size - 1);
   });
@@ -198,12 +198,19 @@ export const offsetOf = ({ axes, centre }, position) =>
   });
 
 /**
- * Returns the unit of an area of the maps, and the factor from its SI unit.
+ * Returns whether maps are curves over one component.
+ * @param {Pick<Maps, 'axes'>} maps
+ */
+export const isCurve = ({ axes }) => axes.length === 1;
+
+/**
+ * Returns the unit of an area of the maps, or of a length on curves, and the factor from its SI unit.
  * @param {MapAxis[]} axes
  * @returns {DisplayUnit}
  */
 export function areaUnit([x, y]) {
-  const [unit, other] = [displayUnit(x), displayUnit(y)];
+  const [unit, other] = [displayUnit(x), displayUnit(y ?? x)];
+  if (!y) return unit;
   const name = unit.unit === other.unit ? `${unit.unit}²` : `${unit.unit}·${other.unit}`;
   return { unit: name, scale: unit.scale * other.scale };
 }

@@ -3,7 +3,7 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { Diagnosis } from '../types/server.js' */
 
-import { fixed, percent, sentence } from '../core/units.js';
+import { fixed, percent, sentence, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { stepSummary } from './step_summary.js';
 
@@ -58,7 +58,7 @@ function faultFinding({ state, masked, headline, causes }) {
  * @returns {Finding}
  */
 function worstFinding(trace, component) {
-  const step = largest(trace.error('fused', 'position') ?? []);
+  const step = largest(trace.error('fused', 'main') ?? []);
   if (step === null) {
     const headline = 'The true state of this run is unknown.';
     return { tone: 'none', headline, evidence: '', step };
@@ -94,9 +94,11 @@ export function outageFinding(trace, component) {
     ({ name, before, during }) =>
       `the effective weight of ${name} ${during > before ? 'rises' : 'falls'} from ${percent(before)} to ${percent(during)}`,
   );
-  const worst = Math.max(...(trace.error('fused', 'position')?.subarray(first, last + 1) ?? [NaN]));
+  const worst = Math.max(...(trace.error('fused', 'main')?.subarray(first, last + 1) ?? [NaN]));
   if (worst >= 0)
-    evidence.push(`the position error stays below ${fixed(Math.ceil(10 * worst) / 10)} cm`);
+    evidence.push(
+      `the ${trace.task.main.name} error stays below ${withUnit(fixed(Math.ceil(10 * worst) / 10), trace.mainUnit)}`,
+    );
   return {
     headline: `The camera goes dark at step ${first}, in contact${action}.`,
     evidence: sentence(evidence.join('; ')),

@@ -2,13 +2,13 @@
 
 /** @import { Trace } from '../data/trace.js' */
 
-import { displayName, fixed, percent } from '../core/units.js';
+import { displayName, fixed, percent, withUnit } from '../core/units.js';
 import { updateLabel } from '../data/trace.js';
 
 const MAX_SIGMAS = 2; // an error up to this many standard deviations is consistent
 const DOMINANT_SHARE = 0.6; // effective weight from which a modality is dominant
 const FEW_PARTICLES = 0.05; // share of the particles
-/** Another estimate counts as more accurate if its error is lower by this many cm, and by this factor. */
+/** Another estimate counts as more accurate if its error is lower by this many units for display, and by this factor. */
 const MIN_GAIN = { consistent: 1, other: 0.2 };
 const MAX_RATIO = 0.8;
 
@@ -54,7 +54,7 @@ export function stepSummary(trace, step, component) {
  */
 function accuracy(trace, step) {
   const name = trace.fuses ? 'Fused estimate' : 'Estimate';
-  const error = `${name}: error ${fixed(trace.error('fused', 'position')?.[step], 1)} cm`;
+  const error = `${name}: error ${withUnit(fixed(trace.error('fused', 'main')?.[step], 1), trace.mainUnit)}`;
   const deviation = trace.largestDeviation(step);
   if (!deviation) return { tone: 'none', text: `${error}; no predicted standard deviation.` };
   const { sigmas, component } = deviation;
@@ -89,11 +89,11 @@ function uninformativeReason(modality, trace, step) {
  */
 function moreAccurateModality(dominant, trace, step, tone) {
   const best = mostAccurateModality(trace, step);
-  const error = trace.error('fused', 'position')?.[step] ?? NaN;
+  const error = trace.error('fused', 'main')?.[step] ?? NaN;
   const gain = tone === 'good' ? MIN_GAIN.consistent : MIN_GAIN.other;
   if (!best || best.name === dominant) return '';
   if (!(best.error < Math.min(error - gain, MAX_RATIO * error))) return '';
-  return `the error of the ${updateLabel(best.name)} is ${fixed(best.error, 1)} cm`;
+  return `the error of the ${updateLabel(best.name)} is ${withUnit(fixed(best.error, 1), trace.mainUnit)}`;
 }
 
 /**
@@ -104,7 +104,7 @@ function mostAccurateModality(trace, step) {
   const modalities = trace.has('modality_mean') ? trace.modalities : [];
   const errors = modalities.map((name) => ({
     name,
-    error: trace.error(name, 'position')?.[step] ?? NaN,
+    error: trace.error(name, 'main')?.[step] ?? NaN,
   }));
   return errors.sort((a, b) => a.error - b.error)[0];
 }

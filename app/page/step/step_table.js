@@ -77,34 +77,36 @@ export class StepTable {
  * @returns {Column[]}
  */
 function errorColumns(trace) {
+  const { task, mainUnit: unit } = trace;
+  const [{ name }, several] = [task.main, task.main.indices.length > 1];
   /** @type {Column[]} */
   const columns = [
     {
       title: 'error',
-      unit: 'cm',
-      help: 'Distance to the true position',
-      text: (source, t) => fixed(trace.error(source, 'position')?.[t], 2),
+      unit,
+      help: `Error of the ${name}`,
+      text: (source, t) => fixed(trace.error(source, 'main')?.[t], 2),
     },
     {
       title: 'σ',
-      unit: 'cm',
-      help: 'Predicted standard deviation of the position: root of the summed variances',
-      text: (source, t) => fixed(trace.positionSigma(source)?.[t], 2),
+      unit,
+      help: `Predicted standard deviation of the ${name}${several ? ': root of the summed variances' : ''}`,
+      text: (source, t) => fixed(trace.mainSigma(source)?.[t], 2),
     },
   ];
-  for (const angle of trace.angles) {
-    const name = displayName(trace.components[angle].name);
+  for (const angle of trace.angles.filter((i) => several || i !== task.main.indices[0])) {
+    const angleName = displayName(trace.components[angle].name);
     columns.push(
       {
-        title: name,
+        title: angleName,
         unit: 'err. °',
-        help: `Error of the ${name}`,
+        help: `Error of the ${angleName}`,
         text: (source, t) => fixed(trace.error(source, angle)?.[t], 1),
       },
       {
         title: 'σ',
         unit: '°',
-        help: `Predicted standard deviation of the ${name}`,
+        help: `Predicted standard deviation of the ${angleName}`,
         text: (source, t) => fixed(trace.sigma(source, angle)?.[t], 1),
       },
     );

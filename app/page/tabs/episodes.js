@@ -1,14 +1,14 @@
 /** Table of the episodes of a data set, with the errors of the filter once it has run over them. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, EpisodeErrors, EpisodeSummary, FailureScore, Failures } from '../types/server.js' */
+/** @import { Catalog, EpisodeErrors, EpisodeSummary, FailureScore, Failures, Task } from '../types/server.js' */
 /** @import { Sort } from '../widgets/sorting.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { fixed, percent } from '../core/units.js';
+import { fixed, mainText, mainUnit, percent, withUnit } from '../core/units.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
 import { sortHeading, sortRows } from '../widgets/sorting.js';
-import { centimetres, markRow } from './event_table.js';
+import { markRow } from './event_table.js';
 import { sparkline, sparklineScale } from './sparkline.js';
 
 /**
@@ -28,8 +28,11 @@ import { sparkline, sparklineScale } from './sparkline.js';
  * @property {(row: EpisodeRow) => string} content
  */
 
-/** @type {EpisodeColumn[]} */
-const COLUMNS = [
+/**
+ * @param {Task} task
+ * @returns {EpisodeColumn[]}
+ */
+const columnsOf = (task) => [
   {
     ...summaryColumn('index', 'Index in the data set', ({ index }) => index),
     title: 'episode',
@@ -44,15 +47,16 @@ const COLUMNS = [
   },
   {
     ...errorColumn(
+      task,
       'rmse',
-      'Position RMSE, without the first 30 steps (field tasks: all steps)',
+      'RMSE without the first 30 steps (field tasks: all steps)',
       (e) => e?.rmse,
     ),
-    title: 'RMSE cm',
+    title: withUnit('RMSE', mainUnit(task).unit),
   },
   {
-    ...errorColumn('worst', 'Largest position error', (e) => e?.worst),
-    title: 'worst cm',
+    ...errorColumn(task, 'worst', 'Largest error', (e) => e?.worst),
+    title: withUnit('worst', mainUnit(task).unit),
   },
   {
     name: 'failures',
@@ -83,20 +87,24 @@ function summaryColumn(name, help, read) {
 }
 
 /**
+ * @param {Task} task
  * @param {string} name
- * @param {string} help
- * @param {(errors: EpisodeErrors | undefined) => number | null | undefined} read m
+ * @param {string} help of the main error
+ * @param {(errors: EpisodeErrors | undefined) => number | null | undefined} read
  * @returns {EpisodeColumn}
  */
-function errorColumn(name, help, read) {
+function errorColumn(task, name, help, read) {
   return {
     name,
     title: name,
-    help,
+    help: `${help}: ${task.main.name}`,
     number: true,
     isResult: true,
     value: ({ errors }) => read(errors) ?? null,
-    content: ({ errors }) => centimetres(read(errors)),
+    content: ({ errors }) => {
+      const value = read(errors);
+      return fixed(value === null ? null : Number(value) * mainUnit(task).scale, 2);
+    },
   };
 }
 
@@ -147,10 +155,15 @@ export class Episodes {
     return this.#selectedSort ?? standard;
   }
 
+  get #task() {
+    return this.#catalog.tasks.find(({ name }) => name === this.#store.state.task);
+  }
+
   /** Sorted rows. */
   get #episodes() {
-    const { task, data } = this.#store.state;
-    const sets = this.#catalog.tasks.find(({ name }) => name === task)?.data ?? [];
+    const { data } = this.#store.state;
+    const selected = this.#task;
+    const sets = selected?.data ?? [];
     const summaries = sets.find(({ name }) => name === data)?.episodes ?? [];
     const byIndex = new Map(this.#results?.episodes.map((errors) => [errors.index, errors]));
     const episodes = summaries.map((summary) => {
@@ -159,12 +172,15 @@ export class Episodes {
       return { summary, errors, failures };
     });
     const { name: key, down } = this.#sort;
-    const column = COLUMNS.find(({ name }) => name === key) ?? COLUMNS[0];
-    return sortRows(episodes, column.value, down);
+    const columns = selected ? columnsOf(selected) : [];
+    const column = columns.find(({ name }) => name === key) ?? columns[0];
+    return column ? sortRows(episodes, column.value, down) : [];
   }
 
   #draw() {
     const { task, data, filter, faults, among, episode } = this.#store.state;
+    const selected = this.#task;
+    if (!selected) return;
     const run = [task, data, filter, faults, among];
     const key = JSON.stringify([...run, this.#score?.name, Boolean(this.#results), this.#sort]);
     if (key === this.#key) return;
@@ -176,15 +192,15 @@ export class Episodes {
         : undefined;
     const episodes = this.#episodes;
     const scale = sparklineScale(episodes.flatMap(({ errors }) => errors?.worst || []));
-    const columns = COLUMNS.filter(
+    const columns = columnsOf(selected).filter(
       ({ isResult, value }) => isResult || episodes.some((row) => value(row) !== ''),
     );
     const headings = columns.map((column) =>
       sortHeading(column, this.#sort, (sort) => this.#sortBy(sort), column.isResult),
     );
-    this.#head.replaceChildren(create('tr', {}, ...headings, sparklineHeading(scale)));
+    this.#head.replaceChildren(create('tr', {}, ...headings, sparklineHeading(selected, scale)));
     this.#rows = new Map(
-      episodes.map((row, i) => [row.summary.index, this.#row(columns, row, scale, i)]),
+      episodes.map((row, i) => [row.summary.index, this.#row(selected, columns, row, scale, i)]),
     );
     this.#body.replaceChildren(...[...this.#rows.values()].map(({ row }) => row));
     if (focused) html(`[data-column="${focused}"]`, this.#head).focus();
@@ -203,12 +219,13 @@ export class Episodes {
   }
 
   /**
+   * @param {Task} task
    * @param {EpisodeColumn[]} columns
    * @param {EpisodeRow} episode
-   * @param {number} scale of the sparklines, m
+   * @param {number} scale of the sparklines
    * @param {number} i place in the table
    */
-  #row(columns, episode, scale, i) {
+  #row(task, columns, episode, scale, i) {
     const { index } = episode.summary;
     const row = document.createElement('tr');
     const button = create('button', {
@@ -227,7 +244,9 @@ export class Episodes {
     const cell = row.insertCell();
     cell.className = 'spark';
     if (episode.errors && scale)
-      cell.append(sparkline(episode.errors, scale, (step, time) => this.#open(index, step, time)));
+      cell.append(
+        sparkline(task, episode.errors, scale, (step, time) => this.#open(index, step, time)),
+      );
     return { row, button };
   }
 
@@ -247,11 +266,14 @@ export class Episodes {
   }
 }
 
-/** @param {number} scale m */
-const sparklineHeading = (scale) =>
+/**
+ * @param {Task} task
+ * @param {number} scale
+ */
+const sparklineHeading = (task, scale) =>
   create('th', {
     scope: 'col',
-    textContent: scale ? `error over time, 0–${fixed(100 * scale, 1)} cm` : 'error over time',
+    textContent: scale ? `error over time, 0–${mainText(task, scale)}` : 'error over time',
     title:
-      'Position error; steps in contact are shaded. Same scale for all episodes; larger errors are cut off. Click a step to go there',
+      'Main error; steps in contact are shaded. Same scale for all episodes; larger errors are cut off. Click a step to go there',
   });

@@ -4,10 +4,10 @@
 
 import { copyText } from '../core/clipboard.js';
 import { create, element } from '../core/dom.js';
-import { fixed, percent, significant } from '../core/units.js';
+import { fixed, percent, significant, withUnit } from '../core/units.js';
 import { updateLabel } from '../data/trace.js';
 import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
-import { displayUnit, formatScore } from './failure_scores.js';
+import { formatScore, scoreUnit } from './failure_scores.js';
 
 /**
  * @typedef {object} EventColumn
@@ -151,8 +151,9 @@ function linkButton({ episode, step, link }) {
  * @param {FailureEvent[]} events all events of the score
  * @returns {EventColumn[]}
  */
-function eventColumns({ layers }, score, events) {
-  const { unit, scale } = displayUnit(score.unit);
+function eventColumns({ layers, scores }, score, events) {
+  const main = scoreUnit(scores.find(({ name }) => name === 'error') ?? score);
+  const { unit, scale } = scoreUnit(score);
   const number = true;
   /** @type {EventColumn[]} */
   const columns = [
@@ -180,10 +181,13 @@ function eventColumns({ layers }, score, events) {
   layers.forEach((layer, i) => {
     if (layer === 'fused' ? score.name === 'error' : !fuses) return;
     columns.push({
-      title: `${fuses ? label(layer) : 'error'} cm`,
-      content: ({ error }) => centimetres(error[i]),
+      title: withUnit(fuses ? label(layer) : 'error', main.unit),
+      content: ({ error }) => {
+        const value = error[i];
+        return fixed(value === null ? null : main.scale * value, 2);
+      },
       number,
-      help: 'Position error',
+      help: 'Main error of the task, such as that of the position',
     });
   });
   if (score.name !== 'nees' && events[0]?.nees !== null)
@@ -201,10 +205,6 @@ function eventColumns({ layers }, score, events) {
     });
   return columns;
 }
-
-/** @param {number | null | undefined} metres */
-export const centimetres = (metres) =>
-  fixed(metres === null || metres === undefined ? null : 100 * metres, 2);
 
 /**
  * @param {string[]} modalities

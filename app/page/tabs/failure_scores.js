@@ -4,13 +4,13 @@
 /** @import { Trace } from '../data/trace.js' */
 /** @import { FailureScore } from '../types/server.js' */
 
-import { DISPLAY_UNITS, significant } from '../core/units.js';
+import { significant } from '../core/units.js';
 
 /** @type {Record<string, string>} */
 const NAMES = { nees: 'NEES', ess: 'ESS' };
 /** @type {Record<string, {unit: string, scale: number}>} */
 const UNITS = {
-  ...DISPLAY_UNITS,
+  rad: { unit: '°', scale: 180 / Math.PI },
   sigma: { unit: 'σ', scale: 1 },
   x: { unit: '×', scale: 1 },
 };
@@ -27,9 +27,9 @@ export const scoreName = ({ name }) => NAMES[name] ?? name.replaceAll('_', ' ');
 
 /**
  * Returns the unit that the page displays, and its factor.
- * @param {string} unit of the server
+ * @param {FailureScore} score
  */
-export const displayUnit = (unit) => UNITS[unit] ?? { unit, scale: 1 };
+export const scoreUnit = ({ unit, shown, scale }) => UNITS[unit] ?? { unit: shown, scale };
 
 /**
  * Formats a value of a score with its unit.
@@ -37,7 +37,7 @@ export const displayUnit = (unit) => UNITS[unit] ?? { unit, scale: 1 };
  * @param {number | null} value
  */
 export function formatScore(score, value) {
-  const { unit, scale } = displayUnit(score.unit);
+  const { unit, scale } = scoreUnit(score);
   return `${significant(value === null ? null : scale * value)}${unit && ' '}${unit}`;
 }
 

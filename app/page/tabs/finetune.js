@@ -52,7 +52,7 @@ export class Finetune {
     this.#form = new FinetuneForm(form, catalog, store, faultDialog, (settings) =>
       this.#start(store.state, settings),
     );
-    this.#lineage = new Lineage(html('.lineage', host), store);
+    this.#lineage = new Lineage(html('.lineage', host), catalog, store);
     this.#runView = new FinetuneRun(html('article', host), catalog, store, {
       back: () => this.#closeRun(),
       pauseOrResume: () => this.#pauseOrResume(),

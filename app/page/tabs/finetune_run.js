@@ -4,7 +4,7 @@
 /** @import { Catalog, FineTuneDetails, FineTuneProgress, Job, Plot, RegressionEvent, ResultViews, Task } from '../types/server.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { displayName, fixed } from '../core/units.js';
+import { fixed, mainName, mainText, mainUnit } from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
 import { trainingData } from './finetune_form.js';
@@ -23,7 +23,7 @@ const BODY = `
   <div class="row doing"><progress aria-label="Progress of the fine-tuning" max="1"></progress><button type="button" class="text">Pause</button></div>
   <div class="row decide"></div>
   <div class="figures live"></div>
-  <section class="events" hidden><h4>Events that regressed (cm)</h4><ol></ol></section>
+  <section class="events" hidden><h4>Events that regressed</h4><ol></ol></section>
   <div class="figures report"></div>`;
 
 export class FinetuneRun {
@@ -82,7 +82,7 @@ export class FinetuneRun {
     const task = this.#catalog.tasks.find(({ name }) => name === run.task);
     this.#progress.show(progress && task ? progressFigures(progress, task) : null, null);
     this.#report.show(result?.comparison ?? null, null);
-    this.#drawEvents(run, result?.events ?? []);
+    this.#drawEvents(run, result?.events ?? [], task);
   }
 
   /** @param {string} text */
@@ -133,8 +133,9 @@ export class FinetuneRun {
   /**
    * @param {FineTuneDetails} run
    * @param {RegressionEvent[]} events
+   * @param {Task | undefined} task
    */
-  #drawEvents(run, events) {
+  #drawEvents(run, events, task) {
     const host = html('.events', this.#host);
     host.hidden = !events.length;
     html('ol', host).replaceChildren(
@@ -151,9 +152,7 @@ export class FinetuneRun {
           click.preventDefault();
           this.#handlers.decide('save', link.href); // the link needs it in the catalog
         });
-        const errors = [before, after].map((error) =>
-          fixed(error === null ? null : 100 * error, 2),
-        );
+        const errors = [before, after].map((error) => (task ? mainText(task, error) : ''));
         const text = ` ${slice}${contact ? ', contact' : ''}: ${errors.join(' → ')}`;
         return create('li', {}, link, text);
       }),
@@ -174,18 +173,17 @@ function stateText(job) {
  * @returns {ResultViews}
  */
 function progressFigures({ losses, validations }, task) {
-  const position = displayName(task.map.x).replace(/(^| )x$/, '') || 'position';
   const slices = validations.length ? Object.keys(validations[0].slices) : [];
   const loss = { name: '', layer: '', x: losses.map(([step]) => step), y: losses.map((l) => l[1]) };
   const errors = slices.map((name) => ({
     name,
     layer: '',
     x: validations.map(({ step }) => step),
-    y: validations.map((validation) => validation.slices[name].rmse.position_cm),
+    y: validations.map((validation) => validation.slices[name].rmse[task.main.key]),
   }));
   const plots = [
     linePlot('Loss', '', losses.length ? [loss] : []),
-    linePlot('Validation', `RMSE of the ${position} (cm)`, errors),
+    linePlot('Validation', `RMSE of the ${mainName(task)} (${mainUnit(task).unit})`, errors),
   ];
   return {
     verdict: '',

@@ -1,7 +1,7 @@
 /** The lineage of a task's filters: fine-tuned checkpoints below their base checkpoints, with their errors. */
 
 /** @import { State, Store } from '../core/state.js' */
-/** @import { LineageMember } from '../types/server.js' */
+/** @import { Catalog, LineageMember, Task } from '../types/server.js' */
 
 import { create } from '../core/dom.js';
 import { permalink } from '../core/state.js';
@@ -10,14 +10,17 @@ import * as api from '../data/api.js';
 
 export class Lineage {
   #host;
+  #catalog;
   #store;
 
   /**
    * @param {HTMLElement} host hidden if the task has no fine-tuned checkpoint
+   * @param {Catalog} catalog
    * @param {Store} store
    */
-  constructor(host, store) {
+  constructor(host, catalog, store) {
     this.#host = host;
+    this.#catalog = catalog;
     this.#store = store;
     host.hidden = true;
   }
@@ -45,7 +48,10 @@ export class Lineage {
   #branch(member, base, members) {
     const title = member.catalog_name ?? `${member.name} ${member.hash.slice(0, 6)}`;
     const name = create('b', { textContent: title, title: member.hash });
-    const summary = create('span', { textContent: errorSummary(member, base) });
+    const task = this.#catalog.tasks.find((each) => each.name === this.#store.state.task);
+    const summary = create('span', {
+      textContent: task ? errorSummary(member, base, task.main) : '',
+    });
     const line = create('div', {}, name, ' ', summary, ...this.#links(member, base));
     const finetuned = members.filter((other) => other.base === member.hash);
     const branches = finetuned.map((other) => this.#branch(other, member, members));
@@ -95,20 +101,24 @@ export class Lineage {
  * Returns the error of a checkpoint; of a fine-tuned one the training data and the errors before and after.
  * @param {LineageMember} member
  * @param {LineageMember | null} base null if it is not available
+ * @param {Task['main']} main
  */
-function errorSummary({ base: baseHash, rmse, before, after, train, learned }, base) {
-  if (baseHash === null) return rmse.position_cm === undefined ? '' : `${centimetres(rmse)} cm`;
+function errorSummary(
+  { base: baseHash, rmse, before, after, train, learned },
+  base,
+  { key, unit },
+) {
+  /** @param {Record<string, number | null> | undefined} errors */
+  const error = (errors) => fixed(errors?.[key], 2);
+  if (baseHash === null) return Object.keys(rmse).length ? `${error(rmse)} ${unit}`.trim() : '';
   const changes = Object.keys(after).map(
-    (slice) => `${slice} ${centimetres(before[slice])} → ${centimetres(after[slice])}`,
+    (slice) => `${slice} ${error(before[slice])} → ${error(after[slice])}`,
   );
   const training = [train.join(', '), learned.length ? `on ${learned.join(' and ')}` : ''];
   const text = training.filter(Boolean).join(' ');
-  const errors = changes.length ? `: ${changes.join(', ')} cm` : '';
+  const errors = changes.length ? `: ${changes.join(', ')} ${unit}`.trimEnd() : '';
   return `${text}${errors}${base ? '' : `; base checkpoint ${baseHash.slice(0, 6)} is not available`}`;
 }
-
-/** @param {Record<string, number | null> | undefined} rmse */
-const centimetres = (rmse) => fixed(rmse?.position_cm, 2);
 
 /**
  * @param {string} textContent

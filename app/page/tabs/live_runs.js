@@ -71,7 +71,7 @@ export function liveRunState(catalog, { task, filter, data, episode, steps, stat
     against: '',
     step: isRunning ? Math.max(0, steps - 1) : 0,
     angle: null,
-    component: current.task === task || !map ? current.component : map.x,
+    component: current.task === task || !map ? current.component : map.components[0],
     window: '',
     playing: false,
     follow: isRunning,

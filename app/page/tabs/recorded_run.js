@@ -39,7 +39,7 @@ export function reportedRun(catalog, { task: name, filter, episode, faults }) {
 export function selectRun(catalog, state, run) {
   const isSameTask = state.task === run.task;
   const isSameEpisode = isSameTask && state.data === run.data && state.episode === run.episode;
-  const component = catalog.tasks.find(({ name }) => name === run.task)?.map.x;
+  const component = catalog.tasks.find(({ name }) => name === run.task)?.map.components[0];
   return {
     ...run,
     ...(isSameTask ? {} : { component }),

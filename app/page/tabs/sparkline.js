@@ -1,15 +1,15 @@
-/** Sparkline of the position error over an episode. */
+/** Sparkline of the main error over an episode. */
 
-/** @import { EpisodeErrors } from '../types/server.js' */
+/** @import { EpisodeErrors, Task } from '../types/server.js' */
 
-import { centimetres } from './event_table.js';
+import { mainText } from '../core/units.js';
 
 const SVG = 'http://www.w3.org/2000/svg';
 const HEIGHT = 20; // in units of the view box
 const QUANTILE = 0.95; // share of the episodes whose sparklines are not cut off
 
 /**
- * Returns the error in m at the top of all sparklines.
+ * Returns the error at the top of all sparklines.
  * @param {number[]} errors the largest ones of the episodes
  */
 export function sparklineScale(errors) {
@@ -18,13 +18,15 @@ export function sparklineScale(errors) {
 }
 
 /**
+ * @param {Task} task
  * @param {EpisodeErrors} errors
- * @param {number} scale m
+ * @param {number} scale error at the top
  * @param {(step: number, inputTime: number) => void} open called with the step that was clicked
  */
-export function sparkline({ steps, error, contact, worst, worst_step: worstStep }, scale, open) {
+export function sparkline(task, errors, scale, open) {
+  const { steps, error, contact, worst, worst_step: worstStep } = errors;
   const svg = document.createElementNS(SVG, 'svg');
-  const description = `Largest error ${centimetres(worst)} cm, at step ${worstStep}`;
+  const description = `Largest error ${mainText(task, worst)}, at step ${worstStep}`;
   svg.setAttribute('viewBox', `0 0 ${error.length} ${HEIGHT}`);
   svg.setAttribute('preserveAspectRatio', 'none');
   svg.setAttribute('role', 'img');

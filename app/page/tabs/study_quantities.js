@@ -3,7 +3,7 @@
 /** @import { State } from '../core/state.js' */
 /** @import { StudyRow, Task } from '../types/server.js' */
 
-import { displayName, percent } from '../core/units.js';
+import { displayName, displayUnit, mainName, mainUnit, percent } from '../core/units.js';
 
 /**
  * @typedef {object} Quantity
@@ -14,35 +14,36 @@ import { displayName, percent } from '../core/units.js';
  * @property {string} description
  */
 
-const POSITION = 'position_cm';
-
 /**
- * Returns the quantities of a study for a task: the RMSE of the position and of other components, and NEES.
+ * Returns the quantities of a study for a task: the RMSE of the main error and of the components, and NEES.
  * @param {StudyRow[]} rows
  * @param {Task} task
  * @returns {Quantity[]}
  */
 export function studyQuantities(rows, task) {
+  const { main } = task;
   const keys = new Set(rows.flatMap((row) => Object.keys(row.mean)));
   const errors = [...keys].flatMap((key) => {
-    const [, component, unit] = /^(.*)_(cm|deg)$/.exec(key) ?? [];
-    return component ? [{ key, component, unit: unit === 'deg' ? '°' : unit }] : [];
+    if (key === main.key) return [{ key, component: main.name, unit: mainUnit(task).unit }];
+    const component = task.components.find((c) => key === keyOf(c));
+    return component ? [{ key, component: component.name, unit: displayUnit(component).unit }] : [];
   });
-  errors.sort((a, b) => Number(b.key === POSITION) - Number(a.key === POSITION));
-  const position = displayName(task.map.x).replace(/(^| )x$/, '') || 'position';
+  errors.sort((a, b) => Number(b.key === main.key) - Number(a.key === main.key));
   const quantities = errors.map((error) => {
-    const isPosition = error.key === POSITION;
-    const name = displayName(error.component);
-    return {
-      ...error,
-      title: isPosition ? position : name,
-      description: `RMSE of the ${isPosition ? 'position' : name}`,
-    };
+    const isMain = error.key === main.key;
+    const name = isMain ? main.name : displayName(error.component);
+    return { ...error, title: isMain ? mainName(task) : name, description: `RMSE of the ${name}` };
   });
   if (rows.some((row) => typeof row.mean.nees === 'number'))
     quantities.push({ key: 'nees', component: '', title: 'NEES', unit: '', description: 'NEES/n' });
   return quantities;
 }
+
+/**
+ * Returns the key of a component's RMSE in metrics, such as hinge_x_cm.
+ * @param {Task['components'][number]} component
+ */
+const keyOf = ({ name, shown }) => (shown ? `${name}_${shown}` : name);
 
 /**
  * Returns the changes of the state that list the failures of a filter at a share of image blackout.
@@ -67,7 +68,7 @@ export function failuresOf(state, task, filter, blackout, { key, component }) {
     among: 'held-out',
     by: isNees ? 'nees' : isAngle ? component : 'error',
     phase: '',
-    component: isAngle ? component : task.map.x,
+    component: isAngle ? component : task.map.components[0],
     track: isNees ? 'nees' : 'error',
   };
 }

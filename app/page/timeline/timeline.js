@@ -9,7 +9,7 @@
 /** @import { StepWindow } from './step_window.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { fixed } from '../core/units.js';
+import { fixed, withUnit } from '../core/units.js';
 import { intervals } from '../data/arrays.js';
 import { GUTTER, chart, chartData } from './chart.js';
 import { ChartMenu } from './chart_menu.js';
@@ -400,7 +400,7 @@ export class Timeline {
     if (!trace) return '';
     const parts = [`step ${step}`, `${fixed(step * trace.dt)} s`];
     if (trace.hasTruth(step))
-      parts.push(`error ${fixed(trace.error('fused', 'position')?.[step])} cm`);
+      parts.push(`error ${withUnit(fixed(trace.error('fused', 'main')?.[step]), trace.mainUnit)}`);
     const groups = trace.groups.filter((name) => trace.group(name)[step]);
     parts.push(...groups.map((name) => (name === 'contact' ? 'in contact' : name)));
     if (trace.blackout[step]) parts.push('image blacked out');

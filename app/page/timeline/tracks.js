@@ -209,10 +209,10 @@ function errorTrack(trace, component) {
   const isAngle = trace.angles.includes(component);
   const name = capitalised(displayName(trace.components[component].name));
   return {
-    title: isAngle ? `${name} error` : 'Position error',
-    unit: isAngle ? '°' : 'cm',
+    title: isAngle ? `${name} error` : `${capitalised(trace.task.main.name)} error`,
+    unit: isAngle ? '°' : trace.mainUnit,
     series: availableSeries(trace.sources, (source) =>
-      trace.error(source, isAngle ? component : 'position'),
+      trace.error(source, isAngle ? component : 'main'),
     ),
     fromZero: true,
     digits: 1,
@@ -346,13 +346,13 @@ function availableSeries(names, valuesOf, sigmaOf = () => undefined) {
 const maximum = (values) => values.reduce((a, b) => Math.max(a, b), 0);
 
 /**
- * Returns the error of the fused estimate in the selected component, or of the position.
+ * Returns the error of the fused estimate in the selected component, or its main error.
  * @param {Trace} trace
  * @param {Pick<State, 'component'>} state
  */
 export function selectedError(trace, state) {
   const component = trace.components.findIndex((c) => c.name === state.component);
-  return trace.error('fused', trace.angles.includes(component) ? component : 'position');
+  return trace.error('fused', trace.angles.includes(component) ? component : 'main');
 }
 
 /**

@@ -394,6 +394,10 @@ export interface components {
             title: string;
             /** Unit */
             unit: string;
+            /** Shown */
+            shown: string;
+            /** Scale */
+            scale: number;
             /** Why Not */
             why_not: string | null;
             /** Verdict */
@@ -926,14 +930,28 @@ export interface components {
             message: string;
         };
         /**
+         * MainError
+         * @description The error that runs are summarised by. indices: of the components; scale: factor to the unit for display.
+         */
+        MainError: {
+            /** Name */
+            name: string;
+            /** Key */
+            key: string;
+            /** Unit */
+            unit: string;
+            /** Scale */
+            scale: number;
+            /** Indices */
+            indices: number[];
+        };
+        /**
          * MapArea
-         * @description Components on the axes of the likelihood maps, and half the side length (m).
+         * @description Components on the axes of the likelihood maps, one or two, and half the extent (in the unit of the first).
          */
         MapArea: {
-            /** X */
-            x: string;
-            /** Y */
-            y: string;
+            /** Components */
+            components: string[];
             /** Half Width */
             half_width: number;
         };
@@ -1333,6 +1351,7 @@ export interface components {
          *             filters of several models only. by_seed: seed -> quantity -> value.
          *         from_step_0: mean RMSE over the seeds without omitting the first steps. baselines: name in ``BASELINES`` -> mean
          *             RMSE over the seeds from the same starts. Both empty for studies of earlier versions.
+         *         main: key of the task's main error.
          */
         Row: {
             /** Task */
@@ -1393,6 +1412,11 @@ export interface components {
                     [key: string]: number | null;
                 };
             };
+            /**
+             * Main
+             * @default position_cm
+             */
+            main: string;
         };
         /**
          * RunNames
@@ -1530,6 +1554,7 @@ export interface components {
             /** Dt */
             dt: number;
             map: components["schemas"]["MapArea"];
+            main: components["schemas"]["MainError"];
             /** Fault Presets */
             fault_presets: components["schemas"]["FaultPreset"][];
             /** Filters */
@@ -1741,6 +1766,7 @@ export type ListedLiveRun = components['schemas']['ListedLiveRun'];
 export type LiveList = components['schemas']['LiveList'];
 export type LiveRun = components['schemas']['LiveRun'];
 export type LiveState = components['schemas']['LiveState'];
+export type MainError = components['schemas']['MainError'];
 export type MapArea = components['schemas']['MapArea'];
 export type ModuleInfo = components['schemas']['ModuleInfo'];
 export type Name = components['schemas']['Name'];

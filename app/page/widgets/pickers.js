@@ -139,7 +139,7 @@ function firstRun(task, state) {
     against: '',
     step,
     angle: null,
-    component: task.map.x,
+    component: task.map.components[0],
     playing: false,
   };
 }

@@ -13,6 +13,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from beliefscope.app.runs.settings import Settings
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.filters.checkpoint import load_checkpoint
 from beliefscope.inspect.compare.progress_log import ProgressLog
 
@@ -123,11 +124,11 @@ def test_run_is_compared_with_its_base_and_saved(settings: Settings, open_client
 
 def test_interrupted_run_keeps_its_losses(tmp_path: Path) -> None:
     path = tmp_path / "progress.json"
-    before = ProgressLog(path, 9)
+    before = ProgressLog(path, 9, DOOR.main_error)
     for step in range(1, 6):
         before.add_step(step, 1.0 / step)
     before.write()
-    after = ProgressLog(path, 9)
+    after = ProgressLog(path, 9, DOOR.main_error)
     after.resume(4)  # the last validation; the fifth step is repeated
     after.add_step(5, 0.25)
     after.write()

@@ -37,7 +37,8 @@ def test_catalog(shared_client: TestClient, steps: int) -> None:
     assert catalog["problems"] == []
     door = catalog["tasks"][0]
     assert [c["name"] for c in door["components"]] == ["hinge_x", "hinge_y", "angle"]
-    assert door["map"] == {"x": "hinge_x", "y": "hinge_y", "half_width": 0.135}
+    assert door["map"] == {"components": ["hinge_x", "hinge_y"], "half_width": 0.135}
+    assert door["main"] == {"name": "position", "key": "position_cm", "unit": "cm", "scale": 100.0, "indices": [0, 1]}
     filters = [(f["name"], f["kind"], f["metrics"]) for f in door["filters"][:2]]
     assert filters == [(f"crossmodal-{kind}", kind, {"position_cm": 1.5}) for kind in ("ekf", "pf")]
     mine, sample = door["data"]

@@ -27,7 +27,7 @@ from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compar
 from beliefscope.inspect.compare.effects import Difference, differences
 from beliefscope.inspect.compare.modules import module_outputs
 from beliefscope.inspect.statistics.episode_sums import measures_of, sample_steps
-from beliefscope.inspect.statistics.measures import position_error
+from beliefscope.inspect.statistics.measures import main_error
 from beliefscope.inspect.trace import trace
 from beliefscope.inspect.traces.replay import Edit, Replay
 
@@ -125,7 +125,7 @@ def test_planted_regression_is_found() -> None:
 
 def verdict_of(low: float, effect: float, high: float) -> str:
     """Verdict for a single changed error."""
-    difference = Difference("contact", "position", "m", 0.01, 0.01 * math.exp(effect), effect, low, high)
+    difference = Difference("contact", "position", "cm", 100.0, 0.01, 0.01 * math.exp(effect), effect, low, high)
     return replace(comparison(True), differences=(difference,)).verdict
 
 
@@ -159,7 +159,7 @@ def test_single_modality_event_equals_the_edit_of_its_link(data: Dataset) -> Non
     replay = Replay(BIASED, trace(BIASED, episode, event.episode))
     edited = replay.edited(Edit(0, event.last + 1, weights={event.only[0]: 1.0}))
     # A one-hot beta equals a single modality up to rounding.
-    assert position_error(edited)[event.step, -1] == pytest.approx(event.after, rel=1e-3)
+    assert main_error(edited)[event.step, -1] == pytest.approx(event.after, rel=1e-3)
 
 
 def test_frozen_modules_are_verified_by_hash() -> None:

@@ -18,7 +18,7 @@ from beliefscope.inspect.diagnosis.repair import (
     largest_failure,
     smallest_repair,
 )
-from beliefscope.inspect.statistics.measures import position_error
+from beliefscope.inspect.statistics.measures import main_error
 from beliefscope.inspect.trace import Trace, trace
 
 STEPS, PARTICLES = 46, 50
@@ -33,7 +33,7 @@ def case(name: str, index: int, faults: str) -> tuple[Episode, Trace, float]:
     clean = replace(full, observations=observations, **arrays)
     checkpoint = load_checkpoint(PRETRAINED / f"{name}.safetensors")
     healthy = trace(checkpoint, clean, particles=PARTICLES)
-    bound = 1.5 * float(position_error(healthy)[30:, -1].max())
+    bound = 1.5 * float(main_error(healthy)[30:, -1].max())
     return clean, trace(checkpoint, Faults.parse(faults).apply(clean), particles=PARTICLES), bound
 
 
@@ -77,10 +77,10 @@ def test_restoring_the_planted_steps_gives_the_clean_run() -> None:
         checkpoint = load_checkpoint(PRETRAINED / f"{name}.safetensors")
         search = Candidates(checkpoint, run, (38, 45), clean)
         both = Candidate(("image", "haptics"), True, 33, 45)
-        expected = position_error(trace(checkpoint, clean, particles=PARTICLES))[38:46, -1]
+        expected = main_error(trace(checkpoint, clean, particles=PARTICLES))[38:46, -1]
         assert search.errors([both])[0] == pytest.approx(np.sqrt(np.square(expected).mean()), rel=1e-3)
         nothing = Candidate(("image",), True, 0, 1)
-        original = position_error(run)[38:46, -1]
+        original = main_error(run)[38:46, -1]
         assert search.errors([nothing])[0] == pytest.approx(np.sqrt(np.square(original).mean()), rel=1e-3)
 
 

@@ -197,7 +197,7 @@ def test_errors_are_those_of_the_separate_runs(doors: tuple[Checkpoint, list[Tra
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     alone = np.concatenate(
-        [measures.position_error(standalone(filter_, run, "haptics"))[measures.counted(run), -1] for run in traces]
+        [measures.main_error(standalone(filter_, run, "haptics"))[measures.counted(run), -1] for run in traces]
     )
     total = result.phases[0]
     assert total.standalone[1, 0] == pytest.approx(np.sqrt(np.square(alone).mean()))

@@ -268,7 +268,7 @@ def test_defaults_are_the_worst_step_and_component() -> None:
     replay = builtin("crossmodal-ekf")
     original = replay.original
     checkpoint, y = replay.checkpoint, run(replay.checkpoint, "blackout")
-    error = [measures.position_error(x)[30:, -1] for x in (original, y)]
+    error = [measures.main_error(x)[30:, -1] for x in (original, y)]
     worst = int(np.argmax([x.max() for x in error]))
     result = saliency([original, y], checkpoint)
     assert result.step == 30 + int(error[worst].argmax())

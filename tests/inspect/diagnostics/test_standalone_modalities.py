@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
@@ -31,9 +32,9 @@ def test_errors_are_those_of_the_separate_runs() -> None:
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     runs = [standalone(checkpoint, run, name) for name in run.modalities]
-    alone = np.stack([measures.position_error(other)[:, -1] for other in runs], axis=1)
+    alone = np.stack([measures.main_error(other)[:, -1] for other in runs], axis=1)
     np.testing.assert_array_equal(result.standalone, alone)
-    np.testing.assert_allclose(np.column_stack([result.updates, result.fused]), measures.position_error(run))
+    np.testing.assert_allclose(np.column_stack([result.updates, result.fused]), measures.main_error(run))
     keep = measures.counted(run)
     total = result.phases[0]
     np.testing.assert_allclose(total.standalone[:, 0], np.sqrt(np.square(alone[keep]).mean(0)))
@@ -64,7 +65,7 @@ def result(update: float, alone: float, low: float, high: float) -> StandaloneMo
         high=np.array([high, 0.4]),
     )
     none, mask = np.zeros((0, 2)), np.zeros(0, dtype=bool)
-    return StandaloneModalities("door", "f", ("image", "haptics"), 14, (phase,), none[:, 0], none, none, mask, mask)
+    return StandaloneModalities(DOOR, "f", ("image", "haptics"), 14, (phase,), none[:, 0], none, none, mask, mask)
 
 
 @pytest.mark.parametrize(

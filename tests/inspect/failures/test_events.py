@@ -14,7 +14,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.faults.injection import Faults
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.inspect.diagnostics.weight_steps import position_regret
+from beliefscope.inspect.diagnostics.weight_steps import main_regret
 from beliefscope.inspect.failures.events import event_spans, failures_of, find_failures
 from beliefscope.inspect.failures.step_scores import PHASES, Survey, disagreement, scores_of
 from beliefscope.inspect.failures.survey import survey_of
@@ -142,7 +142,7 @@ def test_events_are_ranked_and_match_the_trace(traces: list[Trace], survey: Surv
         score = scores_of(survey.task)[by].values(run)
         assert event.first <= event.step <= event.last
         assert event.score == score[event.step] == np.nanmax(score[event.first : event.last + 1]) > failures.threshold
-        np.testing.assert_array_equal(event.error, measures.position_error(run)[event.step])
+        np.testing.assert_array_equal(event.error, measures.main_error(run)[event.step])
         np.testing.assert_array_equal(event.nees, measures.nees(run)[event.step])
         assert event.ess == run.effective_sample_size[event.step]  # type: ignore[index]
         assert event.effective_weights is not None
@@ -204,15 +204,15 @@ def test_regret_equals_a_scan_over_weights(traces: list[Trace]) -> None:
     errors = measures.errors(run)
     shares = np.linspace(0.0, 1.0, 2001)[:, None, None]
     mixed = np.linalg.norm(shares * errors[:, 0] + (1 - shares) * errors[:, 1], axis=-1).min(axis=0)
-    expected = measures.position_error(run)[:, -1] - mixed
+    expected = measures.main_error(run)[:, -1] - mixed
     distance = np.linalg.norm(errors[:, 0] - errors[:, 1], axis=-1).max()
-    np.testing.assert_allclose(position_regret(run), expected, atol=distance / 4000)  # half the resolution of the scan
+    np.testing.assert_allclose(main_regret(run), expected, atol=distance / 4000)  # half the resolution of the scan
     assert run.effective_weights is not None
     assert run.effective_weights.shape[-1] == 1
     each = replace(
         run, effective_weights=np.repeat(run.effective_weights, 2, axis=-1)
     )  # a weight for each component can do no worse
-    assert (position_regret(each) >= position_regret(run) - 1e-12).all()
+    assert (main_regret(each) >= main_regret(run) - 1e-12).all()
 
 
 def test_angles_have_a_score_and_wrap() -> None:
@@ -255,7 +255,7 @@ def test_failures_match_the_traces(checkpoint: Checkpoint, episodes: dict[int, E
     failures = find_failures(checkpoint, two, seed=3, particles=20, progress=progress.append)
     event = failures.events[0]
     expected = trace(checkpoint, two[event.episode], event.episode, seed=3, particles=20)
-    assert event.score == measures.position_error(expected)[event.step, -1]
+    assert event.score == measures.main_error(expected)[event.step, -1]
     assert progress == sorted(progress)
     assert progress[-1] == 1.0
     assert failures.episodes == 2

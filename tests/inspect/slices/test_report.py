@@ -77,7 +77,7 @@ def test_a_planted_slice_in_words(traces: list[Trace]) -> None:
     (slice_,) = (s for s in report.slices if s.conditions[0].covariate == "heavy load")
     heavy_ones = [i for i in range(24) if i % EPISODES < 5]
     assert slice_.episodes == tuple(heavy_ones)
-    error = np.array([measures.position_error(trace)[:, -1].mean() for trace in planted])
+    error = np.array([measures.main_error(trace)[:, -1].mean() for trace in planted])
     assert slice_.inside == pytest.approx(error[heavy_ones].mean())
     assert slice_.ratio == pytest.approx(error[heavy_ones].mean() / np.delete(error, heavy_ones).mean())
     assert slice_.low < slice_.ratio < slice_.high

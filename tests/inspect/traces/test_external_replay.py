@@ -122,7 +122,7 @@ def test_shapley_values_add_up() -> None:
 def test_errors_are_statistics_of_an_external_filter(door: list[Episode]) -> None:
     filter_ = load_external(EXAMPLE)
     run = trace(filter_, door[0])
-    error = measures.position_error(run)[measures.counted(run), -1]
+    error = measures.main_error(run)[measures.counted(run), -1]
     expected = float(np.sqrt(np.square(error).mean()))
     assert model_statistics(run, filter_)["error//all"] == pytest.approx(expected)
 
