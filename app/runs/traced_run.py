@@ -15,6 +15,7 @@ from beliefscope.app.protocol.messages import MAP_SIZES
 from beliefscope.app.protocol.trace_format import columns, header
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.data_check import data_warning
+from beliefscope.inspect.diagnosis.diagnose import no_diagnosis
 from beliefscope.inspect.likelihood import LikelihoodMap, MapEngine, Quantity, missing_quantities, no_maps
 from beliefscope.inspect.maps.likelihood_map import MapOptions
 from beliefscope.inspect.trace import Trace, arrays_of
@@ -90,7 +91,7 @@ class TracedRun:
         """Description of the trace for the page."""
         missing = missing_quantities(self.checkpoint, self.trace)
         description = header(self.trace, self.columns[0], self.checkpoint.task, self.no_maps, missing)
-        return description | {"data_warning": self.data_warning}
+        return description | {"data_warning": self.data_warning, "no_diagnosis": no_diagnosis(self.checkpoint)}
 
     @cached_property
     def columns(self) -> tuple[list[dict[str, Any]], bytes]:

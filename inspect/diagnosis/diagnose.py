@@ -183,12 +183,19 @@ def required_profile(checkpoint: Checkpoint) -> HealthyProfile:
     """The healthy profile of a filter. Raises BadInput without one."""
     profile = find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint)
     if profile is None:
-        source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
-        raise BadInput(
-            f"filter {checkpoint.name!r} has no healthy record; compare it with clean episodes: beliefscope diagnose "
-            f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"
-        )
+        raise BadInput(no_diagnosis(checkpoint) or "")
     return profile
+
+
+def no_diagnosis(checkpoint: Checkpoint) -> str | None:
+    """Reason why a filter has no diagnosis, and what it needs; None if it has one."""
+    if find_profile(checkpoint.task.name, checkpoint.name, checkpoint.hash, checkpoint) is not None:
+        return None
+    source = checkpoint.source if isinstance(checkpoint, ExternalFilter) else checkpoint.name
+    return (
+        f"filter {checkpoint.name!r} has no healthy record; compare it with clean episodes: beliefscope diagnose "
+        f"{checkpoint.task.name} --filter {source} --data DATA --profile-from CLEAN_DATA"
+    )
 
 
 def examine(setting: Setting, traces: Sequence[Trace], profile: HealthyProfile, alarm_rate: float) -> Case:

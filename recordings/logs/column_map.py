@@ -130,8 +130,8 @@ def read_map(path: Path) -> ColumnMap:
     if (dt is None and "time" not in values) or not (dt is None or (type(dt) in (int, float) and 0 < dt < math.inf)):
         raise BadInput(f"{path.name} needs either dt, in s and more than 0, or time, the name of a column in s")
     state = {name: _component(name, value) for name, value in _table(values, "state", path).items()}
-    if len(state) < 2:
-        raise BadInput(f'[state] of {path.name} has {len(state)} components, expected two or more: name = "column"')
+    if not state:
+        raise BadInput(f'[state] of {path.name} has no components, expected one or more: name = "column"')
     names = {key: values.get(key, "") for key in ("time", "episode", "contact")}
     control = values.get("control", [])
     lists = [("control", control), *sensors.items(), *((key, estimate[key]) for key in VALUES if key in estimate)]

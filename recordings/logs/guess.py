@@ -14,6 +14,20 @@ TRUTH = r"truth|true|gt|ground|state|mocap|vicon|optitrack"
 ESTIMATE = r"est|mean|pred|filter|posterior|belief"
 POSE_ESTIMATE = ESTIMATE + r"|odom|ekf|amcl|slam|local"
 
+TRUTH_AFFIX = re.compile(r"^(ground_?truth|truth|true|gt|state|mocap|vicon|optitrack)[_./]|_(true|truth|gt)$", re.I)
+"""Part of a column's name that says that it is a true value."""
+
+UNITS_BY_NAME = {
+    "rad/s": r"^w[xyz]?$|omega|yaw_?rate|gyro|angular",
+    "m/s^2": r"^a[xyz]$|acc",
+    "m/s": r"^v[xyz]?$|(^|_)v(el|x|y|z)?(_|$)|velocity|speed",
+    "rad": r"yaw|heading|theta|roll|pitch|angle",
+}
+"""Unit of a component -> pattern of its name; the first that matches."""
+
+CHANNEL = re.compile(r"(.+?)[_.]?(x|y|z|lat|lon|alt|east|north|up|\d+)$", re.I)
+"""Name of a sensor and of one of its channels."""
+
 DT = 0.1
 """s per step, if the log has no times."""
 
@@ -45,11 +59,11 @@ def _table(columns: Columns) -> list[str]:
     control = _named(r"^(action|control|u)$", [*columns])[:1]
     used = {*time, *episode, *counters, *state.values(), *mean, *std, *covariance, *ensemble, *control}
     used |= {n.partition("[")[0] for n in state.values()}
-    sensors = {_key(n): n for n in columns if n not in used and (n in flat or n in rows)}
+    sensors = _sensors([n for n in columns if n not in used and (n in flat or n in rows)], flat)
     lines = [f"time = {_text(time[0])}" if time else f"dt = {DT}  # s per row"]
     lines += [f"episode = {_text(episode[0])}"] if episode else []
     lines += [f"control = {_text(control[0])}"] if control else []
-    lines += _sections({component: _text(reference) for component, reference in state.items()}, sensors)
+    lines += _sections({component: _value(component, reference) for component, reference in state.items()}, sensors)
     if mean or ensemble:
         lines.append("[estimate]")
         # Standard deviations of some components only cannot be imported.
@@ -122,12 +136,30 @@ def _vector(columns: Columns, name: str) -> str:
     return parent if parent and all(_is_reading(columns, n) and columns[n].ndim == 1 for n in fields) else name
 
 
-def _sections(state: Mapping[str, str], sensors: Mapping[str, str]) -> list[str]:
+def _value(component: str, reference: str) -> str:
+    """A component of the state: its column, with the unit that its name implies if it is not m."""
+    unit = next((u for u, pattern in UNITS_BY_NAME.items() if re.search(pattern, component, re.I)), "")
+    return f'{{column = {_text(reference)}, unit = "{unit}"}}' if unit else _text(reference)
+
+
+def _sensors(names: Sequence[str], flat: Sequence[str]) -> dict[str, str | list[str]]:
+    """Modality -> columns; single numbers such as gps_x and gps_y are the channels of one modality."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        channel = CHANNEL.fullmatch(name) if name in flat else None
+        groups.setdefault(channel[1] if channel else name, []).append(name)
+    return {
+        _key(group if len(members) > 1 else members[0]): members if len(members) > 1 else members[0]
+        for group, members in groups.items()
+    }
+
+
+def _sections(state: Mapping[str, str], sensors: Mapping[str, str | list[str]]) -> list[str]:
     """Lines of [state] and [sensors]."""
-    lines = ["[state]  # true values: component = column, or {column = NAME, unit = m, cm, mm, rad or deg}"]
+    lines = ["[state]  # true values: component = column in m, or {column = NAME, unit = cm, rad, deg, or any}"]
     lines += [f"{component} = {value}" for component, value in state.items()] or ['x = ""', 'y = ""']
     lines += ["[sensors]  # modality = column or list of columns"]
-    return lines + [f"{key} = {_text(reference)}" for key, reference in sensors.items()]
+    return lines + [f"{key} = {_text(n) if isinstance(n, str) else _texts(n)}" for key, n in sensors.items()]
 
 
 def _named(pattern: str, names: Sequence[str]) -> list[str]:
@@ -140,7 +172,8 @@ def _topic(topics: Mapping[str, float], name: str) -> str:
 
 def _components(flat: Sequence[str], rows: Columns, arrays: Sequence[str]) -> dict[str, str]:
     if flat:
-        return {_key(name): name for name in flat}
+        names = {_key(TRUTH_AFFIX.sub("", name)): name for name in flat}
+        return names if len(names) == len(flat) else {_key(name): name for name in flat}
     if not arrays or rows[arrays[0]].ndim != 2:
         return {}
     name = arrays[0]

@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 IRREGULAR = 0.1
 """Largest deviation of a time step from their median, relative to it."""
 
+LARGE = 5.0
+"""m, span of the positions above which they are displayed in m."""
+
 MARGIN = 1.2
 """Half width of maps relative to the largest half range of the map components."""
 
@@ -260,16 +263,19 @@ def _task(
     dt: float,
     covariates: dict[str, Covariate],
 ) -> Task:
-    names = list(mapping.state)
-    extent = np.ptp(np.nan_to_num(states[:, :2]), axis=0).max() / 2.0
+    names, units = list(mapping.state), [s.internal[0] for s in mapping.state.values()]
+    spans = np.ptp(np.nan_to_num(states), axis=0)
+    large = max((span for span, unit in zip(spans, units, strict=True) if unit == "m"), default=0.0) > LARGE
+    shown = [("m", 1.0) if unit == "m" and large else None for unit in units]
+    extent = max(span for span, unit in zip(spans[:2], units, strict=False) if unit == units[0]) / 2.0
     task = Task(
         name=mapping.task,
-        components=tuple(Component(name, s.internal[0]) for name, s in mapping.state.items()),
+        components=tuple(Component(*c[:2], display=c[2]) for c in zip(names, units, shown, strict=True)),
         observations={name: array.shape[1:] for name, array in sensors.items()},
         modalities={name: (name,) for name in sensors},
         control_size=controls,
         dt=dt,
-        map_components=(names[0], names[1]),
+        map_components=tuple(names[:2]),
         map_half_width=float(MARGIN * max(extent, 0.01)),
         warmup=0,
         covariates=({"contact": CONTACT} if mapping.contact else {}) | covariates,

@@ -22,6 +22,7 @@ RECORDINGS = (".rrd", ".live")
         "Output: a trace, a run for the folder live of a workspace, or a data set.",
         *(".trace", ".live", ".h5"),
     ),
+    episode=opt.option("I", "Index of the episode of a log that becomes a trace.", "--episode"),
     task=opt.TASK_OF_FILES,
 )
 def import_(

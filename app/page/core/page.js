@@ -235,7 +235,7 @@ export class Page {
         markUseful();
       },
       drawn: (step, { inputTime }) => {
-        this.scene.drawn();
+        this.scene.drawn(this.#trace?.header.scene ?? []);
         stats.drawn = { step };
         if (inputTime) addLatency(stats.scene, performance.now() - inputTime);
       },

@@ -43,11 +43,11 @@ export function append(array, used, values) {
 }
 
 /**
- * Returns the length of two-dimensional vectors over time.
+ * Returns the length of vectors over time.
  * @param {(Series | undefined)[]} components
  */
-export function norm([x, y]) {
-  return x?.map((value, t) => Math.hypot(value, y?.[t] ?? NaN));
+export function norm(components) {
+  return components[0]?.map((_, t) => Math.hypot(...components.map((c) => c?.[t] ?? NaN)));
 }
 
 /**

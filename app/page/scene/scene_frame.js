@@ -3,6 +3,9 @@
 import { html } from '../core/dom.js';
 import { setPanelState } from '../widgets/panel_state.js';
 
+const NO_SCENE =
+  'No 3D scene: the maps of this task are not over a position in m, and it has no replay and no outline';
+
 /**
  * Interface of viser_frame_throttle.js, in the frame.
  * @typedef {object} FrameThrottle
@@ -53,9 +56,15 @@ export class SceneFrame {
     return this.#throttle?.pause(factor) ?? true;
   }
 
-  /** Called when the scene shows the cursor. */
-  drawn() {
-    if (this.#host.dataset.state !== 'ready') setPanelState(this.#host, 'ready');
+  /**
+   * Called when the scene shows the cursor.
+   * @param {string[]} layers of the scene
+   */
+  drawn(layers) {
+    const state = layers.length ? 'ready' : 'empty';
+    if (this.#host.dataset.state === state) return;
+    setPanelState(this.#host, state, layers.length ? '' : NO_SCENE);
+    this.#frame.hidden = !layers.length;
   }
 
   get #throttle() {

@@ -16,7 +16,7 @@ import { jobSummary } from '../widgets/jobs.js';
 import { choice } from '../widgets/pickers.js';
 import { Repair } from './repair.js';
 
-/** @typedef {JobResult<Result> | {state: 'live', job?: undefined, preliminary?: undefined}} Entry */
+/** @typedef {JobResult<Result> | {state: 'live' | 'refused', job?: undefined, preliminary?: undefined}} Entry */
 
 /** @type {[string, string][]} */
 const OVER = [
@@ -81,7 +81,7 @@ export class Diagnosis {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
     this.#repair.show(trace);
-    if (trace.live) return this.#draw();
+    if (trace.live || trace.header.no_diagnosis) return this.#draw();
     const get = () => api.diagnosis(trace.selection, this.#store.state.over, signal);
     await this.#results.load(this.#key, get, signal);
     if (this.#entry.state !== 'absent' || !this.#starts) return;
@@ -97,7 +97,8 @@ export class Diagnosis {
 
   /** @returns {Entry} */
   get #entry() {
-    return this.#trace?.live ? { state: 'live' } : this.#results.get(this.#key);
+    if (this.#trace?.live) return { state: 'live' };
+    return this.#trace?.header.no_diagnosis ? { state: 'refused' } : this.#results.get(this.#key);
   }
 
   #startOrCancel() {
@@ -117,7 +118,7 @@ export class Diagnosis {
     this.#host.dataset.state = entry.state;
     this.#host.dataset.finding = result ? (result.masked ? 'masked' : result.state) : '';
     this.#host.ariaBusy = String(entry.state === 'loading' || entry.state === 'active');
-    const state = stateOf(entry);
+    const state = stateOf(entry) || sentence(this.#trace?.header.no_diagnosis ?? '');
     const text = result?.headline ?? state;
     const headline = html('.headline', this.#host);
     if (headline.dataset.text !== text) headline.replaceChildren(...withCode(text));

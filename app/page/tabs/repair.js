@@ -54,8 +54,8 @@ export class Repair {
     this.#trace = trace;
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
-    this.#host.hidden = Boolean(trace.live);
-    if (trace.live) return;
+    this.#host.hidden = Boolean(trace.live || trace.header.no_diagnosis);
+    if (this.#host.hidden) return;
     this.#results.load(this.#key, () => api.repair(trace.selection, signal), signal);
   }
 
@@ -65,7 +65,7 @@ export class Repair {
 
   #draw() {
     const trace = this.#trace;
-    if (!trace || trace.live) return;
+    if (!trace || this.#host.hidden) return;
     const entry = this.#results.get(this.#key);
     html('.verdict', this.#host).textContent = textOf(entry);
     showJobButton(html('.doing', this.#host), entry, {

@@ -1590,6 +1590,7 @@ export interface components {
          *         nees_bounds: 95 % bounds of a consistent filter's NEES; None without a covariance.
          *         no_maps: why there are no likelihood maps, or None. missing_quantities: quantities without maps, and the
          *             reasons. sensors: those drawn as images.
+         *         no_diagnosis: why the filter has no diagnosis, or None.
          *         data_warning: how the data differ from the checkpoint's training data, or None.
          *         scene: layers of its 3D scene. live: present while the trace is of a live run.
          */
@@ -1641,6 +1642,8 @@ export interface components {
             columns: components["schemas"]["Column"][];
             /** Data Warning */
             data_warning?: string | null;
+            /** No Diagnosis */
+            no_diagnosis?: string | null;
             /** Scene */
             scene: ("replay" | "objects" | "estimates" | "contours" | "particles" | "force" | "map" | "camera")[];
             live?: components["schemas"]["LiveRun"] | null;

@@ -128,6 +128,35 @@ def test_a_guessed_map_is_valid(log: Path, tmp_path: Path) -> None:
     assert len(episodes) == 1
 
 
+def test_a_guessed_map_has_names_units_and_sensors(tmp_path: Path) -> None:
+    t = 0.1 * np.arange(80.0)
+    names = ("true_x", "true_y", "true_vx", "true_yaw", "gps_x", "gps_y", "wheel")
+    columns = {"t": t} | {name: (i + 1.0) * t for i, name in enumerate(names)}
+    text = guess_map(Preview(columns), "drive")
+    values = tomllib.loads(text)
+    assert values["state"] == {
+        "x": "true_x",
+        "y": "true_y",
+        "vx": {"column": "true_vx", "unit": "m/s"},
+        "yaw": {"column": "true_yaw", "unit": "rad"},
+    }
+    assert values["sensors"] == {"gps": ["gps_x", "gps_y"], "wheel": "wheel"}
+    task = read_log(columns, read_map(map_file(tmp_path, text)), "drive")[0].task
+    assert task.main_error.label == "position (m)"  # 15.8 m
+    small = columns | {"true_x": 0.1 * t, "true_y": 0.2 * t}
+    assert read_log(small, read_map(map_file(tmp_path, text)), "drive")[0].task.main_error.label == "position (cm)"
+
+
+def test_one_component_is_a_task(tmp_path: Path) -> None:
+    columns = {"t": 0.1 * np.arange(20.0), "true_level": np.linspace(280.0, 290.0, 20), "est_level": np.full(20, 285.0)}
+    text = guess_map(Preview(columns), "tank").replace('"true_level"', '{column = "true_level", unit = "K"}', 1)
+    mapping = read_map(map_file(tmp_path, text))
+    episodes = read_log(columns, mapping, "tank")
+    trace = recorded_trace(columns, mapping, episodes, 0, "tank")
+    assert (trace.task.map_components, trace.task.main_error.label) == (("level",), "level (K)")
+    assert trace.task.map_half_width == pytest.approx(1.2 * 5.0)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

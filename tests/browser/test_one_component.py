@@ -1,0 +1,50 @@
+"""A task of one component in K: every view shows its unit and its curve, and none fails."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+from beliefscope.datasets.store import write_dataset
+
+TANK = Path(__file__).with_name("tank.py")
+
+
+def test_every_view_of_a_task_with_one_component(open_page: Any, start_server: Any, tmp_path: Path) -> None:
+    tank = runpy.run_path(str(TANK))
+    write_dataset(tmp_path / "tank.h5", tank["TASK"], [tank["episode"](seed) for seed in range(5)])
+    options = ["--task", f"{TANK}:TASK", "--data", str(tmp_path / "tank.h5"), "--filter", f"{TANK}:build"]
+    page = open_page(url=start_server(*options).url)
+    text = page.page.locator
+    page.page.keyboard.press("ArrowRight")
+    page.settle(1)
+    assert text("#heatmaps h3").all_text_contents() == ["thermometer", "pyrometer", "fused"]
+    assert "temperature" in text("#maps h2").text_content()
+    assert " K" in text("#heatmaps figcaption").first.text_content()
+    summary = text("#step-summary").text_content()
+    assert " K; largest deviation" in summary
+    assert "\N{EN DASH}" not in summary  # the error is known
+    assert "Temperature error" in text("#timeline").text_content()
+    text("#heatmaps canvas").first.hover()
+    assert " K" in text("#maps-value").text_content()
+    page.screenshot("one-component")
+
+    page.page.evaluate("document.querySelector('#tab-scene').click()")
+    page.until("() => document.querySelector('#scene').dataset.state === 'empty'")
+    assert "No 3D scene" in text("#scene .note").text_content()
+    page.page.evaluate("document.querySelector('#tab-diagnosis').click()")
+    page.until("() => document.querySelector('#diagnosis').dataset.state === 'refused'")
+    assert "--profile-from" in text("#diagnosis .headline").text_content()
+    assert not text("#diagnosis .doing button").is_visible()
+    assert not text("#diagnosis .repair").is_visible()
+    page.page.evaluate("document.querySelector('#tab-failures').click()")
+    text("#failures").get_by_role("button", name="Search for failures", exact=True).click()
+    page.until("() => document.querySelector('#failures').dataset.state === 'ready'")
+    assert "temperature error K" in text("#failures thead").first.text_content()
+    for tab in ("diagnostics", "finetune", "study", "recordings"):
+        if text(f"#tab-{tab}").is_visible():
+            text(f"#tab-{tab}").click()
+            page.until(f"() => document.querySelector('#{tab}').checkVisibility()")
+    words = page.page.evaluate("document.body.innerText")
+    assert " cm" not in words
