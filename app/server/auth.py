@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from html import escape
 from urllib.parse import parse_qsl, urlencode
 
+from beliefscope.app.server.plain_pages import plain_page
 from beliefscope.datasets.errors import BadInput
 
 VARIABLE = "BELIEFSCOPE_TOKEN"
@@ -148,7 +149,7 @@ def redirect_page(address: str) -> str:
 
     Not an HTTP redirect: if the link is on another site, the browser would follow that without the SameSite cookie.
     """
-    return _PAGE.format(
+    return plain_page(
         head=f'<meta http-equiv="refresh" content="0;url={escape(address)}">',
         body=f'<p>Signed in. <a href="{escape(address)}">Continue</a></p>',
     )
@@ -160,20 +161,9 @@ def sign_in_page(problem: str, address: str) -> str:
     Browsers do not send the SameSite cookie when they follow a link from another page, such as a displayed report;
     from this page they do.
     """
-    return _PAGE.format(
-        head="",
-        body=f"<p>{escape(problem)}</p>"
+    return plain_page(
+        f"<p>{escape(problem)}</p>"
         '<form action="/" method="get"><label>Token <input name="token" type="password" autocomplete="off" required '
         'autofocus></label> <button type="submit">Sign in</button></form>'
         f'<p>Already signed in? <a href="{escape(address)}">Continue</a>.</p>',
     )
-
-
-_PAGE = (
-    '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Beliefscope</title>'
-    '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    '<meta name="color-scheme" content="light dark">'
-    "<style>body{{font:15px/1.5 system-ui,sans-serif;max-width:34rem;margin:18vh auto 0;padding:0 1.5rem}}"
-    "input,button{{font:inherit;padding:.3rem .6rem}}</style>{head}</head>"
-    "<body><h1>Beliefscope</h1>{body}</body></html>"
-)

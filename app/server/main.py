@@ -17,7 +17,7 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, Response
 from starlette.exceptions import HTTPException
 
 from beliefscope import __version__
@@ -46,6 +46,7 @@ from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.app.runs.trace_worker import TraceWorker
 from beliefscope.app.server.auth import LOOPBACK, OPEN, VARIABLE, Access, host_names
 from beliefscope.app.server.logs import is_relevant
+from beliefscope.app.server.plain_pages import not_found_page
 from beliefscope.app.server.security import Guard
 from beliefscope.app.server.static_files import PageFiles
 from beliefscope.app.server.timeouts import MAX_HEAD, UNREAD_TIMEOUT, HTTPProtocol, WebSocketProtocol
@@ -264,8 +265,10 @@ def _validation_error(_: Request, error: Exception) -> JSONResponse:
     return JSONResponse({"error": describe_error(error)}, 422)
 
 
-def _http_error(_: Request, error: Exception) -> JSONResponse:
+def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
+    if error.status_code == 404 and "text/html" in request.headers.get("accept", ""):  # opened in a browser
+        return HTMLResponse(not_found_page(request.url.path), 404)
     return JSONResponse({"error": error.detail}, error.status_code, headers=error.headers)
 
 

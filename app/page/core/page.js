@@ -280,6 +280,7 @@ export class Page {
     [this.#trace, this.#failed] = [null, false];
     this.clock.show(null);
     this.diagnosis.show(null);
+    this.finding.show(null);
     const loadingState = startLoading();
     try {
       const selection = { task: name, filter, data, episode, faults };
@@ -290,7 +291,7 @@ export class Page {
       loadingState.stop();
       if (loading.signal.aborted) return;
       this.#failed = true;
-      showError(error);
+      this.finding.fail(showError(error));
     }
   }
 

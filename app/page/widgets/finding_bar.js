@@ -2,6 +2,7 @@
 
 /** @import { Store } from '../core/state.js' */
 /** @import { Trace } from '../data/trace.js' */
+/** @import { Finding } from '../step/finding.js' */
 /** @import { Catalog, Diagnosis } from '../types/server.js' */
 
 import { useful } from '../core/common_panels.js';
@@ -32,11 +33,13 @@ export class FindingBar {
 
   /**
    * Shows the finding from the trace alone, and then the preliminary diagnosis.
-   * @param {Trace} trace
+   * @param {Trace | null} trace null while another one is loading
    */
   async show(trace) {
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
+    this.#host.classList.toggle('stale', !trace);
+    if (!trace) return;
     this.#draw(trace, null);
     if (trace.live || !this.#isDiagnosable(trace)) return;
     await useful;
@@ -44,6 +47,15 @@ export class FindingBar {
     const reply = await api.diagnosis(trace.selection, 'episode', signal).catch(() => null);
     const result = reply && 'job' in reply ? reply.preliminary : reply;
     if (result && !signal.aborted) this.#draw(trace, result);
+  }
+
+  /**
+   * Shows why there is no run.
+   * @param {string} reason
+   */
+  fail(reason) {
+    const headline = 'This run cannot be displayed.';
+    this.#write({ tone: 'bad', headline, evidence: reason, step: null }, 'error');
   }
 
   /** @param {number} inputTime */
@@ -64,9 +76,16 @@ export class FindingBar {
   #draw(trace, diagnosis) {
     const { component } = this.#store.state;
     const index = trace.components.findIndex(({ name }) => name === component);
-    const { tone, headline, evidence, step } = finding(trace, Math.max(index, 0), diagnosis);
-    this.#host.dataset.tone = tone;
-    this.#host.dataset.source = diagnosis?.state ?? 'trace';
+    this.#write(finding(trace, Math.max(index, 0), diagnosis), diagnosis?.state ?? 'trace');
+  }
+
+  /**
+   * @param {Finding} finding
+   * @param {string} source
+   */
+  #write({ tone, headline, evidence, step }, source) {
+    this.#host.classList.remove('stale');
+    [this.#host.dataset.tone, this.#host.dataset.source] = [tone, source];
     const line = html('.sentence', this.#host);
     html('strong', line).textContent = headline;
     html('span', line).textContent = evidence;

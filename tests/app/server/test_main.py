@@ -128,6 +128,19 @@ def test_edited_file_has_a_new_address(tmp_path: Path) -> None:
     assert files.file(request("br"), "a.js").body == b"export const a = 123;"
 
 
+def test_unknown_address_is_a_page_for_browsers_and_json_for_programs(shared_client: TestClient) -> None:
+    path = "/door/<script>"
+    shown = shared_client.get(path, headers={"Accept": "text/html,*/*;q=0.8"})
+    assert shown.status_code == 404
+    assert 'href="/"' in shown.text
+    assert "/door/&lt;script&gt;" in shown.text
+    assert "<script" not in shown.text
+    assert "default-src" in shown.headers["content-security-policy"]
+    program = shared_client.get(path)
+    assert program.status_code == 404
+    assert set(program.json()) == {"error"}
+
+
 @pytest.mark.parametrize("path", ["/static/../server.py", "/static/..%2fserver.py", "/static/x/..%2f__init__.py"])
 def test_files_outside_the_page_are_not_served(shared_client: TestClient, path: str) -> None:
     assert shared_client.get(path).status_code == 404
