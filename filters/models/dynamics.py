@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from beliefscope.filters.models.networks import Residual, Stack, dual_linear, vector_stack
+from beliefscope.filters.models.networks import Residual, Stack, linear, vector_stack
 
 
 class Dynamics(nn.Module):
@@ -65,18 +65,13 @@ class Dynamics(nn.Module):
         return change.index_fill(-1, torch.tensor(self.static, device=change.device), 0.0)
 
     def with_jacobian(self, states: Tensor, control_part: Tensor) -> tuple[Tensor, Tensor]:
-        """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass with dual numbers."""
-        identity = torch.eye(self.n, dtype=states.dtype, device=states.device)
-        tangents = identity.expand(*states.shape[:-1], self.n, self.n)
-        x = torch.cat([states.unsqueeze(-2), tangents], dim=-2)
-        x = dual_linear(self.join_state, self.state_encoder.dual(x))
-        value_only = torch.zeros_like(x[..., :1]).index_fill_(-2, torch.tensor(0, device=x.device), 1.0)
-        x = x + value_only * control_part.unsqueeze(-2)
-        change, gate = dual_linear(self.output, self.shared.dual(x)).split([self.n, 1], dim=-1)
-        change = self._without_static(change)
-        scale = torch.sigmoid(gate[..., :1, :])
-        next_states = states + change[..., 0, :] * scale[..., 0, :]
-        slope = scale * (1.0 - scale)
-        # Row i holds d(next)/d(state i); A has d(next j)/d(state i) at [j, i].
-        derivative = scale * change[..., 1:, :] + slope * gate[..., 1:, :] * change[..., :1, :]
-        return next_states, identity + derivative.transpose(-1, -2)
+        """Next states (..., n) and the Jacobian A (..., n, n) by the previous state, in one pass."""
+        offsets = torch.eye(self.n + 1, self.n, dtype=states.dtype, device=states.device)  # the last row is zero
+        x = states + offsets.view(-1, *(1,) * (states.ndim - 1), self.n)
+        hidden = linear(self.join_state, self.state_encoder.with_tangents(x)) + control_part
+        y = linear(self.output, self.shared.with_tangents(hidden))
+        change, gate = y.split([self.n, 1], dim=-1)
+        change, scale = self._without_static(change), torch.sigmoid(gate[-1])
+        moved = torch.addcmul(change, change[-1] * (1.0 - scale), gate - gate[-1]).mul(scale).add(x)
+        # Row i of the difference is the derivative by state i; A has d(next j)/d(state i) at [j, i].
+        return moved[-1], (moved[:-1] - moved[-1]).movedim(0, -1)

@@ -29,19 +29,21 @@ def predict(belief: Gaussian, mean: Tensor, jacobian: Tensor, noise: Tensor) -> 
 def update(belief: Gaussian, observation: Tensor, noise: Tensor) -> Gaussian:
     """Update with an observation of the whole state, H = I: ``K = S (S + R)^-1`` (Lee et al., eq. 7-9).
 
-    The covariance ``(I - K) S`` is computed in Joseph form, ``(I - K) S (I - K)^T + K R K^T``, which stays positive
-    definite despite rounding.
+    The covariance ``(I - K) S`` is computed as ``K R``, which is equal and has no difference that would lose precision.
 
     Args:
         observation: (..., n) z. noise: (..., n) square root of R's diagonal.
     """
-    r = torch.diag_embed(noise**2)
+    r = noise.square()
     # K^T = (S + R)^-1 S, since S and R are symmetric.
-    gain = torch.linalg.solve(belief.covariance + r, belief.covariance).transpose(-1, -2)
+    gain = torch.linalg.solve(belief.covariance + torch.diag_embed(r), belief.covariance).mT
     mean = belief.mean + (gain @ (observation - belief.mean).unsqueeze(-1)).squeeze(-1)
-    keep = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain
-    covariance = keep @ belief.covariance @ keep.transpose(-1, -2) + gain @ r @ gain.transpose(-1, -2)
-    return Gaussian(mean, symmetric(covariance))
+    return Gaussian(mean, symmetric(gain * r.unsqueeze(-2)))
+
+
+def shared(belief: Gaussian) -> Gaussian:
+    """A belief (N, n) as one that all filters of a bank have in common, (N, 1, n)."""
+    return Gaussian(belief.mean.unsqueeze(1), belief.covariance.unsqueeze(1))
 
 
 class VirtualSensor(nn.Module):
@@ -81,7 +83,8 @@ class ExtendedKalmanFilter(Filter):
     """A bank of K unimodal EKFs that share the dynamics model, fused after every step.
 
     The belief passed between steps is the bank, Gaussian (N, K, n): the unimodal filters stay independent, as in
-    the paper's text, unless ``architecture.feedback`` replaces each belief by the fused one.
+    the paper's text, unless ``architecture.feedback`` replaces each belief by the fused one. A belief that all filters
+    have in common is (N, 1, n), and predicted once.
     """
 
     def __init__(self, architecture: Architecture) -> None:
@@ -102,13 +105,13 @@ class ExtendedKalmanFilter(Filter):
         )
 
     def start(self, belief: Gaussian, particles: int, generator: torch.Generator) -> Belief:
-        return self.bank_of(belief)
+        return shared(belief)
 
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         predicted, bank = self.predict_and_update(belief, evidence)
         fused = self.fuse(bank, evidence.log_weights, evidence.present)
         trace = StepTrace(predicted=predicted, posterior=fused, estimate=fused, modality=bank)
-        return (self.bank_of(fused) if self.architecture.feedback else bank), trace
+        return (shared(fused) if self.architecture.feedback else bank), trace
 
     def predict_and_update(self, belief: Belief, evidence: Evidence) -> tuple[Gaussian, Gaussian]:
         """The predicted bank, and the bank after the update of each filter with its own observation, (N, K, n)."""
@@ -116,6 +119,7 @@ class ExtendedKalmanFilter(Filter):
         assert evidence.noise is not None
         predicted = self.predict(belief, evidence.control.unsqueeze(1))
         bank = update(predicted, evidence.observation, evidence.noise)
+        predicted = Gaussian(predicted.mean.expand_as(bank.mean), predicted.covariance.expand_as(bank.covariance))
         if evidence.present is not None:
             present = evidence.present.unsqueeze(-1)
             mean = torch.where(present, bank.mean, predicted.mean)
@@ -139,7 +143,7 @@ class ExtendedKalmanFilter(Filter):
         return torch.softmax(evidence.log_weights, dim=-2)
 
     def predict(self, belief: Gaussian, control_part: Tensor) -> Gaussian:
-        """The predicted bank (N, K, n); ``control_part`` (N, 1, u)."""
+        """The predicted bank (N, K, n), or (N, 1, n) from a common belief; ``control_part`` (N, 1, u)."""
         mean, jacobian = self.dynamics.with_jacobian(belief.mean, control_part)
         return predict(belief, mean, jacobian, self.dynamics.noise)
 

@@ -1,4 +1,4 @@
-"""Building blocks of the networks: residual layers, encoders, and forward-mode derivatives."""
+"""Building blocks of the networks: residual layers, encoders, and derivatives by the input."""
 
 from __future__ import annotations
 
@@ -38,38 +38,37 @@ class Residual(nn.Module):
         y = self.second(functional.relu(self.first(x), inplace=True))
         return functional.relu(y.add_(x), inplace=True)
 
-    def dual(self, x: Tensor) -> Tensor:
-        return dual_relu(x + dual_linear(self.second, dual_relu(dual_linear(self.first, x))))
+    def with_tangents(self, x: Tensor) -> Tensor:
+        y = linear(self.second, relu_with_tangents(linear(self.first, x)))
+        return relu_with_tangents(y.add_(x))
 
 
-def dual_linear(layer: nn.Linear, x: Tensor) -> Tensor:
-    """A linear layer on dual numbers: (..., 1 + n, d), row 0 the value and row i its derivative by input i."""
-    y = functional.linear(x, layer.weight)
-    if layer.bias is None:
-        return y
-    is_value = torch.zeros(x.shape[-2], 1, dtype=x.dtype, device=x.device)
-    is_value[0] = 1.0
-    return y + is_value * layer.bias
+def linear(layer: nn.Linear, x: Tensor) -> Tensor:
+    """The layer's output, without the cost of calling a module."""
+    return functional.linear(x, layer.weight, layer.bias)
 
 
-def dual_relu(x: Tensor) -> Tensor:
-    """ReLU on dual numbers."""
-    return x * (x[..., :1, :] > 0)
+def relu_with_tangents(x: Tensor) -> Tensor:
+    """ReLU of x and, in the same linear piece, of x + dx, in place: (n + 1, ..., d), x in the last row."""
+    return x.mul_(x.detach()[-1].sign().relu_())
 
 
 class Stack(nn.Sequential):
-    """A sequence of Linear, ReLU and Residual layers, for values or dual numbers."""
+    """A sequence of Linear, ReLU and Residual layers."""
 
-    def dual(self, x: Tensor) -> Tensor:
-        """Values and derivatives (..., 1 + n, d) through the stack."""
+    def with_tangents(self, x: Tensor) -> Tensor:
+        """``x + dx_i`` and, in the last row, x to ``f(x) + f'(x) dx_i`` and f(x): (n + 1, ..., d).
+
+        All rows pass through the linear piece of the network that contains x, so dx need not be small.
+        """
         for layer in self:
-            if isinstance(layer, nn.Linear):
-                x = dual_linear(layer, x)
-            elif isinstance(layer, nn.ReLU):
-                x = dual_relu(x)
+            if isinstance(layer, nn.ReLU):
+                x = relu_with_tangents(x)
+            elif isinstance(layer, nn.Linear):
+                x = linear(layer, x)
             else:
                 assert isinstance(layer, Residual)
-                x = layer.dual(x)
+                x = layer.with_tangents(x)
         return x
 
 
@@ -102,6 +101,13 @@ class ResidualConvolution(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         y = self.second(functional.relu(self.first(x), inplace=True))
         return functional.relu(y.add_(x), inplace=True)
+
+
+class ChannelsFirst(nn.Module):
+    """Images (B, C, H, W) in the order of their axes in memory, which pooling reads."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.contiguous()
 
 
 class SpatialSoftmax(nn.Module):
@@ -150,6 +156,7 @@ class ImageEncoder(nn.Module):
             nn.Conv2d(32, 16, 3, padding=1),
             nn.ReLU(inplace=True),
             nn.Conv2d(16, 8, 3, padding=1),
+            ChannelsFirst(),
             nn.Identity() if networks == "authors" else nn.ReLU(inplace=True),
         )
         # With channels last, convolutions on a CPU take two thirds of the time.

@@ -1,4 +1,4 @@
-"""Derivatives with dual numbers, and resampling."""
+"""Derivatives of networks, and resampling."""
 
 from __future__ import annotations
 
