@@ -163,6 +163,7 @@ OVERVIEW = {
     "worst_step": "arg_max(r.worst_step, r.worst)",
     "checkpoint": "r.checkpoint",
     "data": "r.data",
+    "provenance": "any_value(c.provenance)",
 }
 """Column of the overview -> its expression."""
 
@@ -173,14 +174,19 @@ _OVERVIEW_QUERY = (
 )
 
 
+def as_csv(rows: pa.Table) -> bytes:
+    """A table as CSV with a header."""
+    data = io.BytesIO()
+    csv.write_csv(rows, data)
+    return data.getvalue()
+
+
 def write_rows(rows: pa.Table, path: Path) -> None:
     """Write a table as ``.csv`` or ``.parquet``."""
-    data = io.BytesIO()
     if path.suffix == ".csv":
-        csv.write_csv(rows, data)
+        write_atomically(path, as_csv(rows))
     else:
-        pq.write_table(rows, data, compression="zstd")
-    write_atomically(path, data.getvalue())
+        _write(rows, path)
 
 
 class Experiments:
@@ -190,7 +196,7 @@ class Experiments:
     """
 
     def __init__(self, folders: Iterable[Path]) -> None:
-        """Raises BadInput for a folder without results."""
+        """Raises BadInput for a folder without results, and for damaged ones."""
         self.folders = tuple(Path(folder).resolve() for folder in folders)
         for folder in self.folders:
             if not (folder / f"{RESULTS}.parquet").is_file():
@@ -198,8 +204,10 @@ class Experiments:
         self._database = duckdb.connect(config={"autoinstall_known_extensions": False})
         for table in TABLES:
             files = [str(folder / f"{table}.parquet") for folder in self.folders]
-            relation = self._database.read_parquet(files, union_by_name=True)
-            relation.create_view(table)
+            try:
+                self._database.read_parquet(files, union_by_name=True).create_view(table)
+            except duckdb.Error as error:
+                raise BadInput(f"damaged results of a sweep: {error}") from None
         paths = [str(folder) for folder in self.folders]
         self._database.execute(f"SET allowed_directories={paths}")
         self._database.execute("SET enable_external_access=false")
@@ -228,6 +236,14 @@ class Experiments:
             name for (name,) in self._database.execute(f"SELECT DISTINCT phase FROM {RESULTS} ORDER BY 1").fetchall()
         ]
 
+    def episodes(self, checkpoint: str, data: str, faults: str = "", phase: str = "all") -> pa.Table:
+        """The results of one checkpoint by episode and seed, largest error first."""
+        return self.query(
+            f"SELECT episode, seed, policy, steps, error, unit, worst, worst_step, nees FROM {RESULTS} "
+            "WHERE checkpoint = ? AND data = ? AND faults = ? AND phase = ? ORDER BY error DESC, episode, seed",
+            [checkpoint, data, faults, phase],
+        )
+
     def trace(self, row: Mapping[str, Any]) -> Trace:
         """Run the filter of a row of the results again.
 
@@ -236,17 +252,18 @@ class Experiments:
 
         Raises BadInput if a file is missing or was changed.
         """
-        checkpoint = load_checkpoint(self._path(CHECKPOINTS, "checkpoint", row["checkpoint"]))
+        checkpoint = load_checkpoint(self.path(CHECKPOINTS, "checkpoint", row["checkpoint"]))
         if checkpoint.hash != row["checkpoint"]:
             raise BadInput(f"the checkpoint with hash {row['checkpoint'][:12]} was changed after the sweep")
-        path = self._path(DATASETS, "data", row["data"])
+        path = self.path(DATASETS, "data", row["data"])
         with open_dataset(path, checkpoint.task) as data:
             if data.hash != row["data"]:
                 raise BadInput(f"{path} was changed after the sweep")
             faults, particles = read_faults(row["faults"], data.task), row.get("particles") or 300
             return trace(checkpoint, data[row["episode"]], row["episode"], row["seed"], particles, faults)
 
-    def _path(self, table: str, column: str, value: str) -> Path:
+    def path(self, table: str, column: str, value: str) -> Path:
+        """File of a checkpoint or data set with this hash. Raises BadInput for an unknown hash."""
         found = self._database.execute(f"SELECT path FROM {table} WHERE {column} = ?", [value]).fetchone()
         if found is None:
             raise BadInput(f"no {column} with hash {value[:12]} in these sweeps")

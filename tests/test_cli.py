@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
 OPTIONS = {
     "demo": "--port --open --no-open",
-    "serve": "--port --host --token --read-only --allow-host --workspace --task --data --filter --study "
+    "serve": "--port --host --token --read-only --allow-host --workspace --task --data --filter --study --sweep "
     "--views --open --no-open --log-level --log-format --seed",
     "collect": "--episodes --steps --seed --workers -o --json",
     "convert": "--data --skip-bad -o --json",

@@ -28,7 +28,7 @@ class Settings:
         seed: seed of the filters.
         views: maximum number of pages open at a time.
         tasks: user-defined tasks, as accepted by ``load_task``.
-        studies: displayed name -> folder of a study.
+        studies, sweeps: displayed name -> folder of a study or of a sweep.
     """
 
     workspace: Path
@@ -40,6 +40,7 @@ class Settings:
     views: int = 32
     tasks: tuple[str, ...] = ()
     studies: Mapping[str, Path] = field(default_factory=dict)
+    sweeps: Mapping[str, Path] = field(default_factory=dict)
 
     @property
     def definitions(self) -> list[Task]:

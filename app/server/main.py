@@ -25,6 +25,7 @@ from beliefscope.app.api import (
     comparison,
     diagnosis,
     diagnostics,
+    experiments,
     failures,
     finetune,
     lineage,
@@ -122,6 +123,7 @@ def create_app(settings: Settings, warm: bool = True, subprocess: bool = False, 
         reports.routes(store, jobs),
         live.routes(store),
         studies.routes(store, jobs),
+        experiments.routes(store),
         lineage.routes(store),
     ):
         app.include_router(router)

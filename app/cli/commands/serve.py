@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
+from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
     from beliefscope.app.runs.settings import Settings
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
         "has none, for the one given with --task.",
     ),
     study=opt.option("DIR", "Folder of a study to serve. Repeatable."),
+    sweep=opt.option("DIR", "Folder of a sweep to serve (docs/sweep.md). Repeatable."),
     views=opt.option("N", "Maximum number of open pages.", parser=opt.integer(1, 1024)),
     open_page=opt.flag("Open the dashboard in a browser.", "--open/--no-open"),
     log_level=opt.option("LEVEL", "Log level on standard error: debug, info, warning or error."),
@@ -46,6 +48,7 @@ def serve(
     data: list[Path] | None = None,
     filter: list[str] | None = None,
     study: list[Path] | None = None,
+    sweep: list[Path] | None = None,
     views: int = 32,
     open_page: bool = False,
     log_level: Literal["debug", "info", "warning", "error"] = "warning",
@@ -88,9 +91,13 @@ def serve(
         views=views,
         tasks=tuple(task or ()),
         studies=short_names(study or (), {SHIPPED}),
+        sweeps=short_names(sweep or ()),
     )
     for name, folder in settings.studies.items():
         Study(name, folder, has_checkpoints=True).read()  # raises BadInput early
+    for folder in settings.sweeps.values():
+        if not (folder / "results.parquet").is_file():
+            raise BadInput(f"{folder} has no results of a sweep; write them: beliefscope sweep ... -o {folder}")
     serve_page(settings, port, open_page, host, access)
 
 

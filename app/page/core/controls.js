@@ -44,6 +44,7 @@ export function bindControls(page) {
     r: openTab('recordings'),
     t: openTab('finetune'),
     u: openTab('study'),
+    k: openTab('experiments'),
     n: ({ timeStamp }) => page.failures.go(1, timeStamp),
     b: ({ timeStamp }) => page.failures.go(-1, timeStamp),
     c: () => page.selectNextComponent(),

@@ -24,6 +24,7 @@ import { Finetune } from '../tabs/finetune.js';
 import { Live } from '../tabs/live_runs.js';
 import { Recordings } from '../tabs/recordings.js';
 import { Rerun } from '../tabs/rerun.js';
+import { Experiments } from '../tabs/experiments.js';
 import { Study } from '../tabs/study.js';
 import { Timeline } from '../timeline/timeline.js';
 import { CommandPalette } from '../widgets/command_palette.js';
@@ -132,6 +133,7 @@ export class Page {
     );
     this.finetune = new Finetune(html('#finetune'), catalog, store, this.jobs, faultDialog);
     this.study = new Study(html('#study'), catalog, store, this.failures, this.jobs);
+    this.experiments = new Experiments(html('#experiments'), catalog, store);
     this.live = new Live(catalog, store, this.#liveHandlers(refreshPickers), live);
     this.recordings = new Recordings(html('#recordings'), catalog, store, this.jobs, this.rerun);
     this.selectTab = tabBar(store);
@@ -410,6 +412,7 @@ export class Page {
     this.recordings.open = tab === 'recordings';
     this.finetune.open = tab === 'finetune';
     this.study.open = tab === 'study';
+    this.experiments.open = tab === 'experiments';
     if (this.#trace) this.rerun.move(this.#store.state.step, false);
   }
 
@@ -427,6 +430,7 @@ export class Page {
     this.diagnostics.redraw();
     this.compare.redraw();
     this.finetune.redraw();
+    this.experiments.redraw();
   }
 
   /** @param {number} step */

@@ -49,6 +49,12 @@ import { displayName } from './units.js';
  * @property {string} study selected study, empty for the first one
  * @property {string} quantity of the study, empty for the first one
  * @property {string} start of the study's runs: `offset` from the truth, if the study has such runs, or at the `truth`
+ * @property {string} sweep selected sweep, empty for the first one
+ * @property {string} steps phase of the sweep's results
+ * @property {string} match words and conditions that the results must match
+ * @property {string} sort column of the results, with a minus for descending
+ * @property {string} x quantity of the x axis of the results. @property {string} y of the y axis
+ * @property {string} cell selected result
  * @property {string} pin step whose maps are the reference of the displayed ones, URL-encoded; empty for none
  * @property {boolean} playing
  * @property {number} speed
@@ -66,6 +72,7 @@ export const TABS = [
   'compare',
   'finetune',
   'study',
+  'experiments',
   'recordings',
 ];
 
@@ -98,6 +105,13 @@ const TEXTS = {
   run: '',
   study: '',
   quantity: '',
+  sweep: '',
+  steps: 'all',
+  match: '',
+  sort: '-error',
+  x: 'error',
+  y: 'nees',
+  cell: '',
   pin: '',
   plane: '',
   sensor: '',
@@ -135,6 +149,7 @@ const HISTORY_KEYS = [
   'diagnostic',
   'run',
   'study',
+  'sweep',
 ];
 const LINK_DELAY = 250; // ms; browsers limit how often a page may change its address
 

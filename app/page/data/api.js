@@ -15,6 +15,9 @@ export { ServerError };
  * @typedef {import('../types/server.js').DiagnosticResult} DiagnosticResult
  * @typedef {import('../types/server.js').FailureEvent} FailureEvent
  * @typedef {import('../types/server.js').Diagnosis} Diagnosis
+ * @typedef {import('../types/server.js').EpisodeResults} EpisodeResults
+ * @typedef {import('../types/server.js').ExperimentRow} ExperimentRow
+ * @typedef {import('../types/server.js').Experiments} Experiments
  * @typedef {import('../types/server.js').Failures} Failures
  * @typedef {import('../types/server.js').FineTuneDetails} FineTuneDetails
  * @typedef {import('../types/server.js').FineTuneOffer} FineTuneOffer
@@ -31,6 +34,7 @@ export { ServerError };
  * @typedef {import('../types/server.js').Selection} Selection
  * @typedef {import('../types/server.js').StartedJob} StartedJob
  * @typedef {import('../types/server.js').StudyList} StudyList
+ * @typedef {import('../types/server.js').SweepList} SweepList
  * @typedef {import('../types/server.js').Task} Task
  * @typedef {import('../types/server.js').TraceDiagnosticInfo} TraceDiagnosticInfo
  * @typedef {import('../types/server.js').TraceHeader} TraceHeader
@@ -449,3 +453,46 @@ export const trainStudy = (study) => send(path(['studies', study, 'cells']));
  */
 export const addStudyFilter = (study, task, filter, seed) =>
   send(path(['studies', study, task, filter, seed]));
+
+/**
+ * Lists the sweeps.
+ * @returns {Promise<SweepList>}
+ */
+export const sweeps = () => get('/api/experiments');
+
+/**
+ * Gets the results of a sweep by checkpoint, for the steps of one phase.
+ * @param {string} sweep
+ * @param {string} phase
+ * @returns {Promise<Experiments>}
+ */
+export const experiments = (sweep, phase) =>
+  get(`${path(['experiments', sweep])}?${new URLSearchParams({ phase })}`);
+
+/**
+ * Address of the same results as CSV.
+ * @param {string} sweep
+ * @param {string} phase
+ */
+export const experimentsCsv = (sweep, phase) =>
+  `${path(['experiments', sweep, 'results.csv'])}?${new URLSearchParams({ phase })}`;
+
+/**
+ * Gets the results of a checkpoint by episode.
+ * @param {string} sweep
+ * @param {Pick<ExperimentRow, 'checkpoint' | 'data' | 'faults'>} row
+ * @param {string} phase
+ * @returns {Promise<EpisodeResults>}
+ */
+export const experimentEpisodes = (sweep, { checkpoint, data, faults }, phase) => {
+  const query = new URLSearchParams({ checkpoint, data, faults, phase });
+  return get(`${path(['experiments', sweep, 'episodes'])}?${query}`);
+};
+
+/**
+ * Adds a checkpoint of a sweep to the catalog.
+ * @param {string} sweep
+ * @param {string} checkpoint hash
+ * @returns {Promise<{filter: string}>} its name in the catalog
+ */
+export const addSweepFilter = (sweep, checkpoint) => send(path(['experiments', sweep, checkpoint]));

@@ -316,6 +316,38 @@ export interface components {
             contact: boolean[];
         };
         /**
+         * EpisodeResult
+         * @description Results of an episode in one phase; error and worst in ``unit``.
+         */
+        EpisodeResult: {
+            /** Episode */
+            episode: number;
+            /** Seed */
+            seed: number;
+            /** Policy */
+            policy: string;
+            /** Steps */
+            steps: number;
+            /** Error */
+            error: number | null;
+            /** Unit */
+            unit: string;
+            /** Worst */
+            worst: number | null;
+            /** Worst Step */
+            worst_step: number;
+            /** Nees */
+            nees: number | null;
+        };
+        /**
+         * EpisodeResults
+         * @description Results of a checkpoint by episode, largest errors first.
+         */
+        EpisodeResults: {
+            /** Episodes */
+            episodes: components["schemas"]["EpisodeResult"][];
+        };
+        /**
          * EpisodeSummary
          * @description Metadata of an episode. ``contact_fraction`` is its fraction of steps in contact.
          */
@@ -352,6 +384,63 @@ export interface components {
             help: string;
             /** Link */
             link: string;
+        };
+        /**
+         * ExperimentRow
+         * @description Results of a checkpoint over a data set in one phase.
+         *
+         *     Attributes:
+         *         checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it.
+         *         error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``.
+         *         provenance: JSON of the file beside the checkpoint.
+         */
+        ExperimentRow: {
+            /** Name */
+            name: string;
+            /** Filter */
+            filter: string;
+            /** Task */
+            task: string;
+            /** Faults */
+            faults: string;
+            /** Episodes */
+            episodes: number;
+            /** Steps */
+            steps: number;
+            /** Error */
+            error: number | null;
+            /** Unit */
+            unit: string;
+            /** Nees */
+            nees: number | null;
+            /** Coverage95 */
+            coverage95: number | null;
+            /** Worst */
+            worst: number | null;
+            /** Worst Episode */
+            worst_episode: number | null;
+            /** Worst Step */
+            worst_step: number | null;
+            /** Checkpoint */
+            checkpoint: string;
+            /** Data */
+            data: string;
+            /** Provenance */
+            provenance: string;
+            /** Catalog Name */
+            catalog_name: string | null;
+            /** Data Name */
+            data_name: string | null;
+        };
+        /**
+         * Experiments
+         * @description Results by checkpoint, largest errors first. count: number of rows, of which only the first are sent.
+         */
+        Experiments: {
+            /** Rows */
+            rows: components["schemas"]["ExperimentRow"][];
+            /** Count */
+            count: number;
         };
         /**
          * FailureEvent
@@ -1529,6 +1618,32 @@ export interface components {
             rows: components["schemas"]["Row"][];
         };
         /**
+         * SweepInfo
+         * @description A sweep. faults: texts, the empty one for clean data.
+         */
+        SweepInfo: {
+            /** Name */
+            name: string;
+            /** Checkpoints */
+            checkpoints: number;
+            /** Rows */
+            rows: number;
+            /** Phases */
+            phases: string[];
+            /** Faults */
+            faults: string[];
+        };
+        /**
+         * SweepList
+         * @description All sweeps. problems: one line per unreadable sweep.
+         */
+        SweepList: {
+            /** Sweeps */
+            sweeps: components["schemas"]["SweepInfo"][];
+            /** Problems */
+            problems: string[];
+        };
+        /**
          * Table
          * @description Rows of values, None where a value is not available. Column names include the unit.
          */
@@ -1740,9 +1855,13 @@ export type DiagnosticOption = components['schemas']['DiagnosticOption'];
 export type DiagnosticResult = components['schemas']['DiagnosticResult'];
 export type DisplayedSensor = components['schemas']['DisplayedSensor'];
 export type EpisodeErrors = components['schemas']['EpisodeErrors'];
+export type EpisodeResult = components['schemas']['EpisodeResult'];
+export type EpisodeResults = components['schemas']['EpisodeResults'];
 export type EpisodeSummary = components['schemas']['EpisodeSummary'];
 export type Error = components['schemas']['Error'];
 export type Example = components['schemas']['Example'];
+export type ExperimentRow = components['schemas']['ExperimentRow'];
+export type Experiments = components['schemas']['Experiments'];
 export type FailureEvent = components['schemas']['FailureEvent'];
 export type FailureScore = components['schemas']['FailureScore'];
 export type Failures = components['schemas']['Failures'];
@@ -1796,6 +1915,8 @@ export type StudyFilter = components['schemas']['StudyFilter'];
 export type StudyInfo = components['schemas']['StudyInfo'];
 export type StudyList = components['schemas']['StudyList'];
 export type StudyTask = components['schemas']['StudyTask'];
+export type SweepInfo = components['schemas']['SweepInfo'];
+export type SweepList = components['schemas']['SweepList'];
 export type Table = components['schemas']['Table'];
 export type TaskInfo = components['schemas']['TaskInfo'];
 export type TraceDiagnosticInfo = components['schemas']['TraceDiagnosticInfo'];

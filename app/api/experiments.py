@@ -1,0 +1,119 @@
+"""Routes under ``/api/experiments``: results of sweeps, and checkpoints to open."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from fastapi import APIRouter
+from fastapi.responses import Response
+
+from beliefscope.app.api.models.experiments import (
+    EpisodeResult,
+    EpisodeResults,
+    ExperimentRow,
+    Experiments,
+    SweepInfo,
+    SweepList,
+)
+from beliefscope.app.api.models.training import FilterName
+from beliefscope.app.protocol.errors import NotFound
+from beliefscope.app.runs.catalog import short_names
+from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.datasets.errors import BadInput
+from beliefscope.filters.checkpoint import load_checkpoint
+
+if TYPE_CHECKING:
+    from beliefscope.recordings.sweep_table import Experiments as Tables
+
+LARGEST = 2000
+"""Maximum number of rows that are sent."""
+
+
+def routes(store: TraceStore) -> APIRouter:
+    router = APIRouter()
+
+    def sweeps() -> dict[str, Any]:
+        """Folders by name: those given to the server, and those in the workspace."""
+        given = store.settings.sweeps
+        paths = {folder.resolve() for folder in given.values()}
+        found = sorted(store.settings.workspace.glob("*/results.parquet"))
+        others = [path.parent for path in found if path.parent.resolve() not in paths]
+        return {**given, **short_names(others, given)}
+
+    def tables(name: str) -> Tables:
+        from beliefscope.recordings.sweep_table import Experiments as Tables  # pyarrow and DuckDB are slow to import
+
+        folder = sweeps().get(name)
+        if folder is None:
+            raise NotFound(f"Sweep {name!r} does not exist.")
+        return Tables([folder])
+
+    def catalog_name(task: str, hash_: str) -> str | None:
+        filters = store.filters(task) if task in store.tasks() else {}
+        return next((name for name, filter_ in filters.items() if filter_.hash == hash_), None)
+
+    @router.get("/api/experiments")
+    def list_sweeps() -> SweepList:
+        entries, problems = [], []
+        for name in sweeps():
+            try:
+                experiments = tables(name)
+                (size,) = experiments.query(
+                    "SELECT count(*) AS rows, count(DISTINCT checkpoint) AS c FROM results"
+                ).to_pylist()
+                faults = experiments.query("SELECT DISTINCT faults FROM results ORDER BY faults")["faults"].to_pylist()
+                phases = experiments.phases()
+                entries.append(
+                    SweepInfo(name=name, checkpoints=size["c"], rows=size["rows"], phases=phases, faults=faults)
+                )
+            except BadInput as error:
+                problems.append(str(error))
+        return SweepList(sweeps=entries, problems=problems)
+
+    @router.get("/api/experiments/{sweep}")
+    def results(sweep: str, phase: str = "all") -> Experiments:
+        rows = tables(sweep).overview(phase)
+        tasks = set(rows["task"].to_pylist()) & set(store.tasks())
+        data = {data.hash: name for task in tasks for name, data in store.datasets(task).items()}
+        sent = [
+            ExperimentRow(
+                **_finite(row),
+                catalog_name=catalog_name(row["task"], row["checkpoint"]),
+                data_name=data.get(row["data"]),
+            )
+            for row in rows.slice(0, LARGEST).to_pylist()
+        ]
+        return Experiments(rows=sent, count=len(rows))
+
+    @router.get("/api/experiments/{sweep}/episodes")
+    def episodes(sweep: str, checkpoint: str, data: str, faults: str = "", phase: str = "all") -> EpisodeResults:
+        rows = tables(sweep).episodes(checkpoint, data, faults, phase).slice(0, LARGEST).to_pylist()
+        return EpisodeResults(episodes=[EpisodeResult(**_finite(row)) for row in rows])
+
+    @router.get("/api/experiments/{sweep}/results.csv")
+    def results_as_csv(sweep: str, phase: str = "all") -> Response:
+        from beliefscope.recordings.sweep_table import as_csv
+
+        name = {"Content-Disposition": f'attachment; filename="results-{phase.replace(" ", "-")}.csv"'}
+        return Response(as_csv(tables(sweep).overview(phase)), media_type="text/csv", headers=name)
+
+    @router.post("/api/experiments/{sweep}/{checkpoint}")
+    def open_checkpoint(sweep: str, checkpoint: str) -> FilterName:
+        path = tables(sweep).path("checkpoints", "checkpoint", checkpoint)
+        loaded = load_checkpoint(path, store.settings.definitions)
+        if loaded.hash != checkpoint:
+            raise BadInput(f"{str(path)!r} was changed after the sweep")
+        name = catalog_name(loaded.task.name, checkpoint)
+        if name is None:
+            names = store.filters(loaded.task.name)
+            name = path.stem if path.stem not in names else f"{path.stem}-{checkpoint[:8]}"
+            store.add_filter(loaded.task.name, name, loaded, path, first=False)
+        return FilterName(filter=name)
+
+    return router
+
+
+def _finite(row: dict[str, Any]) -> dict[str, Any]:
+    """The row with None in place of NaN, which JSON lacks."""
+    return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}

@@ -1,0 +1,78 @@
+"""Response models of sweeps."""
+
+from __future__ import annotations
+
+from beliefscope.app.api.models.catalog import Number, Reply
+
+
+class SweepInfo(Reply):
+    """A sweep. faults: texts, the empty one for clean data."""
+
+    name: str
+    checkpoints: int
+    rows: int
+    phases: list[str]
+    faults: list[str]
+
+
+class SweepList(Reply):
+    """All sweeps. problems: one line per unreadable sweep."""
+
+    sweeps: list[SweepInfo]
+    problems: list[str]
+
+
+class ExperimentRow(Reply):
+    """Results of a checkpoint over a data set in one phase.
+
+    Attributes:
+        checkpoint, data: hashes. catalog_name, data_name: their names in the catalog; None: not in it.
+        error, worst: in ``unit``, at ``worst_episode`` and ``worst_step``.
+        provenance: JSON of the file beside the checkpoint.
+    """
+
+    name: str
+    filter: str
+    task: str
+    faults: str
+    episodes: int
+    steps: int
+    error: Number
+    unit: str
+    nees: Number
+    coverage95: Number
+    worst: Number
+    worst_episode: int | None
+    worst_step: int | None
+    checkpoint: str
+    data: str
+    provenance: str
+    catalog_name: str | None
+    data_name: str | None
+
+
+class Experiments(Reply):
+    """Results by checkpoint, largest errors first. count: number of rows, of which only the first are sent."""
+
+    rows: list[ExperimentRow]
+    count: int
+
+
+class EpisodeResult(Reply):
+    """Results of an episode in one phase; error and worst in ``unit``."""
+
+    episode: int
+    seed: int
+    policy: str
+    steps: int
+    error: Number
+    unit: str
+    worst: Number
+    worst_step: int
+    nees: Number
+
+
+class EpisodeResults(Reply):
+    """Results of a checkpoint by episode, largest errors first."""
+
+    episodes: list[EpisodeResult]

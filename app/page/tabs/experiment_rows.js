@@ -1,0 +1,101 @@
+/** Rows of the Experiments tab: quantities, filtering by words and conditions, and the order as text. */
+
+/** @import { ExperimentRow } from '../types/server.js' */
+/** @import { Sort } from '../widgets/sorting.js' */
+
+import { fixed, percent } from '../core/units.js';
+
+/** @typedef {'error' | 'nees' | 'coverage95' | 'worst' | 'episodes' | 'steps'} NumberKey */
+/** @typedef {{title: string, help: string, hasUnit: boolean, format: (value: number | null) => string}} NumberColumn */
+
+/** Numbers of a row. @type {Record<NumberKey, NumberColumn>} */
+export const NUMBERS = {
+  error: {
+    title: 'RMSE',
+    help: 'Root mean square position error, pooled over the steps',
+    hasUnit: true,
+    format: (value) => fixed(value, 2),
+  },
+  nees: {
+    title: 'NEES/n',
+    help: 'Mean normalised squared error: 1 if the covariance is consistent',
+    hasUnit: false,
+    format: (value) => fixed(value, 2),
+  },
+  coverage95: {
+    title: '95 % coverage',
+    help: 'Share of steps whose 95 % ellipsoid contains the true state',
+    hasUnit: false,
+    format: percent,
+  },
+  worst: {
+    title: 'worst',
+    help: 'Largest position error of all steps',
+    hasUnit: true,
+    format: (value) => fixed(value, 2),
+  },
+  episodes: { title: 'episodes', help: 'Number of episodes', hasUnit: false, format: String },
+  steps: { title: 'steps', help: 'Number of steps', hasUnit: false, format: String },
+};
+
+export const NUMBER_KEYS = /** @type {NumberKey[]} */ (Object.keys(NUMBERS));
+
+/**
+ * Value of a column, by which rows are sorted.
+ * @param {ExperimentRow} row
+ * @param {string} column
+ */
+export function valueOf(row, column) {
+  const values = /** @type {Record<string, string | number | null>} */ ({ ...row });
+  return values[column] ?? null;
+}
+
+/**
+ * Identifies a row of a sweep.
+ * @param {Pick<ExperimentRow, 'checkpoint' | 'data' | 'faults'>} row
+ */
+export const rowKey = ({ checkpoint, data, faults }) =>
+  `${checkpoint.slice(0, 12)}.${data.slice(0, 12)}.${faults}`;
+
+/** @type {Record<string, (value: number, limit: number) => boolean>} */
+const COMPARISONS = {
+  '>': (value, limit) => value > limit,
+  '<': (value, limit) => value < limit,
+  '>=': (value, limit) => value >= limit,
+  '<=': (value, limit) => value <= limit,
+};
+
+/**
+ * Returns the rows that contain all words, in any text or the provenance, and meet all conditions such as `nees>2`.
+ * @param {ExperimentRow[]} rows
+ * @param {string} text
+ */
+export function matching(rows, text) {
+  const tests = text
+    .toLowerCase()
+    .split(/\s+/)
+    .filter(Boolean)
+    .map((word) => {
+      const [, key, sign, limit] = word.match(/^(\w+)(>=|<=|>|<)(-?[\d.]+)$/) ?? [];
+      if (key in NUMBERS) {
+        const column = /** @type {NumberKey} */ (key);
+        return (/** @type {ExperimentRow} */ row) => {
+          const value = row[column];
+          return value !== null && COMPARISONS[sign](value, Number(limit));
+        };
+      }
+      return (/** @type {ExperimentRow} */ { name, filter, task, faults, provenance }) =>
+        [name, filter, task, faults, provenance].some((part) => part.toLowerCase().includes(word));
+    });
+  return rows.filter((row) => tests.every((test) => test(row)));
+}
+
+/**
+ * Reads an order from the permalink: a column, with a minus for descending.
+ * @param {string} text
+ * @returns {Sort}
+ */
+export const parseSort = (text) => ({ name: text.replace(/^-/, ''), down: text.startsWith('-') });
+
+/** @param {Sort} sort */
+export const sortText = ({ name, down }) => `${down ? '-' : ''}${name}`;

@@ -1,0 +1,402 @@
+/** The Experiments tab: checkpoints of a sweep as a sortable, filterable table and a scatter plot, and their episodes. */
+
+/** @import { State, Store } from '../core/state.js' */
+/** @import { Catalog, EpisodeResult, ExperimentRow, SweepInfo } from '../types/server.js' */
+
+import { create, element, html, messageOf } from '../core/dom.js';
+import { permalink } from '../core/state.js';
+import { displayName, fixed, sentence, significant } from '../core/units.js';
+import * as api from '../data/api.js';
+import { setPanelState } from '../widgets/panel_state.js';
+import { navigateRows, setTabStop } from '../widgets/row_navigation.js';
+import { sortHeading, sortRows } from '../widgets/sorting.js';
+import {
+  matching,
+  NUMBER_KEYS,
+  NUMBERS,
+  parseSort,
+  rowKey,
+  sortText,
+  valueOf,
+} from './experiment_rows.js';
+import { drawScatter, seriesOf } from './scatter.js';
+
+const EMPTY =
+  'No sweep yet. Run many checkpoints over many episodes, then serve the results: ' +
+  "beliefscope sweep --checkpoints 'runs/*.safetensors' -o sweep, and beliefscope serve --sweep sweep";
+const EPISODES = 50; // listed for a checkpoint, the worst first
+
+const BODY = `
+  <div class="top">
+    <label class="picker">Sweep <select class="sweep" aria-label="Sweep"></select></label>
+    <label class="picker">Steps <select class="steps" aria-label="Steps"></select></label>
+    <label class="picker">Show <input class="match" type="search" placeholder="ekf blackout nees>2" aria-label="Words and conditions that rows must match" title="Words in any column, and conditions such as nees&gt;2"></label>
+    <a class="csv" download>CSV</a>
+  </div>
+  <p class="problems" role="alert"></p>
+  <div class="axes">
+    <p class="about" role="status"></p>
+    <label class="picker">x <select class="x" aria-label="Quantity of the x axis"></select></label>
+    <label class="picker">y <select class="y" aria-label="Quantity of the y axis"></select></label>
+  </div>
+  <div class="chart"></div>
+  <div class="scroll" tabindex="-1"><table class="checkpoints"><thead></thead><tbody></tbody></table></div>
+  <section class="episodes" aria-label="Episodes of the selected checkpoint" hidden>
+    <div class="bar"><h4></h4><button type="button" class="compare">Compare with it</button><button type="button" class="diagnose">Diagnose</button></div>
+    <ol></ol>
+  </section>
+  <p class="note"></p>`;
+
+export class Experiments {
+  #host;
+  #catalog;
+  #store;
+  #open = false;
+  /** @type {SweepInfo[] | null} */
+  #sweeps = null;
+  /** Rows of the sweep and steps in `#loaded`. @type {ExperimentRow[]} */
+  #rows = [];
+  /** Displayed rows, in order. @type {ExperimentRow[]} */
+  #matching = [];
+  #count = 0;
+  #loaded = '';
+  /** Episodes of the selected row. @type {EpisodeResult[]} */
+  #episodes = [];
+  #body;
+
+  /**
+   * @param {HTMLElement} host
+   * @param {Catalog} catalog
+   * @param {Store} store
+   */
+  constructor(host, catalog, store) {
+    this.#host = host;
+    this.#catalog = catalog;
+    this.#store = store;
+    host.innerHTML = BODY;
+    this.#body = element('.checkpoints tbody', HTMLTableSectionElement, host);
+    navigateRows(this.#body);
+    new ResizeObserver(() => this.#drawChart()).observe(html('.chart', host));
+    this.#listenToPickers();
+    html('.compare', host).addEventListener('click', () =>
+      this.#openRow((row, filter) => ({
+        tab: 'compare',
+        against: `filter=${encodeURIComponent(filter)}`,
+      })),
+    );
+    html('.diagnose', host).addEventListener('click', () =>
+      this.#openRow((row, filter) => ({
+        ...this.#runOf(row, filter),
+        tab: 'diagnosis',
+        over: 'held-out',
+      })),
+    );
+    store.listen((_, changed) => {
+      if (!this.#open) return;
+      if (['sweep', 'steps'].some((key) => changed.has(key))) this.#load();
+      else if (['match', 'sort', 'x', 'y'].some((key) => changed.has(key))) this.#draw();
+      else if (changed.has('cell')) this.#showSelected();
+    });
+  }
+
+  /** Whether the tab is selected. */
+  set open(/** @type {boolean} */ open) {
+    const opened = open && !this.#open;
+    this.#open = open;
+    if (opened) this.#load();
+  }
+
+  /** Draws the chart again in the colours of the theme. */
+  redraw() {
+    if (this.#open && this.#rows.length) this.#draw();
+  }
+
+  #listenToPickers() {
+    const store = this.#store;
+    const pick = (/** @type {keyof State} */ key, /** @type {string} */ selector) => {
+      const picker = element(selector, HTMLSelectElement, this.#host);
+      picker.addEventListener('change', () => store.set({ [key]: picker.value }));
+    };
+    pick('sweep', '.sweep');
+    pick('steps', '.steps');
+    pick('x', '.x');
+    pick('y', '.y');
+    const match = element('.match', HTMLInputElement, this.#host);
+    match.addEventListener('input', () => store.set({ match: match.value }));
+  }
+
+  /** The selected sweep, or the first one. @returns {SweepInfo | undefined} */
+  get #sweep() {
+    return this.#sweeps?.find(({ name }) => name === this.#store.state.sweep) ?? this.#sweeps?.[0];
+  }
+
+  get #steps() {
+    const { steps } = this.#store.state;
+    return this.#sweep?.phases.includes(steps) ? steps : 'all';
+  }
+
+  async #load() {
+    if (!this.#sweeps) setPanelState(this.#host, 'loading', 'Loading …');
+    try {
+      const { sweeps, problems } = await api.sweeps();
+      this.#sweeps = sweeps;
+      html('.problems', this.#host).textContent = problems.map(sentence).join(' ');
+      const sweep = this.#sweep;
+      if (!sweep) return setPanelState(this.#host, 'empty', EMPTY);
+      const wanted = `${sweep.name} ${this.#steps}`;
+      const { rows, count } = await api.experiments(sweep.name, this.#steps);
+      if (wanted !== `${this.#sweep?.name} ${this.#steps}`) return; // another choice was made meanwhile
+      [this.#rows, this.#count, this.#loaded] = [rows, count, wanted];
+      setPanelState(this.#host, 'ready');
+      this.#fillPickers(sweep);
+      this.#draw();
+      this.#showSelected();
+    } catch (error) {
+      setPanelState(this.#host, 'error', messageOf(error));
+    }
+  }
+
+  /** @param {SweepInfo} sweep */
+  #fillPickers(sweep) {
+    const { state } = this.#store;
+    /** @type {Record<string, string>} */
+    const titles = Object.fromEntries(NUMBER_KEYS.map((key) => [key, NUMBERS[key].title]));
+    const fill = (
+      /** @type {string} */ selector,
+      /** @type {string[]} */ names,
+      /** @type {string} */ value,
+    ) => {
+      const picker = element(selector, HTMLSelectElement, this.#host);
+      picker.replaceChildren(...names.map((name) => new Option(titles[name] ?? name, name)));
+      picker.value = value;
+      return picker;
+    };
+    const names = (this.#sweeps ?? []).map(({ name }) => name);
+    const picker = fill('.sweep', names, sweep.name);
+    if (picker.parentElement) picker.parentElement.hidden = names.length < 2;
+    fill('.steps', ['all', ...sweep.phases.filter((name) => name !== 'all')], this.#steps);
+    fill('.x', NUMBER_KEYS, state.x);
+    fill('.y', NUMBER_KEYS, state.y);
+    element('.match', HTMLInputElement, this.#host).value = state.match;
+    element('.csv', HTMLAnchorElement, this.#host).href = api.experimentsCsv(
+      sweep.name,
+      this.#steps,
+    );
+  }
+
+  #draw() {
+    const { state } = this.#store;
+    const sort = parseSort(state.sort);
+    const rows = sortRows(
+      matching(this.#rows, state.match),
+      (row) => valueOf(row, sort.name),
+      sort.down,
+    );
+    const more =
+      this.#count > this.#rows.length ? `, the ${this.#rows.length} worst of which are listed` : '';
+    html('.about', this.#host).textContent =
+      `${rows.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.`;
+    const columns = columnsOf(this.#rows);
+    const heads = columns.map(({ key, title, help, number }) =>
+      sortHeading(
+        { name: key, title, help, number },
+        sort,
+        (next) => this.#store.set({ sort: sortText(next) }),
+        number,
+      ),
+    );
+    element('.checkpoints thead', HTMLTableSectionElement, this.#host).replaceChildren(
+      create('tr', {}, ...heads),
+    );
+    this.#body.replaceChildren(...rows.map((row) => this.#tableRow(row, columns)));
+    this.#matching = rows;
+    this.#mark();
+  }
+
+  #drawChart() {
+    const { x, y, cell } = this.#store.state;
+    const select = (/** @type {ExperimentRow} */ row) => this.#select(row);
+    drawScatter(html('.chart', this.#host), this.#matching, x, y, this.#filters, cell, select);
+  }
+
+  /** Names of all filters; their order sets the colours. */
+  get #filters() {
+    return [...new Set(this.#rows.map(({ filter }) => filter))];
+  }
+
+  /**
+   * @param {ExperimentRow} row
+   * @param {Column[]} columns
+   */
+  #tableRow(row, columns) {
+    const button = create('button', { type: 'button', className: 'quiet', textContent: row.name });
+    button.title = `${row.name}: its worst episodes`;
+    button.addEventListener('click', () => this.#select(row));
+    const dot = create('span', { className: `dot ${seriesOf(row, this.#filters)}` });
+    const line = create('tr', {}, create('th', { scope: 'row' }, dot, button));
+    line.dataset.cell = rowKey(row);
+    for (const { content, number } of columns.slice(1)) {
+      const cell = line.insertCell();
+      cell.className = number ? 'number' : '';
+      cell.textContent = content(row);
+    }
+    return line;
+  }
+
+  /** @param {ExperimentRow} row */
+  #select(row) {
+    const cell = rowKey(row);
+    this.#store.set({ cell: cell === this.#store.state.cell ? '' : cell });
+  }
+
+  /** @returns {ExperimentRow | undefined} */
+  get #selected() {
+    return this.#rows.find((row) => rowKey(row) === this.#store.state.cell);
+  }
+
+  #mark() {
+    for (const line of this.#body.rows) {
+      const here = line.dataset.cell === this.#store.state.cell;
+      line.classList.toggle('here', here);
+      if (here) setTabStop(line, false);
+    }
+    this.#drawChart();
+  }
+
+  /** Lists the episodes of the selected checkpoint. */
+  async #showSelected() {
+    this.#mark();
+    const row = this.#selected;
+    const [sweep, section] = [this.#sweep, html('.episodes', this.#host)];
+    section.hidden = !row;
+    if (!row || !sweep) return;
+    try {
+      const { episodes } = await api.experimentEpisodes(sweep.name, row, this.#steps);
+      if (row !== this.#selected) return;
+      this.#episodes = episodes;
+    } catch (error) {
+      html('.problems', this.#host).textContent = messageOf(error);
+      return;
+    }
+    const faults = row.faults && `, ${row.faults}`;
+    html('.episodes h4', this.#host).textContent =
+      `${row.name}${faults}: ${this.#episodes.length} episodes, the worst first`;
+    const items = this.#episodes
+      .slice(0, EPISODES)
+      .map((episode) => this.#episodeItem(row, episode));
+    html('.episodes ol', this.#host).replaceChildren(...items);
+  }
+
+  /**
+   * @param {ExperimentRow} row
+   * @param {EpisodeResult} result
+   */
+  #episodeItem(row, { episode, error, unit, worst, worst_step: step, nees, policy }) {
+    const link = create('a', { textContent: `Episode ${episode}, step ${step}` });
+    const patch = (/** @type {string} */ filter) => ({
+      ...this.#runOf(row, filter),
+      episode,
+      step,
+      tab: 'scene',
+    });
+    link.href = permalink({ ...this.#store.state, ...patch(row.catalog_name ?? row.name) });
+    link.addEventListener('click', (event) => {
+      if (event.ctrlKey || event.metaKey || event.shiftKey) return;
+      event.preventDefault();
+      this.#openRow((_, filter) => patch(filter));
+    });
+    const values = [`RMSE ${fixed(error, 2)} ${unit}`, `worst ${fixed(worst, 2)} ${unit}`];
+    if (nees !== null) values.push(`NEES ${significant(nees)}`);
+    return create(
+      'li',
+      {},
+      link,
+      create('span', { textContent: [...values, policy].filter(Boolean).join(', ') }),
+    );
+  }
+
+  /**
+   * The displayed run of a row.
+   * @param {ExperimentRow} row
+   * @param {string} filter its name in the catalog
+   * @returns {Partial<State>}
+   */
+  #runOf({ task, faults, data_name: data, worst_episode: episode, worst_step: step }, filter) {
+    const names = this.#catalog.tasks.find(({ name }) => name === task);
+    const place = { episode: episode ?? 0, step: step ?? 0 };
+    return {
+      task,
+      filter,
+      faults,
+      data: data ?? names?.data[0]?.name ?? '',
+      ...place,
+      against: '',
+      playing: false,
+    };
+  }
+
+  /**
+   * Opens the selected checkpoint, which is added to the catalog if necessary.
+   * @param {(row: ExperimentRow, filter: string) => Partial<State>} patch
+   */
+  async #openRow(patch) {
+    const [row, sweep] = [this.#selected, this.#sweep];
+    if (!row || !sweep) return;
+    if (!row.data_name) {
+      html('.problems', this.#host).textContent =
+        `This server does not have the episodes of ${row.name} (data ${row.data.slice(0, 12)}): serve them with --data.`;
+      return;
+    }
+    if (row.catalog_name) {
+      this.#store.set(patch(row, row.catalog_name));
+      return;
+    }
+    try {
+      const { filter } = await api.addSweepFilter(sweep.name, row.checkpoint);
+      // Loads the catalog again.
+      location.assign(`/${permalink({ ...this.#store.state, ...patch(row, filter) })}`);
+    } catch (error) {
+      html('.problems', this.#host).textContent = messageOf(error);
+    }
+  }
+}
+
+/** @typedef {{key: string, title: string, help: string, number: boolean, content: (row: ExperimentRow) => string}} Column */
+
+/**
+ * Columns of the table; texts that are equal in all rows are left out.
+ * @param {ExperimentRow[]} rows
+ * @returns {Column[]}
+ */
+function columnsOf(rows) {
+  const units = [...new Set(rows.map(({ unit }) => unit))];
+  const texts = /** @type {const} */ (['filter', 'task', 'faults']).filter(
+    (key) => new Set(rows.map((row) => row[key])).size > 1,
+  );
+  return [
+    {
+      key: 'name',
+      title: 'checkpoint',
+      help: 'Name of the file',
+      number: false,
+      content: ({ name }) => name,
+    },
+    ...texts.map((key) => ({
+      key,
+      title: key,
+      help: displayName(key),
+      number: false,
+      content: (/** @type {ExperimentRow} */ row) => row[key] || 'none',
+    })),
+    ...NUMBER_KEYS.map((key) => ({ key, ...NUMBERS[key] })).map(
+      ({ key, title, help, hasUnit, format }) => ({
+        key,
+        title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
+        help,
+        number: true,
+        content: (/** @type {ExperimentRow} */ row) =>
+          `${format(row[key])}${hasUnit && units.length > 1 ? ` ${row.unit}` : ''}`,
+      }),
+    ),
+  ];
+}

@@ -1,0 +1,57 @@
+"""Experiments tab: results are sorted, filtered and opened at their worst moment."""
+
+from __future__ import annotations
+
+import shutil
+from typing import Any
+
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import shipped
+from beliefscope.inspect.sweep import Cell, Inputs
+from beliefscope.recordings.sweep_table import Experiments, run_sweep
+
+READY = "() => document.querySelector('#experiments').dataset.state === 'ready'"
+
+
+def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any) -> None:
+    page = open_page("?tab=experiments&sweep=none", size=(1440, 900))
+    page.until("() => document.querySelector('#experiments').dataset.state === 'empty'")
+    assert "beliefscope serve --sweep" in page.page.locator("#experiments .note").text_content()
+
+    paths = tuple(shipped("door", name) for name in ("image-ekf", "haptics-ekf"))
+    with open_dataset(sample_path("door")) as sample:
+        episodes = tuple(sample.held_out()[:3])
+    cells = [
+        Cell(**{**vars(cell), "episodes": episodes}) for cell in Inputs(paths, faults=("", "blackout=0.8")).cells()
+    ]
+    folder = server.workspace / "sweep"
+    run_sweep(cells, folder)
+    worst = Experiments([folder]).overview("contact").to_pylist()
+    try:
+        page.page.reload()
+        page.until(READY)
+        panel = page.page.locator("#experiments")
+        panel.locator("select.steps").select_option("contact")
+        page.until("() => location.search.includes('steps=contact')")
+        names = "() => [...document.querySelectorAll('#experiments tbody button')].map((b) => b.textContent)"
+        page.until(f"() => ({names})().join() === '{','.join(row['name'] for row in worst)}'")
+        assert panel.locator("circle").count() == 4
+        panel.locator("thead button", has_text="NEES").click()
+        page.until("() => beliefscope.state().sort === '-nees'")
+        expected = [row["name"] for row in sorted(worst, key=lambda row: -row["nees"])]
+        assert page.page.evaluate(names) == expected
+        panel.locator("input.match").fill("haptics blackout")
+        page.until("() => document.querySelectorAll('#experiments tbody tr').length === 1")
+        panel.locator("tbody button").click()
+        page.until("() => document.querySelectorAll('#experiments .episodes li').length === 3")
+        page.screenshot("experiments")
+        (row,) = (r for r in worst if r["name"].endswith("haptics-ekf") and r["faults"])
+        episode = (
+            Experiments([folder]).episodes(row["checkpoint"], row["data"], row["faults"], "contact").to_pylist()[0]
+        )
+        panel.locator(".episodes a").first.click()
+        page.until("() => beliefscope.state().tab === 'scene'")
+        shown = {"filter": "haptics-ekf", "faults": "blackout=0.8", "episode": episode["episode"]}
+        assert page.state.items() >= {**shown, "step": episode["worst_step"]}.items()
+    finally:
+        shutil.rmtree(folder)

@@ -1,0 +1,67 @@
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import {
+  matching,
+  NUMBER_KEYS,
+  parseSort,
+  rowKey,
+  sortText,
+} from '../../app/page/tabs/experiment_rows.js';
+import { niceStep } from '../../app/page/tabs/scatter.js';
+
+const ROW = {
+  name: 'run-1',
+  filter: 'crossmodal-ekf',
+  task: 'door',
+  faults: 'blackout=0.4',
+  episodes: 3,
+  steps: 90,
+  error: 0.5,
+  unit: 'cm',
+  nees: 2.5,
+  coverage95: 0.9,
+  worst: 1.5,
+  worst_episode: 2,
+  worst_step: 40,
+  checkpoint: 'a'.repeat(64),
+  data: 'b'.repeat(64),
+  provenance: '{"lr": 0.001}',
+  catalog_name: null,
+  data_name: null,
+};
+const ROWS = [ROW, { ...ROW, name: 'run-2', faults: '', nees: null, error: 0.7 }];
+/** @param {string} text */
+const names = (text) => matching(ROWS, text).map(({ name }) => name);
+
+test('words match in any text, conditions match numbers, and more of them never match more', () => {
+  assert.deepEqual(names(''), ['run-1', 'run-2']);
+  assert.deepEqual(names('EKF door'), ['run-1', 'run-2']);
+  assert.deepEqual(names('blackout'), ['run-1']);
+  assert.deepEqual(names('0.001'), ['run-1', 'run-2']);
+  assert.deepEqual(names('nees>2'), ['run-1'], 'a missing value meets no condition');
+  assert.deepEqual(names('error>=0.7'), ['run-2']);
+  assert.deepEqual(names('error<0.7 nees>2.5'), []);
+  for (const key of NUMBER_KEYS) assert.equal(names(`${key}<-1e9`).length, 0);
+});
+
+test('an unfinished condition is a word, and does not fail', () => {
+  assert.deepEqual(names('nees>'), []);
+  assert.deepEqual(names('('), []);
+});
+
+test('the order survives the permalink', () => {
+  for (const text of ['error', '-nees', '-name']) assert.equal(sortText(parseSort(text)), text);
+});
+
+test('rows of different faults have different keys', () => {
+  assert.notEqual(rowKey(ROWS[0]), rowKey(ROWS[1]));
+});
+
+test('steps of ticks are 1, 2 or 5 times a power of ten, and at least as large as required', () => {
+  for (const step of [0.0011, 0.2, 0.21, 1, 3.3, 7, 9999]) {
+    const nice = niceStep(step);
+    assert.ok(nice >= step * (1 - 1e-12) && nice <= 2.5 * step);
+    assert.match(nice.toExponential(6), /^[125]\.000000e/);
+  }
+});
