@@ -81,5 +81,13 @@ def test_key_help_is_complete() -> None:
         "PageDown": "page ↓",
         "-": "\N{MINUS SIGN}",
     }
-    labels |= {"Home": "home", "End": "end", "=": "+", "ctrl+z": "ctrl z", "ctrl+y": "ctrl z", "ctrl+shift+z": "shift"}
+    labels |= {
+        "Home": "home",
+        "End": "end",
+        "=": "+",
+        "ctrl+k": "ctrl k",
+        "ctrl+z": "ctrl z",
+        "ctrl+y": "ctrl z",
+        "ctrl+shift+z": "shift",
+    }
     assert {labels.get(key, key) for key in keys} | {"shift"} == documented

@@ -192,8 +192,7 @@ export class Experiments {
       (row) => valueOf(row, sort.name),
       sort.down,
     );
-    const more =
-      this.#count > this.#rows.length ? `, the ${this.#rows.length} worst of which are listed` : '';
+    const more = this.#count > this.#rows.length ? `, ${this.#rows.length} are listed` : '';
     html('.about', this.#host).textContent =
       `${rows.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.`;
     const columns = columnsOf(this.#rows);
