@@ -52,7 +52,7 @@ class ExperimentRow(Reply):
 
 
 class Experiments(Reply):
-    """Results by checkpoint, largest errors first. count: number of rows, of which only the first are sent."""
+    """Results by checkpoint, largest errors first. count: number of all rows; only the first ones are sent."""
 
     rows: list[ExperimentRow]
     count: int

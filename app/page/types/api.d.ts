@@ -434,7 +434,7 @@ export interface components {
         };
         /**
          * Experiments
-         * @description Results by checkpoint, largest errors first. count: number of rows, of which only the first are sent.
+         * @description Results by checkpoint, largest errors first. count: number of all rows; only the first ones are sent.
          */
         Experiments: {
             /** Rows */
