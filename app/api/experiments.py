@@ -58,15 +58,7 @@ def routes(store: TraceStore) -> APIRouter:
         entries, problems = [], []
         for name in sweeps():
             try:
-                experiments = tables(name)
-                (size,) = experiments.query(
-                    "SELECT count(*) AS rows, count(DISTINCT checkpoint) AS c FROM results"
-                ).to_pylist()
-                faults = experiments.query("SELECT DISTINCT faults FROM results ORDER BY faults")["faults"].to_pylist()
-                phases = experiments.phases()
-                entries.append(
-                    SweepInfo(name=name, checkpoints=size["c"], rows=size["rows"], phases=phases, faults=faults)
-                )
+                entries.append(_info(name, tables(name)))
             except BadInput as error:
                 problems.append(str(error))
         return SweepList(sweeps=entries, problems=problems)
@@ -112,6 +104,13 @@ def routes(store: TraceStore) -> APIRouter:
         return FilterName(filter=name)
 
     return router
+
+
+def _info(name: str, tables: Tables) -> SweepInfo:
+    size = "SELECT count(*) AS rows, count(DISTINCT checkpoint) AS checkpoints FROM results"
+    (info,) = tables.query(size).to_pylist()
+    faults = tables.query("SELECT DISTINCT faults FROM results ORDER BY faults")["faults"].to_pylist()
+    return SweepInfo(name=name, phases=tables.phases(), faults=faults, **info)
 
 
 def _finite(row: dict[str, Any]) -> dict[str, Any]:
