@@ -88,6 +88,18 @@ def test_separators_and_layouts_resize_the_panels(open_page: Any) -> None:
     second = open_page("?step=20", size=(1280, 720))
     assert second.page.locator("#maps").bounding_box()["width"] == narrower, "sizes are not remembered"
 
+    # Tabs without the run fill the page; one key returns to it.
+    page.page.evaluate("() => localStorage.removeItem('beliefscope.sizes')")
+    page.page.reload()
+    page.until("() => window.beliefscope?.stats.maps?.size === 135")
+    page.page.keyboard.press("u")
+    page.until("() => !document.querySelector('#study').hidden")
+    assert size("#views")["width"] > 1260
+    assert not page.page.locator("#timeline").is_visible()
+    page.page.keyboard.press("g")
+    page.until("() => document.querySelectorAll('#tracks .track').length === 3")
+    assert size("#maps") == default
+
     # Layouts: from the menu at its button; the first one has the default sizes.
     page.page.locator("#layout").click()
     assert not page.violations("#layouts")

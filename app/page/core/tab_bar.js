@@ -5,6 +5,11 @@
 import { element, html } from './dom.js';
 import { TABS } from './state.js';
 
+/** Tabs without the run: they fill the page, unless the user has chosen other sizes. */
+const FULL_TABS = ['finetune', 'study', 'recordings'];
+/** Tabs that use the width of maps and current step too. */
+const WIDE_TABS = ['rerun', ...FULL_TABS];
+
 /**
  * @param {Store} store
  * @returns {(tab: string) => void} displays a tab
@@ -22,6 +27,9 @@ export function tabBar(store) {
     });
   });
   return (selected) => {
+    const { classList } = document.documentElement;
+    classList.toggle('wide-tab', WIDE_TABS.includes(selected));
+    classList.toggle('full-tab', FULL_TABS.includes(selected));
     TABS.forEach((name, i) => {
       buttons[i].ariaSelected = String(name === selected);
       buttons[i].tabIndex = name === selected ? 0 : -1;
