@@ -6,7 +6,7 @@ import { element, html } from './dom.js';
 import { TABS } from './state.js';
 
 /** Tabs without the run: they fill the page, unless the user has chosen other sizes. */
-const FULL_TABS = ['finetune', 'study', 'recordings'];
+const FULL_TABS = ['finetune', 'experiments', 'study', 'recordings'];
 /** Tabs that use the width of maps and current step too. */
 const WIDE_TABS = ['rerun', ...FULL_TABS];
 

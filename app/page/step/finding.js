@@ -26,13 +26,15 @@ const BEFORE = 10; // steps that are compared with the outage
  * @returns {Finding}
  */
 export function finding(trace, component, diagnosis) {
-  if (diagnosis && diagnosis.state !== 'healthy') return faultFinding(diagnosis);
-  const outage = outageFinding(trace, component);
+  const fault = diagnosis && diagnosis.state !== 'healthy' ? faultFinding(diagnosis) : null;
+  if (fault?.evidence) return fault;
+  const outage = fault ? null : outageFinding(trace, component);
   if (outage) return { ...outage, tone: diagnosis ? 'good' : 'none' };
   const worst = worstFinding(trace, component);
   if (!diagnosis) return worst;
   const evidence = `${worst.headline} ${worst.evidence}`.trim();
-  return { tone: 'good', headline: sentence(diagnosis.headline), evidence, step: worst.step };
+  const { tone = 'good', headline = sentence(diagnosis.headline) } = fault ?? {};
+  return { tone, headline, evidence, step: worst.step };
 }
 
 /**
