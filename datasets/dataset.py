@@ -17,14 +17,14 @@ SPLITS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class EpisodeSummary:
-    """Metadata of an episode. ``contact_fraction`` is its fraction of steps in contact."""
+    """Metadata of an episode. ``contact_fraction`` of its steps are in contact; None without such a covariate."""
 
     index: int
     steps: int
     policy: str
     split: str
     seed: int
-    contact_fraction: float
+    contact_fraction: float | None
 
 
 class Dataset(ABC):

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beliefscope.datasets.covariate import CONTACT, Covariate
+from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.simulation.camera import Camera
 
@@ -194,7 +194,7 @@ class Task:
     ingredients: Mapping[str, Ingredient] = field(default_factory=dict)
     start_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     warmup: int = 30
-    covariates: Mapping[str, Covariate] = field(default_factory=lambda: {"contact": CONTACT})
+    covariates: Mapping[str, Covariate] = field(default_factory=dict)
     arrays: tuple[str, ...] = ()
 
     def __hash__(self) -> int:

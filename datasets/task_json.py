@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, get_args
 
-from beliefscope.datasets.covariate import Covariate, Kind
+from beliefscope.datasets.covariate import CONTACT, Covariate, Kind
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.task import Component, Ingredient, Task
@@ -67,9 +67,9 @@ def _component(values: Mapping[str, Any]) -> Component:
 
 
 def _covariates(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The covariates, which definitions of earlier versions lack."""
+    """The covariates; definitions of earlier versions have none, and mean contact."""
     if "covariates" not in values:
-        return {}
+        return {"covariates": {"contact": CONTACT}}
     covariates = {
         name: Covariate(c["kind"], tuple(c["groups"]), tuple(c["cuts"]), c["unit"])
         for name, c in values["covariates"].items()

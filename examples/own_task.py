@@ -2,13 +2,13 @@
 
 python examples/own_task.py own.h5
 beliefscope train examples/own_task.py:TASK --filter crossmodal-ekf --data own.h5 -o own.safetensors
-beliefscope record examples/own_task.py:TASK --filter own.safetensors --data own.h5 -o own.rrd
 """
 
 import sys
 
 import numpy as np
 
+from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.store import write_dataset
 from beliefscope.datasets.task import Component, Task
@@ -25,6 +25,7 @@ TASK = Task(
     dt=DT,
     map_components=("x", "y"),
     map_half_width=0.2,
+    covariates={"wind": Covariate("boolean")},
 )
 
 
@@ -45,7 +46,8 @@ def roll(seed: int, steps: int = 60) -> Episode:
         states=position.astype(np.float32),
         controls=wind.astype(np.float32),
         observations={"image": image, "distances": distances.astype(np.float32), "loud": loud.astype(np.float32)},
-        contact=loud[:, 0],  # shaded in every view
+        contact=np.zeros(steps, bool),
+        covariates={"wind": loud[:, 0].astype(np.float32)},  # its steps are shaded in every view
         qpos=np.zeros((steps, 0), np.float32),  # no replay
         dt=DT,
         seed=seed,

@@ -245,6 +245,7 @@ def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) 
     result = metrics(task, torch.cat([e for e, _ in late]), torch.cat([c for _, c in late]))
     sums = [[float(len(e)), *(float(values.sum()) for values in squares(task, e).values())] for e, _ in late]
     everything = squares(task, torch.cat([e for e, _ in trajectories]))
+    has_contact = "contact" in task.covariates
     touched = np.concatenate([np.maximum.accumulate(e.contact)[task.first_counted(len(e)) :] for e in episodes])
     late_errors = squares(task, torch.cat([e for e, _ in late]))
     before, after = (
@@ -253,8 +254,8 @@ def _pool(task: Task, trajectories: Sequence[Run], episodes: Sequence[Episode]) 
     return replace(
         result,
         rmse_from_step_0=_root_mean(everything),
-        rmse_before_contact=before if not touched.all() else {},
-        rmse_after_contact=after if touched.any() else {},
+        rmse_before_contact=before if has_contact and not touched.all() else {},
+        rmse_after_contact=after if has_contact and touched.any() else {},
         squares=np.array(sums),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -12,13 +13,14 @@ from torch import Tensor
 
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import BadInput
-from beliefscope.datasets.task import DISPLAY_UNITS, Task
+from beliefscope.datasets.task import DISPLAY_UNITS, Task, display_unit
 from beliefscope.filters.batch import Batch
 from beliefscope.filters.belief import Gaussian
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import first_belief
 
-"""Internal unit -> unit of reported values, and the conversion factor."""
+NUMBER = re.compile(r"[-+\d.]*(e[-+]?\d+)?")
+"""The start of an offset."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +38,11 @@ class StartOffset:
     @classmethod
     def parse(cls, text: str, task: Task) -> StartOffset:
         """From text such as ``3cm,20deg``. Raises BadInput for other text and for units that the task does not have."""
-        units = {DISPLAY_UNITS[c.unit][0]: c.unit for c in task.components if c.unit in DISPLAY_UNITS}
+        units = {c.shown[0]: (c.unit, c.shown[1]) for c in task.components}
+        units |= {c.unit: (c.unit, 1.0) for c in task.components if c.unit not in units and c.unit not in DISPLAY_UNITS}
         lengths: dict[str, float] = {}
         for part in filter(None, (part.strip() for part in text.split(","))):
-            number = part.rstrip("abcdefghijklmnopqrstuvwxyz ")
+            number = NUMBER.match(part)[0]  # type: ignore[index]  # matches any text
             shown = part[len(number) :].strip()
             if shown not in units:
                 raise BadInput(f"start offset {part!r} is not in a unit of task {task.name!r}: {', '.join(units)}")
@@ -47,9 +50,10 @@ class StartOffset:
                 value = float(number)
             except ValueError:
                 value = math.nan
-            if not 0.0 < value < 1e6 or units[shown] in lengths:
+            unit, factor = units[shown]
+            if not 0.0 < value < 1e6 or unit in lengths:
                 raise BadInput(f"start offset {part!r} of {text!r} is not one positive length, such as 3{shown}")
-            lengths[units[shown]] = value / DISPLAY_UNITS[units[shown]][1]
+            lengths[unit] = value / factor
         return cls(lengths)
 
     def of(self, task: Task) -> StartOffset:
@@ -62,7 +66,7 @@ class StartOffset:
         return bool(self.lengths)
 
     def __str__(self) -> str:
-        shown = {unit: DISPLAY_UNITS[unit] for unit in self.lengths}
+        shown = {unit: display_unit(unit) for unit in self.lengths}
         return ",".join(f"{factor * self.lengths[unit]:g}{name}" for unit, (name, factor) in shown.items())
 
     def vectors(self, task: Task, episodes: Sequence[Episode], seed: int) -> FloatArray:

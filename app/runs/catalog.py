@@ -232,7 +232,8 @@ def _filter_json(name: str, checkpoint: Checkpoint, path: Path | None) -> dict[s
 
 def _data_json(name: str, data: Dataset) -> dict[str, Any]:
     episode, step = first_moment(data)
-    episodes = [asdict(summary) for summary in data.summaries]
+    has_contact = "contact" in data.task.covariates
+    episodes = [asdict(s) | ({} if has_contact else {"contact_fraction": None}) for s in data.summaries]
     return {"name": name, "first": episode, "first_step": step, "episodes": episodes}
 
 

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode, FloatArray
 from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.simulation.camera import Camera, Image, RayCaster
@@ -157,6 +158,7 @@ def _task(name: str, rate: int, yaw: bool) -> Task:
         dt=1 / rate,
         map_components=("x", "y"),
         map_half_width=0.135,
+        covariates={"contact": CONTACT},
         positions={"effector_position": (0, 1), "control": (0, 1)},
         replay=replay,
         outline=block_outline if yaw else post_outline,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
+from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.camera import Camera
@@ -211,6 +212,7 @@ DOOR = Task(
     dt=DT,
     map_components=("hinge_x", "hinge_y"),
     map_half_width=0.135,
+    covariates={"contact": CONTACT},
     positions={"effector_position": (0, 1), "control": (0, 1)},
     replay=_replay,
     outline=panel_outline,

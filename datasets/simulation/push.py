@@ -12,6 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
+from beliefscope.datasets.covariate import CONTACT
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.controller import DOWN, Impedance, add_controller
@@ -226,6 +227,7 @@ PUSH = Task(
     dt=DT,
     map_components=("x", "y"),
     map_half_width=0.135,
+    covariates={"contact": CONTACT},
     positions={"effector_position": (0, 1), "control": (0, 1)},
     replay=lambda _: push_model(visual=True),
     outline=puck_outline,

@@ -117,8 +117,10 @@ class Slice:
         return ":".join([self.name, *(parts or ["faults="])])
 
     def check(self, task: Task, models: Sequence[str]) -> None:
-        """Raises BadInput if the task lacks a sensor, or the filter's ``models`` lack one of the slice's modalities."""
+        """Raises BadInput if the task lacks a sensor or contact, or the ``models`` one of the slice's modalities."""
         self.faults.check(task)
+        if self.contact is not None and "contact" not in task.covariates:
+            raise BadInput(f"slice {self.name!r} selects steps by contact, which task {task.name!r} does not declare")
         for name in self.only:
             if name not in models:
                 raise unknown_name(f"modality of slice {self.name!r}", name, models)

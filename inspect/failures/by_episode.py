@@ -43,7 +43,10 @@ def by_episode(survey: Survey) -> list[EpisodeErrors]:
 
 
 def _errors(survey: Survey, part: slice) -> EpisodeErrors:
-    error, contact = survey.error[part, -1], survey.phases["steady contact"][part]
+    error, contact = (
+        survey.error[part, -1],
+        survey.phases.get("steady contact", np.zeros(len(survey.error), bool))[part],
+    )
     steps = len(error)
     counted = error[min(int(survey.phases["start"][part].sum()), steps - 1) :]
     has_errors = np.isfinite(error).any()

@@ -17,7 +17,7 @@ from beliefscope.datasets.task import display_name, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
-from beliefscope.inspect.failures.step_scores import PHASES, RECENT, Survey
+from beliefscope.inspect.failures.step_scores import RECENT, Survey
 from beliefscope.inspect.failures.survey import check_applies, find_score, survey_of
 from beliefscope.inspect.statistics.measures import UPDATES_NOTE, Mask, layer_label
 
@@ -75,7 +75,7 @@ class PhaseStatistics:
     """Events of one phase in comparison with all steps.
 
     Attributes:
-        name: one of ``PHASES``.
+        name: one of ``phases_of`` the task.
         steps, events: number of steps, and of events whose peak is in the phase.
         share, event_share: shares of all steps with a score, and of all events.
         lift: ``event_share / share``, the relative frequency of events in the phase.
@@ -107,7 +107,7 @@ class Failures(Diagnostic):
         episodes, steps: numbers of episodes and steps.
         layers: L names: the K modalities, then ``fused``.
         angles: names of the A components in rad.
-        phases: statistics of phases with steps, in the order of ``PHASES``.
+        phase_names: of the survey. phases: statistics of phases with steps, in the order of ``phase_names``.
         events: all events, highest score first.
         quantiles: phase or ``all`` -> (51,) quantiles of the scores, ascending.
     """
@@ -128,6 +128,7 @@ class Failures(Diagnostic):
     steps: int
     layers: tuple[str, ...]
     angles: tuple[str, ...]
+    phase_names: tuple[str, ...]
     phases: tuple[PhaseStatistics, ...]
     events: tuple[Event, ...]
     quantiles: Mapping[str, Array]
@@ -158,8 +159,8 @@ class Failures(Diagnostic):
 
     def worst(self, top: int | None = None, phase: str | None = None) -> tuple[Event, ...]:
         """The ``top`` worst events, of one phase or of all. Raises BadInput for an unknown phase."""
-        if phase is not None and phase not in PHASES:
-            raise unknown_name("phase", phase, PHASES)
+        if phase is not None and phase not in self.phase_names:
+            raise unknown_name("phase", phase, self.phase_names)
         return tuple(event for event in self.events if phase in (None, event.phase))[:top]
 
     def format(self, value: float) -> str:
@@ -270,7 +271,7 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
     events = [_event(survey, score, first, last) for first, last in spans]
     events.sort(key=lambda event: (-event.score, event.episode, event.step))
     quantiles = {"all": _quantiles(score)}
-    quantiles |= {name: _quantiles(score[phase == i]) for i, name in enumerate(PHASES) if (phase == i).any()}
+    quantiles |= {name: _quantiles(score[phase == i]) for i, name in enumerate(survey.phases) if (phase == i).any()}
     return Failures(
         task=survey.task.name,
         filter=survey.filter,
@@ -288,9 +289,10 @@ def failures_of(survey: Survey, by: str = "error") -> Failures:
         steps=len(score),
         layers=survey.layers,
         angles=survey.angles,
+        phase_names=tuple(survey.phases),
         phases=tuple(
             _phase_statistics(name, (phase == i)[has_score], score[has_score], events)
-            for i, name in enumerate(PHASES)
+            for i, name in enumerate(survey.phases)
             if (phase == i).any()
         ),
         events=tuple(events),
@@ -313,7 +315,7 @@ def event_spans(high: Mask, episode: NDArray[np.int_], gap: int) -> list[tuple[i
 
 def _event(survey: Survey, score: Array, first: int, last: int) -> Event:
     peak = first + int(np.nanargmax(score[first : last + 1]))
-    phases = [name for name in PHASES if survey.phases[name][peak]]
+    phases = [name for name, mask in survey.phases.items() if mask[peak]]
 
     def at(array: Array | None) -> Array | None:
         return None if array is None else array[peak]

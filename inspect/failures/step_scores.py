@@ -20,11 +20,23 @@ from beliefscope.inspect.trace import Trace
 RECENT = 0.5
 """s, duration for which a change of contact counts as a phase."""
 
+GROUP = "group "
+"""Prefix of the columns of groups of covariates."""
+
 FAST = 0.95
 """Quantile of the speeds in the data set above which a step is fast motion."""
 
-PHASES = ("contact made", "contact lost", "blackout", "fast motion", "start", "steady contact", "free motion")
-"""Phases by priority; a step belongs to the first phase that applies."""
+OTHER = "other steps"
+"""Phase of the steps of no other phase."""
+
+
+def phases_of(task: Task) -> tuple[str, ...]:
+    """Names of the phases: changes of contact, blackout, fast motion, start, and the groups of the covariates."""
+    groups = [g for name, c in task.covariates.items() if name != "contact" for g in c.group_names(name)]
+    if "contact" in task.covariates:
+        last = ("steady contact", "free motion")
+        return ("contact made", "contact lost", "blackout", "fast motion", "start", *groups, *last)
+    return ("blackout", "fast motion", "start", *groups, OTHER)
 
 
 @dataclass(frozen=True)
@@ -61,7 +73,8 @@ class Survey:
         nees: (S, L) NEES / n.
         ess: (S,) effective sample size, or None.
         beta, effective_weights: (S, K) weights, averaged over map components, or None.
-        phases: each of ``PHASES`` -> (S,) mask; several may apply to a step.
+        phases: name (``phases_of``) -> (S,) mask, by priority: a step belongs to the first that applies. The groups of
+            covariates are in the order of their size, the smallest first.
     """
 
     task: Task
@@ -115,7 +128,7 @@ class Survey:
             angles=tuple(c.name for c in task.components if c.unit == "rad"),
             scores={name: columns[f"score {name}"] for name in available if f"score {name}" in columns},
             refused={name: why for name, score in available.items() if (why := score.why_not(first))},
-            phases=_phases(columns),
+            phases=_phases(columns, first.task),
             episode=columns["episode"],
             step=columns["step"],
             error=columns["error"],
@@ -128,8 +141,8 @@ class Survey:
 
     @property
     def phase_index(self) -> NDArray[np.int_]:
-        """(S,) index in ``PHASES`` of the phase of each step."""
-        return np.argmax(np.stack([self.phases[name] for name in PHASES]), axis=0)
+        """(S,) index in ``phases`` of the phase of each step."""
+        return np.argmax(np.stack([*self.phases.values()]), axis=0)
 
 
 def scores_of(task: Task) -> dict[str, Score]:
@@ -215,6 +228,10 @@ def _columns(trace: Trace) -> dict[str, NDArray[Any]]:
         "start": steps < task.warmup,
         "speed": _speeds(trace, task),
     }
+    for name, covariate in task.covariates.items():
+        if name != "contact":
+            masks = covariate.masks(name, trace.episode.covariate(name))
+            columns |= {f"{GROUP}{group}": mask for group, mask in masks}
     if trace.effective_sample_size is not None:
         columns["ess"] = trace.effective_sample_size
     where = list(task.map_indices)
@@ -241,9 +258,13 @@ def _speeds(trace: Trace, task: Task) -> Array:
     return np.stack([np.linalg.norm(change, axis=-1) for change in changes], axis=-1) / trace.episode.dt
 
 
-def _phases(columns: dict[str, NDArray[Any]]) -> dict[str, Mask]:
+def _phases(columns: dict[str, NDArray[Any]], task: Task) -> dict[str, Mask]:
     contact = columns["contact"].astype(bool)
     fast = (columns["speed"] > np.quantile(columns["speed"], FAST, axis=0)).any(axis=-1)
     names = {"made": "contact made", "lost": "contact lost", "blackout": "blackout", "start": "start"}
     masks = {name: columns[key].astype(bool) for key, name in names.items()}
-    return {**masks, "fast motion": fast, "steady contact": contact, "free motion": ~contact}
+    masks |= {"fast motion": fast, "steady contact": contact, "free motion": ~contact, OTHER: np.ones_like(contact)}
+    groups = {name.removeprefix(GROUP): mask.astype(bool) for name, mask in columns.items() if name.startswith(GROUP)}
+    smallest = iter(sorted(groups, key=lambda name: int(groups[name].sum())))
+    order = [next(smallest) if name in groups else name for name in phases_of(task)]
+    return {name: {**masks, **groups}[name] for name in order}

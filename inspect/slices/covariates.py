@@ -81,8 +81,9 @@ def _step_columns(trace: Trace, task: Task) -> Iterator[tuple[str, str, NDArray[
     episode, dt, steps = trace.episode, trace.episode.dt, np.arange(len(trace))
     contact, outage = episode.contact.astype(bool), measures.blackout(trace)
     yield "time since start", "s", steps * dt
-    yield "contact", "", contact
-    yield "contact duration", "s", _duration(contact) * dt
+    if "contact" in task.covariates:
+        yield "contact", "", contact
+        yield "contact duration", "s", _duration(contact) * dt
     for name, covariate in task.covariates.items():
         values = episode.covariate(name)
         if name != "contact" and covariate.kind == "continuous":

@@ -179,9 +179,10 @@ class Writer:
         omitted = (
             f" The {MAX_CHARTS} of {len(traces)} traces with the largest errors." if len(charts) < len(traces) else ""
         )
+        shaded = "Shaded: contact; g" if "contact" in traces[0].task.covariates else "G"
         caption = (
             f"{traces[0].task.main_error.title} error of the single-modality updates of the fused filter's prior, "
-            "which are not standalone filters, and of the fused estimate. Shaded: contact; gray: image "
+            f"which are not standalone filters, and of the fused estimate. {shaded}ray: image "
             f"blackout. Dotted: the events below.{omitted}"
         )
         items = [

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from beliefscope.datasets.catalog import TASKS, find_task
 from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.simulation.door import DOOR
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))
@@ -23,3 +27,24 @@ def test_unknown_names_list_the_available_ones() -> None:
         find_task("dor")
     with pytest.raises(BadInput, match=r"component of task 'door' 'hinge_z' .*Available: hinge_x, hinge_y, angle"):
         find_task("door").index("hinge_z")
+
+
+@pytest.mark.parametrize(
+    ("units", "expected", "key"),
+    [
+        (("m", "m"), ("position", "cm", 100.0, (0, 1)), "position_cm"),
+        (("mm", "mm"), ("position", "mm", 1.0, (0, 1)), "position_mm"),
+        (("K", "K"), ("hinge x and hinge y", "K", 1.0, (0, 1)), "hinge_x_and_hinge_y_K"),
+        (("m", "K"), ("hinge x", "cm", 100.0, (0,)), "hinge_x_cm"),
+        (("", ""), ("hinge x and hinge y", "", 1.0, (0, 1)), "hinge_x_and_hinge_y"),
+    ],
+)
+def test_main_error_is_that_of_map_components_of_one_unit(
+    units: tuple[str, str], expected: tuple[object, ...], key: str
+) -> None:
+    parts = [replace(c, unit=unit) for c, unit in zip(DOOR.components, units, strict=False)]
+    main = replace(DOOR, components=(*parts, *DOOR.components[2:])).main_error
+    assert (main.name, main.unit, main.factor, main.indices) == expected
+    assert main.key == key
+    assert main.norm(np.array([[3.0, 4.0, 7.0]]))[0] == (5.0 if len(main.indices) == 2 else 3.0)
+    assert replace(DOOR, components=(*parts, *DOOR.components[2:])).floor == ((0, 1) if units == ("m", "m") else None)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from beliefscope.app.protocol.map_format import encode_maps
 from beliefscope.app.protocol.trace_format import columns, header, scene_layers
+from beliefscope.datasets.covariate import Covariate
 from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Component, Task
@@ -19,8 +20,10 @@ from beliefscope.datasets.task_json import task_from_json, task_to_json
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.catalog import DIAGNOSTICS, run_diagnostics
 from beliefscope.inspect.failures.events import find_failures
+from beliefscope.inspect.failures.step_scores import OTHER, Survey, phases_of
 from beliefscope.inspect.likelihood import MapEngine
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
@@ -167,10 +170,36 @@ def test_every_diagnostic_is_computed_or_refused_with_a_reason(runs: list[Trace]
     assert "osition" not in text
 
 
+def test_start_offsets_have_the_unit_of_the_component() -> None:
+    offset = StartOffset.parse("2.5K", task())
+    assert (dict(offset.lengths), str(offset)) == ({"K": 2.5}, "2.5K")
+    assert StartOffset.parse("5 cm", task("km", ("cm", 1e5), 1e-3)).lengths["km"] == pytest.approx(5e-5)
+    with pytest.raises(BadInput, match="not in a unit of task 'tank': K"):
+        StartOffset.parse("3cm", task())
+
+
 def test_failures_are_in_the_unit_of_the_component(runs: list[Trace]) -> None:
     failures = find_failures(checkpoint(task()), [run.episode for run in runs])
     assert (failures.title, failures.unit, failures.shown) == ("temperature error", "K", ("K", 1.0))
     assert "K at step" in failures.verdict
+
+
+def test_phases_of_failures_are_groups_of_declared_covariates(runs: list[Trace]) -> None:
+    """Without covariates all steps are of one group; a rare group precedes a common one that contains its steps."""
+    assert phases_of(task()) == ("blackout", "fast motion", "start", OTHER)
+    covariates = {"lit": Covariate("boolean"), "stage": Covariate("categorical", ("heat", "hold"))}
+    steps = np.arange(STEPS)
+    values = {"lit": (steps < 150).astype(np.float32), "stage": (steps >= 20).astype(np.float32)}
+    declared = replace(task(), covariates=covariates)
+    traces = [replace(run, episode=replace(run.episode, task=declared, covariates=values)) for run in runs]
+    survey = Survey.from_traces(traces)
+    assert [*survey.phases][3:] == ["heat", "no lit", "lit", "hold", OTHER]
+    assert sorted(survey.phases) == sorted(phases_of(declared))
+    phase = np.array([*survey.phases])[survey.phase_index].reshape(len(runs), STEPS)
+    slow = ~survey.phases["fast motion"].reshape(phase.shape)
+    for name, where in (("heat", steps < 20), ("lit", (steps >= 20) & (steps < 150)), ("no lit", steps >= 150)):
+        assert (phase[:, where][slow[:, where]] == name).all()
+    assert not evaluate(checkpoint(declared), [traces[0].episode]).rmse_before_contact
 
 
 def test_recording_report_export_and_page(runs: list[Trace], tmp_path: Path) -> None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.datasets.errors import unknown_name
+from beliefscope.datasets.errors import check_name
 from beliefscope.recordings.report.command_lines import serve_command
 
 
@@ -29,7 +29,8 @@ def failures(
 
     Searches the held-out episodes for stretches of steps with a score in the worst 10 %, and ranks these events by
     their peak. Reports the phase of each event and which phases are over-represented: contact made, contact lost,
-    blackout, fast motion, start, steady contact, free motion. A permalink opens an event in the dashboard.
+    blackout, fast motion, start, steady contact, free motion; and groups of other covariates. A permalink opens an
+    event in the dashboard.
 
     \b
     Examples:
@@ -43,11 +44,11 @@ def failures(
     from beliefscope.filters.open_filter import is_path
     from beliefscope.inspect.diagnostics.views import as_json
     from beliefscope.inspect.failures.events import find_failures
-    from beliefscope.inspect.failures.step_scores import PHASES
+    from beliefscope.inspect.failures.step_scores import phases_of
 
-    if phase is not None and phase not in PHASES:
-        raise unknown_name("phase", phase, PHASES)
     checkpoint, faults = runs.open()
+    if phase is not None:
+        check_name("phase", phase, phases_of(checkpoint.task))
     particles, seed = runs.particles, runs.seed
     with runs.episodes(checkpoint.task) as episodes, console.progress("Filtering") as advance:
         indices = range(len(episodes)) if every else episodes.held_out()

@@ -42,7 +42,7 @@ const columnsOf = (task) => [
   summaryColumn('seed', 'Seed of the simulation', ({ seed }) => seed),
   summaryColumn('steps', 'Number of steps', ({ steps }) => steps),
   {
-    ...summaryColumn('contact', 'Share of steps in contact', (s) => s.contact_fraction),
+    ...summaryColumn('contact', 'Share of steps in contact', (s) => s.contact_fraction ?? ''),
     content: ({ summary }) => percent(summary.contact_fraction),
   },
   {

@@ -48,7 +48,7 @@ const BODY = `
   <div class="row">
     <label title="Data slice to train on; its definition is shown on the right">Train on <select name="slice"></select></label>
     <label>Sensors <select name="faults"></select></label>
-    <label title="Steps of an episode that contribute to the loss">Steps <select name="contact"></select></label>
+    <label class="phase" title="Steps of an episode that contribute to the loss">Steps <select name="contact"></select></label>
     <label title="Modalities whose measurements the filter uses">Modalities <select name="only"></select></label>
   </div>
   <div class="row numbers"></div>
@@ -154,6 +154,7 @@ export class FinetuneForm {
       ['', 'clean data only'],
       [CUSTOM, 'custom'],
     ]);
+    html('.phase', this.#form).hidden = slices.every(({ contact }) => contact === null);
     this.#select('slice').value = settings.mix[0]?.slice.name ?? '';
     for (const { name } of NUMBERS) this.#input(name).value = String(settings[name]);
     html('.past', this.#form).hidden = !runs.length;

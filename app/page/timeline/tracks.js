@@ -206,13 +206,13 @@ function estimateTrack(trace, component) {
  */
 function errorTrack(trace, component) {
   if (!trace.truth(component).some(Number.isFinite)) return emptyTrack('Error', NO_TRUTH);
-  const isAngle = trace.angles.includes(component);
+  const isOther = !trace.main.includes(component);
   const name = capitalised(displayName(trace.components[component].name));
   return {
-    title: isAngle ? `${name} error` : `${capitalised(trace.task.main.name)} error`,
-    unit: isAngle ? '°' : trace.mainUnit,
+    title: isOther ? `${name} error` : `${capitalised(trace.task.main.name)} error`,
+    unit: isOther ? trace.unitOf(component).unit : trace.mainUnit,
     series: availableSeries(trace.sources, (source) =>
-      trace.error(source, isAngle ? component : 'main'),
+      trace.error(source, isOther ? component : 'main'),
     ),
     fromZero: true,
     digits: 1,
@@ -352,7 +352,7 @@ const maximum = (values) => values.reduce((a, b) => Math.max(a, b), 0);
  */
 export function selectedError(trace, state) {
   const component = trace.components.findIndex((c) => c.name === state.component);
-  return trace.error('fused', trace.angles.includes(component) ? component : 'main');
+  return trace.error('fused', trace.main.includes(component) ? 'main' : component);
 }
 
 /**

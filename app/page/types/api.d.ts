@@ -349,7 +349,7 @@ export interface components {
         };
         /**
          * EpisodeSummary
-         * @description Metadata of an episode. ``contact_fraction`` is its fraction of steps in contact.
+         * @description Metadata of an episode. ``contact_fraction`` of its steps are in contact; None without such a covariate.
          */
         EpisodeSummary: {
             /** Index */
@@ -363,7 +363,7 @@ export interface components {
             /** Seed */
             seed: number;
             /** Contact Fraction */
-            contact_fraction: number;
+            contact_fraction: number | null;
         };
         /**
          * Error

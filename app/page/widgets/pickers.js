@@ -147,7 +147,8 @@ function firstRun(task, state) {
 /** @param {EpisodeSummary} episode */
 function episodeLabel({ index, policy, split, steps, contact_fraction, label }) {
   if (label) return label;
-  const parts = [index, policy, split, `${steps} steps`, `contact ${percent(contact_fraction)}`];
+  const parts = [index, policy, split, `${steps} steps`];
+  if (contact_fraction !== null) parts.push(`contact ${percent(contact_fraction)}`);
   return parts.filter((part) => part !== '').join(' · ');
 }
 

@@ -16,7 +16,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.weight_steps import main_regret
 from beliefscope.inspect.failures.events import event_spans, failures_of, find_failures
-from beliefscope.inspect.failures.step_scores import PHASES, Survey, disagreement, scores_of
+from beliefscope.inspect.failures.step_scores import Survey, disagreement, phases_of, scores_of
 from beliefscope.inspect.failures.survey import survey_of
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
@@ -159,7 +159,9 @@ def test_phases_partition_steps_and_events(survey: Survey) -> None:
         assert g.lift == pytest.approx((g.events / len(failures.events)) / (g.steps / failures.steps))
         overall = survey.scores["disagreement"].mean()  # mean of inside and outside, weighted by share
         assert g.share * g.inside + (1 - g.share) * g.outside == pytest.approx(overall)
-    assert [g.name for g in failures.phases] == [name for name in PHASES if name in {g.name for g in failures.phases}]
+    assert [g.name for g in failures.phases] == [
+        name for name in phases_of(survey.task) if name in {g.name for g in failures.phases}
+    ]
 
 
 def test_regret_in_the_warm_up_is_no_failure(survey: Survey) -> None:
