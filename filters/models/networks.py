@@ -40,7 +40,7 @@ class Residual(nn.Module):
 
     def with_tangents(self, x: Tensor) -> Tensor:
         y = linear(self.second, relu_with_tangents(linear(self.first, x)))
-        return relu_with_tangents(y.add_(x))
+        return relu_with_tangents(y + x)
 
 
 def linear(layer: nn.Linear, x: Tensor) -> Tensor:
@@ -49,12 +49,21 @@ def linear(layer: nn.Linear, x: Tensor) -> Tensor:
 
 
 def relu_with_tangents(x: Tensor) -> Tensor:
-    """ReLU of x and, in the same linear piece, of x + dx, in place: (n + 1, ..., d), x in the last row."""
-    return x.mul_(x.detach()[-1].sign().relu_())
+    """ReLU of x and, in the same linear piece, of x + dx: (n + 1, ..., d), x in the last row."""
+    return x * x.detach()[-1].sign().relu_()
 
 
 class Stack(nn.Sequential):
-    """A sequence of Linear, ReLU and Residual layers."""
+    """A sequence of Linear, ReLU and Residual layers, for inputs (..., d)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        shape = x.shape[:-1]
+        for layer in self:
+            if not isinstance(layer, nn.ReLU):
+                # With more axes, a layer's output is a view, of which operations in place copy the gradient.
+                x = x.reshape(-1, x.shape[-1])
+            x = layer(x)
+        return x.view(*shape, x.shape[-1])
 
     def with_tangents(self, x: Tensor) -> Tensor:
         """``x + dx_i`` and, in the last row, x to ``f(x) + f'(x) dx_i`` and f(x): (n + 1, ..., d).
