@@ -1,11 +1,11 @@
-"""Registry of the filters, for any task. To add one, add a line here."""
+"""Registry of the filters, for any task. To add one, add a line here and in ``names``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -20,6 +20,7 @@ from beliefscope.filters.models.lstm import Lstm
 from beliefscope.filters.models.pf import MixtureParticleFilter
 from beliefscope.filters.models.transformer import Transformer
 from beliefscope.filters.models.ukf import UnscentedKalmanFilter
+from beliefscope.filters.names import filter_names
 
 KINDS: dict[Kind, type[Filter]] = {
     "ekf": ExtendedKalmanFilter,
@@ -32,39 +33,27 @@ KINDS: dict[Kind, type[Filter]] = {
 INFORMATION: dict[Kind, type[Filter]] = {"ekf": InformationFilter, "pf": InformationParticleFilter}
 """Filters with fusion ``information``."""
 
-FILTERS: dict[str, tuple[Literal["each", "all", "one"], Callable[..., Architecture]]] = {
-    "crossmodal-ekf": ("each", partial(Architecture, kind="ekf", fusion="crossmodal", feedback=True)),
-    "crossmodal-pf": ("each", partial(Architecture, kind="pf", fusion="crossmodal")),
-    "crossmodal-ukf": ("each", partial(Architecture, kind="ukf", fusion="crossmodal", feedback=True)),
-    "information-ekf": ("each", partial(Architecture, kind="ekf", fusion="information", feedback=True)),
-    "information-pf": ("each", partial(Architecture, kind="pf", fusion="information")),
-    "unimodal-ekf": ("each", partial(Architecture, kind="ekf", fusion="unimodal")),
-    "unimodal-pf": ("each", partial(Architecture, kind="pf", fusion="unimodal", likelihoods="raw")),
-    "feature-ekf": ("all", partial(Architecture, kind="ekf", fusion="none")),
-    "feature-pf": ("all", partial(Architecture, kind="pf", fusion="none")),
-    "{modality}-ekf": ("one", partial(Architecture, kind="ekf", fusion="none")),
-    "{modality}-pf": ("one", partial(Architecture, kind="pf", fusion="none")),
-    "lstm": ("all", partial(Architecture, kind="lstm", fusion="none")),
-    "transformer": ("all", partial(Architecture, kind="transformer", fusion="none")),
+FILTERS: dict[str, Callable[..., Architecture]] = {
+    "crossmodal-ekf": partial(Architecture, kind="ekf", fusion="crossmodal", feedback=True),
+    "crossmodal-pf": partial(Architecture, kind="pf", fusion="crossmodal"),
+    "crossmodal-ukf": partial(Architecture, kind="ukf", fusion="crossmodal", feedback=True),
+    "information-ekf": partial(Architecture, kind="ekf", fusion="information", feedback=True),
+    "information-pf": partial(Architecture, kind="pf", fusion="information"),
+    "unimodal-ekf": partial(Architecture, kind="ekf", fusion="unimodal"),
+    "unimodal-pf": partial(Architecture, kind="pf", fusion="unimodal", likelihoods="raw"),
+    "feature-ekf": partial(Architecture, kind="ekf", fusion="none"),
+    "feature-pf": partial(Architecture, kind="pf", fusion="none"),
+    "{modality}-ekf": partial(Architecture, kind="ekf", fusion="none"),
+    "{modality}-pf": partial(Architecture, kind="pf", fusion="none"),
+    "lstm": partial(Architecture, kind="lstm", fusion="none"),
+    "transformer": partial(Architecture, kind="transformer", fusion="none"),
 }
-"""Name -> measurement models and architecture. ``each``: one model per modality. ``all``: one model of all modalities.
-``one``: a filter per modality, with that modality only (``image-pf``, ``haptics-pf``). The task is added by
-``filters_of``."""
+"""Key of ``names.MODELS`` -> architecture; the task and the measurement models are added by ``filters_of``."""
 
 
 def filters_of(task: Task) -> dict[str, Architecture]:
-    """All filters of a task by name, with measurement models named after its modalities."""
-    each = tuple(task.modalities)
-    models: dict[str, list[tuple[str, ...]]] = {
-        "each": [each],
-        "all": [("+".join(each),)],
-        "one": [(modality,) for modality in each],
-    }
-    return {
-        name.format(modality=names[0]): template(task=task, models=names)
-        for name, (inputs, template) in FILTERS.items()
-        for names in models[inputs]
-    }
+    """All filters of a task by name."""
+    return {name: FILTERS[key](task=task, models=models) for name, (key, models) in filter_names(task).items()}
 
 
 NETWORKS: dict[str, dict[str, Any]] = {"default": {}, "authors": {"networks": "authors", "image_stride": 1}}

@@ -21,19 +21,20 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch.overrides import TorchFunctionMode
 
-from beliefscope.datasets.catalog import TASKS, find_task, stored_task
+from beliefscope.datasets.catalog import stored_task
 from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_atomically
 from beliefscope.datasets.io.strict_json import read_json
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference, task_to_json
-from beliefscope.filters.catalog import build, filters_of
+from beliefscope.filters.catalog import build
 from beliefscope.filters.filter import Architecture, Filter, Kind
 from beliefscope.filters.legacy_names import training_record
+from beliefscope.filters.names import PRETRAINED as PRETRAINED
+from beliefscope.filters.names import shipped as shipped
 
 FORMAT = 1
-PRETRAINED = Path(__file__).parent / "pretrained"
 
 
 @dataclass(frozen=True)
@@ -171,20 +172,3 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         if not isinstance(header[name], kind):
             raise BadInput(f"{str(path)!r} has the {name} {header[name]!r:.200} in its header, expected {expected}")
     return header
-
-
-def shipped(task: str | Task, name: str) -> Path:
-    """Path of the pretrained checkpoint of a task and filter. Raises BadInput if there is none."""
-    definition = find_task(task)
-    filters, task = filters_of(definition), definition.name
-    paths = {known: PRETRAINED / f"{task}-{known}.safetensors" for known in filters}
-    is_shipped = task in TASKS and not difference(TASKS[task], definition)
-    available = [known for known, path in paths.items() if is_shipped and path.is_file()]
-    if name not in filters:
-        raise unknown_name("filter", name, available)
-    if name not in available:
-        raise BadInput(
-            f"no pretrained {name!r} for task {task!r}; train one: beliefscope train {task} --filter {name}. "
-            f"Available: {', '.join(available) or 'none'}."
-        )
-    return paths[name]

@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
 from beliefscope.filters.external.load import load_external
-
-
-def is_path(text: str) -> bool:
-    """Whether the text is the path of a checkpoint rather than a filter name."""
-    return text.endswith(".safetensors") or os.sep in text
-
-
-def is_code(text: str) -> bool:
-    """Whether the text names a build function: ``package.module:build`` or ``path/to/file.py:build``."""
-    return ":" in text and not text.endswith(".safetensors")
+from beliefscope.filters.names import is_code, is_path, shipped
 
 
 def open_filter(task: str | Task, text: str) -> Checkpoint:

@@ -211,6 +211,15 @@ class Runs:
     particles: int = 300
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Raises BadInput for an unknown name of a task or built-in filter, before a command imports PyTorch."""
+        from beliefscope.datasets.catalog import TASKS
+        from beliefscope.filters.names import is_code, is_path, shipped
+
+        has_definition = self.task not in TASKS and (":" in self.task or self.data is not None)
+        if not (has_definition or is_path(self.filter) or is_code(self.filter)):
+            shipped(self.task, self.filter)
+
     def open(self) -> tuple[Checkpoint, Faults]:
         """The filter, and the faults to inject."""
         from beliefscope.datasets.faults.injection import read_faults

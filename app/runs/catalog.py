@@ -22,7 +22,7 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.catalog import filters_of
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
-from beliefscope.filters.open_filter import is_path
+from beliefscope.filters.names import is_path
 from beliefscope.inspect.diagnostics.healthy_profile import has_profile
 
 SAMPLE = "sample"

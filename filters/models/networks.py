@@ -60,7 +60,7 @@ class Stack(nn.Sequential):
         shape = x.shape[:-1]
         for layer in self:
             if not isinstance(layer, nn.ReLU):
-                # With more axes, a layer's output is a view, of which operations in place copy the gradient.
+                # With more axes, a layer's output is a view: operations in place on it would copy its gradient.
                 x = x.reshape(-1, x.shape[-1])
             x = layer(x)
         return x.view(*shape, x.shape[-1])

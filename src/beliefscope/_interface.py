@@ -15,7 +15,7 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import Metrics
 from beliefscope.filters.evaluate import evaluate as evaluate_filter
 from beliefscope.filters.external.load import ExternalFilter, as_external, load_external
-from beliefscope.filters.open_filter import is_code
+from beliefscope.filters.names import is_code
 from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.catalog import quick
 from beliefscope.inspect.diagnosis.cause import Diagnosis

@@ -45,7 +45,8 @@ def change(
     from beliefscope.app.protocol.permalinks import comparison_permalink, permalink
     from beliefscope.app.runs.catalog import served_names
     from beliefscope.filters.finetuning.slices import parse_slices
-    from beliefscope.filters.open_filter import is_path, open_filters
+    from beliefscope.filters.names import is_path
+    from beliefscope.filters.open_filter import open_filters
     from beliefscope.inspect.compare.checkpoints import compare_checkpoints, write_comparison
     from beliefscope.inspect.diagnostics.views import as_json
 

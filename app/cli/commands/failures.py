@@ -41,7 +41,7 @@ def failures(
     """
     from beliefscope.app.protocol.permalinks import permalink
     from beliefscope.app.runs.catalog import served_names
-    from beliefscope.filters.open_filter import is_path
+    from beliefscope.filters.names import is_path
     from beliefscope.inspect.diagnostics.views import as_json
     from beliefscope.inspect.failures.events import find_failures
     from beliefscope.inspect.failures.step_scores import phases_of

@@ -107,7 +107,7 @@ def _permalinks(
     """(index of a trace, step) -> permalink or empty text; and a note on how to open permalinks, or why none exist."""
     from beliefscope.app.protocol.permalinks import permalink
     from beliefscope.app.runs.catalog import served_names
-    from beliefscope.filters.open_filter import is_code, is_path
+    from beliefscope.filters.names import is_code, is_path
     from beliefscope.inspect.traces.provenance import reproducible
 
     first, task = traces[0], traces[0].task

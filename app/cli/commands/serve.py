@@ -128,7 +128,7 @@ def _checkpoints(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path
     from beliefscope.app.runs.catalog import PRETRAINED, short_names
     from beliefscope.datasets.catalog import load_task
     from beliefscope.filters.external.load import load_external
-    from beliefscope.filters.open_filter import is_code
+    from beliefscope.filters.names import is_code
 
     given = [load_task(name) for name in tasks]
     external = [load_external(name, given=given) for name in filters if is_code(name)]

@@ -1,0 +1,70 @@
+"""Names of the built-in filters and their shipped checkpoints. Without PyTorch: a wrong name is reported at once."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal
+
+from beliefscope.datasets.catalog import TASKS, find_task
+from beliefscope.datasets.errors import BadInput, unknown_name
+from beliefscope.datasets.task import Task
+from beliefscope.datasets.task_json import difference
+
+PRETRAINED = Path(__file__).parent / "pretrained"
+
+MODELS: dict[str, Literal["each", "all", "one"]] = {
+    "crossmodal-ekf": "each",
+    "crossmodal-pf": "each",
+    "crossmodal-ukf": "each",
+    "information-ekf": "each",
+    "information-pf": "each",
+    "unimodal-ekf": "each",
+    "unimodal-pf": "each",
+    "feature-ekf": "all",
+    "feature-pf": "all",
+    "{modality}-ekf": "one",
+    "{modality}-pf": "one",
+    "lstm": "all",
+    "transformer": "all",
+}
+"""Filter -> measurement models. ``each``: one model per modality. ``all``: one model of all modalities. ``one``: a
+filter per modality, with that modality only (``image-pf``, ``haptics-pf``)."""
+
+
+def filter_names(task: Task) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """Name of each filter of a task -> its key in ``MODELS``, and measurement models named after the modalities."""
+    each = tuple(task.modalities)
+    models: dict[str, list[tuple[str, ...]]] = {
+        "each": [each],
+        "all": [("+".join(each),)],
+        "one": [(modality,) for modality in each],
+    }
+    return {key.format(modality=names[0]): (key, names) for key, kind in MODELS.items() for names in models[kind]}
+
+
+def shipped(task: str | Task, name: str) -> Path:
+    """Path of the pretrained checkpoint of a task and filter. Raises BadInput if there is none."""
+    definition = find_task(task)
+    filters, task = filter_names(definition), definition.name
+    paths = {known: PRETRAINED / f"{task}-{known}.safetensors" for known in filters}
+    is_shipped = task in TASKS and not difference(TASKS[task], definition)
+    available = [known for known, path in paths.items() if is_shipped and path.is_file()]
+    if name not in filters:
+        raise unknown_name("filter", name, available)
+    if name not in available:
+        raise BadInput(
+            f"no pretrained {name!r} for task {task!r}; train one: beliefscope train {task} --filter {name}. "
+            f"Available: {', '.join(available) or 'none'}."
+        )
+    return paths[name]
+
+
+def is_path(text: str) -> bool:
+    """Whether the text is the path of a checkpoint rather than a filter name."""
+    return text.endswith(".safetensors") or os.sep in text
+
+
+def is_code(text: str) -> bool:
+    """Whether the text names a build function: ``package.module:build`` or ``path/to/file.py:build``."""
+    return ":" in text and not text.endswith(".safetensors")
