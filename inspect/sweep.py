@@ -196,7 +196,7 @@ def summary(trace: Trace) -> Iterator[Row]:
             "phase": phase,
             "steps": len(steps),
             "error": rmse(main, mask),
-            "unit": main.rpartition("_")[2],
+            "unit": trace.task.main_error.unit,
             **{key: rmse(key, mask) for key in components},
             "worst": float(np.sqrt(squared[main][at])),
             "worst_step": at,

@@ -43,7 +43,7 @@ OPTIONS = {
     "-o --json",
     "live": "--filter --data --skip-bad --episode --faults --particles --seed --rate --workspace --name --json",
     "import": "--map --guess --episode -o --json",
-    "export": "-o --json",
+    "export": "--filter --interactive -o --json",
     "inspect": "--filter --only --option --all --figures --format --json",
     "diagnose": "--filter --data --skip-bad --episode --base --alarm-rate --faults --particles --seed --json",
     "report": "-o --title --event --filter --data --all --url --pdf --json",

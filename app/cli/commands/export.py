@@ -1,30 +1,82 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
+from beliefscope.datasets.errors import BadInput
+
+if TYPE_CHECKING:
+    from beliefscope.inspect.trace import Trace
 
 
 @opt.with_options(
-    source=opt.argument("TRACE|RUN.rrd", "Trace file or recording."),
-    output=opt.output_file("FILE", "Output file: .parquet, .mcap or .npz."),
+    sources=opt.argument("TRACE|RUN.rrd...", "Trace file or recording; several for a folder of interactive pages."),
+    output=opt.option(
+        "FILE|DIR", "Output: .parquet, .mcap, .npz, or .html for an interactive page; or a folder.", "-o", "--output"
+    ),
     task=opt.TASK_OF_FILES,
+    filter=opt.TRACE_FILTER,
+    interactive=opt.flag("Write interactive pages: the default for .html and for folders.", "--interactive"),
 )
-def export(source: Path, output: Path, task: str = "") -> console.Result:
-    """Export a trace to Parquet, MCAP or NumPy.
+def export(
+    sources: list[Path], output: Path, task: str = "", filter: str = "", interactive: bool = False
+) -> console.Result:
+    """Export a trace to Parquet, MCAP, NumPy or an interactive page.
 
     Parquet has one row per step and one column per number, for pandas and similar tools. MCAP has one topic per array,
-    and images and particles in Foxglove's schemas. npz has the arrays unchanged. Names: docs/recordings.md.
+    and images and particles in Foxglove's schemas. npz has the arrays unchanged. Names: docs/recordings.md. HTML is one
+    file that works offline, for a paper's supplement or a colleague: timeline, maps, scene from above, images, values
+    and diagnosis under one cursor; run.html#step=42 opens a step. A folder has a page for each trace, and index.html.
 
     \b
     Examples:
       beliefscope export run.trace -o run.parquet
       beliefscope export run.rrd -o run.mcap
+      beliefscope export run.trace -o run.html --interactive
+      beliefscope export first.trace second.trace -o supplement
     """
     from beliefscope.recordings.export import export_format, export_trace
 
+    if not output.suffix or output.is_dir():
+        return _folder(sources, output, task, filter)
+    opt.check_output(output)
+    if len(sources) > 1:
+        raise BadInput(f"{len(sources)} traces need a folder as output, not {str(output)!r}")
+    if output.suffix == ".html":
+        return opt.trace_result(_page(sources[0], output, task, filter), output)
+    if interactive:
+        raise BadInput(f"--interactive writes a page: output {str(output)!r} must end in .html")
     export_format(output)
-    trace = opt.open_trace(source, task)
+    trace = opt.open_trace(sources[0], task)
     export_trace(trace, output)
     return opt.trace_result(trace, output)
+
+
+def _page(source: Path, output: Path, task: str, filter_: str) -> Trace:
+    """Write the interactive page of a trace."""
+    from beliefscope.inspect.traces.provenance import checkpoint_of
+    from beliefscope.recordings.interactive.export import write_interactive
+
+    trace = opt.open_trace(source, task)
+    checkpoint = checkpoint_of([trace], [source], filter_)
+    with console.progress(source.stem) as advance:
+        write_interactive(trace, output, checkpoint, progress=advance)
+    return trace
+
+
+def _folder(sources: list[Path], folder: Path, task: str, filter_: str) -> console.Result:
+    """Write a page for each trace, and their index."""
+    from beliefscope.recordings.interactive.export import write_index
+
+    names = [f"{source.stem}.html" for source in sources]
+    if len({*names, "index.html"}) <= len(names):
+        raise BadInput("traces need different names, other than index, to be pages of one folder")
+    opt.check_folder(folder, "output")
+    folder.mkdir(exist_ok=True)
+    pages = [folder / name for name in names]
+    traces = [_page(source, page, task, filter_) for source, page in zip(sources, pages, strict=True)]
+    index = folder / "index.html"
+    write_index(list(zip(pages, traces, strict=True)), index)
+    return console.Result({"pages": names}, f"{len(names)} pages", index)

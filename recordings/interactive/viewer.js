@@ -1,0 +1,496 @@
+/** Viewer of one run (write_interactive): every panel follows one cursor, which is in the address as #step=42. */
+
+/**
+ * @typedef {(number | null)[]} Row
+ * @typedef {{name: string, label: string, colour: string}} Layer
+ * @typedef {{label: string, unit: string, truth: Row, mean: Row[], std: Row[]}} Component
+ * @typedef {{name: string, mask: string}} Band
+ * @typedef {{name: string, height: number, width: number, channels: number, data: string}} Images
+ * @typedef {{stride: number, steps: [string, number[]][][], places: Row[][], truth: Row[]}} Scene
+ * @typedef {object} Maps
+ * @property {string} title
+ * @property {number} stride
+ * @property {Layer[]} layers
+ * @property {[number, number, number]} shape
+ * @property {string[]} axes
+ * @property {number[]} reach half the side lengths
+ * @property {Row[]} centres
+ * @property {Row[][]} places
+ * @property {Row[]} truth
+ * @property {string} data
+ * @typedef {object} Run
+ * @property {number} dt
+ * @property {number} steps
+ * @property {Layer[]} layers
+ * @property {string} truth colour
+ * @property {Component[]} components
+ * @property {{label: string, unit: string, values: Row[]}} error
+ * @property {{label: string, names: string[], colours: string[], values: Row[]} | null} weights
+ * @property {Band[]} bands
+ * @property {Images[]} images
+ * @property {Scene | null} scene
+ * @property {Maps | null} maps
+ * @property {string} no_maps
+ * @property {string} palette
+ * @property {{step: number, error: string}[]} moments
+ * @typedef {{label: string, unit: string, lines: {name: string, colour: string, values: Row, dash?: boolean}[], band?: {centre: Row, std: Row, colour: string}, stacked?: boolean}} Chart
+ */
+
+/** @param {string} selector */
+const html = (selector) => /** @type {HTMLElement} */ (document.querySelector(selector));
+/** @type {Run} */
+const run = JSON.parse(html('#run').textContent ?? '');
+const cursor = /** @type {HTMLInputElement} */ (html('#cursor'));
+const fused = run.layers.length - 1;
+const scale = Math.max(1, window.devicePixelRatio);
+const LEFT = 56; // px, of the charts
+const MAP = 176; // px, side of a map
+let step = 0;
+let timer = 0;
+
+/** @param {string} text base64 */
+const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+/** @param {string} name */
+const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
+/** @param {number | null | undefined} value */
+const digits = (value) => (value == null ? '–' : Number(value.toPrecision(3)).toString());
+
+/**
+ * @param {string} tag
+ * @param {Record<string, unknown>} properties
+ * @param {...(Node | string)} children
+ */
+function create(tag, properties = {}, ...children) {
+  const element = Object.assign(document.createElement(tag), properties);
+  element.append(...children);
+  return element;
+}
+
+/**
+ * @param {number} width in pixels
+ * @param {number} height
+ */
+function bitmap(width, height) {
+  const canvas = document.createElement('canvas');
+  canvas.width = width;
+  canvas.height = height;
+  return canvas;
+}
+
+/**
+ * @param {number} width in CSS px
+ * @param {number} height
+ */
+function canvasOf(width, height) {
+  const canvas = bitmap(Math.round(width * scale), Math.round(height * scale));
+  canvas.style.width = `${width}px`;
+  canvas.style.height = `${height}px`;
+  return canvas;
+}
+
+/** @param {HTMLCanvasElement} canvas */
+const context = (canvas) => /** @type {CanvasRenderingContext2D} */ (canvas.getContext('2d'));
+
+/* Charts */
+
+/** @returns {Chart[]} */
+function charts() {
+  /** @type {Chart[]} */
+  const result = [];
+  const { weights, error, components, layers } = run;
+  if (weights) {
+    const lines = weights.names.map((name, k) => ({
+      name,
+      colour: weights.colours[k],
+      values: weights.values[k],
+    }));
+    result.push({ label: weights.label, unit: '', lines, stacked: true });
+  }
+  const layerLines = (/** @type {Row[]} */ values) =>
+    layers.map(({ label, colour }, l) => ({
+      name: label,
+      colour,
+      values: values[l],
+      dash: l < fused,
+    }));
+  for (const { label, unit, truth, mean, std } of components) {
+    const lines = [{ name: 'truth', colour: run.truth, values: truth }, ...layerLines(mean)];
+    const band = { centre: mean[fused], std: std[fused], colour: layers[fused].colour };
+    result.push({ label, unit, lines, band });
+  }
+  result.push({ label: `${error.label} error`, unit: error.unit, lines: layerLines(error.values) });
+  return result;
+}
+
+/** Masks of contact and blackout. */
+const bands = run.bands.map(({ name, mask }) => ({ name, mask: bytes(mask) }));
+
+/**
+ * Draws everything of a chart but the cursor.
+ * @param {Chart} chart
+ * @param {number} width
+ * @param {number} height
+ */
+function drawChart(chart, width, height) {
+  const canvas = canvasOf(width, height);
+  const c = context(canvas);
+  c.scale(scale, scale);
+  const values = chart.stacked
+    ? [0, 1]
+    : chart.lines.flatMap((line) => line.values.filter((v) => v !== null));
+  if (chart.band)
+    chart.band.centre.forEach((v, t) => {
+      const s = chart.band?.std[t];
+      if (v !== null && s != null) values.push(v - 2 * s, v + 2 * s);
+    });
+  let [low, high] = [Math.min(...values), Math.max(...values)];
+  if (!(high > low)) [low, high] = [low - 1, low + 1];
+  const x = (/** @type {number} */ t) =>
+    LEFT + ((width - LEFT - 8) * t) / Math.max(1, run.steps - 1);
+  const y = (/** @type {number} */ v) => height - 5 - ((height - 10) * (v - low)) / (high - low);
+  for (const { name, mask } of bands) {
+    c.fillStyle = name === 'blackout' ? css('--muted') : css('--contact');
+    c.globalAlpha = 0.18;
+    mask.forEach((on, t) => on && c.fillRect(x(t - 0.5), 0, x(1) - x(0), height));
+  }
+  c.globalAlpha = 1;
+  c.fillStyle = css('--muted');
+  c.font = '11px system-ui';
+  c.textAlign = 'right';
+  c.fillText(digits(high), LEFT - 6, 12);
+  c.fillText(digits(low), LEFT - 6, height - 3);
+  c.strokeStyle = css('--grid');
+  c.strokeRect(LEFT, 1, width - LEFT - 8, height - 2);
+  c.beginPath();
+  c.rect(LEFT, 0, width - LEFT - 8, height);
+  c.clip();
+  if (chart.stacked) drawStack(c, chart, x, y);
+  else drawLines(c, chart, x, y);
+  return canvas;
+}
+
+/**
+ * @param {CanvasRenderingContext2D} c
+ * @param {Chart} chart
+ * @param {(t: number) => number} x
+ * @param {(v: number) => number} y
+ */
+function drawStack(c, { lines }, x, y) {
+  const total = Array.from({ length: run.steps }, (_, t) =>
+    lines.reduce((sum, { values }) => sum + (values[t] ?? 0), 0),
+  );
+  const base = new Float64Array(run.steps);
+  for (const { values, colour } of lines) {
+    c.fillStyle = colour;
+    for (let t = 0; t < run.steps; t++) {
+      const share = (values[t] ?? 0) / (total[t] || 1);
+      const top = y(base[t] + share);
+      c.fillRect(x(t - 0.5), top, x(1) - x(0) + 0.5, y(base[t]) - top);
+      base[t] += share;
+    }
+  }
+}
+
+/**
+ * @param {CanvasRenderingContext2D} c
+ * @param {Chart} chart
+ * @param {(t: number) => number} x
+ * @param {(v: number) => number} y
+ */
+function drawLines(c, { lines, band }, x, y) {
+  if (band) {
+    c.fillStyle = band.colour;
+    c.globalAlpha = 0.2;
+    band.centre.forEach((v, t) => {
+      const s = band.std[t];
+      if (v !== null && s !== null)
+        c.fillRect(x(t - 0.5), y(v + 2 * s), x(1) - x(0), y(v - 2 * s) - y(v + 2 * s));
+    });
+    c.globalAlpha = 1;
+  }
+  for (const { values, colour, dash } of lines) {
+    c.strokeStyle = colour;
+    c.lineWidth = dash ? 1.2 : 1.8;
+    c.setLineDash(dash ? [4, 3] : []);
+    c.beginPath();
+    values.forEach(
+      (v, t) => v !== null && c[t && values[t - 1] !== null ? 'lineTo' : 'moveTo'](x(t), y(v)),
+    );
+    c.stroke();
+  }
+  c.setLineDash([]);
+}
+
+/** Draws the cursor. @type {((t: number) => void)[]} */
+let cursorPainters = [];
+
+function buildTimeline() {
+  const host = html('#timeline');
+  host.replaceChildren();
+  cursorPainters = [];
+  const width = host.clientWidth - 24;
+  for (const chart of charts()) {
+    const height = chart.stacked ? 64 : 92;
+    const drawn = drawChart(chart, width, height);
+    const canvas = canvasOf(width, height);
+    const c = context(canvas);
+    cursorPainters.push((t) => {
+      c.clearRect(0, 0, canvas.width, canvas.height);
+      c.drawImage(drawn, 0, 0);
+      c.fillStyle = css('--ink');
+      const x = LEFT + ((width - LEFT - 8) * t) / Math.max(1, run.steps - 1);
+      c.fillRect(x * scale - 1, 0, 2, canvas.height);
+    });
+    const point = (/** @type {PointerEvent} */ event) => {
+      if (event.type === 'pointermove' && !event.buttons) return;
+      const share = (event.offsetX - LEFT) / (canvas.clientWidth - LEFT - 8);
+      move(Math.round(share * (run.steps - 1)));
+    };
+    canvas.addEventListener('pointerdown', point);
+    canvas.addEventListener('pointermove', point);
+    const entries = chart.lines.map(({ name, colour }) => {
+      const sample = create('i');
+      sample.style.setProperty('--c', colour);
+      return create('span', {}, sample, name);
+    });
+    if (!host.childElementCount)
+      for (const { name, mask } of bands)
+        if (mask.includes(1)) {
+          const sample = create('i', { className: 'band' });
+          sample.style.setProperty('--c', name === 'blackout' ? 'var(--muted)' : 'var(--contact)');
+          entries.push(create('span', {}, sample, name));
+        }
+    const title = create('b', {
+      textContent: chart.unit ? `${chart.label} (${chart.unit})` : chart.label,
+    });
+    host.append(create('div', { className: 'legend' }, title, ...entries), canvas);
+  }
+}
+
+/* Maps, scene and images */
+
+/** Draws the panel of a step. @type {((t: number) => void)[]} */
+const painters = [];
+
+/**
+ * Draws a marker: a plus for the truth, a ring for estimates.
+ * @param {CanvasRenderingContext2D} c
+ * @param {number} x
+ * @param {number} y
+ * @param {string} colour
+ * @param {boolean} plus
+ */
+function marker(c, x, y, colour, plus) {
+  c.strokeStyle = colour;
+  c.lineWidth = 2 * scale;
+  c.beginPath();
+  if (plus) {
+    c.moveTo(x - 7 * scale, y);
+    c.lineTo(x + 7 * scale, y);
+    c.moveTo(x, y - 7 * scale);
+    c.lineTo(x, y + 7 * scale);
+  } else c.arc(x, y, 5 * scale, 0, 7);
+  c.stroke();
+}
+
+/** @param {Maps} maps */
+function buildMaps(maps) {
+  const [, rows, columns] = maps.shape;
+  const data = bytes(maps.data);
+  const palette = bytes(run.palette);
+  const isCurve = rows === 1;
+  html('#maps h2').textContent = maps.title;
+  const sides = maps.axes.map((axis, i) => `${axis} ±${digits(maps.reach[i])}`);
+  html('#maps p').textContent = `${sides.join(', ')} around the truth (plus). Ring: estimate.`;
+  maps.layers.forEach(({ name }, l) => {
+    const canvas = canvasOf(MAP, isCurve ? MAP / 3 : MAP);
+    const c = context(canvas);
+    const pixels = bitmap(columns, rows);
+    const image = context(pixels).createImageData(columns, rows);
+    html('#maps > div').append(
+      create('figure', {}, canvas, create('figcaption', { textContent: name })),
+    );
+    painters.push((t) => {
+      const index = Math.floor(t / maps.stride);
+      const first = (index * maps.layers.length + l) * rows * columns;
+      for (let row = 0; row < rows; row++)
+        for (let column = 0; column < columns; column++) {
+          const value = 3 * data[first + row * columns + column];
+          const at = 4 * ((rows - 1 - row) * columns + column);
+          image.data.set([palette[value], palette[value + 1], palette[value + 2], 255], at);
+        }
+      context(pixels).putImageData(image, 0, 0);
+      c.imageSmoothingEnabled = false;
+      c.drawImage(pixels, 0, 0, canvas.width, canvas.height);
+      const centre = maps.centres[index];
+      const draw = (
+        /** @type {Row} */ place,
+        /** @type {string} */ colour,
+        /** @type {boolean} */ plus,
+      ) => {
+        const [dx, dy] = maps.reach.map(
+          (reach, i) => ((place[i] ?? NaN) - (centre[i] ?? NaN)) / reach,
+        );
+        const y = isCurve ? 0.5 : 0.5 - 0.5 * dy;
+        if (Number.isFinite(dx))
+          marker(c, (0.5 + 0.5 * dx) * canvas.width, y * canvas.height, colour, plus);
+      };
+      draw(maps.truth[t], '#fff', true);
+      draw(maps.places[t][fused], run.layers[fused].colour, false);
+    });
+  });
+}
+
+/** @param {Scene} scene */
+function buildScene(scene) {
+  const points = scene.steps.flatMap((shapes) => shapes.flatMap(([, outline]) => outline));
+  const xs = points.filter((_, i) => i % 2 === 0);
+  const ys = points.filter((_, i) => i % 2 === 1);
+  const range = (/** @type {number[]} */ v) =>
+    v.reduce(([a, b], x) => [Math.min(a, x), Math.max(b, x)], [Infinity, -Infinity]);
+  const [[left, right], [bottom, top]] = [range(xs), range(ys)];
+  const width = 300;
+  const factor = ((width - 12) * scale) / (right - left);
+  const canvas = canvasOf(width, Math.min(360, ((top - bottom) * factor) / scale + 12));
+  const c = context(canvas);
+  const at = (/** @type {number} */ x, /** @type {number} */ y) =>
+    /** @type {[number, number]} */ ([
+      6 * scale + (x - left) * factor,
+      canvas.height - 6 * scale - (y - bottom) * factor,
+    ]);
+  html('#pictures').append(
+    create('figure', {}, canvas, create('figcaption', { textContent: 'from above' })),
+  );
+  painters.push((t) => {
+    c.clearRect(0, 0, canvas.width, canvas.height);
+    for (const [colour, outline] of scene.steps[Math.floor(t / scene.stride)]) {
+      c.beginPath();
+      for (let i = 0; i < outline.length; i += 2) c.lineTo(...at(outline[i], outline[i + 1]));
+      c.closePath();
+      c.fillStyle = colour;
+      c.globalAlpha = 0.6;
+      c.fill();
+      c.globalAlpha = 1;
+      c.lineWidth = scale;
+      c.strokeStyle = css('--muted');
+      c.stroke();
+    }
+    run.layers.forEach(({ colour }, l) => {
+      const [x, y] = scene.places[t][l];
+      if (x != null && y != null) marker(c, ...at(x, y), colour, false);
+    });
+    const [x, y] = scene.truth[t];
+    if (x != null && y != null) marker(c, ...at(x, y), run.truth, true);
+  });
+}
+
+/** @param {Images} images */
+function buildImages({ name, width, height, channels, data }) {
+  const values = bytes(data);
+  const canvas = canvasOf(140, (140 * height) / width);
+  const pixels = bitmap(width, height);
+  const image = context(pixels).createImageData(width, height);
+  html('#pictures').append(
+    create('figure', {}, canvas, create('figcaption', { textContent: name })),
+  );
+  painters.push((t) => {
+    const first = t * width * height * channels;
+    for (let i = 0; i < width * height; i++) {
+      const at = first + i * channels;
+      const green = channels === 3 ? at + 1 : at;
+      const blue = channels === 3 ? at + 2 : at;
+      image.data.set([values[at], values[green], values[blue], 255], 4 * i);
+    }
+    context(pixels).putImageData(image, 0, 0);
+    const c = context(canvas);
+    c.imageSmoothingEnabled = false;
+    c.drawImage(pixels, 0, 0, canvas.width, canvas.height);
+  });
+}
+
+/** @param {number} t */
+function showValues(t) {
+  const heads = ['', `${run.error.label} error (${run.error.unit})`];
+  for (const { label, unit } of run.components) heads.push(`${label} (${unit})`, 'σ');
+  const weights = run.weights;
+  if (weights) heads.push(weights.label);
+  const cells = run.layers.map(({ name, label }, l) => {
+    const values = [label, digits(run.error.values[l][t])];
+    for (const { mean, std } of run.components) values.push(digits(mean[l][t]), digits(std[l][t]));
+    if (weights) values.push(digits(weights.values[weights.names.indexOf(name)]?.[t]));
+    return values;
+  });
+  const row = (/** @type {string[]} */ texts, /** @type {string} */ tag) =>
+    create('tr', {}, ...texts.map((textContent, i) => create(i ? tag : 'th', { textContent })));
+  html('#values table').replaceChildren(
+    create('thead', {}, row(heads, 'th')),
+    create('tbody', {}, ...cells.map((texts) => row(texts, 'td'))),
+  );
+}
+
+/* Cursor */
+
+function draw() {
+  for (const paint of painters) paint(step);
+  for (const paint of cursorPainters) paint(step);
+  showValues(step);
+  cursor.value = String(step);
+  html('#place').textContent = `step ${step} of ${run.steps - 1}, ${(step * run.dt).toFixed(2)} s`;
+}
+
+/** @param {number} target */
+function move(target) {
+  step = Math.min(Math.max(target || 0, 0), run.steps - 1);
+  draw();
+  history.replaceState(null, '', `#step=${step}`);
+}
+
+function play() {
+  clearInterval(timer);
+  const isPlaying = html('#play').textContent === '❚❚';
+  html('#play').textContent = isPlaying ? '▶' : '❚❚';
+  if (!isPlaying)
+    timer = window.setInterval(() => move(step + 1 < run.steps ? step + 1 : 0), 1000 * run.dt);
+}
+
+/** Moves to the step in the address. */
+function followAddress() {
+  const [, text] = location.hash.match(/^#step=(\d+)$/) ?? [];
+  move(text === undefined ? (run.moments[0]?.step ?? 0) : Number(text));
+}
+
+cursor.max = String(run.steps - 1);
+cursor.addEventListener('input', () => move(Number(cursor.value)));
+html('#play').addEventListener('click', play);
+document.addEventListener('keydown', (event) => {
+  /** @type {Record<string, number>} */
+  const targets = {
+    ArrowLeft: step - 1,
+    ArrowRight: step + 1,
+    PageUp: step - 10,
+    PageDown: step + 10,
+    Home: 0,
+    End: run.steps - 1,
+  };
+  if (event.key === ' ' && event.target instanceof Element && !event.target.closest('button, a'))
+    play();
+  else if (event.key in targets) move(targets[event.key]);
+  else return;
+  event.preventDefault();
+});
+window.addEventListener('hashchange', followAddress);
+window.addEventListener('resize', () => {
+  buildTimeline();
+  draw();
+});
+html('#moments ol').append(
+  ...run.moments.map(({ step: at, error }) =>
+    create('li', {}, create('a', { href: `#step=${at}`, textContent: `step ${at}: ${error}` })),
+  ),
+);
+if (run.scene) buildScene(run.scene);
+run.images.forEach(buildImages);
+if (run.maps) buildMaps(run.maps);
+else html('#maps h2').textContent = `No maps: ${run.no_maps}`;
+buildTimeline();
+followAddress();

@@ -1,0 +1,46 @@
+"""Interactive pages in the browser: one cursor, deep links, no network, no errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from beliefscope.datasets.faults.injection import Faults
+from beliefscope.datasets.store import open_dataset, sample_path
+from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.trace import trace
+from beliefscope.recordings.interactive.export import write_interactive
+
+
+def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
+    checkpoint = load_checkpoint(shipped("push", "crossmodal-ekf"))
+    with open_dataset(sample_path("push")) as data:
+        run = trace(checkpoint, data[29], 29, faults=Faults.parse("blackout=0.4"))
+    write_interactive(run, tmp_path / "run.html", checkpoint, 21)
+    page = context.new_page()
+    problems: list[str] = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+    requests: list[str] = []
+    page.on("request", lambda request: requests.append(request.url))
+    address = (tmp_path / "run.html").as_uri()
+    page.goto(f"{address}#step=42")
+    assert page.text_content("#place") == "step 42 of 99, 4.20 s"
+    assert page.locator("#maps canvas").count() == 3
+    shown = "() => document.querySelector('#maps canvas').toDataURL()"
+    first = page.evaluate(shown)
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("() => location.hash") == "#step=43"
+    assert page.evaluate(shown) != first
+    page.keyboard.press("End")
+    assert page.text_content("#place").startswith("step 99 of 99")
+    page.locator("#moments a").first.click()
+    page.wait_for_function("() => location.hash !== '#step=99'")
+    moment = int(page.evaluate("() => location.hash").removeprefix("#step="))
+    assert page.input_value("#cursor") == str(moment)
+    cells = page.locator("#values tbody tr").last.locator("td").all_text_contents()
+    estimate = 100.0 * run.estimate_mean[moment, 0]
+    assert abs(float(cells[1]) - estimate) <= 5e-3 * abs(estimate)  # three digits
+    assert requests == [f"{address}#step=42"] or requests == [address]
+    assert not problems
+    page.close()
