@@ -52,6 +52,7 @@ OPTIONS = {
     "failures": "--filter --data --skip-bad --faults --by --top --phase --all --url --particles --seed --json",
     "slices": "--filter --data --skip-bad --faults --by --alpha --all --particles --seed --json",
     "faults": "--json",
+    "mcp": "--task --data --filter --url --particles --seed",
     "doctor": "--workspace --host --port --json",
 }
 """Options that external scripts may rely on."""

@@ -21,7 +21,7 @@ from beliefscope.datasets.errors import BadInput
 COMMANDS = (
     *("demo", "serve", "collect", "convert", "train", "finetune", "modules", "change", "lineage"),
     *("evaluate", "calibrate", "study", "sweep", "experiments", "trace", "record", "live", "import", "export"),
-    *("inspect", "diagnose", "report", "counterfactual", "figure", "failures", "slices", "faults", "doctor"),
+    *("inspect", "diagnose", "report", "counterfactual", "figure", "failures", "slices", "faults", "mcp", "doctor"),
 )
 """In the order of the help text. Each is a function of a module in ``commands`` with the same name."""
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def export(
     sources: list[Path], output: Path, task: str = "", filter: str = "", interactive: bool = False
 ) -> console.Result:
-    """Export a trace to Parquet, MCAP, NumPy or an interactive page.
+    """Export traces as tables or interactive pages.
 
     Parquet has one row per step and one column per number, for pandas and similar tools. MCAP has one topic per array,
     and images and particles in Foxglove's schemas. npz has the arrays unchanged. Names: docs/recordings.md. HTML is one

@@ -85,7 +85,7 @@ def serve(
     settings = Settings(
         workspace=workspace,
         data=short_names(data or (), {SAMPLE}),
-        checkpoints=_checkpoints(filter or (), task or ()),
+        checkpoints=filters_of_command_line(filter or (), task or ()),
         hosts=(*host_names(host), *(allow_host or ())),
         seed=seed,
         views=views,
@@ -123,7 +123,7 @@ def serve_page(
         signal.signal(number, signal.SIG_IGN)  # the server has stopped; do not interrupt interpreter shutdown
 
 
-def _checkpoints(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path | Checkpoint]:
+def filters_of_command_line(filters: Sequence[str], tasks: Sequence[str]) -> dict[str, Path | Checkpoint]:
     """Displayed name -> checkpoint file or external filter, of the filters and tasks on the command line."""
     from beliefscope.app.runs.catalog import PRETRAINED, short_names
     from beliefscope.datasets.catalog import load_task

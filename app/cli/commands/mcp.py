@@ -1,0 +1,45 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from beliefscope.app.cli import options as opt
+from beliefscope.datasets.errors import BadInput
+
+
+@opt.with_options(
+    task=opt.option("FILE.py:NAME", "Custom task. Repeatable."),
+    data=opt.option("FILE|DIR", "Additional episodes. Repeatable."),
+    filter=opt.option("CHECKPOINT|MODULE:BUILD", "Additional filter. Repeatable."),
+    url=opt.option("URL", "Address of a running dashboard, for the links in answers."),
+)
+def mcp(
+    task: list[str] | None = None,
+    data: list[Path] | None = None,
+    filter: list[str] | None = None,
+    url: str = "",
+    particles: int = 300,
+    seed: int = 0,
+) -> None:
+    """Answer an assistant's questions about runs.
+
+    A server of the Model Context Protocol on standard input and output, started by the assistant. Its tools explain a
+    run, list the worst moments, diagnose faults, read values and draw figures, for the included filters and data and
+    those given here. It only reads, and opens no network connection. Needs: pip install 'beliefscope[mcp]'.
+
+    \b
+    Examples:
+      beliefscope mcp
+      beliefscope mcp --data door.h5 --filter mine.safetensors --url http://127.0.0.1:8000
+    """
+    from beliefscope.app.cli.commands.serve import filters_of_command_line
+    from beliefscope.app.runs.catalog import SAMPLE, short_names, task_catalogs
+    from beliefscope.app.server.assistant import Assistant, build_server
+    from beliefscope.datasets.catalog import load_task
+
+    checkpoints = filters_of_command_line(filter or (), task or ())
+    tasks = [load_task(name) for name in task or ()]
+    catalogs, problems = task_catalogs(checkpoints, short_names(data or (), {SAMPLE}), tasks)
+    if problems:
+        raise BadInput("; ".join(problems))
+    base = url and f"{url.rstrip('/')}/"
+    build_server(Assistant(catalogs, base, seed, particles)).run()
