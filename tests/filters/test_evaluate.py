@@ -18,6 +18,7 @@ from beliefscope.filters.batch import Steps
 from beliefscope.filters.catalog import architecture, build
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.filters.evaluate import evaluate, metrics, nees_bounds
+from beliefscope.filters.external.load import as_external
 from beliefscope.filters.filter import Filter
 from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.start_offset import NO_OFFSET, StartOffset, offset_start
@@ -40,6 +41,27 @@ def test_errors_drawn_from_their_covariance_are_consistent() -> None:
     assert result.rmse["position_cm"] == pytest.approx(100 * math.sqrt(0.03**2 + 0.01**2 + 0.02**2), rel=0.02)
     # Half the standard deviation: four times the squared error relative to the variance.
     assert metrics(DOOR, error, covariance.expand(len(error), 3, 3) / 4).nees == pytest.approx(4.0, abs=0.08)
+
+
+def test_full_turns_are_no_error() -> None:
+    """An external filter whose angle counts turns: the same metrics, up to the rounding of 2 pi in float32."""
+
+    class Truth:
+        task = "door"
+        turns = 0.0
+
+        def __call__(self, *, observations: dict[str, np.ndarray], controls: np.ndarray) -> dict[str, np.ndarray]:
+            mean = episode.states[:, None] + np.array([0.01, 0.0, 0.02 + 2.0 * np.pi * self.turns], np.float32)
+            return {"estimate_mean": mean, "estimate_covariance": np.broadcast_to(1e-3 * np.eye(3), (*mean.shape, 3))}
+
+    with open_dataset(sample_path("door")) as dataset:
+        episode = dataset[9]
+    model = Truth()
+    results = []
+    for model.turns in (0.0, 1.0, -3.0):
+        results.append(evaluate(as_external(model, "turning"), [episode]))
+        assert results[-1].rmse["angle_deg"] == pytest.approx(math.degrees(0.02), rel=1e-4)
+        assert results[-1].nees == pytest.approx(results[0].nees, rel=1e-3)
 
 
 def test_consistency_is_null_without_a_covariance() -> None:
