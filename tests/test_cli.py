@@ -109,6 +109,19 @@ def test_help_imports_no_heavy_module() -> None:
     assert done.stdout.split() == []
 
 
+@pytest.mark.parametrize("names", [("dor", "crossmodal-pf"), ("door", "crosmodal-pf"), ("push", "crossmodal-ukf")])
+def test_wrong_names_are_reported_without_pytorch(names: tuple[str, str]) -> None:
+    code = (
+        "import sys\n"
+        "from beliefscope.app.cli.options import Runs\n"
+        "from beliefscope.datasets.errors import BadInput\n"
+        f"try: Runs(*{names})\n"
+        "except BadInput: print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "False\n"
+
+
 EKF = "door --filter ekf.safetensors"
 BAD = [
     "nosuch",
