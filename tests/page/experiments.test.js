@@ -2,11 +2,13 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import {
+  comparedWith,
   matching,
   NUMBER_KEYS,
   parseSort,
   rowKey,
   sortText,
+  unknownConditions,
 } from '../../app/page/tabs/experiment_rows.js';
 import { niceStep } from '../../app/page/tabs/scatter.js';
 
@@ -43,6 +45,19 @@ test('words match in any text, conditions match numbers, and more of them never 
   assert.deepEqual(names('error>=0.7'), ['run-2']);
   assert.deepEqual(names('error<0.7 nees>2.5'), []);
   for (const key of NUMBER_KEYS) assert.equal(names(`${key}<-1e9`).length, 0);
+});
+
+test('conditions on columns that do not exist are reported', () => {
+  assert.match(
+    unknownConditions('ekf neez>2 nees>2 (  lr<=1'),
+    /^No column of neez>2, lr<=1\. .*nees/,
+  );
+  assert.equal(unknownConditions('ekf nees>2 nees> ('), '');
+});
+
+test('a row of the displayed filter is compared by its sensor faults', () => {
+  assert.equal(comparedWith(ROW, 'a', 'b'), 'filter=a');
+  assert.equal(comparedWith(ROW, 'a', 'a'), 'faults=blackout%3D0.4');
 });
 
 test('an unfinished condition is a word, and does not fail', () => {

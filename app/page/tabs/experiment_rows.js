@@ -65,6 +65,33 @@ const COMPARISONS = {
   '<=': (value, limit) => value <= limit,
 };
 
+const CONDITION = /^(\w+)(>=|<=|>|<)(-?[\d.]+)$/;
+
+/**
+ * Reports the conditions, such as `neez>2`, whose column does not exist; empty without any.
+ * @param {string} text
+ */
+export function unknownConditions(text) {
+  const unknown = text.split(/\s+/).filter((word) => {
+    const [, key] = word.toLowerCase().match(CONDITION) ?? [];
+    return key !== undefined && !(key in NUMBERS);
+  });
+  return unknown.length
+    ? `No column of ${unknown.join(', ')}. Columns: ${NUMBER_KEYS.join(', ')}.`
+    : '';
+}
+
+/**
+ * The comparison of the displayed run with a row: by filter or, if both have the same one, by sensor faults.
+ * @param {Pick<ExperimentRow, 'faults'>} row
+ * @param {string} filter of the row
+ * @param {string} displayed filter
+ */
+export const comparedWith = ({ faults }, filter, displayed) =>
+  filter === displayed
+    ? `faults=${encodeURIComponent(faults)}`
+    : `filter=${encodeURIComponent(filter)}`;
+
 /**
  * Returns the rows that contain all words, in any text or the provenance, and meet all conditions such as `nees>2`.
  * @param {ExperimentRow[]} rows
@@ -76,7 +103,7 @@ export function matching(rows, text) {
     .split(/\s+/)
     .filter(Boolean)
     .map((word) => {
-      const [, key, sign, limit] = word.match(/^(\w+)(>=|<=|>|<)(-?[\d.]+)$/) ?? [];
+      const [, key, sign, limit] = word.match(CONDITION) ?? [];
       if (key in NUMBERS) {
         const column = /** @type {NumberKey} */ (key);
         return (/** @type {ExperimentRow} */ row) => {

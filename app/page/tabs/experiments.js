@@ -18,6 +18,8 @@ import {
   rowKey,
   sortText,
   valueOf,
+  unknownConditions,
+  comparedWith,
 } from './experiment_rows.js';
 import { drawScatter, seriesOf } from './scatter.js';
 
@@ -81,7 +83,8 @@ export class Experiments {
     html('.compare', host).addEventListener('click', () =>
       this.#openRow((row, filter) => ({
         tab: 'compare',
-        against: `filter=${encodeURIComponent(filter)}`,
+        // the sensor faults are compared if the filter is the same
+        against: comparedWith(row, filter, store.state.filter),
       })),
     );
     html('.diagnose', host).addEventListener('click', () =>
@@ -194,6 +197,7 @@ export class Experiments {
     );
     const more = this.#count > this.#rows.length ? `, ${this.#rows.length} are listed` : '';
     html('.about', this.#host).textContent =
+      unknownConditions(state.match) ||
       `${rows.length} of ${this.#rows.length} results of ${this.#sweep?.checkpoints ?? 0} checkpoints match${more}.`;
     const columns = columnsOf(this.#rows);
     const heads = columns.map(({ key, title, help, number }) =>
@@ -322,16 +326,8 @@ export class Experiments {
    */
   #runOf({ task, faults, data_name: data, worst_episode: episode, worst_step: step }, filter) {
     const names = this.#catalog.tasks.find(({ name }) => name === task);
-    const place = { episode: episode ?? 0, step: step ?? 0 };
-    return {
-      task,
-      filter,
-      faults,
-      data: data ?? names?.data[0]?.name ?? '',
-      ...place,
-      against: '',
-      playing: false,
-    };
+    const place = { episode: episode ?? 0, step: step ?? 0, against: '', playing: false };
+    return { task, filter, faults, data: data ?? names?.data[0]?.name ?? '', ...place };
   }
 
   /**

@@ -4,7 +4,7 @@
 /** @import { NumberKey } from './experiment_rows.js' */
 
 import { scaled } from '../core/palette.js';
-import { significant } from '../core/units.js';
+import { fixed, significant } from '../core/units.js';
 import { extent, padded } from '../widgets/plots.js';
 import { NUMBERS, rowKey } from './experiment_rows.js';
 
@@ -47,7 +47,7 @@ export function drawScatter(host, rows, xKey, yKey, filters, selected, select) {
         y1: MARGIN.top,
         y2: height - MARGIN.bottom,
       }),
-      text(significant(value), right(value), height - MARGIN.bottom + scaled(13), 'middle'),
+      text(fixed(value, x.decimals), right(value), height - MARGIN.bottom + scaled(13), 'middle'),
     );
   for (const value of y.ticks)
     svg.append(
@@ -58,7 +58,7 @@ export function drawScatter(host, rows, xKey, yKey, filters, selected, select) {
         y1: up(value),
         y2: up(value),
       }),
-      text(significant(value), MARGIN.left - scaled(5), up(value) + scaled(4), 'end'),
+      text(fixed(value, y.decimals), MARGIN.left - scaled(5), up(value) + scaled(4), 'end'),
     );
   svg.append(text(x.title, (MARGIN.left + width) / 2, height - scaled(4), 'middle'));
   const side = text(y.title, 0, 0, 'middle');
@@ -103,6 +103,7 @@ function axis(rows, name) {
     key,
     title: hasUnit && units.length === 1 ? `${title}, ${units[0]}` : title,
     ticks: Array.from({ length: count }, (_, i) => (first + i) * step),
+    decimals: Math.max(0, -Math.floor(Math.log10(step))),
     share: (/** @type {number} */ value) => (value - low) / (high - low),
   };
 }

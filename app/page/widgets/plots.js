@@ -216,7 +216,7 @@ export function extent(values) {
  * @returns {Range}
  */
 export function padded([low, high]) {
-  const margin = MARGIN * (high - low) || 1;
+  const margin = MARGIN * (high - low) || Math.abs(high) / 10 || 1;
   return [low === 0 ? -margin / 4 : low - margin, high + margin];
 }
 
