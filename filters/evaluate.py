@@ -89,6 +89,11 @@ class Metrics:
                 document[key] = {name: result._errors() for name, result in by_modality.items()}
         return document
 
+    def __str__(self) -> str:
+        parts = [f"RMSE {key} {value:.3g}" for key, value in self.rmse.items()]
+        parts += [f"{name} {getattr(self, name):.3g}" for name in ("nll", "nees", "coverage95")]
+        return ", ".join(parts)
+
     def _repr_html_(self) -> str:
         """Errors beside those of the baselines, and the measures of consistency, in a notebook."""
         columns = {FILTER: self, **self.baselines}

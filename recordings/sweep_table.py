@@ -216,9 +216,12 @@ class Experiments:
     def query(self, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
         """The result of a query. Raises BadInput with the message of the database."""
         try:
-            return self._database.sql(sql, params=list(parameters)).to_arrow_table()
+            relation = self._database.sql(sql, params=list(parameters))
         except duckdb.Error as error:
             raise BadInput(f"query {sql!r}: {str(error).strip()}") from None
+        if relation is None:  # no statement, or one without a result
+            raise BadInput(f"query {sql!r} has no result; write one that starts with SELECT")
+        return relation.to_arrow_table()
 
     def overview(self, phase: str = "all", sort: str = "error") -> pa.Table:
         """Results of each checkpoint, data set and faults in a phase, highest values of the column ``sort`` first.

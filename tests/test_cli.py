@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import shlex
+import signal
 import socket
 import subprocess
 import sys
@@ -301,6 +302,32 @@ def test_busy_port(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert f"port {port}" in err
     assert "--port" in err
     assert not (tmp_path / "workspace").exists()
+
+
+def test_an_interrupt_prints_one_line_and_exits_with_130(tmp_path: Path) -> None:
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from beliefscope.app.cli.main import main; main()"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "collect",
+        "push",
+        "--episodes",
+        "40",
+        "--steps",
+        "50",
+        "-o",
+        str(tmp_path / "push.h5"),
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().count("%") == 1, "the first line of the progress"
+        process.send_signal(signal.SIGINT)
+        *_, last = process.stderr.read().splitlines()
+    assert (last, process.returncode) == ("error: interrupted", 130)
 
 
 def test_unexpected_errors_exit_with_1_and_a_traceback_on_request(

@@ -70,13 +70,12 @@ def grid(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | int |
 
 
 def arrow(title: str, rows: Any) -> str:
-    """Format an Arrow table without provenance; hashes are shortened."""
+    """Format an Arrow table; hashes are shortened."""
 
     def short(value: Any) -> Any:
         return value[:12] if isinstance(value, str) and len(value) == 64 else value
 
-    printed = rows.drop_columns([name for name in ("provenance",) if name in rows.column_names])
-    return grid(title, printed.column_names, [list(map(short, row.values())) for row in printed.to_pylist()])
+    return grid(title, rows.column_names, [list(map(short, row.values())) for row in rows.to_pylist()])
 
 
 def grids(tables: Iterable[Table]) -> list[str]:

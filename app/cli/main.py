@@ -25,6 +25,9 @@ COMMANDS = (
 )
 """In the order of the help text. Each is a function of a module in ``commands`` with the same name."""
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, of the shell; typer returns it instead of raising the interrupt."""
+
 cli = typer.Typer(
     name="beliefscope",
     add_completion=False,
@@ -44,13 +47,15 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # like standard error: file names may not be valid text
     try:
         code = cli(prog_name="beliefscope", standalone_mode=False)
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
         console.flush()
     except typer.TyperException as error:
         command = getattr(getattr(error, "ctx", None), "command_path", "beliefscope")
         message = error.format_message().rstrip(".").replace("Value error, ", "")
         console.fail(f"{message}. See: {command} --help", error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
-        console.fail("interrupted", 130)
+        console.fail("interrupted", INTERRUPTED)
     except Exception as error:
         if debug:
             raise

@@ -164,6 +164,7 @@ def test_commands(run: Run, sweep: Path, tmp_path: Path) -> None:
     assert len((tmp_path / "all.csv").read_text().splitlines()) == 5
     for line, message in {
         "--sql 'SELECT * FROM nowhere'": "nowhere",
+        "--sql ' '": "has no result",
         "--phase asleep": "no steps in phase 'asleep'. Available: all, blackout, contact, free motion",
         "--sort speed": "column of the overview 'speed' does not exist",
     }.items():

@@ -46,5 +46,7 @@ def experiments(
     shown = rows.slice(0, top)
     more = f"\n{len(rows) - top} more rows: --top {len(rows)}" if len(rows) > top else ""
     document = {"rows": shown.to_pylist(), "count": len(rows)}
-    title = "Results" if sql else f"Checkpoints, {phase} steps"
-    return console.Result(document, console.arrow(title, shown) + more, output)
+    if sql:
+        return console.Result(document, console.arrow("Results", shown) + more, output)
+    text = console.arrow(f"Checkpoints, {phase} steps", shown.drop_columns(["provenance"]))
+    return console.Result(document, text + more, output)

@@ -73,7 +73,9 @@ def sweep(
     overview = Experiments([output]).overview()
     document = {"checkpoints": len(inputs.checkpoints), "cells": len(cells), "rows": len(table)}
     document |= {"overview": overview.to_pylist()}
-    return console.Result(document, console.arrow("Checkpoints", overview), output / "results.parquet")
+    return console.Result(
+        document, console.arrow("Checkpoints", overview.drop_columns(["provenance"])), output / "results.parquet"
+    )
 
 
 def _matches(pattern: str) -> list[Path]:
