@@ -9,6 +9,7 @@ from typing import Any
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.names import is_code
 from beliefscope.filters.open_filter import open_filter
 from beliefscope.inspect.traces.data import Trace
 
@@ -44,7 +45,8 @@ def checkpoint_of(traces: Sequence[Trace], files: Sequence[Path], filter_: str =
     if filter_:
         checkpoint = open_filter(first.task, filter_)
         if checkpoint.hash != first.checkpoint_hash:
-            raise BadInput(f"{files[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}")
+            own = "; a filter that Python built has another hash than its build function" if is_code(filter_) else ""
+            raise BadInput(f"{files[0]} is from checkpoint {first.checkpoint_hash[:12]}, not from {filter_!r}{own}")
         return checkpoint
     try:
         checkpoint = load_checkpoint(shipped(first.task, first.filter))

@@ -33,7 +33,7 @@
  * @property {string} no_maps
  * @property {string} palette
  * @property {{step: number, error: string}[]} moments
- * @typedef {{label: string, unit: string, lines: {name: string, colour: string, values: Row, dash?: boolean}[], band?: {centre: Row, std: Row, colour: string}, stacked?: boolean}} Chart
+ * @typedef {{label: string, unit: string, lines: {name: string, colour: string, values: Row, dash?: boolean}[], band?: {centre: Row, std: Row, colour: string}, stacked?: boolean, fromZero?: boolean}} Chart
  */
 
 /** @param {string} selector */
@@ -44,7 +44,8 @@ const cursor = /** @type {HTMLInputElement} */ (html('#cursor'));
 const fused = run.layers.length - 1;
 const scale = Math.max(1, window.devicePixelRatio);
 const LEFT = 56; // px, of the charts
-const MAP = 176; // px, side of a map
+const SMALLEST_MAP = 150; // px
+const LARGEST_MAP = 240;
 let step = 0;
 let timer = 0;
 
@@ -53,7 +54,7 @@ const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeA
 /** @param {string} name */
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
 /** @param {number | null | undefined} value */
-const digits = (value) => (value == null ? '–' : Number(value.toPrecision(3)).toString());
+const digits = (value) => (value == null ? '–' : Number(value.toPrecision(4)).toString());
 
 /**
  * @param {string} tag
@@ -91,6 +92,17 @@ function canvasOf(width, height) {
 /** @param {HTMLCanvasElement} canvas */
 const context = (canvas) => /** @type {CanvasRenderingContext2D} */ (canvas.getContext('2d'));
 
+/** Lines in pale colours are darker on white. */
+const isDark = matchMedia('(prefers-color-scheme: dark)').matches;
+/** @param {string} colour #rrggbb */
+function legible(colour) {
+  const [r, g, b] = [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
+  const isPale = 0.3 * r + 0.6 * g + 0.1 * b > 190;
+  return isPale && !isDark ? `rgb(${0.6 * r} ${0.6 * g} ${0.6 * b})` : colour;
+}
+for (const layer of run.layers) layer.colour = legible(layer.colour);
+run.weights?.colours.forEach((colour, k, colours) => (colours[k] = legible(colour)));
+
 /* Charts */
 
 /** @returns {Chart[]} */
@@ -118,7 +130,12 @@ function charts() {
     const band = { centre: mean[fused], std: std[fused], colour: layers[fused].colour };
     result.push({ label, unit, lines, band });
   }
-  result.push({ label: `${error.label} error`, unit: error.unit, lines: layerLines(error.values) });
+  result.push({
+    label: `${error.label} error`,
+    unit: error.unit,
+    lines: layerLines(error.values),
+    fromZero: true,
+  });
   return result;
 }
 
@@ -143,6 +160,7 @@ function drawChart(chart, width, height) {
       const s = chart.band?.std[t];
       if (v !== null && s != null) values.push(v - 2 * s, v + 2 * s);
     });
+  if (chart.fromZero) values.push(0);
   let [low, high] = [Math.min(...values), Math.max(...values)];
   if (!(high > low)) [low, high] = [low - 1, low + 1];
   const x = (/** @type {number} */ t) =>
@@ -296,6 +314,8 @@ function marker(c, x, y, colour, plus) {
 /** @param {Maps} maps */
 function buildMaps(maps) {
   const [, rows, columns] = maps.shape;
+  const side = html('#maps').clientWidth / maps.layers.length - 20;
+  const size = Math.round(Math.min(LARGEST_MAP, Math.max(SMALLEST_MAP, side)));
   const data = bytes(maps.data);
   const palette = bytes(run.palette);
   const isCurve = rows === 1;
@@ -303,7 +323,7 @@ function buildMaps(maps) {
   const sides = maps.axes.map((axis, i) => `${axis} ±${digits(maps.reach[i])}`);
   html('#maps p').textContent = `${sides.join(', ')} around the truth (plus). Ring: estimate.`;
   maps.layers.forEach(({ name }, l) => {
-    const canvas = canvasOf(MAP, isCurve ? MAP / 3 : MAP);
+    const canvas = canvasOf(size, isCurve ? size / 2 : size);
     const c = context(canvas);
     const pixels = bitmap(columns, rows);
     const image = context(pixels).createImageData(columns, rows);
@@ -313,15 +333,25 @@ function buildMaps(maps) {
     painters.push((t) => {
       const index = Math.floor(t / maps.stride);
       const first = (index * maps.layers.length + l) * rows * columns;
-      for (let row = 0; row < rows; row++)
+      if (isCurve) {
+        c.clearRect(0, 0, canvas.width, canvas.height);
+        c.fillStyle = css('--muted');
+        const width = canvas.width / columns;
         for (let column = 0; column < columns; column++) {
-          const value = 3 * data[first + row * columns + column];
-          const at = 4 * ((rows - 1 - row) * columns + column);
-          image.data.set([palette[value], palette[value + 1], palette[value + 2], 255], at);
+          const height = (data[first + column] / 255) * canvas.height;
+          c.fillRect(column * width, canvas.height - height, width + 0.5, height);
         }
-      context(pixels).putImageData(image, 0, 0);
-      c.imageSmoothingEnabled = false;
-      c.drawImage(pixels, 0, 0, canvas.width, canvas.height);
+      } else {
+        for (let row = 0; row < rows; row++)
+          for (let column = 0; column < columns; column++) {
+            const value = 3 * data[first + row * columns + column];
+            const at = 4 * ((rows - 1 - row) * columns + column);
+            image.data.set([palette[value], palette[value + 1], palette[value + 2], 255], at);
+          }
+        context(pixels).putImageData(image, 0, 0);
+        c.imageSmoothingEnabled = false;
+        c.drawImage(pixels, 0, 0, canvas.width, canvas.height);
+      }
       const centre = maps.centres[index];
       const draw = (
         /** @type {Row} */ place,
@@ -335,7 +365,7 @@ function buildMaps(maps) {
         if (Number.isFinite(dx))
           marker(c, (0.5 + 0.5 * dx) * canvas.width, y * canvas.height, colour, plus);
       };
-      draw(maps.truth[t], '#fff', true);
+      draw(maps.truth[t], isCurve ? run.truth : '#fff', true);
       draw(maps.places[t][fused], run.layers[fused].colour, false);
     });
   });
@@ -490,6 +520,7 @@ html('#moments ol').append(
 );
 if (run.scene) buildScene(run.scene);
 run.images.forEach(buildImages);
+html('#pictures').hidden = !painters.length;
 if (run.maps) buildMaps(run.maps);
 else html('#maps h2').textContent = `No maps: ${run.no_maps}`;
 buildTimeline();

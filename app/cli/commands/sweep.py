@@ -62,6 +62,7 @@ def sweep(
     cells = inputs.cells(block)
     opt.check_output(output / "results.parquet" if output.is_dir() else output)
     output.mkdir(exist_ok=True)
+    console.note(f"{len(cells)} cells; if interrupted, the same command resumes")
     with console.bars() as update:
         table = run_sweep(
             cells,

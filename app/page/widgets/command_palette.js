@@ -45,7 +45,7 @@ export class CommandPalette {
   }
 
   toggle() {
-    if (this.#dialog.open) return this.#dialog.close();
+    if (this.#dialog.open) return this.#close();
     this.#all = this.#source();
     this.#input.value = '';
     this.#draw();
@@ -74,7 +74,7 @@ export class CommandPalette {
       PageUp: Math.max(this.#active - 10, 0),
     };
     const isToggle = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === 'k';
-    if (isToggle) this.#dialog.close();
+    if (isToggle) this.toggle();
     else if (event.key === 'Enter') this.#run(this.#active);
     else if (event.key in targets) this.#activate(targets[event.key]);
     else return;
@@ -95,8 +95,13 @@ export class CommandPalette {
   #run(index) {
     const command = this.#shown[index];
     if (!command) return;
-    this.#dialog.close();
+    this.#close();
     command.run();
+  }
+
+  #close() {
+    this.#input.blur(); // otherwise it keeps the focus, and the keys, until the next frame
+    this.#dialog.close();
   }
 }
 
