@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from typing import Any
 
+import pytest
+
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import shipped
 from beliefscope.inspect.sweep import Cell, Inputs
@@ -13,6 +15,7 @@ from beliefscope.recordings.sweep_table import Experiments, run_sweep
 READY = "() => document.querySelector('#experiments').dataset.state === 'ready'"
 
 
+@pytest.mark.long
 def test_from_a_sweep_to_its_worst_moment(open_page: Any, server: Any) -> None:
     page = open_page("?tab=experiments&sweep=none", size=(1440, 900))
     page.until("() => document.querySelector('#experiments').dataset.state === 'empty'")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 EXAMPLES = 5
 
 VISIBLE = """(selectors) => selectors.filter((selector) => {
@@ -54,6 +56,7 @@ def test_a_first_visit_shows_a_finding_with_its_moment_and_evidence(open_page: A
     assert again.page.locator("#intro").is_hidden(), "closing the introduction is not remembered"
 
 
+@pytest.mark.long
 def test_separators_and_layouts_resize_the_panels(open_page: Any) -> None:
     page = open_page("?step=20", size=(1280, 720))
 

@@ -6,11 +6,14 @@ import runpy
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from beliefscope.datasets.store import write_dataset
 
 TANK = Path(__file__).with_name("tank.py")
 
 
+@pytest.mark.long
 def test_every_view_of_a_task_with_one_component(open_page: Any, start_server: Any, tmp_path: Path) -> None:
     tank = runpy.run_path(str(TANK))
     write_dataset(tmp_path / "tank.h5", tank["TASK"], [tank["episode"](seed) for seed in range(5)])
