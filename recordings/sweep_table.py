@@ -271,8 +271,3 @@ class Experiments:
         if found is None:
             raise BadInput(f"no {column} with hash {value[:12]} in these sweeps")
         return Path(found[0])
-
-    def columns(self) -> dict[str, str]:
-        """Name and type of each column of the results."""
-        description = self.query(f"DESCRIBE {RESULTS}")
-        return dict(zip(*(description[name].to_pylist() for name in ("column_name", "column_type")), strict=True))
