@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 from fastapi import APIRouter
@@ -17,11 +16,13 @@ from beliefscope.app.api.models.experiments import (
     SweepList,
 )
 from beliefscope.app.api.models.training import FilterName
+from beliefscope.app.api.studies import catalog_names
 from beliefscope.app.protocol.errors import NotFound
 from beliefscope.app.runs.catalog import short_names
 from beliefscope.app.runs.trace_store import TraceStore
 from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.checkpoint import load_checkpoint
+from beliefscope.inspect.diagnostics.views import as_json
 
 if TYPE_CHECKING:
     from beliefscope.recordings.sweep_table import Experiments as Tables
@@ -49,10 +50,6 @@ def routes(store: TraceStore) -> APIRouter:
             raise NotFound(f"Sweep {name!r} does not exist.")
         return Tables([folder])
 
-    def catalog_name(task: str, hash_: str) -> str | None:
-        filters = store.filters(task) if task in store.tasks() else {}
-        return next((name for name, filter_ in filters.items() if filter_.hash == hash_), None)
-
     @router.get("/api/experiments")
     def list_sweeps() -> SweepList:
         entries, problems = [], []
@@ -66,12 +63,13 @@ def routes(store: TraceStore) -> APIRouter:
     @router.get("/api/experiments/{sweep}")
     def results(sweep: str, phase: str = "all") -> Experiments:
         rows = tables(sweep).overview(phase)
+        names = catalog_names(store)
         tasks = set(rows["task"].to_pylist()) & set(store.tasks())
         data = {data.hash: name for task in tasks for name, data in store.datasets(task).items()}
         sent = [
             ExperimentRow(
-                **_finite(row),
-                catalog_name=catalog_name(row["task"], row["checkpoint"]),
+                **as_json(row),
+                catalog_name=names.get((row["task"], row["checkpoint"])),
                 data_name=data.get(row["data"]),
             )
             for row in rows.slice(0, LARGEST).to_pylist()
@@ -81,7 +79,7 @@ def routes(store: TraceStore) -> APIRouter:
     @router.get("/api/experiments/{sweep}/episodes")
     def episodes(sweep: str, checkpoint: str, data: str, faults: str = "", phase: str = "all") -> EpisodeResults:
         rows = tables(sweep).episodes(checkpoint, data, faults, phase).slice(0, LARGEST).to_pylist()
-        return EpisodeResults(episodes=[EpisodeResult(**_finite(row)) for row in rows])
+        return EpisodeResults(episodes=[EpisodeResult(**as_json(row)) for row in rows])
 
     @router.get("/api/experiments/{sweep}/results.csv")
     def results_as_csv(sweep: str, phase: str = "all") -> Response:
@@ -96,7 +94,7 @@ def routes(store: TraceStore) -> APIRouter:
         loaded = load_checkpoint(path, store.settings.definitions)
         if loaded.hash != checkpoint:
             raise BadInput(f"{str(path)!r} was changed after the sweep")
-        name = catalog_name(loaded.task.name, checkpoint)
+        name = catalog_names(store).get((loaded.task.name, checkpoint))
         if name is None:
             names = store.filters(loaded.task.name)
             name = path.stem if path.stem not in names else f"{path.stem}-{checkpoint[:8]}"
@@ -111,8 +109,3 @@ def _info(name: str, tables: Tables) -> SweepInfo:
     (info,) = tables.query(size).to_pylist()
     faults = tables.query("SELECT DISTINCT faults FROM results ORDER BY faults")["faults"].to_pylist()
     return SweepInfo(name=name, phases=tables.phases(), faults=faults, **info)
-
-
-def _finite(row: dict[str, Any]) -> dict[str, Any]:
-    """The row with None in place of NaN, which JSON lacks."""
-    return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}

@@ -48,7 +48,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.get("/api/studies")
     def list_studies() -> StudyList:
-        names = _catalog_names(store)
+        names = catalog_names(store)
         entries, problems = [], []
         for study in studies().values():
             try:
@@ -76,7 +76,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         hash_ = None if study is None else study.read().checkpoints.get(cell)
         if study is None or hash_ is None:
             raise NotFound(f"Study {name!r} has no checkpoint {cell!r}.")
-        catalog_name = _catalog_names(store).get((task, hash_))
+        catalog_name = catalog_names(store).get((task, hash_))
         if catalog_name is None:
             path = study.checkpoint(cell)
             checkpoint = load_checkpoint(path)
@@ -167,6 +167,7 @@ def _key(study: Study, results: Results) -> object:
     return str(study.folder.resolve()), results.preset, sorted(results.cells)
 
 
-def _catalog_names(store: TraceStore) -> CatalogNames:
+def catalog_names(store: TraceStore) -> CatalogNames:
+    """Names of all filters in the catalog."""
     filters = {task: store.filters(task) for task in store.tasks()}
     return {(task, filter_.hash): name for task in filters for name, filter_ in filters[task].items()}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 from numpy.typing import NDArray
 
@@ -73,8 +73,7 @@ def write_interactive(
     }
     diagnosis = _diagnosis(trace, checkpoint)
     script = (FOLDER / "viewer.js").read_text()
-    environment = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined)
-    page = environment.get_template("page.html.j2").render(
+    page = _template("page.html.j2").render(
         title=run["title"],
         version=__version__,
         style=Markup((FOLDER / "viewer.css").read_text()),
@@ -90,7 +89,6 @@ def write_interactive(
 
 def write_index(files: Sequence[tuple[Path, Trace]], path: Path) -> None:
     """Write a page that lists files of ``write_interactive`` in the same folder, with the error of each run."""
-    environment = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined)
     rows = []
     for file, trace in files:
         error, main = measures.main_error(trace)[measures.counted(trace), -1], trace.task.main_error
@@ -102,7 +100,12 @@ def write_index(files: Sequence[tuple[Path, Trace]], path: Path) -> None:
                 "worst": main.text(float(error.max())),
             }
         )
-    write_atomically(path, environment.get_template("index.html.j2").render(rows=rows, version=__version__).encode())
+    write_atomically(path, _template("index.html.j2").render(rows=rows, version=__version__).encode())
+
+
+def _template(name: str) -> Template:
+    environment = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined)
+    return environment.get_template(name)
 
 
 def _layer(trace: Trace, name: str) -> dict[str, str]:

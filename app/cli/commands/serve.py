@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Literal
 
 from beliefscope.app.cli import console
 from beliefscope.app.cli import options as opt
-from beliefscope.datasets.errors import BadInput
 
 if TYPE_CHECKING:
     from beliefscope.app.runs.settings import Settings
@@ -95,9 +94,10 @@ def serve(
     )
     for name, folder in settings.studies.items():
         Study(name, folder, has_checkpoints=True).read()  # raises BadInput early
-    for folder in settings.sweeps.values():
-        if not (folder / "results.parquet").is_file():
-            raise BadInput(f"{folder} has no results of a sweep; write them: beliefscope sweep ... -o {folder}")
+    if sweep:
+        from beliefscope.recordings.sweep_table import Experiments  # DuckDB is slow to import
+
+        Experiments(settings.sweeps.values())
     serve_page(settings, port, open_page, host, access)
 
 
