@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from beliefscope.datasets.simulation.door_field import DOOR_FIELD
 from beliefscope.datasets.simulation.push import PUSH
 from beliefscope.datasets.simulation.push_field import PUSH_FIELD
 from beliefscope.datasets.task import Task
-from beliefscope.datasets.task_json import check_definition, difference, task_from_json, with_functions
+from beliefscope.datasets.task_json import check_definition, difference, task_from_json, task_to_json, with_functions
 
 TASKS: dict[str, Task] = {task.name: task for task in (DOOR, PUSH, DOOR_FIELD, PUSH_FIELD, *PUSH_REAL_TASKS)}
 """Shipped tasks by name."""
@@ -50,6 +51,14 @@ def stored_task(stored: Any, given: Iterable[Task] = ()) -> Task:
     task = task_from_json(stored)
     source = next((other for other in known if not difference(task, other)), None)
     return task if source is None else with_functions(task, source)
+
+
+def _reduce(task: Task) -> tuple[Any, ...]:
+    """For other processes: by definition, as some of its functions cannot be pickled."""
+    return stored_task, (task_to_json(task),)
+
+
+copyreg.pickle(Task, _reduce)
 
 
 def load_task(task: str | Task) -> Task:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import hashlib
 import json
 import math
@@ -293,6 +294,15 @@ class EpisodeFile(Dataset):
 
     def _place(self, group: h5py.Group, key: str) -> str:
         return f"{self.path}: {key!r} of {group.name[1:]}"
+
+
+def _reduce(data: Dataset) -> tuple[Any, ...]:
+    """For other processes, which open the file themselves."""
+    return open_dataset, (data.path, data.task, bool(data.skipped))
+
+
+for _kind in (EpisodeFile, MitPushDataset, PaperDataset):
+    copyreg.pickle(_kind, _reduce)
 
 
 def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> None:

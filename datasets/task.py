@@ -200,6 +200,10 @@ class Task:
     def __hash__(self) -> int:
         return hash(self.name)
 
+    def __deepcopy__(self, memo: Mapping[int, Any]) -> Task:
+        """The task itself, which never changes."""
+        return self
+
     def dtype(self, key: str) -> type[np.uint8] | type[np.float32]:
         """Type of an observation's values: uint8 for images, else float32."""
         return np.uint8 if len(self.observations[key]) > 1 and key not in self.arrays else np.float32

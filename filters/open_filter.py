@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import copyreg
 from pathlib import Path
+from typing import Any
 
 from beliefscope.datasets.catalog import load_task
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
-from beliefscope.filters.external.load import load_external
+from beliefscope.filters.external.load import ExternalFilter, load_external
 from beliefscope.filters.names import is_code, is_path, shipped
 
 
@@ -42,3 +44,16 @@ def open_filters(task: str | None, first: str, second: str) -> tuple[Checkpoint,
     target = task or next(iter(files.values())).task
     before, after = (files.get(text) or open_filter(target, text) for text in (first, second))
     return before, after
+
+
+def _reduce(external: ExternalFilter) -> tuple[Any, ...]:
+    """For other processes, which call the build function. Raises BadInput if there is none."""
+    if not is_code(external.source):
+        raise BadInput(
+            f"{external.source} was built in Python and cannot run in other processes: use one worker, or load it by "
+            "its build function, path/to/file.py:NAME"
+        )
+    return load_external, (external.source, external.task)
+
+
+copyreg.pickle(ExternalFilter, _reduce)

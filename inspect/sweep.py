@@ -24,9 +24,9 @@ from beliefscope.datasets.task import Task
 from beliefscope.datasets.task_json import difference
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint
 from beliefscope.filters.evaluate import squares
-from beliefscope.inspect.failures.survey import traces_of
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.batch import trace_all
 
 FORMAT = 1
 """Version of the rows; rows of other versions are computed again."""
@@ -69,7 +69,7 @@ class Cell:
         if checkpoint.hash != self.checkpoint_hash:
             raise BadInput(f"{self.checkpoint} was changed while the sweep ran")
         faults = read_faults(self.faults, data.task)
-        runs = traces_of(checkpoint, data, self.episodes, faults=faults, seed=self.seed, particles=self.particles)
+        runs = trace_all(checkpoint, data, self.episodes, self.seed, self.particles, faults)
         by_episode = {run.episode_index: list(summary(run)) for run in runs}
         given = {"checkpoint": self.checkpoint_hash, "data": self.data_hash, "faults": self.faults, "seed": self.seed}
         return [given | row for index in self.episodes for row in by_episode[index]]

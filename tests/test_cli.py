@@ -50,7 +50,8 @@ OPTIONS = {
     "report": "-o --title --event --filter --data --all --url --pdf --json",
     "counterfactual": "--filter --data --episode --faults --weights --from --to --particles --seed --trace -o --json",
     "figure": "--filter --data --skip-bad --episode --step --faults --particles --seed -o --json",
-    "failures": "--filter --data --skip-bad --faults --by --top --phase --all --url --particles --seed --json",
+    "failures": "--filter --data --skip-bad --faults --by --top --phase --all --url --engine --workers --particles "
+    "--seed --json",
     "slices": "--filter --data --skip-bad --faults --by --alpha --all --particles --seed --json",
     "faults": "--json",
     "mcp": "--task --data --filter --url --particles --seed",

@@ -15,6 +15,7 @@ from beliefscope.datasets.errors import unknown_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import display_name, with_unit
 from beliefscope.filters.checkpoint import Checkpoint
+from beliefscope.filters.engine import Engine
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Line, Plot, Table, Value
 from beliefscope.inspect.failures.step_scores import RECENT, Survey
@@ -236,6 +237,8 @@ def find_failures(
     faults: Faults = NO_FAULTS,
     seed: int = 0,
     particles: int = 300,
+    engine: Engine = "local",
+    workers: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> Failures:
     """Run a filter over the episodes of a data set and rank its failures.
@@ -243,6 +246,7 @@ def find_failures(
     Args:
         episodes: indices in ``data``; by default the held-out episodes of a ``Dataset``, otherwise all.
         by: one of ``scores_of(checkpoint.task)``.
+        engine, workers: as for ``survey_of``.
         progress: called with the completed fraction, 0..1.
 
     Raises BadInput for an unknown score, and as ``trace``.
@@ -253,7 +257,16 @@ def find_failures(
     elif episodes is None:
         episodes = data if isinstance(data, Mapping) else range(len(data))
     survey = survey_of(
-        checkpoint, data, episodes, by=by, faults=faults, seed=seed, particles=particles, progress=progress
+        checkpoint,
+        data,
+        episodes,
+        by=by,
+        faults=faults,
+        seed=seed,
+        particles=particles,
+        engine=engine,
+        workers=workers,
+        progress=progress,
     )
     return failures_of(survey, by)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -98,37 +98,28 @@ class Survey:
     phases: dict[str, Mask]
 
     @classmethod
-    def from_traces(cls, traces: Iterable[Trace]) -> Survey:
-        """Collect the scores of traces in any order, without keeping the traces.
+    def from_episodes(cls, episodes: Iterable[EpisodeScores]) -> Survey:
+        """Concatenate episodes in any order.
 
-        Raises BadInput without traces, and for traces of different filters, faults or seeds.
+        Raises BadInput without episodes, and for those of different filters, faults or seeds.
         """
-        by_index: dict[int, dict[str, NDArray[Any]]] = {}
-        first: Trace | None = None
-        for trace in traces:
-            first = trace if first is None else first
-            _check_same_run(first, trace)
-            if trace.episode_index in by_index:
-                raise BadInput(f"two traces of episode {trace.episode_index}")
-            by_index[trace.episode_index] = _columns(trace)
-        if first is None:
+        by_index: dict[int, EpisodeScores] = {}
+        for episode in episodes:
+            by_index.setdefault(episode.index, episode)
+            if by_index[episode.index] is not episode:
+                raise BadInput(f"two traces of episode {episode.index}")
+            _check_same_run(next(iter(by_index.values())).run, episode.run)
+        if not by_index:
             raise BadInput("the failure search needs at least one trace")
-        episodes = [by_index[index] for index in sorted(by_index)]
-        columns = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
-        task = first.task
-        available = scores_of(task)
+        parts = [by_index[index].columns for index in sorted(by_index)]
+        columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        run: dict[str, Any] = dict(next(iter(by_index.values())).run)
+        task = run["task"]
         return cls(
-            task=task,
-            filter=first.filter,
-            checkpoint_hash=first.checkpoint_hash,
-            faults=str(first.faults),
-            seed=first.seed,
-            particles=first.particle_count,
-            layers=measures.layers(first),
+            **run,
             angles=tuple(c.name for c in task.components if c.unit == "rad"),
-            scores={name: columns[f"score {name}"] for name in available if f"score {name}" in columns},
-            refused={name: why for name, score in available.items() if (why := score.why_not(first))},
-            phases=_phases(columns, first.task),
+            scores={name: columns[f"score {name}"] for name in scores_of(task) if f"score {name}" in columns},
+            phases=_phases(columns, task),
             episode=columns["episode"],
             step=columns["step"],
             error=columns["error"],
@@ -139,10 +130,43 @@ class Survey:
             effective_weights=columns.get("effective_weights"),
         )
 
+    @classmethod
+    def from_traces(cls, traces: Iterable[Trace]) -> Survey:
+        """As ``from_episodes``, of traces, which are not kept."""
+        return cls.from_episodes(map(EpisodeScores.from_trace, traces))
+
     @property
     def phase_index(self) -> NDArray[np.int_]:
         """(S,) index in ``phases`` of the phase of each step."""
         return np.argmax(np.stack([*self.phases.values()]), axis=0)
+
+
+@dataclass(frozen=True)
+class EpisodeScores:
+    """The part of a survey that one trace gives.
+
+    Attributes:
+        index: of the episode. run: attributes of the survey that are the same for all its episodes.
+        columns: name -> (T, ...).
+    """
+
+    index: int
+    run: Mapping[str, Any]
+    columns: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def from_trace(cls, trace: Trace) -> EpisodeScores:
+        run = {
+            "task": trace.task,
+            "filter": trace.filter,
+            "checkpoint_hash": trace.checkpoint_hash,
+            "faults": str(trace.faults),
+            "seed": trace.seed,
+            "particles": trace.particle_count,
+            "layers": measures.layers(trace),
+            "refused": {name: why for name, score in scores_of(trace.task).items() if (why := score.why_not(trace))},
+        }
+        return cls(trace.episode_index, run, _columns(trace))
 
 
 def scores_of(task: Task) -> dict[str, Score]:
@@ -200,9 +224,9 @@ def _no_fusion(trace: Trace) -> str | None:
     return None if trace.effective_weights is not None else "this filter does not fuse several modalities"
 
 
-def _check_same_run(first: Trace, other: Trace) -> None:
+def _check_same_run(first: Mapping[str, Any], other: Mapping[str, Any]) -> None:
     for field in ("checkpoint_hash", "faults", "seed"):
-        a, b = str(getattr(first, field)), str(getattr(other, field))
+        a, b = str(first[field]), str(other[field])
         if a != b:
             raise BadInput(f"traces differ in {field}, {a!r} and {b!r}; the failure search needs traces of one run")
 

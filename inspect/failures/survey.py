@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from beliefscope.datasets.dataset import Dataset
@@ -11,60 +12,70 @@ from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.datasets.task import Task
 from beliefscope.filters.checkpoint import Checkpoint
-from beliefscope.inspect.failures.step_scores import Score, Survey, scores_of
-from beliefscope.inspect.trace import Trace, trace
+from beliefscope.filters.engine import Engine, one_thread, run_all
+from beliefscope.inspect.failures.step_scores import EpisodeScores, Score, Survey, scores_of
 from beliefscope.inspect.traces.batch import trace_all
+
+Episodes = Dataset | Mapping[int, Episode] | Sequence[Episode]
+
+BLOCK = 16
+"""Episodes that a process runs at a time."""
 
 
 def survey_of(
     checkpoint: Checkpoint,
-    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    data: Episodes,
     episodes: Iterable[int],
     *,
     by: str | None = None,
     faults: Faults = NO_FAULTS,
     seed: int = 0,
     particles: int = 300,
+    engine: Engine = "local",
+    workers: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> Survey:
     """Run a filter over episodes of a data set, many at once.
 
-    Particle filters and external filters run over one episode after the other: the random numbers are those of
-    ``trace``.
-
     Args:
         by: a score that must apply to the filter.
+        engine, workers: where to run, as for ``filters.engine.run_all``. The values do not depend on them.
 
-    Raises BadInput after the first trace if ``by`` does not apply, and as ``trace``.
+    Raises BadInput after the first episode if ``by`` does not apply, as ``trace``, and for several workers with an
+    external filter that has no build function.
     """
     indices = list(episodes)
     settings: dict[str, Any] = {"faults": faults, "seed": seed, "particles": particles}
-    return Survey.from_traces(traces_of(checkpoint, data, indices, by=by, progress=progress, **settings))
+    if by is not None:
+        try_score(by, checkpoint, data, indices[:1], **settings)
+    blocks = [indices[i : i + BLOCK] for i in range(0, len(indices), BLOCK)]
+    scores: list[EpisodeScores] = []
+
+    def advance(share: float = 0.0) -> None:
+        """Report the finished episodes and a share of the next block."""
+        if progress is not None:
+            progress((len(scores) + share * min(BLOCK, len(indices) - len(scores))) / len(indices))
+
+    if engine == "local" and workers == 1:
+        with one_thread():
+            for block in blocks:
+                scores += _scores(checkpoint, data, settings, block, advance)
+    else:
+        for _, finished in run_all(partial(_scores, checkpoint, data, settings), blocks, engine, workers):
+            scores += finished
+            advance()
+    return Survey.from_episodes(scores)
 
 
-def traces_of(
+def _scores(
     checkpoint: Checkpoint,
-    data: Dataset | Mapping[int, Episode] | Sequence[Episode],
+    data: Episodes,
+    settings: Mapping[str, Any],
     indices: Sequence[int],
-    *,
-    by: str | None = None,
     progress: Callable[[float], None] | None = None,
-    **settings: Any,
-) -> Iterator[Trace]:
-    """The traces of ``survey_of``, with the same arguments and errors."""
-
-    def one_by_one() -> Iterator[Trace]:
-        for done, index in enumerate(indices):
-            share = _partial_progress(progress, done, len(indices))
-            yield trace(checkpoint, data[index], index, **settings, progress=share)
-
-    batched = checkpoint.kind not in ("pf", "external")
-    for done, run in enumerate(trace_all(checkpoint, data, indices, **settings) if batched else one_by_one()):
-        if not done and by is not None:
-            check_applies(by, find_score(by, checkpoint.task).why_not(run))
-        if batched and progress is not None:
-            progress((done + 1) / len(indices))
-        yield run
+) -> list[EpisodeScores]:
+    runs = trace_all(checkpoint, data, indices, **settings, progress=progress)
+    return [EpisodeScores.from_trace(run) for run in runs]
 
 
 def find_score(by: str, task: Task) -> Score:
@@ -74,13 +85,13 @@ def find_score(by: str, task: Task) -> Score:
     return scores[by]
 
 
+def try_score(by: str, checkpoint: Checkpoint, data: Episodes, indices: Sequence[int], **settings: Any) -> None:
+    """Raise BadInput if the score does not apply to runs over these episodes: cheaper than finding out after all."""
+    for run in trace_all(checkpoint, data, indices, **settings):
+        check_applies(by, find_score(by, checkpoint.task).why_not(run))
+
+
 def check_applies(by: str, reason: str | None) -> None:
     """Raise BadInput if there is a reason why the score does not apply."""
     if reason:
         raise BadInput(f"no failures by {by}: {reason}")
-
-
-def _partial_progress(
-    progress: Callable[[float], None] | None, done: int, count: int
-) -> Callable[[float], None] | None:
-    return None if progress is None else lambda share: progress((done + share) / count)

@@ -15,12 +15,13 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.inspect.diagnostics.base import Diagnostic
 from beliefscope.inspect.diagnostics.views import Array, Table, as_json
-from beliefscope.inspect.failures.survey import check_applies, find_score, traces_of
+from beliefscope.inspect.failures.survey import check_applies, find_score, try_score
 from beliefscope.inspect.slices.covariates import covariates_of
 from beliefscope.inspect.slices.search import ALPHA, Candidate, Condition, Index, find_candidates
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.statistics.intervals import jackknife
 from beliefscope.inspect.trace import Trace
+from beliefscope.inspect.traces.batch import trace_all
 
 
 @dataclass(frozen=True)
@@ -148,16 +149,10 @@ def find_slices(
     Raises BadInput for an unknown score, one that does not apply, and as ``trace``.
     """
     find_score(by, checkpoint.task)
-    runs = traces_of(
-        checkpoint,
-        data,
-        list(episodes),
-        by=by,
-        faults=faults,
-        seed=seed,
-        particles=particles,
-        progress=lambda share: progress(0.8 * share),
-    )
+    indices = list(episodes)
+    settings: dict[str, Any] = {"faults": faults, "seed": seed, "particles": particles}
+    try_score(by, checkpoint, data, indices[:1], **settings)
+    runs = trace_all(checkpoint, data, indices, **settings, progress=lambda share: progress(0.8 * share))
     return slices_of(list(runs), by, alpha=alpha, progress=lambda share: progress(0.8 + 0.2 * share))
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import islice
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -16,59 +15,101 @@ from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
+from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.run import assemble_trace, trace
 
-AT_ONCE = 32
-"""Episodes in one run; limits memory."""
+EPISODES, STEPS = 32, 10_000
+"""Maximum number of episodes in one run, and of their steps; limits memory."""
+
+Progress = Callable[[float], None]
 
 
 @torch.no_grad()
 def trace_all(
     checkpoint: Checkpoint,
     data: Dataset | Mapping[int, Episode] | Sequence[Episode],
-    indices: Iterable[int],
+    indices: Collection[int],
     seed: int = 0,
     particles: int = 300,
     faults: Faults = NO_FAULTS,
+    progress: Progress | None = None,
 ) -> Iterator[Trace]:
     """Trace the episodes with these indices, those of equal length together, with an external filter one by one.
 
-    Traces without random numbers differ from those of ``trace`` by rounding only. The random numbers of a particle
-    filter differ, as ``trace`` has one generator per episode: same distribution, other values. Raises BadInput as
-    ``trace``.
+    The traces have the random numbers of ``trace`` and differ from it by rounding only, which may select another
+    particle in a resampling. Raises BadInput as ``trace``.
+
+    Args:
+        progress: called with the completed fraction, 0..1.
     """
-    generator = torch.Generator().manual_seed(seed)
-    settings = {"particles": particles, "torch": torch.__version__}
-    remaining = iter(indices)
+    done = 0
     if isinstance(checkpoint, ExternalFilter):
-        for index in remaining:
-            yield trace(checkpoint, data[index], index, seed=seed, particles=particles, faults=faults)
-    while episodes := {index: data[index] for index in islice(remaining, AT_ONCE)}:
+        for index in indices:
+            share = _part(progress, done, 1, len(indices))
+            yield trace(checkpoint, data[index], index, seed, particles, faults, share)
+            done += 1
+        return
+    for episodes in _blocks(data, indices):
         lengths: dict[int, list[int]] = {}
         for index, episode in episodes.items():
             checkpoint.check_task(episode)
             lengths.setdefault(len(episode), []).append(index)
-        for length, members in sorted(lengths.items()):
-            inputs = [faults.apply(episodes[index], seed) for index in members]
-            steps = Steps.from_episodes(checkpoint.task, inputs)
-            batch = steps.windows(steps.first, length)
-            evidence, start = checkpoint.filter.encode(batch), first_belief(checkpoint.filter, batch)
-            result = rollout(checkpoint.filter, evidence, start, generator, particles, keep=True)
-            for i, (index, episode) in enumerate(zip(members, inputs, strict=True)):
-                yield assemble_trace(
-                    checkpoint,
-                    episode,
-                    _select(start, i),
-                    _select(evidence, i, axis=1),
-                    [_select(step, i) for step in result.steps],
-                    data_hash=episodes[index].digest(),
-                    episode_index=index,
-                    seed=seed,
-                    faults=faults,
-                    settings=settings,
-                )
+        for _, members in sorted(lengths.items()):
+            share = _part(progress, done, len(members), len(indices))
+            selected = {index: episodes[index] for index in members}
+            yield from _run_together(checkpoint, selected, seed, particles, faults, share)
+            done += len(members)
+
+
+def _blocks(
+    data: Dataset | Mapping[int, Episode] | Sequence[Episode], indices: Iterable[int]
+) -> Iterator[dict[int, Episode]]:
+    """Episodes by index, as many as run together."""
+    block: dict[int, Episode] = {}
+    for index in indices:
+        episode = data[index]
+        if len(block) == EPISODES or (block and sum(map(len, block.values())) + len(episode) > STEPS):
+            yield block
+            block = {}
+        block[index] = episode
+    if block:
+        yield block
+
+
+def _run_together(
+    checkpoint: Checkpoint,
+    episodes: Mapping[int, Episode],
+    seed: int,
+    particles: int,
+    faults: Faults,
+    progress: Progress | None,
+) -> Iterator[Trace]:
+    """The traces of episodes of equal length."""
+    inputs = [faults.apply(episode, seed) for episode in episodes.values()]
+    steps = Steps.from_episodes(checkpoint.task, inputs)
+    batch = steps.windows(steps.first, len(inputs[0]))
+    evidence, start = checkpoint.filter.encode(batch), first_belief(checkpoint.filter, batch)
+    generator = Common().manual_seed(seed)  # ``trace`` gives each episode the numbers of a batch of one
+    result = rollout(checkpoint.filter, evidence, start, generator, particles, keep=True, progress=progress)
+    for i, (index, episode) in enumerate(zip(episodes, inputs, strict=True)):
+        yield assemble_trace(
+            checkpoint,
+            episode,
+            _select(start, i),
+            _select(evidence, i, axis=1),
+            [_select(step, i) for step in result.steps],
+            data_hash=episodes[index].digest(),
+            episode_index=index,
+            seed=seed,
+            faults=faults,
+            settings={"particles": particles, "torch": torch.__version__},
+        )
+
+
+def _part(progress: Progress | None, done: int, size: int, total: int) -> Progress | None:
+    return None if progress is None else lambda share: progress((done + share * size) / total)
 
 
 def _select(value: Any, i: int, axis: int = 0) -> Any:

@@ -26,14 +26,14 @@ def calibrate(runs: opt.Runs, output: Path, level: float = 0.95) -> console.Resu
     from beliefscope.filters.calibration import save_calibration
     from beliefscope.inspect.calibrate import calibrate as fit
     from beliefscope.inspect.calibrate import check_level
-    from beliefscope.inspect.failures.survey import traces_of
+    from beliefscope.inspect.traces.batch import trace_all
 
     checkpoint, faults = runs.open()
     with runs.episodes(checkpoint.task) as data, console.progress("Filtering") as advance:
         held_out = data.held_out()
         fitted, tested = held_out[::2], held_out[1::2]
         check_level(level, len(fitted), len(tested))
-        traces = traces_of(
+        traces = trace_all(
             checkpoint,
             data,
             [*fitted, *tested],

@@ -16,6 +16,8 @@ from beliefscope.recordings.report.command_lines import serve_command
     phase=opt.option("NAME", "Only events of this phase, such as 'contact made'."),
     every=opt.flag("Search all episodes, not only the held-out ones.", "--all"),
     url=opt.option("URL", "Address of a running server; prints a full permalink per event."),
+    engine=opt.ENGINE,
+    workers=opt.WORKERS,
 )
 def failures(
     runs: opt.Runs,
@@ -24,6 +26,8 @@ def failures(
     phase: str | None = None,
     every: bool = False,
     url: str | None = None,
+    engine: opt.Engine = "local",
+    workers: int = 1,
 ) -> console.Result:
     """Find the events at which a filter fails.
 
@@ -38,6 +42,7 @@ def failures(
       beliefscope failures push --filter crossmodal-pf --by disagreement --phase "contact made"
       beliefscope failures push --filter crossmodal-pf --faults blackout=0.4 --url http://127.0.0.1:8000
       beliefscope failures door --filter mine.safetensors --data door.h5 --by angle --top 5 --json -
+      beliefscope failures door --filter mine.safetensors --data door.h5 --all --workers 8
     """
     from beliefscope.app.protocol.permalinks import permalink
     from beliefscope.app.runs.catalog import served_names
@@ -53,7 +58,16 @@ def failures(
     with runs.episodes(checkpoint.task) as episodes, console.progress("Filtering") as advance:
         indices = range(len(episodes)) if every else episodes.held_out()
         report = find_failures(
-            checkpoint, episodes, indices, by=by, faults=faults, seed=seed, particles=particles, progress=advance
+            checkpoint,
+            episodes,
+            indices,
+            by=by,
+            faults=faults,
+            seed=seed,
+            particles=particles,
+            engine=engine,
+            workers=workers,
+            progress=advance,
         )
     (name,), data_name = served_names([runs.filter], runs.data)
     events = report.worst(top, phase)

@@ -17,7 +17,7 @@ from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.inspect.diagnostics.weight_steps import main_regret
 from beliefscope.inspect.failures.events import event_spans, failures_of, find_failures
 from beliefscope.inspect.failures.step_scores import Survey, disagreement, phases_of, scores_of
-from beliefscope.inspect.failures.survey import survey_of
+from beliefscope.inspect.failures.survey import BLOCK, survey_of
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace, trace
 
@@ -240,8 +240,9 @@ def test_a_score_that_does_not_apply_is_refused_after_the_first_trace() -> None:
     assert max(progress, default=0.0) <= 0.5
 
 
-def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[int, Episode]) -> None:
-    filter_ = load_checkpoint(shipped("push", "crossmodal-ekf"))
+@pytest.mark.parametrize("name", ["crossmodal-ekf", "crossmodal-pf"])
+def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[int, Episode], name: str) -> None:
+    filter_ = load_checkpoint(shipped("push", name))
     members = episodes | {999: shortened(next(iter(episodes.values())), CUT // 2)}
     faults = Faults.parse("blackout=0.4,force_bias:x=5")
     survey = survey_of(filter_, members, members, faults=faults)
@@ -249,6 +250,17 @@ def test_episodes_run_together_have_the_scores_of_single_traces(episodes: dict[i
         single = Survey.from_traces([trace(filter_, episode, index, faults=faults)])
         np.testing.assert_allclose(survey.error[survey.episode == index], single.error, rtol=1e-3, atol=1e-6)
         np.testing.assert_allclose(survey.nees[survey.episode == index], single.nees, rtol=1e-2)  # float32 covariances
+
+
+@pytest.mark.slow
+def test_values_do_not_depend_on_the_number_of_processes() -> None:
+    filter_ = load_checkpoint(shipped("push", "crossmodal-ekf"))
+    with open_dataset(sample_path("push")) as data:
+        one, two = (survey_of(filter_, data, range(BLOCK + 1), workers=workers) for workers in (1, 2))
+    assert one.phases.keys() == two.phases.keys()
+    for name, values in one.scores.items():
+        np.testing.assert_array_equal(values, two.scores[name])
+    np.testing.assert_array_equal(one.phase_index, two.phase_index)
 
 
 def test_failures_match_the_traces(checkpoint: Checkpoint, episodes: dict[int, Episode]) -> None:
