@@ -76,7 +76,7 @@ coverage: $(VENV)/installed-test
 lint: install lint-page
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy src/beliefscope
+	@$(BIN)/mypy src/beliefscope examples/06_public_calls.py
 	@$(BIN)/lint-imports --no-logo --no-cache
 
 # The page has no build step: the Node.js packages of package.json are development tools only.

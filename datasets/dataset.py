@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -77,3 +78,37 @@ class Dataset(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class EpisodeList(Dataset):
+    """Episodes of one task in memory."""
+
+    def __init__(self, episodes: Sequence[Episode]) -> None:
+        """Raises BadInput if there is none, or if their tasks differ."""
+        if not episodes:
+            raise BadInput("data are an empty list, expected at least one episode")
+        self.task = episodes[0].task
+        for episode in episodes:
+            if episode.task != self.task:
+                raise BadInput(f"data are episodes of the tasks {self.task.name!r} and {episode.task.name!r}")
+        self.path = Path("list of episodes")
+        self._episodes = tuple(episodes)
+        with_contact = "contact" in self.task.covariates
+        self.summaries = tuple(
+            EpisodeSummary(
+                index=i,
+                steps=len(e),
+                policy=str(e.provenance.get("policy", "")),
+                split=e.split,
+                seed=e.seed,
+                contact_fraction=float(e.contact.mean()) if with_contact else None,
+            )
+            for i, e in enumerate(episodes)
+        )
+
+    @property
+    def hash(self) -> str:
+        return hashlib.sha256("\n".join(e.digest() for e in self._episodes).encode()).hexdigest()
+
+    def _episode(self, index: int) -> Episode:
+        return self._episodes[index]

@@ -14,6 +14,16 @@ from beliefscope.datasets.task import Task
 
 FloatArray = NDArray[np.float32]
 
+_MISSING: Any = np.zeros(0)
+
+
+def _missing() -> Any:
+    return _MISSING
+
+
+def _single(array: NDArray[Any]) -> NDArray[Any]:
+    return array.astype(np.float32) if array.dtype == np.float64 else array
+
 
 @dataclass(frozen=True)
 class Episode:
@@ -22,11 +32,11 @@ class Episode:
     Attributes:
         task: definition of the state, the sensors and the control.
         states: (T, n) true state, components as in ``Task.components`` (m, rad), float32.
-        controls: (T, c) control applied between steps t-1 and t, float32.
+        controls: (T, c) control applied between steps t-1 and t, float32; default: none (c is 0).
         observations: observation key -> (T, ...) sensor readings, uint8 images and float32 (``Task.dtype``).
-        contact: (T,) bool, ground truth of contact between robot and object; False if the task has no such covariate.
-        qpos: (T, nq) joint positions for replay, float32; nq is 0 without replay.
-        dt: seconds per step.
+        contact: (T,) bool, ground truth of contact between robot and object; default: False.
+        qpos: (T, nq) joint positions for replay, float32; default: no replay (nq is 0).
+        dt: seconds per step; default: that of the task.
         seed: seed of the simulation, or -1 for recorded data.
         split: ``train``, ``val`` or ``test``.
         covariates: name -> (T,) float32, values of the task's covariates except contact; NaN where unknown.
@@ -35,15 +45,30 @@ class Episode:
 
     task: Task
     states: FloatArray
-    controls: FloatArray
-    observations: Mapping[str, NDArray[Any]]
-    contact: NDArray[np.bool_]
-    qpos: FloatArray
-    dt: float
-    seed: int
+    controls: FloatArray = field(default_factory=_missing)
+    observations: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    contact: NDArray[np.bool_] = field(default_factory=_missing)
+    qpos: FloatArray = field(default_factory=_missing)
+    dt: float = 0.0
+    seed: int = -1
     split: str = "train"
     provenance: Mapping[str, Any] = field(default_factory=dict)
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Fill in the defaults, and convert floating-point arrays to float32."""
+        steps = len(self.states)
+        absent = {"contact": np.zeros(steps, bool), "controls": np.zeros((steps, 0)), "qpos": np.zeros((steps, 0))}
+        values: dict[str, Any] = {name: array for name, array in absent.items() if getattr(self, name) is _MISSING}
+        values |= {} if self.dt else {"dt": self.task.dt}
+        for name in ("states", "controls", "qpos"):
+            values[name] = _single(values.get(name, getattr(self, name)))
+        for name in ("observations", "covariates"):
+            mapping = getattr(self, name)
+            if any(array.dtype == np.float64 for array in mapping.values()):
+                values[name] = {key: _single(array) for key, array in mapping.items()}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)  # episodes are frozen
 
     def covariate(self, name: str) -> FloatArray:
         """(T,) values of one of the task's covariates; NaN where unknown."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -15,6 +16,9 @@ from beliefscope.datasets.simulation.camera import Camera
 
 DISPLAY_UNITS = {"m": ("cm", 100.0), "rad": ("deg", 180.0 / np.pi)}
 """SI unit -> unit for display, and the factor."""
+
+HALF_WIDTHS = {"m": 0.135, "rad": 0.5}
+"""Unit -> default of ``Task.map_half_width``; 1 in other units."""
 
 LENGTHS = ("m", "km", "dm", "cm", "mm", "um", "nm", "px")
 """Units of a position."""
@@ -155,8 +159,8 @@ class Task:
         control_size: length of the control vector.
         dt: seconds per step.
         map_components: the two components of the likelihood map (x to the right, y up), or one, whose map is a curve.
-            ``main_error`` is the error in them.
-        map_half_width: half the extent of the map, in the unit of the first of them.
+            ``main_error`` is the error in them. Default: the first two if they have the same unit, else the first.
+        map_half_width: half the extent of the map, in the unit of the first of them. Default: ``HALF_WIDTHS``.
         positions: observation key or ``control`` -> its two channels that are x and y in the frame of the map
             components. Shifting them together with the map components leaves all other readings unchanged.
         replay: builds the ``mujoco.MjModel`` for the ``qpos`` of an episode; None without replay.
@@ -183,8 +187,8 @@ class Task:
     modalities: Mapping[str, tuple[str, ...]]
     control_size: int
     dt: float
-    map_components: tuple[str, ...]
-    map_half_width: float
+    map_components: tuple[str, ...] = ()
+    map_half_width: float = math.nan
     positions: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     replay: Callable[[Any], Any] | None = None
     outline: Callable[[ArrayLike], Outline] | None = None
@@ -196,6 +200,16 @@ class Task:
     warmup: int = 30
     covariates: Mapping[str, Covariate] = field(default_factory=dict)
     arrays: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Fill in the default map."""
+        if not self.map_components:
+            first = self.components[:2]
+            alike = [c.name for c in first if c.unit == first[0].unit]
+            object.__setattr__(self, "map_components", tuple(alike))  # tasks are frozen
+        if math.isnan(self.map_half_width) and self.map_components:
+            units = [c.unit for c in self.components if c.name == self.map_components[0]]
+            object.__setattr__(self, "map_half_width", HALF_WIDTHS.get(units[0], 1.0) if units else 1.0)
 
     def __hash__(self) -> int:
         return hash(self.name)

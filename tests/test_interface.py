@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +16,8 @@ import beliefscope as bs
 from beliefscope.filters.evaluate import evaluate
 from beliefscope.inspect.trace import trace
 
-DOCS = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
+ROOT = Path(__file__).parents[1]
+DOCS = (ROOT / "docs" / "python.md").read_text()
 
 pytestmark = pytest.mark.slow
 
@@ -59,6 +61,40 @@ def test_functions_agree_with_those_of_the_modules(run: bs.Trace) -> None:
     assert [m.step for m in bs.maps(filter_, run, [3, 50])] == [3, 50]
     first = bs.trace(filter_, data)
     assert first.episode_index == data.held_out()[0]
+
+
+def test_task_and_episode_need_few_fields(tmp_path: Path) -> None:
+    task = bs.Task(
+        "tank", (bs.Component("level", "m"), bs.Component("flow", "l/s")), {"gauge": (1,)}, {"g": ("gauge",)}, 0, 0.1
+    )
+    assert (task.map_components, task.map_half_width) == (("level",), 0.135)
+    episodes = [bs.Episode(task, np.full((40, 2), k), observations={"gauge": np.ones((40, 1))}) for k in (1.0, 2.0)]
+    path = bs.save_dataset(episodes, tmp_path / "tank.h5")
+    stored, listed = bs.open_dataset(path, task), bs.open_dataset(episodes)
+    assert stored.hash == listed.hash
+    assert stored[1].dt == 0.1
+    run = bs.trace(
+        bs.load_filter(lambda **inputs: np.repeat(inputs["observations"]["gauge"], 2, -1), task), episodes, 1
+    )
+    assert run.estimate_mean[0].tolist() == [1.0, 1.0]
+    with pytest.raises(bs.BadInput, match="empty list"):
+        bs.open_dataset([])
+    with pytest.raises(bs.BadInput, match="tasks 'tank' and 'push'"):
+        bs.open_dataset([episodes[0], bs.open_dataset("push")[0]])
+
+
+def test_every_function_has_a_call_in_the_example() -> None:
+    example = (ROOT / "examples" / "06_public_calls.py").read_text()
+    functions = [name for name in bs.__all__ if name[0].islower()]
+    assert not [name for name in functions if f"bs.{name}(" not in example]
+
+
+@pytest.mark.long
+def test_example_runs(tmp_path: Path) -> None:
+    names = runpy.run_path(str(ROOT / "examples" / "06_public_calls.py"))
+    names["main"](tmp_path)
+    assert (tmp_path / "run.rrd").stat().st_size > 10_000
+    assert "<html" in (tmp_path / "run.html").read_text()
 
 
 def test_record(run: bs.Trace, tmp_path: Path) -> None:

@@ -72,7 +72,8 @@ class ExternalFilter(Checkpoint):
 
     Attributes:
         adapter: the filter and its conventions. source: its origin, as given by the user.
-        hash: SHA-256 of the source's name, of the files of its classes and of its parameters.
+        hash: SHA-256 of its class, of the files of its classes and of its parameters: the same in Python and on the
+            command line.
     """
 
     def __init__(self, adapter: Adapter, task: Task, name: str, source: str = "") -> None:
@@ -80,7 +81,7 @@ class ExternalFilter(Checkpoint):
         values = {
             "name": name,
             "record": {"source": source or name},
-            "hash": fingerprint(adapter, source or name),
+            "hash": fingerprint(adapter),
             "adapter": adapter,
             "source": source or name,
             "_task": task,

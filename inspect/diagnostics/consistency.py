@@ -286,7 +286,9 @@ def _step_measures(trace: Trace) -> dict[str, Array]:
             from_mean = measures.wrapped(task, deviation - error[:, k, None])
             level[:, k] = particle_level(from_mean, weights[:, k], error[:, k], covariance[:, k])
             crps[:, k] = particle_crps(np.swapaxes(deviation, 1, 2), weights[:, k, None])
-    nll = 0.5 * (n * nees + np.linalg.slogdet(covariance)[1] + n * math.log(2.0 * math.pi))
+    with np.errstate(invalid="ignore"):  # covariances of a filter that has none are NaN
+        volume = np.linalg.slogdet(covariance)[1]
+    nll = 0.5 * (n * nees + volume + n * math.log(2.0 * math.pi))
     return {"error": error, "variance": variance, "nees": nees, "nis": nis, "level": level, "nll": nll, "crps": crps}
 
 

@@ -94,6 +94,13 @@ class ImagePanel:
 class Views(ABC):
     """A result with a verdict and views; subclasses are frozen dataclasses whose fields are its numbers."""
 
+    def __init_subclass__(cls) -> None:
+        """Results print their verdict: ``dataclass`` keeps a method that the class has."""
+        cls.__repr__ = Views._one_line  # type: ignore[assignment]
+
+    def _one_line(self) -> str:
+        return f"<{type(self).__name__}: {self.verdict}>"
+
     @property
     @abstractmethod
     def verdict(self) -> str:

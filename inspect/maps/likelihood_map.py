@@ -5,14 +5,16 @@ from __future__ import annotations
 import base64
 import io
 from dataclasses import dataclass
-from html import escape
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beliefscope.datasets.html import html_paragraph
 from beliefscope.inspect.maps.plane import Others
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float32]
 
@@ -68,6 +70,11 @@ class LikelihoodMap:
     others: Others = "fixed"
     note: str = ""
 
+    def __repr__(self) -> str:
+        """One line; the arrays have thousands of values."""
+        cells = " x ".join(map(str, self.log_likelihood.shape[1:]))
+        return f"<LikelihoodMap: {self.quantity} of {', '.join(self.layers)} at step {self.step}, {cells} cells>"
+
     @property
     def is_curve(self) -> bool:
         """Whether it shows one component."""
@@ -79,18 +86,32 @@ class LikelihoodMap:
         return f"{self.quantity.capitalize()}{self.note and f', {self.note}'}. Fused: {self.rule}"
 
     def _repr_html_(self) -> str:
-        """Title, and an image of each layer with the offset of its maximum, in a notebook."""
-        from matplotlib import colormaps, image  # slow to import
+        """Title, and an image of all layers, in a notebook."""
+        png = io.BytesIO()
+        self.plot().savefig(png, format="png", dpi=100)
+        source = base64.b64encode(png.getvalue()).decode()
+        return html_paragraph(f"Step {self.step}. {self.title}", strong=True) + (
+            f'<img src="data:image/png;base64,{source}">'
+        )
 
-        figures = []
-        for name, values, (x, y) in zip(self.layers, self.normalised(), self.peaks(), strict=True):
-            png = io.BytesIO()
-            image.imsave(png, colormaps["viridis"](values, bytes=True), format="png", origin="lower")
-            source = f"data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}"
-            picture = f'<img src="{source}" width="200" height="200" style="image-rendering:pixelated">'
-            caption = f"<figcaption>{escape(name)}: maximum at {x:+.3g}, {y:+.3g}</figcaption>"
-            figures.append(f'<figure style="display:inline-block;margin:4px">{picture}{caption}</figure>')
-        return html_paragraph(f"Step {self.step}. {self.title}", strong=True) + "".join(figures)
+    def plot(self) -> Figure:
+        """The layers side by side, relative to their maximum, over offsets from the centre (SI)."""
+        from matplotlib.figure import Figure  # slow to import
+
+        count = len(self.layers)
+        figure = Figure(figsize=(2.1 * count, 1.4 if self.is_curve else 2.3), layout="constrained")
+        for axes, name, values in zip(
+            figure.subplots(1, count, squeeze=False)[0], self.layers, self.normalised(), strict=True
+        ):
+            if self.is_curve:
+                axes.plot(self.offsets_x, values[0] / 255.0)
+            else:
+                x, y = self.offsets_x, self.offsets_y
+                axes.imshow(values, extent=(x[0], x[-1], y[0], y[-1]), origin="lower", cmap="viridis")
+                axes.plot(0, 0, "+", color="white")
+            axes.set_title(name, fontsize=9)
+            axes.tick_params(labelsize=7)
+        return figure
 
     def normalised(self) -> NDArray[np.uint8]:
         """(L, R, S) uint8: value relative to the maximum of its layer, times 255."""

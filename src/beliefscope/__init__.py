@@ -9,15 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from beliefscope._interface import (
+        compare,
         diagnose,
         evaluate,
         experiments,
+        export_page,
+        find_failures,
+        finetune,
         inspect_run,
         load_filter,
         maps,
         open_dataset,
         record,
+        save_dataset,
         serve,
+        sweep,
         trace,
     )
     from beliefscope.datasets.covariate import Covariate
@@ -29,8 +35,10 @@ if TYPE_CHECKING:
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.filters.evaluate import Metrics
     from beliefscope.filters.external.adapter import Adapter
+    from beliefscope.inspect.compare.checkpoints import CheckpointComparison
     from beliefscope.inspect.diagnosis.cause import Diagnosis
     from beliefscope.inspect.diagnostics.base import Diagnostic
+    from beliefscope.inspect.failures.events import Failures
     from beliefscope.inspect.maps.likelihood_map import LikelihoodMap
     from beliefscope.inspect.trace import Trace, load_trace, save_trace
     from beliefscope.recordings.live import LiveRecorder
@@ -40,8 +48,8 @@ __version__ = "0.1.0"
 
 _SOURCES = {
     "_interface": (
-        *("load_filter", "open_dataset", "trace", "maps", "inspect_run", "diagnose", "evaluate", "record"),
-        *("experiments", "serve"),
+        *("load_filter", "open_dataset", "save_dataset", "trace", "maps", "inspect_run", "diagnose", "evaluate"),
+        *("find_failures", "finetune", "compare", "sweep", "experiments", "record", "export_page", "serve"),
     ),
     "datasets.covariate": ("Covariate",),
     "datasets.dataset": ("Dataset",),
@@ -52,8 +60,10 @@ _SOURCES = {
     "filters.checkpoint": ("Checkpoint",),
     "filters.evaluate": ("Metrics",),
     "filters.external.adapter": ("Adapter",),
+    "inspect.compare.checkpoints": ("CheckpointComparison",),
     "inspect.diagnosis.cause": ("Diagnosis",),
     "inspect.diagnostics.base": ("Diagnostic",),
+    "inspect.failures.events": ("Failures",),
     "inspect.maps.likelihood_map": ("LikelihoodMap",),
     "inspect.trace": ("Trace", "load_trace", "save_trace"),
     "recordings.live": ("LiveRecorder",),
@@ -67,6 +77,7 @@ __all__ = [
     "Adapter",
     "BadInput",
     "Checkpoint",
+    "CheckpointComparison",
     "Component",
     "Covariate",
     "Dataset",
@@ -74,6 +85,7 @@ __all__ = [
     "Diagnostic",
     "Episode",
     "Experiments",
+    "Failures",
     "Faults",
     "LikelihoodMap",
     "LiveRecorder",
@@ -81,17 +93,23 @@ __all__ = [
     "Task",
     "Trace",
     "__version__",
+    "compare",
     "diagnose",
     "evaluate",
     "experiments",
+    "export_page",
+    "find_failures",
+    "finetune",
     "inspect_run",
     "load_filter",
     "load_trace",
     "maps",
     "open_dataset",
     "record",
+    "save_dataset",
     "save_trace",
     "serve",
+    "sweep",
     "trace",
 ]
 

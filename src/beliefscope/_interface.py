@@ -3,37 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from beliefscope.datasets import store
 from beliefscope.datasets.catalog import TASKS, load_task
-from beliefscope.datasets.dataset import Dataset
-from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.dataset import Dataset, EpisodeList
+from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.datasets.faults.injection import Faults, read_faults
 from beliefscope.datasets.task import Task
-from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
+from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, shipped
 from beliefscope.filters.evaluate import Metrics
 from beliefscope.filters.evaluate import evaluate as evaluate_filter
+from beliefscope.filters.external.adapter import Adapter
 from beliefscope.filters.external.load import ExternalFilter, as_external, load_external
+from beliefscope.filters.finetuning.defaults import default_settings
+from beliefscope.filters.finetuning.finetune import finetune as finetune_filter
+from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.finetuning.slices import parse_slices
 from beliefscope.filters.names import is_code
 from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.catalog import quick
+from beliefscope.inspect.compare.checkpoints import CheckpointComparison, compare_checkpoints
 from beliefscope.inspect.diagnosis.cause import Diagnosis
 from beliefscope.inspect.diagnosis.diagnose import diagnose as diagnose_episodes
 from beliefscope.inspect.diagnostics.base import Diagnostic
-from beliefscope.inspect.healthy import profile_of
+from beliefscope.inspect.failures.events import Failures
+from beliefscope.inspect.failures.events import find_failures as rank_failures
+from beliefscope.inspect.healthy import measure_profile, profile_of
 from beliefscope.inspect.likelihood import COARSE, MapEngine
 from beliefscope.inspect.maps.likelihood_map import LikelihoodMap, Quantity
+from beliefscope.inspect.sweep import Inputs
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.trace import trace as trace_episode
-from beliefscope.recordings.sweep_table import Experiments
+from beliefscope.recordings.interactive.export import write_interactive
+from beliefscope.recordings.sweep_table import Experiments, run_sweep
 from beliefscope.recordings.write import write_recording
 
 Filter = Checkpoint | str | Path
-Data = Dataset | str | Path
+Data = Dataset | Sequence[Episode] | str | Path
 
 
-def load_filter(source: object, task: Task | str = "") -> Checkpoint:
+def load_filter(source: object, task: Task | str = "", name: str = "") -> Checkpoint:
     """A filter.
 
     Args:
@@ -41,6 +54,7 @@ def load_filter(source: object, task: Task | str = "") -> Checkpoint:
             checkpoint; a build function, ``path/to/file.py:build`` or ``package.module:build``; or your own filter: a
             ``torch.nn.Module``, any other object, a function, or an ``Adapter`` of one (docs/own_filter.md).
         task: of a filter of your own: its definition, name or ``path/to/file.py:NAME``.
+        name: of a filter of your own, for display; default: its class or function.
 
     Raises BadInput if there is no such filter, or if it does not fit the task.
     """
@@ -50,23 +64,31 @@ def load_filter(source: object, task: Task | str = "") -> Checkpoint:
         given = (load_task(task),) if isinstance(task, Task) or ":" in task else ()
         return load_checkpoint(Path(source), given)
     if not isinstance(source, str):
-        return as_external(source, type(source).__name__, task)
+        filter_ = source.module if isinstance(source, Adapter) else source
+        kind = getattr(filter_, "__name__", type(filter_).__name__)
+        return as_external(source, kind, task, name=name or kind)
     if is_code(source):
         return load_external(source, task)
-    name, _, filter_ = source.partition("/")
-    if not filter_:
-        raise BadInput(f"filter {source!r} is neither TASK/NAME, such as door/crossmodal-pf, nor a .safetensors file")
-    return load_checkpoint(shipped(name, filter_))
+    return load_checkpoint(_shipped(source))
 
 
-def open_dataset(source: str | Path, task: Task | None = None) -> Dataset:
-    """Episodes of a file or folder (docs/data.md), or the sample data set of a task, such as ``door``.
+def open_dataset(source: str | Path | Sequence[Episode], task: Task | None = None) -> Dataset:
+    """Episodes of a file or folder (docs/data.md), of the sample data set of a task, such as ``door``, or of a list.
 
     Raises BadInput if there is none, or if it is damaged.
     """
+    if not isinstance(source, str | Path):
+        return EpisodeList(source)
     if isinstance(source, str) and source in TASKS and not Path(source).exists():
         return store.open_dataset(store.sample_path(load_task(source)))
     return store.open_dataset(source, task)
+
+
+def save_dataset(episodes: Sequence[Episode], path: str | Path) -> Path:
+    """Write episodes of one task to an HDF5 file, which all commands read as ``--data``."""
+    source = EpisodeList(episodes)
+    store.write_dataset(path, source.task, source)
+    return Path(path)
 
 
 def trace(
@@ -185,11 +207,130 @@ def evaluate(
     )
 
 
+def find_failures(
+    filter_: Filter,
+    data: Data,
+    episodes: Sequence[int] | None = None,
+    *,
+    by: str = "error",
+    faults: str | Faults = "",
+    seed: int = 0,
+    particles: int = 300,
+) -> Failures:
+    """Run a filter over episodes and rank the events at which it fails (docs/diagnostics.md#failures).
+
+    Args:
+        episodes: indices; default: the held-out ones.
+        by: ``error``, the name of an angle, ``nees``, ``ess``, ``disagreement`` or ``regret``.
+
+    Raises BadInput for a score that the filter or task does not have.
+    """
+    checkpoint = load_filter(filter_)
+    source = _episodes(data, checkpoint)
+    injected = _faults(faults, checkpoint)
+    return rank_failures(checkpoint, source, episodes, by=by, faults=injected, seed=seed, particles=particles)
+
+
+def finetune(
+    filter_: Filter,
+    data: Data,
+    path: str | Path,
+    *,
+    train: Sequence[str] = (),
+    freeze: Sequence[str] = (),
+    faults: Sequence[str] = (),
+    slices: Sequence[str] = (),
+    **settings: Any,
+) -> Checkpoint:
+    """Train selected modules further and write the result as a checkpoint (docs/finetune.md).
+
+    Args:
+        data: all episodes; those of the split ``train`` are trained on.
+        path: of the new checkpoint, ``NAME.safetensors``. The base checkpoint is not changed.
+        train, freeze: presets and patterns of trained and frozen modules; default: those of the filter.
+        faults, slices: sensor faults and data slices to learn; default: the fault that the training data lack.
+        settings: other settings of ``FineTune``, such as ``steps=300``, ``rate=3e-4`` and ``clean_weight=0.5``.
+
+    Raises BadInput for names that match no module, and for settings that do not exist.
+    """
+    base = load_filter(filter_)
+    if unknown := settings.keys() - FineTune.__dataclass_fields__.keys():
+        raise unknown_name("setting of a fine-tuning", min(unknown), FineTune.__dataclass_fields__)
+    given = any((train, freeze, faults, slices))
+    mix = tuple((slice_, 1.0) for slice_ in parse_slices(slices, faults, base.task))
+    chosen = FineTune(train=tuple(train), freeze=tuple(freeze), mix=mix) if given else default_settings(base.filter)
+    source = _episodes(data, base)
+    episodes = list(source)
+    tuned = finetune_filter(base, episodes, data_hash=source.hash, settings=replace(chosen, **settings))
+    assert tuned is not None  # it has no callback that stops it
+    profile = measure_profile(tuned.filter, base.name, episodes, str(source.path))
+    save_checkpoint(tuned.filter, base.name, tuned.record, Path(path), profile)
+    return load_checkpoint(Path(path), (base.task,))
+
+
+def compare(
+    before: Filter,
+    after: Filter,
+    data: Data,
+    episodes: Sequence[int] | None = None,
+    *,
+    slices: Sequence[str] = (),
+    seed: int = 0,
+    particles: int = 300,
+) -> CheckpointComparison:
+    """What improved and what regressed between two filters of one task, with intervals over episodes.
+
+    Args:
+        episodes: indices; default: the held-out ones. slices: to evaluate in addition to the standard ones.
+
+    Raises BadInput for filters that cannot be compared.
+    """
+    first, second = load_filter(before), load_filter(after)
+    own = parse_slices(slices, (), first.task)
+    source = _episodes(data, first)
+    return compare_checkpoints(first, second, source, episodes, slices=own, particles=particles, seed=seed)
+
+
+def sweep(
+    folder: str | Path,
+    filters: Sequence[str | Path],
+    data: Sequence[str | Path] = (),
+    *,
+    faults: Sequence[str] = ("",),
+    seeds: int = 1,
+    particles: int = 300,
+    all_episodes: bool = False,
+    workers: int = 1,
+) -> Experiments:
+    """Run many checkpoints over many episodes and store a table of the results; resumes if interrupted (docs/sweep.md).
+
+    Args:
+        folder: of the sweep; created if missing.
+        filters: checkpoint files, or ``TASK/NAME`` of pretrained filters.
+        data: files of episodes; default: the sample data set of each filter's task.
+        faults: each is run; an empty text is clean data. seeds: number of seeds, from 0.
+        all_episodes: whether to run over training episodes as well. workers: processes.
+    """
+    files = tuple(Path(f) if str(f).endswith(".safetensors") else _shipped(str(f)) for f in filters)
+    sets = tuple(store.sample_path(str(d)) if str(d) in TASKS else Path(d).resolve() for d in data)
+    inputs = Inputs(files, sets, tuple(faults), tuple(range(seeds)), particles, all_episodes)
+    target = Path(folder)
+    target.mkdir(exist_ok=True)
+    run_sweep(inputs.cells(), target.resolve(), workers=workers)
+    return Experiments([target])
+
+
 def record(run: Trace, path: str | Path, filter_: Filter | None = None, map_stride: int = 10) -> Path:
     """Write a Rerun recording of a trace, with maps of every ``map_stride``-th step if the filter is given."""
     steps = range(0, len(run), map_stride)
     layers = None if filter_ is None else MapEngine(load_filter(filter_), run).maps(steps)
     return write_recording(run, path, maps=layers, diagnostics=inspect_run(run, filter_))
+
+
+def export_page(run: Trace, path: str | Path, filter_: Filter | None = None) -> Path:
+    """Write an interactive page of a trace, one HTML file that works offline; maps need the filter."""
+    write_interactive(run, Path(path), None if filter_ is None else load_filter(filter_))
+    return Path(path)
 
 
 def experiments(*sweeps: str | Path) -> Experiments:
@@ -220,6 +361,14 @@ def serve(
     own = {f.name: f for f in filters if isinstance(f, Checkpoint)}
     settings = Settings(Path(workspace), short_names(map(Path, data), {SAMPLE}), {**paths, **own})
     serve_until_signal(settings, port=port)
+
+
+def _shipped(text: str) -> Path:
+    """File of a pretrained filter, ``TASK/NAME``."""
+    task, _, name = text.partition("/")
+    if not name:
+        raise BadInput(f"filter {text!r} is neither TASK/NAME, such as door/crossmodal-pf, nor a .safetensors file")
+    return shipped(task, name)
 
 
 def _episodes(data: Data, checkpoint: Checkpoint) -> Dataset:

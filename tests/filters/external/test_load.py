@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.simulation.door import DOOR
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.external.adapter import Adapter
-from beliefscope.filters.external.load import ExternalFilter, load_external
+from beliefscope.filters.external.load import ExternalFilter, as_external, load_external
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +94,29 @@ def test_hash_depends_on_weights_code_and_adapter(tmp_path: Path) -> None:
     assert hashes[0] == hashes[1] != hashes[2]
     first, second = Adapter(nn.Linear(2, 2), std=(1, 1, 1)), Adapter(nn.Linear(2, 2), std=(1, 1, 2))
     assert ExternalFilter(first, DOOR, "a").hash != ExternalFilter(second, DOOR, "a").hash
+
+
+def test_hash_is_the_same_in_python_and_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "class Own:\n    task = 'door'\n    def __call__(self, *, observations, controls): {}\n"
+    (tmp_path / "own_place.py").write_text(code.format("return controls[..., :3]"))
+    monkeypatch.syspath_prepend(tmp_path)
+    in_python = as_external(importlib.import_module("own_place").Own(), "Own").hash
+    assert in_python == load_external(f"{tmp_path}/own_place.py:Own").hash
+    sys.modules.pop("own_place")
+
+
+def test_hash_covers_code_without_a_file() -> None:
+    """Classes and functions of notebooks: their modules have no file."""
+
+    def filter_of(code: str) -> Any:
+        names: dict[str, Any] = {"__name__": "no_such_module"}
+        exec(f"def outer(b):\n    def own(*, observations, controls): return {code}\n    return own", names)
+        return names["outer"]
+
+    a, b = (as_external(filter_of(f"controls + {n} + b")(0), "own", "door").hash for n in (1, 2))
+    enclosed = as_external(filter_of("controls + 1 + b")(1), "own", "door").hash
+    assert len({a, b, enclosed}) == 3
+    assert a == as_external(filter_of("controls + 1 + b")(0), "own", "door").hash
 
 
 @pytest.mark.parametrize(
