@@ -20,7 +20,7 @@ export PYTHONDONTWRITEBYTECODE :=
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve test test-fast coverage lint lint-page api-types check check-all claims bench lock licences audit clean
+.PHONY: help install serve test test-fast coverage lint lint-page api-types check check-all claims docs bench lock licences audit clean
 
 help:
 	@echo "make serve      install what is missing and serve the page on http://127.0.0.1:8000"
@@ -34,6 +34,7 @@ help:
 	@echo "make api-types  regenerate the page's types and constants from the server's"
 	@echo "make coverage   run the tests and print the coverage of each module"
 	@echo "make claims     run the commands named beside the numbers of the documentation and compare (ARGS=--all: long ones too)"
+	@echo "make docs       build the documentation site in build/site"
 	@echo "make bench      measure filters, maps, recordings and the page"
 	@echo "make lock       pin every package with its hashes in requirements.lock"
 	@echo "make licences   list the licences of all packages; fail if one is not allowed"
@@ -104,6 +105,15 @@ check-all: lint
 
 claims: install
 	@$(BIN)/python tools/claims.py $(ARGS)
+
+$(VENV)/installed-docs: $(VENV)/installed
+	@echo "Adding the documentation generator to $(VENV)."
+	@$(PIP) -e '.[docs]'
+	@touch $@
+
+docs: $(VENV)/installed-docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "The site is in build/site; open build/site/index.html."
 
 bench: install
 	@$(BIN)/python bench/run.py $(ARGS)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
+import runpy
+import subprocess
+import sys
 import tomllib
 from html import unescape
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
 
@@ -12,12 +17,14 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import beliefscope as bs
 from beliefscope import __version__
 from beliefscope.filters.checkpoint import shipped
+from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.palette import COLOURS
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def test_citation_has_the_version() -> None:
@@ -27,9 +34,70 @@ def test_citation_has_the_version() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_resolve(page: Path) -> None:
-    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
-    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
-    assert not missing
+    links = re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)", page.read_text())
+    for target, anchor in (
+        (page if not path else page.parent / path, anchor) for path, anchor in links if "://" not in path
+    ):
+        assert target.exists(), target
+        assert not anchor or anchor in anchors(target), f"{target}#{anchor}"
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings of a page, as repository hosts and the documentation site name them."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_front_page_answers_twelve_questions() -> None:
+    """Each question links to its answer: a heading, or the start of a page."""
+    questions = re.findall(r"^\d+\. \[(.+\?)\]\((.+?)\)$", (ROOT / "docs" / "index.md").read_text(), re.MULTILINE)
+    assert len(questions) == 12
+    assert len({link for _, link in questions}) == 12
+
+
+def test_site_has_every_page() -> None:
+    listed = re.findall(r"([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    pages = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
+    assert sorted(listed) == sorted(pages | {"changelog.md"})
+
+
+def test_every_diagnostic_has_limits_and_a_remedy() -> None:
+    text = (ROOT / "docs" / "diagnostics.md").read_text()
+    sections = dict(re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL))
+    for entry in DIAGNOSTICS.values():
+        section = sections[entry.title]
+        assert re.match(r"\*[^*]+\?\*", section), entry.title
+        assert re.search(r"`[^`]*[=/(∫√Σ][^`]*`", section), f"{entry.title} has no equation"
+        assert section.index("**How it can mislead.**") < section.index("**What to do.**")
+
+
+def test_python_reference_is_complete() -> None:
+    text = (ROOT / "docs" / "python_reference.md").read_text()
+    names = re.findall(r"^::: (\S+)\.(\w+)$", text, re.MULTILINE)
+    assert {name for _, name in names} == set(bs.__all__) - {"__version__"}
+    for module, name in names:
+        assert getattr(import_module(module), name) is getattr(bs, name)
+
+
+def test_command_line_reference_is_current() -> None:
+    tool = runpy.run_path(str(ROOT / "tools" / "cli_reference.py"))
+    assert (ROOT / "docs" / "cli.md").read_text() == tool["reference"](), "run python tools/cli_reference.py"
+
+
+@pytest.mark.long
+def test_site_is_built_without_warnings(tmp_path: Path) -> None:
+    """The site loads nothing from other hosts."""
+    pytest.importorskip("mkdocs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path]
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    pages = [page.read_text() for page in tmp_path.rglob("*.html")]
+    assert len(pages) > 30
+    assert not [
+        p for page in pages for p in re.findall(r'<(?:script|img|link rel="stylesheet")[^>]+"https?://[^"]+"', page)
+    ]
 
 
 def test_files_in_the_architecture_exist() -> None:
