@@ -113,7 +113,7 @@ $(VENV)/installed-docs: $(VENV)/installed
 
 docs: $(VENV)/installed-docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
-	@echo "The site is in build/site; open build/site/index.html."
+	@echo "The site is in build/site; to use its search as well: python -m http.server -d build/site"
 
 bench: install
 	@$(BIN)/python bench/run.py $(ARGS)
