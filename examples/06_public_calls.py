@@ -47,6 +47,9 @@ def main(folder: Path) -> None:
     print(bs.record(run, folder / "run.rrd", checkpoint, map_stride=50))
     print(bs.export_page(run, folder / "run.html", checkpoint))
 
+    widget = bs.show(run, checkpoint)
+    widget.step = 40
+
     own = bs.load_filter(follow_hand, task="push", name="hand")
     print(bs.trace(own, bs.open_dataset(episodes), 0))
 

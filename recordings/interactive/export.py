@@ -52,9 +52,27 @@ def write_interactive(
         size: cells per side of a map. progress: called with the completed fraction.
     """
     report = progress or (lambda fraction: None)
-    maps, reason = _maps(trace, checkpoint, size, report)
-    run = {
-        "title": repr(trace)[len("<Trace: ") : -1],
+    run = run_document(trace, checkpoint, size, report)
+    script = f"{(FOLDER / 'viewer.js').read_text()}\nopenPage();\n"
+    page = _template("page.html.j2").render(
+        title=run["title"],
+        style=Markup(style()),
+        script=Markup(script),
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        run=Markup(as_text(run).replace("<", "\\u003c")),
+        **_texts(trace, checkpoint),
+    )
+    write_atomically(path, page.encode())
+    report(1.0)
+
+
+def run_document(
+    trace: Trace, checkpoint: Checkpoint | None, size: int, progress: Callable[[float], None]
+) -> dict[str, Any]:
+    """Everything that ``viewer.js`` draws, as JSON values: type ``Run`` there."""
+    maps, reason = _maps(trace, checkpoint, size, progress)
+    return {
+        "title": _title(trace),
         "dt": trace.episode.dt,
         "steps": len(trace),
         "layers": [_layer(trace, name) for name in measures.layers(trace)],
@@ -71,20 +89,29 @@ def write_interactive(
         "palette": _packed(colour_table("viridis")),
         "moments": _moments(trace),
     }
-    diagnosis = _diagnosis(trace, checkpoint)
-    script = (FOLDER / "viewer.js").read_text()
-    page = _template("page.html.j2").render(
-        title=run["title"],
-        version=__version__,
-        style=Markup((FOLDER / "viewer.css").read_text()),
-        script=Markup(script),
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        run=Markup(json.dumps(run, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")),
-        diagnosis=diagnosis,
-        provenance=describe(trace),
-    )
-    write_atomically(path, page.encode())
-    report(1.0)
+
+
+def as_text(run: dict[str, Any]) -> str:
+    """JSON of ``run_document``."""
+    return json.dumps(run, separators=(",", ":"), allow_nan=False)
+
+
+def body(trace: Trace, checkpoint: Checkpoint | None) -> str:
+    """HTML of the elements that ``viewer.js`` fills."""
+    return _template("body.html.j2").render(title=_title(trace), **_texts(trace, checkpoint))
+
+
+def style() -> str:
+    """Style sheet of the elements."""
+    return (FOLDER / "viewer.css").read_text()
+
+
+def _title(trace: Trace) -> str:
+    return repr(trace)[len("<Trace: ") : -1]
+
+
+def _texts(trace: Trace, checkpoint: Checkpoint | None) -> dict[str, Any]:
+    return {"version": __version__, "diagnosis": _diagnosis(trace, checkpoint), "provenance": describe(trace)}
 
 
 def write_index(files: Sequence[tuple[Path, Trace]], path: Path) -> None:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         sweep,
         trace,
     )
+    from beliefscope._notebook import show
     from beliefscope.datasets.covariate import Covariate
     from beliefscope.datasets.dataset import Dataset
     from beliefscope.datasets.episode import Episode
@@ -51,6 +52,7 @@ _SOURCES = {
         *("load_filter", "open_dataset", "save_dataset", "trace", "maps", "inspect_run", "diagnose", "evaluate"),
         *("find_failures", "finetune", "compare", "sweep", "experiments", "record", "export_page", "serve"),
     ),
+    "_notebook": ("show",),
     "datasets.covariate": ("Covariate",),
     "datasets.dataset": ("Dataset",),
     "datasets.episode": ("Episode",),
@@ -109,6 +111,7 @@ __all__ = [
     "save_dataset",
     "save_trace",
     "serve",
+    "show",
     "sweep",
     "trace",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
 from beliefscope.inspect.trace import trace
 from beliefscope.recordings.interactive.export import write_interactive
+from beliefscope.recordings.interactive.widget import RunWidget
 
 
 def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
@@ -42,5 +44,52 @@ def test_cursor_and_deep_links(context: Any, tmp_path: Path) -> None:
     estimate = 100.0 * run.estimate_mean[moment, 0]
     assert abs(float(cells[1]) - estimate) <= 5e-3 * abs(estimate)  # three digits
     assert requests == [f"{address}#step=42"] or requests == [address]
+    assert not problems
+    page.close()
+
+
+HOST = """
+const traits = JSON.parse(document.querySelector('#traits').textContent), listeners = [];
+window.model = {
+  get: (name) => traits[name],
+  set: (name, value) => { traits[name] = value; },
+  save_changes: () => {},
+  on: (event, listener) => listeners.push(listener),
+  off: () => listeners.pop(),
+  push: (step) => { traits.step = step; listeners.forEach((listener) => listener()); },
+};
+const url = URL.createObjectURL(new Blob([traits._esm], { type: 'text/javascript' }));
+const { default: widget } = await import(url);
+window.close_widget = widget.render({ model, el: document.querySelector('#cell') });
+"""
+"""A notebook as the widget sees it: the model with its traits, and an element."""
+
+
+def test_widget_shares_its_cursor(context: Any) -> None:
+    with open_dataset(sample_path("push")) as data:
+        run = trace(load_checkpoint(shipped("push", "crossmodal-ekf")), data[29], 29)
+    widget = RunWidget(run, load_checkpoint(shipped("push", "crossmodal-ekf")), 21)
+    traits = {name: getattr(widget, name) for name in ("_esm", "_run", "_body", "_style", "step")}
+    page = context.new_page()
+    problems: list[str] = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    text = json.dumps(traits).replace("<", "\\u003c")
+    page.set_content(
+        '<body data-jp-theme-light="false"><div id="cell"></div>'
+        f'<script type="application/json" id="traits">{text}</script>'
+        f'<script type="module">{HOST}</script>'
+    )
+    page.wait_for_function("() => window.close_widget")
+    assert page.text_content("#place").startswith(f"step {widget.step} of 99")
+    assert page.locator(".run.dark").count() == 1
+    page.evaluate("() => model.push(42)")
+    assert page.text_content("#place") == "step 42 of 99, 4.20 s"
+    page.locator(".run").press("ArrowRight")
+    assert page.evaluate("() => model.get('step')") == 43
+    page.locator("#moments a").first.click()
+    assert page.evaluate("() => model.get('step')") == widget.step
+    assert page.evaluate("() => location.hash") == ""
+    assert page.locator("#timeline canvas").count() >= 4
+    page.evaluate("() => close_widget()")
     assert not problems
     page.close()
