@@ -24,12 +24,19 @@ from beliefscope.inspect.catalog import DIAGNOSTICS
 from beliefscope.inspect.palette import COLOURS
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "README_PACKAGE.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def test_citation_has_the_version() -> None:
     (version,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     assert version == __version__
+
+
+def test_package_description_links_to_no_file() -> None:
+    """A package index shows it without the repository."""
+    text = (ROOT / "README_PACKAGE.md").read_text()
+    assert not re.findall(r"\]\((?!https://)", text)
+    assert tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["readme"] == "README_PACKAGE.md"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

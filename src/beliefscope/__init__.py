@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from beliefscope.recordings.live import LiveRecorder
     from beliefscope.recordings.sweep_table import Experiments
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _SOURCES = {
     "_interface": (

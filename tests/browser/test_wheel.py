@@ -23,7 +23,7 @@ PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the sources, so that setuptools neither writes into the checkout nor reads older builds from it."""
     tree = tmp_path_factory.mktemp("tree")
-    for name in ("README.md", "LICENSE", "pyproject.toml"):
+    for name in ("README_PACKAGE.md", "LICENSE", "pyproject.toml"):
         shutil.copy(ROOT / name, tree)
     ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
     for name in (*FOLDERS, "src"):
