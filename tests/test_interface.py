@@ -114,6 +114,9 @@ def test_representations(run: bs.Trace) -> None:
         assert html.count("<table>") == html.count("</table>")
         assert re.search(r"<table>|<img", html)
     assert diagnosis.headline in diagnosis._repr_html_()
+    for figure in (map_.plot(), bs.inspect_run(run)["errors"].plot()):
+        assert figure._repr_png_().startswith(b"\x89PNG")  # displayed without pyplot
+    assert repr(map_) == "<LikelihoodMap: likelihood of image, haptics, fused at step 40, 41 x 41 cells>"
 
 
 @pytest.mark.parametrize(

@@ -78,9 +78,10 @@ def figure_format(path: Path) -> str:
 def new_figure(**settings: Any) -> Figure:
     """A figure with a canvas of its own, independent of pyplot; settings as for matplotlib's ``Figure``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    figure = Figure(**settings)
+    from beliefscope.inspect.displayed_figure import DisplayedFigure
+
+    figure = DisplayedFigure(**settings)
     FigureCanvasAgg(figure)
     return figure
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -14,7 +13,7 @@ from beliefscope.datasets.html import html_paragraph
 from beliefscope.inspect.maps.plane import Others
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from beliefscope.inspect.displayed_figure import DisplayedFigure
 
 Array = NDArray[np.float32]
 
@@ -87,19 +86,17 @@ class LikelihoodMap:
 
     def _repr_html_(self) -> str:
         """Title, and an image of all layers, in a notebook."""
-        png = io.BytesIO()
-        self.plot().savefig(png, format="png", dpi=100)
-        source = base64.b64encode(png.getvalue()).decode()
+        source = base64.b64encode(self.plot()._repr_png_()).decode()
         return html_paragraph(f"Step {self.step}. {self.title}", strong=True) + (
             f'<img src="data:image/png;base64,{source}">'
         )
 
-    def plot(self) -> Figure:
+    def plot(self) -> DisplayedFigure:
         """The layers side by side, relative to their maximum, over offsets from the centre (SI)."""
-        from matplotlib.figure import Figure  # slow to import
+        from beliefscope.inspect.displayed_figure import DisplayedFigure  # slow to import
 
         count = len(self.layers)
-        figure = Figure(figsize=(2.1 * count, 1.4 if self.is_curve else 2.3), layout="constrained")
+        figure = DisplayedFigure(figsize=(2.1 * count, 1.4 if self.is_curve else 2.3), layout="constrained")
         for axes, name, values in zip(
             figure.subplots(1, count, squeeze=False)[0], self.layers, self.normalised(), strict=True
         ):
