@@ -106,12 +106,7 @@ check-all: lint
 claims: install
 	@$(BIN)/python tools/claims.py $(ARGS)
 
-$(VENV)/installed-docs: $(VENV)/installed
-	@echo "Adding the documentation generator to $(VENV)."
-	@$(PIP) -e '.[docs]'
-	@touch $@
-
-docs: $(VENV)/installed-docs
+docs: install
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "The site is in build/site; to use its search as well: python -m http.server -d build/site"
 

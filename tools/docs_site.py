@@ -20,8 +20,11 @@ PAGES = {"CHANGELOG.md": "changelog.md"}
 """File of the project -> page of the site."""
 
 
-def on_config(config: Any) -> None:
-    """Copy the package with ``__init__.py`` in every folder, without which docstrings are not collected."""
+def on_startup(**_: Any) -> None:
+    """Copy the package with ``__init__.py`` in every folder, without which docstrings are not collected.
+
+    Before the configuration: its paths must exist.
+    """
     copy = ROOT / "build" / "source"
     shutil.rmtree(copy, ignore_errors=True)
 
