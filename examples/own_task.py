@@ -8,28 +8,25 @@ import sys
 
 import numpy as np
 
-from beliefscope.datasets.covariate import Covariate
-from beliefscope.datasets.episode import Episode
-from beliefscope.datasets.store import write_dataset
-from beliefscope.datasets.task import Component, Task
+import beliefscope as bs
 
 DT, SIDE = 0.1, 0.5  # s per step; half the table's side, m
 MICROPHONES = np.array([(-SIDE, -SIDE), (SIDE, -SIDE)])
 
-TASK = Task(
+TASK = bs.Task(
     name="ball",
-    components=(Component("x", "m"), Component("y", "m")),
+    components=(bs.Component("x", "m"), bs.Component("y", "m")),
     observations={"image": (16, 16), "distances": (2,), "loud": (1,)},
     modalities={"image": ("image",), "sound": ("distances", "loud")},
     control_size=2,
     dt=DT,
     map_components=("x", "y"),
     map_half_width=0.2,
-    covariates={"wind": Covariate("boolean")},
+    covariates={"wind": bs.Covariate("boolean")},
 )
 
 
-def roll(seed: int, steps: int = 60) -> Episode:
+def roll(seed: int, steps: int = 60) -> bs.Episode:
     """Wind (the control, m/s) moves the ball, which bounces off the edges; without wind its sound is uninformative."""
     rng = np.random.default_rng(seed)
     wind = np.repeat(rng.normal(0, 0.3, (steps // 10 + 1, 2)), 10, axis=0)[:steps]
@@ -41,19 +38,16 @@ def roll(seed: int, steps: int = 60) -> Episode:
     loud = np.linalg.norm(wind, axis=1, keepdims=True) > 0.2
     noise = rng.normal(0, np.where(loud, 0.01, 0.3), (steps, 2))
     distances = np.linalg.norm(position[:, None] - MICROPHONES, axis=-1) + noise
-    return Episode(
+    return bs.Episode(
         task=TASK,
-        states=position.astype(np.float32),
-        controls=wind.astype(np.float32),
-        observations={"image": image, "distances": distances.astype(np.float32), "loud": loud.astype(np.float32)},
-        contact=np.zeros(steps, bool),
+        states=position,
+        controls=wind,
+        observations={"image": image, "distances": distances, "loud": loud.astype(np.float32)},
         covariates={"wind": loud[:, 0].astype(np.float32)},  # its steps are shaded in every view
-        qpos=np.zeros((steps, 0), np.float32),  # no replay
-        dt=DT,
         seed=seed,
         split={8: "val", 9: "test"}.get(seed % 10, "train"),
     )
 
 
 if __name__ == "__main__":
-    write_dataset(sys.argv[1], TASK, (roll(seed) for seed in range(100)))
+    bs.save_dataset([roll(seed) for seed in range(100)], sys.argv[1])
