@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from beliefscope.datasets.catalog import TASKS, find_task, stored_task
 from beliefscope.datasets.dataset import SPLITS, Dataset, EpisodeSummary
 from beliefscope.datasets.episode import Episode
+from beliefscope.datasets.episode_index import read_index, write_index
 from beliefscope.datasets.errors import BadInput
 from beliefscope.datasets.io.atomic_write import write_error
 from beliefscope.datasets.io.strict_json import read_json
@@ -82,6 +83,8 @@ def open_dataset(
     """
     path = Path(path)
     files = data_files(path)
+    if read_index(path) is not None:
+        mark_readable(path)  # it was read completely when the index was written
     probe(files)
     if is_mit_push(files[0]):
         return MitPushDataset(path, files, task if task in PUSH_REAL_TASKS else PUSH_REAL, skip_bad)
@@ -115,10 +118,9 @@ class EpisodeFile(Dataset):
         self._file = open_hdf5(path)
         try:
             self.task = self._read_task(given)
-            self._groups = self._usable_groups() if skip_bad else self._find_groups()
-            self.summaries = tuple(self._summary(group, i) for i, group in enumerate(self._groups))
-            digests = "\n".join(self._attribute(group, "digest", str) for group in self._groups)
-            self._hash = hashlib.sha256(digests.encode()).hexdigest()
+            self._names: list[str] | None = None  # trajectory0, trajectory1, ...
+            index = None if skip_bad else read_index(path)
+            self.summaries, self._hash = self._read_all(skip_bad) if index is None else index
         except BadInput:
             self.close()
             raise
@@ -130,8 +132,26 @@ class EpisodeFile(Dataset):
     def hash(self) -> str:
         return self._hash
 
+    def _read_all(self, skip_bad: bool) -> tuple[tuple[EpisodeSummary, ...], str]:
+        """Summaries and hash of the episodes. Keeps the names of usable groups, or else stores the index."""
+        groups = self._usable_groups() if skip_bad else self._find_groups()
+        summaries = tuple(self._summary(group, i) for i, group in enumerate(groups))
+        digest = _combined(self._attribute(group, "digest", str) for group in groups)
+        if skip_bad:
+            self._names = [group.name for group in groups]
+        else:
+            write_index(self.path, summaries, digest)
+        return summaries, digest
+
     def _episode(self, index: int) -> Episode:
-        return self._read_checked(self._groups[index])
+        name = f"trajectory{index}" if self._names is None else self._names[index]
+        try:
+            group = self._file.get(name)
+        except HDF5_ERRORS as error:
+            raise read_error(self.path, error) from None
+        if not isinstance(group, h5py.Group):
+            raise BadInput(f"{self.path}: {name} is not a group.")
+        return self._read_checked(group)
 
     def _read_checked(self, group: h5py.Group) -> Episode:
         try:
@@ -305,8 +325,12 @@ for _kind in (EpisodeFile, MitPushDataset, PaperDataset):
     copyreg.pickle(_kind, _reduce)
 
 
+def _combined(digests: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(digests).encode()).hexdigest()
+
+
 def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> None:
-    """Write episodes to a file, which is replaced atomically. The same episodes give the same bytes.
+    """Write episodes to a file, which is replaced atomically, and its index. The same episodes give the same bytes.
 
     Raises BadInput if the file cannot be written.
     """
@@ -314,17 +338,32 @@ def write_dataset(path: str | Path, task: Task, episodes: Iterable[Episode]) -> 
     if not path.parent.is_dir():
         raise BadInput(f"Folder {path.parent} does not exist: cannot write {path.name} there.")
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    summaries: list[EpisodeSummary] = []
+    digests: list[str] = []
     try:
         with DeferredErrorFile(partial, "w+b") as output:
             with h5py.File(output, "w", libver=("v110", "v110")) as file:
                 file.attrs["format"], file.attrs["version"], file.attrs["task"] = FORMAT, VERSION, task.name
                 file.attrs["definition"] = json.dumps(task_to_json(task), sort_keys=True)
                 for index, episode in enumerate(episodes):
-                    _write_episode(file.create_group(f"trajectory{index}"), episode)
+                    group = file.create_group(f"trajectory{index}")
+                    _write_episode(group, episode)
                     output.check()
+                    summaries.append(
+                        EpisodeSummary(
+                            index=index,
+                            steps=len(episode),
+                            policy=str(episode.provenance.get("policy", "")),
+                            split=episode.split,
+                            seed=int(episode.seed),
+                            contact_fraction=group.attrs["contact_fraction"],
+                        )
+                    )
+                    digests.append(group.attrs["digest"])
             output.check()
         os.replace(partial, path)
         mark_readable(path)
+        write_index(path, tuple(summaries), _combined(digests))
     except OSError as error:
         partial.unlink(missing_ok=True)  # before the free space is measured
         raise write_error(path, error) from None

@@ -1,0 +1,67 @@
+"""Index of a large data file, stored beside it: opening reads the index instead of the attributes of all episodes."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from beliefscope.datasets.dataset import SPLITS, EpisodeSummary
+from beliefscope.datasets.errors import BadInput
+from beliefscope.datasets.io.atomic_write import write_atomically
+from beliefscope.datasets.io.strict_json import read_json
+
+VERSION = 1
+
+EPISODES = 500
+"""Files with fewer episodes open fast enough without an index."""
+
+COLUMNS = tuple(f.name for f in fields(EpisodeSummary) if f.name != "index")
+
+
+def index_path(path: Path) -> Path:
+    """``.push.h5.index`` for ``push.h5``."""
+    return path.with_name(f".{path.name}.index")
+
+
+def read_index(path: Path) -> tuple[tuple[EpisodeSummary, ...], str] | None:
+    """The summaries and the hash of a data file; None without an index of the file's present size and time."""
+    try:
+        stored = read_json(index_path(path).read_bytes())
+        if stored["version"] != VERSION or stored["file"] != _identity(path):
+            return None
+        columns, digest = [stored["columns"][name] for name in COLUMNS], stored["hash"]
+        rows = zip(*columns, strict=True)
+        summaries = tuple(_summary(index, dict(zip(COLUMNS, row, strict=True))) for index, row in enumerate(rows))
+    except (OSError, KeyError, TypeError, ValueError):
+        return None
+    return (summaries, digest) if summaries and isinstance(digest, str) else None
+
+
+def write_index(path: Path, summaries: tuple[EpisodeSummary, ...], digest: str) -> None:
+    """Store the index if the file is large and its folder can be written."""
+    if len(summaries) < EPISODES:
+        return
+    columns = {name: [getattr(s, name) for s in summaries] for name in COLUMNS}
+    with suppress(OSError, BadInput):
+        document = {"version": VERSION, "file": _identity(path), "hash": digest, "columns": columns}
+        write_atomically(index_path(path), json.dumps(document, separators=(",", ":")).encode())
+
+
+def _identity(path: Path) -> list[int]:
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns]
+
+
+def _summary(index: int, values: dict[str, Any]) -> EpisodeSummary:
+    """Raises ValueError for values that ``EpisodeFile`` would refuse."""
+    summary = EpisodeSummary(index=index, **values)
+    whole = all(type(value) is int for value in (summary.steps, summary.seed))
+    contact = summary.contact_fraction
+    if not (whole and summary.steps > 0 and summary.split in SPLITS and isinstance(summary.policy, str)):
+        raise ValueError("invalid summary")
+    if not (isinstance(contact, int | float) and 0.0 <= contact <= 1.0):
+        raise ValueError("invalid contact fraction")
+    return summary
