@@ -51,6 +51,8 @@ def task_from_json(values: Any) -> Task:
             arrays=tuple(values.get("arrays", ())),  # definitions of earlier versions lack it
             **_covariates(values),
         )
+        if not values["map_components"]:  # ``Task`` has chosen them; a stored definition names them
+            raise BadInput("the definition's map components are [], expected one or two names.")
         check_definition(task)
     except BadInput:
         raise
