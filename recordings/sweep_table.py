@@ -216,6 +216,8 @@ class Experiments:
     def query(self, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
         """The result of a query. Raises BadInput with the message of the database."""
         try:
+            if len(self._database.extract_statements(sql)) > 1:
+                raise BadInput(f"query {sql!r} has several statements, expected one SELECT.")
             relation = self._database.sql(sql, params=list(parameters))
         except duckdb.Error as error:
             raise BadInput(f"query {sql!r}: {str(error).strip()}") from None

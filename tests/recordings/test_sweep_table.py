@@ -141,6 +141,7 @@ def test_provenance_of_checkpoints(sweep: Path) -> None:
         "SET enable_external_access=true",
         "ATTACH '{folder}/new.db'",
         "INSTALL httpfs",
+        "SELECT 1; SELECT 2",
     ],
 )
 def test_queries_cannot_reach_other_files(sweep: Path, tmp_path: Path, sql: str) -> None:
@@ -165,6 +166,7 @@ def test_commands(run: Run, sweep: Path, tmp_path: Path) -> None:
     for line, message in {
         "--sql 'SELECT * FROM nowhere'": "nowhere",
         "--sql ' '": "has no result",
+        "--sql 'SELECT 1; DROP VIEW results'": "has several statements, expected one SELECT",
         "--phase asleep": "no steps in phase 'asleep'. Available: all, blackout, contact, free motion",
         "--sort speed": "column of the overview 'speed' does not exist",
     }.items():
