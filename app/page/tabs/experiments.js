@@ -234,10 +234,10 @@ export class Experiments {
   #tableRow(row, columns) {
     const button = create('button', { type: 'button', className: 'quiet', textContent: row.name });
     button.title = `${row.name}: its worst episodes`;
-    button.addEventListener('click', () => this.#select(row));
     const dot = create('span', { className: `dot ${seriesOf(row, this.#filters)}` });
     const line = create('tr', {}, create('th', { scope: 'row' }, dot, button));
     line.dataset.cell = rowKey(row);
+    line.addEventListener('click', () => this.#select(row)); // also clicks on the button, which serves the keyboard
     for (const { content, number } of columns.slice(1)) {
       const cell = line.insertCell();
       cell.className = number ? 'number' : '';
