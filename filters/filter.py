@@ -167,11 +167,13 @@ class Filter(nn.Module, ABC):
     def step(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> tuple[Belief, StepTrace]:
         """One prediction and update. ``evidence`` is of one step: leading axis N. Uses no other random numbers."""
 
-    def steps(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> Iterator[StepTrace]:
-        """The traces of all T steps of ``evidence``, each from the belief of the previous one."""
+    def steps(
+        self, belief: Belief, evidence: Evidence, generator: torch.Generator
+    ) -> Iterator[tuple[Belief, StepTrace]]:
+        """Belief and trace of all T steps of ``evidence``, each from the belief of the previous one."""
         for t in range(len(evidence)):
             belief, trace = self.step(belief, evidence[t], generator)
-            yield trace
+            yield belief, trace
 
 
 def encoders(

@@ -55,7 +55,7 @@ def rollout(
     estimates: list[Gaussian] = []
     steps: list[StepTrace] = []
     single: list[Gaussian] = []
-    for t, trace in enumerate(filter_.steps(belief, evidence, generator)):
+    for t, (_, trace) in enumerate(filter_.steps(belief, evidence, generator)):
         estimates.append(trace.estimate)
         if keep:
             steps.append(trace)

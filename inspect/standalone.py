@@ -16,12 +16,12 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.external.load import ExternalFilter
-from beliefscope.filters.rollout import first_belief, rollout
+from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.subsets import modalities_of, standalone_evidence
 from beliefscope.inspect.statistics import measures
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external_replay import run_alone
-from beliefscope.inspect.traces.run import assemble_trace
+from beliefscope.inspect.traces.run import assemble_trace, run_arrays
 
 
 def check_standalone(checkpoint: Checkpoint, modality: str) -> None:
@@ -91,7 +91,13 @@ def standalone(
     evidence = standalone_evidence(filter_, batch, filter_.encode(batch), modality)
     start, generator = first_belief(filter_, batch), torch.Generator().manual_seed(trace.seed)
     particles = int(trace.settings["particles"])
-    steps = rollout(filter_, evidence, start, generator, particles, keep=True, progress=progress).steps
+    kept = particles if trace.particles is None else trace.particles.shape[1]
+
+    def advance(steps: int) -> None:
+        if progress is not None:
+            progress(steps / len(trace))
+
+    arrays = run_arrays(checkpoint, [evidence], start, generator, particles, kept, advance)
     settings = {key: value for key, value in trace.settings.items() if key != "edits"} | {"standalone": modality}
     provenance = {name: getattr(trace, name) for name in ("data_hash", "episode_index", "seed", "faults")}
-    return assemble_trace(checkpoint, trace.episode, start, evidence, steps, **provenance, settings=settings)
+    return assemble_trace(checkpoint, trace.episode, start, arrays, **provenance, settings=settings)

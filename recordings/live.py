@@ -41,7 +41,7 @@ from beliefscope.filters.external.adapter import (
 from beliefscope.inspect.trace import Trace
 from beliefscope.inspect.traces.external import fill_missing
 from beliefscope.inspect.traces.live_file import SUFFIX, LiveFileWriter
-from beliefscope.inspect.traces.run import assemble_trace
+from beliefscope.inspect.traces.run import assemble_trace, step_arrays
 from beliefscope.recordings.rerun_log.live_views import LiveViews, write_live
 
 FOLDER = Path("workspace/live")
@@ -310,7 +310,8 @@ class LiveRecorder:
         steps = [row.values for row in rows if isinstance(row.values, StepTrace)]
         evidence = [row.evidence for row in rows if row.evidence is not None]
         if self._checkpoint is not None and len(steps) == len(evidence) == len(rows):
-            return assemble_trace(self._checkpoint, episode, start, _stack_evidence(evidence), steps, **self._fields)
+            arrays = step_arrays(self._checkpoint, _stack_evidence(evidence), steps)
+            return assemble_trace(self._checkpoint, episode, start, arrays, **self._fields)
         return self._external_part(
             [row.values for row in rows if not isinstance(row.values, StepTrace)], episode, start
         )

@@ -33,6 +33,7 @@ Needs = Literal[
     "ekf",
     "sensors",
     "pf",
+    "sample",
     "measurements",
     "extra",
     "maps",
@@ -55,8 +56,8 @@ class Entity:
         shape: per step; T steps, K modalities, n components, M particles, c controls, S cells per side of a map,
             W weights per modality, B bounds.
         unit: of the stored numbers.
-        needs: property of the trace that the path requires; ``ekf`` includes UKFs; ``sensors`` are
-            virtual ones; ``measurements`` and ``extra`` come from external filters.
+        needs: property of the trace that the path requires; ``ekf`` includes UKFs; ``sensors`` are virtual ones;
+            ``sample``: only some particles are kept; ``measurements`` and ``extra`` come from external filters.
         meaning: one-line description for the documentation.
     """
 
@@ -106,6 +107,7 @@ SCHEMA: tuple[Entity, ...] = (
     Entity("trace/log_weights", "Trace", "(M,)", "log", "pf", "normalised weights after it, before resampling"),
     Entity("trace/log_likelihood", "Trace", "(K, M)", "log", "pf", "log-likelihood of each particle, unnormalised"),
     Entity("trace/ancestors", "Trace", "(M,)", "index", "pf", "index of the particle before resampling"),
+    Entity("trace/all_particles_ess", "Trace", "()", "particles", "sample", "effective sample size of all"),
     Entity("trace/innovation", "Trace", "(K, m)", "task's", "measurements", "innovation of each measurement, or NaN"),
     Entity("trace/innovation_covariance", "Trace", "(K, m, m)", "task's", "measurements", "its predicted covariance S"),
     Entity("trace/accepted", "Trace", "(K,)", "1", "measurements", "whether the gate accepted the measurement"),

@@ -39,7 +39,7 @@ OPTIONS = {
     "study": "--preset --task --filter --seeds --data --skip-bad --engine --workers -o --json",
     "sweep": "--checkpoints --data --faults --seeds --particles --all --block --engine --workers -o --json",
     "experiments": "--phase --sort --top --sql -o --json",
-    "trace": "--filter --data --skip-bad --episode --faults --seed -o --json",
+    "trace": "--filter --data --skip-bad --episode --faults --seed --particles-kept -o --json",
     "record": "--filter --data --skip-bad --episode --maps --map-size --diagnostics --no-diagnostics --faults --seed "
     "-o --json",
     "live": "--filter --data --skip-bad --episode --faults --particles --seed --rate --workspace --name --json",

@@ -142,6 +142,7 @@ OPTIONS: dict[str, Any] = {
         "posterior for an external filter that reports no virtual observations.",
         "--map",
     ),
+    "particles_kept": option("M", "Particles of each step that are stored; moments are of all.", parser=integer(1)),
     "particles": option("M", "Number of particles (particle filters).", parser=integer(1)),
     "seed": option("S", "Random seed.", parser=integer(0)),
     "train": option(
@@ -267,15 +268,16 @@ class Run(Runs):
             index = episodes.held_out()[0] if self.episode is None else self.episode
             return episodes[index], index
 
-    def trace(self, align: bool = False) -> tuple[Checkpoint, Trace]:
-        """Run the filter with a progress bar; its checkpoint and the trace."""
+    def trace(self, align: bool = False, **settings: int) -> tuple[Checkpoint, Trace]:
+        """Run the filter with a progress bar; its checkpoint and the trace. settings: further ones of ``trace``."""
         from beliefscope.inspect.trace import trace
 
         checkpoint, faults = self.open()
         episode, index = self.read_episode(checkpoint.task)
         (episode,) = self.check(checkpoint, [episode], align)
         with console.progress("Filtering") as advance:
-            return checkpoint, trace(checkpoint, episode, index, self.seed, self.particles, faults, advance)
+            run = trace(checkpoint, episode, index, self.seed, self.particles, faults, advance, **settings)
+            return checkpoint, run
 
 
 def key_values(texts: Iterable[str], name: str, example: str) -> dict[str, str]:

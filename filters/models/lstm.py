@@ -58,7 +58,9 @@ class Lstm(SequenceModel):
             x = hidden[-1][:, 0]
         return self.read(belief, torch.stack(hidden, dim=1), x)
 
-    def steps(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> Iterator[StepTrace]:
+    def steps(
+        self, belief: Belief, evidence: Evidence, generator: torch.Generator
+    ) -> Iterator[tuple[Belief, StepTrace]]:
         """All steps, layer by layer: identical results, but each layer's weights stay in the CPU cache."""
         assert isinstance(belief, Recurrent)
         inputs, hidden = evidence.observation.squeeze(2).unbind(0), []
@@ -71,4 +73,4 @@ class Lstm(SequenceModel):
             hidden.append(states)
         for output, *layers in zip(inputs, *hidden, strict=True):
             belief, trace = self.read(belief, torch.stack(layers, dim=1), output)
-            yield trace
+            yield belief, trace

@@ -69,13 +69,15 @@ class Transformer(SequenceModel):
         sequences, output = self.run(belief, evidence.observation)
         return self.read(belief, sequences[:, :, -WINDOW:], output[:, -1])
 
-    def steps(self, belief: Belief, evidence: Evidence, generator: torch.Generator) -> Iterator[StepTrace]:
+    def steps(
+        self, belief: Belief, evidence: Evidence, generator: torch.Generator
+    ) -> Iterator[tuple[Belief, StepTrace]]:
         """All steps at once: equal to single steps up to rounding."""
         assert isinstance(belief, Recurrent)
         sequences, output = self.run(belief, evidence.observation.squeeze(2).transpose(0, 1))
         for t, memory in enumerate(sequences.unfold(2, WINDOW, 1)[:, :, -len(evidence) :].unbind(2)):
             belief, trace = self.read(belief, memory.transpose(-1, -2), output[:, t])
-            yield trace
+            yield belief, trace
 
     def run(self, belief: Recurrent, x: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs (N, T, U) of T steps to each layer's inputs (N, L, WINDOW + T, U), and the outputs (N, T, U)."""

@@ -31,10 +31,11 @@ def equation_statistics(trace: Trace, checkpoint: Checkpoint) -> dict[str, float
     Particle filters also have ``particles``: number M; ``ancestors``: share of particles with offspring;
     ``offspring``: mean square of the difference between the number of offspring and its expectation M w; and
     ``prior ess``: relative effective sample size of the weights after resampling.
-    Information filters have none of them: their belief is larger than that of the trace.
+    Information filters have none of them: their belief is larger than that of the trace. Neither have traces without
+    some of the particles.
     """
     filter_ = checkpoint.filter
-    if filter_.architecture.fusion == "information":
+    if filter_.architecture.fusion == "information" or trace.all_particles_ess is not None:
         return {}
     if isinstance(filter_, MixtureParticleFilter) and trace.particles is not None:
         return _particle_statistics(trace, filter_)

@@ -132,7 +132,7 @@ class Candidates:
         start, end = min(c.first for c in candidates), self.failure[1] + 1
         belief = repeat_belief(self.replay.beliefs[start], len(candidates))
         evidence, generator = self._evidence(candidates)[start:end], self.replay.generator(start, Common)
-        means = [step.estimate.mean for step in self.filter.steps(belief, evidence, generator)]
+        means = [step.estimate.mean for _, step in self.filter.steps(belief, evidence, generator)]
         estimates = self.filter.statistics.state_to_si(torch.stack(means)).numpy()  # (t, N, n)
         difference = wrapped(self.trace.task, estimates - self.trace.episode.states[start:end, None])
         squared = np.square(self.trace.task.main_error.norm(difference))

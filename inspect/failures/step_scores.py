@@ -202,9 +202,9 @@ def _angle(index: int, component: Component) -> Score:
 
 
 def _degeneracy(trace: Trace) -> Array:
-    assert trace.particles is not None
+    assert trace.particle_count is not None
     assert trace.effective_sample_size is not None
-    return trace.particles.shape[1] / trace.effective_sample_size.astype(np.float64)
+    return trace.particle_count / trace.effective_sample_size.astype(np.float64)
 
 
 def _regret(trace: Trace) -> Array:

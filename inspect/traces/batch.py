@@ -18,7 +18,7 @@ from beliefscope.filters.external.load import ExternalFilter
 from beliefscope.filters.models.common_random_numbers import Common
 from beliefscope.filters.rollout import first_belief, rollout
 from beliefscope.inspect.traces.data import Trace
-from beliefscope.inspect.traces.run import assemble_trace, trace
+from beliefscope.inspect.traces.run import assemble_trace, step_arrays, trace
 
 EPISODES, STEPS = 32, 10_000
 """Maximum number of episodes in one run, and of their steps; limits memory."""
@@ -98,8 +98,7 @@ def _run_together(
             checkpoint,
             episode,
             _select(start, i),
-            _select(evidence, i, axis=1),
-            [_select(step, i) for step in result.steps],
+            step_arrays(checkpoint, _select(evidence, i, axis=1), [_select(step, i) for step in result.steps]),
             data_hash=episodes[index].digest(),
             episode_index=index,
             seed=seed,

@@ -51,9 +51,12 @@ class Trace:
         observation_mean, observation_covariance: filters with virtual sensors: (T, K, n), (T, K, n, n) their output z
             and R.
         particles: PF: (T, M, n) predicted particles.
+            M is the number kept; moments and effective weights are those of all.
         prior_log_weights, log_weights: PF: (T, M) normalised, before and after the observation.
         log_likelihood: PF: (T, K, M), not normalised.
-        ancestors: PF: (T, M) int32 index of the particle that each resampled particle was copied from.
+        ancestors: PF: (T, M) int32 index of the particle that each resampled particle was copied from. None if not all
+            particles are kept.
+        all_particles_ess: (T,) effective sample size of all particles, if not all are kept.
         innovation, innovation_covariance: external filters: (T, K, m), (T, K, m, m) in the space and units of each
             measurement; NaN after its last channel and where there was none.
         accepted: external filters with a gate: (T, K) 1 if the measurement was used, 0 if not; NaN without one.
@@ -86,6 +89,7 @@ class Trace:
     log_weights: Array | None = None
     log_likelihood: Array | None = None
     ancestors: NDArray[np.int32] | None = None
+    all_particles_ess: Array | None = None
     innovation: Array | None = None
     innovation_covariance: Array | None = None
     accepted: Array | None = None
@@ -119,8 +123,10 @@ class Trace:
 
     @property
     def particle_count(self) -> int | None:
-        """M; None for a filter without particles."""
-        return None if self.particles is None else self.particles.shape[1]
+        """Number of particles of the run, kept or not; None for a filter without particles."""
+        if self.particles is None:
+            return None
+        return self.particles.shape[1] if self.all_particles_ess is None else int(self.settings["particles"])
 
     @property
     def has_covariance(self) -> bool:
@@ -140,7 +146,9 @@ class Trace:
 
     @property
     def effective_sample_size(self) -> Array | None:
-        """(T,) ``1 / sum w_i^2`` of the posterior weights, between 1 and M; None for a filter without particles."""
+        """(T,) ``1 / sum w_i^2`` of all posterior weights; None for a filter without particles."""
+        if self.all_particles_ess is not None:
+            return self.all_particles_ess
         return None if self.log_weights is None else effective_sample_size(torch.from_numpy(self.log_weights)).numpy()
 
 

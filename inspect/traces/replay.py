@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 from urllib.parse import parse_qsl
@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.errors import BadInput, check_name
 from beliefscope.datasets.faults.injection import NO_FAULTS, Faults
 from beliefscope.filters.batch import Steps
@@ -20,7 +21,7 @@ from beliefscope.filters.checkpoint import Checkpoint
 from beliefscope.filters.rollout import first_belief
 from beliefscope.filters.subsets import standalone_evidence
 from beliefscope.inspect.traces.data import ARRAYS, Trace
-from beliefscope.inspect.traces.run import assemble_trace
+from beliefscope.inspect.traces.run import assemble_trace, step_arrays, with_fewer_particles
 
 
 @dataclass(frozen=True)
@@ -169,9 +170,8 @@ class Replay:
                 progress((t + 1) / len(trace))
         names = ("data_hash", "episode_index", "seed", "faults", "settings")
         self._provenance = {name: getattr(trace, name) for name in names}
-        self.original = assemble_trace(
-            checkpoint, trace.episode, self.start, self.evidence, self.steps, **self._provenance
-        )
+        self._kept = 0 if trace.particles is None else trace.particles.shape[1]
+        self.original = self._trace(trace.episode, self.evidence, self.steps, self._provenance)
         self.exact = all(equal(getattr(trace, name), getattr(self.original, name)) for name in ARRAYS)
 
     def check_step(self, step: int) -> None:
@@ -219,7 +219,13 @@ class Replay:
             "faults": original.faults + edit.timed_faults,
             "settings": {**original.settings, "edits": edits},
         }
-        return assemble_trace(self.checkpoint, episode, self.start, evidence, steps, **provenance)
+        return self._trace(episode, evidence, steps, provenance)
+
+    def _trace(
+        self, episode: Episode, evidence: Evidence, steps: Sequence[StepTrace], provenance: Mapping[str, Any]
+    ) -> Trace:
+        arrays = with_fewer_particles(step_arrays(self.checkpoint, evidence, steps), self._kept)
+        return assemble_trace(self.checkpoint, episode, self.start, arrays, **provenance)
 
     def apply_weights(self, evidence: Evidence, edit: Edit) -> Evidence:
         """Replace beta in the evidence by the weights of an edit."""

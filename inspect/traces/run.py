@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,19 @@ from beliefscope.filters.filter import Filter, Kind
 from beliefscope.filters.models.ekf import ExtendedKalmanFilter
 from beliefscope.filters.models.information import InformationFilter
 from beliefscope.filters.models.pf import MixtureParticleFilter
-from beliefscope.filters.rollout import first_belief, rollout
+from beliefscope.filters.models.resampling import effective_sample_size
+from beliefscope.filters.rollout import first_belief
 from beliefscope.inspect.traces.data import Trace
 from beliefscope.inspect.traces.external import trace_external
+
+PARTICLES_KEPT = 10_000
+"""Particles of each step that a trace stores by default."""
+
+STEPS_ENCODED = 4096
+"""Steps of one episode that are encoded at once; limits memory."""
+
+PARTICLES_AT_ONCE = 1 << 21
+"""Particles whose arrays are computed at once if not all are kept; limits memory."""
 
 
 @torch.no_grad()
@@ -35,25 +46,34 @@ def trace(
     particles: int = 300,
     faults: Faults = NO_FAULTS,
     progress: Callable[[float], None] | None = None,
+    particles_kept: int = PARTICLES_KEPT,
 ) -> Trace:
     """Run a filter over an episode from the true state, covariance 0.1 I (standardised), and keep every step.
 
-    Estimates are bit-identical to those of an untraced run with the same seed.
+    Estimates are bit-identical to those of an untraced run with the same seed. Memory is linear in the steps, with the
+    size of the trace's arrays and of the episode, and does not depend on ``particles`` times steps.
 
     Args:
         faults: sensor faults to inject; the trace's episode holds the observations after injection.
         progress: called with the completed fraction, 0..1.
+        particles_kept: maximum number of particles of each step in the trace: every (particles / particles_kept)-th.
+            Moments, effective weights and the effective sample size are those of all particles.
 
     Raises:
         BadInput: the episode or the faults do not fit the checkpoint's task, or a setting is out of range.
     """
     if isinstance(checkpoint, ExternalFilter):
         return trace_external(checkpoint, episode, episode_index, seed, faults, progress)
+    if particles_kept < 1:
+        raise BadInput(f"particles kept must be at least 1, not {particles_kept}")
     run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
-    result = rollout(
-        checkpoint.filter, run.evidence, run.start, run.generator(), particles, keep=True, progress=progress
-    )
-    return assemble_trace(checkpoint, run.episode, run.start, run.evidence, result.steps, **run.provenance)
+
+    def advance(steps: int) -> None:
+        if progress is not None:
+            progress(steps / len(episode))
+
+    arrays = run_arrays(checkpoint, run.blocks(), run.start, run.generator(), particles, particles_kept, advance)
+    return assemble_trace(checkpoint, run.episode, run.start, arrays, **run.provenance)
 
 
 @dataclass(frozen=True)
@@ -62,15 +82,32 @@ class FilterRun:
 
     Attributes:
         episode: filter input, after fault injection.
+        filter: of the run.
+        steps: the episode's steps.
         start: belief before step 0, N = 1.
-        evidence: evidence of all steps.
         provenance: trace fields that identify the run.
     """
 
     episode: Episode
+    filter: Filter
+    steps: Steps
     start: Gaussian
-    evidence: Evidence
     provenance: Mapping[str, Any]
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """Evidence of all steps."""
+        with torch.no_grad():
+            return self.filter.encode(self.steps.episode(0))
+
+    def blocks(self) -> Iterator[Evidence]:
+        """Evidence of consecutive steps, a limited number at once."""
+        total = len(self.episode)
+        for first in range(0, total, STEPS_ENCODED):
+            lead = min(first, self.filter.history)
+            size = min(STEPS_ENCODED, total - first)
+            batch = self.steps.windows(torch.tensor([first - lead]), lead + size)
+            yield self.filter.encode(batch)[lead:]
 
     def generator(self) -> torch.Generator:
         """A new generator of the run's random numbers."""
@@ -81,38 +118,99 @@ class FilterRun:
 def start_run(
     checkpoint: Checkpoint, episode: Episode, episode_index: int, seed: int, particles: int, faults: Faults
 ) -> FilterRun:
-    """Inject faults and encode the episode. Arguments and errors as for ``trace``."""
+    """Inject faults and check the episode. Arguments and errors as for ``trace``."""
     if particles < 1:
         raise BadInput(f"particles must be at least 1, not {particles}")
     checkpoint.check_task(episode)
     filter_ = checkpoint.filter
     provenance = {"data_hash": episode.digest(), "episode_index": episode_index, "seed": seed, "faults": faults}
     episode = faults.apply(episode, seed)
-    batch = Steps.from_episodes(filter_.task, [episode]).episode(0)
+    steps = Steps.from_episodes(filter_.task, [episode])
+    start = first_belief(filter_, steps.windows(steps.first, 1))
     settings = {"particles": particles, "torch": torch.__version__}
-    return FilterRun(episode, first_belief(filter_, batch), filter_.encode(batch), provenance | {"settings": settings})
+    return FilterRun(episode, filter_, steps, start, provenance | {"settings": settings})
 
 
-def assemble_trace(
+def run_arrays(
     checkpoint: Checkpoint,
-    episode: Episode,
+    blocks: Iterable[Evidence],
     start: Gaussian,
-    evidence: Evidence,
-    steps: Sequence[StepTrace],
-    **provenance: Any,
-) -> Trace:
-    """Build the trace of T steps with N = 1. That of a standalone run has only its modality, and no weights."""
+    generator: torch.Generator,
+    particles: int,
+    particles_kept: int = PARTICLES_KEPT,
+    progress: Callable[[int], None] = lambda _: None,
+) -> dict[str, Tensor]:
+    """Run a filter over consecutive evidence with N = 1; the arrays (T, ...) of its trace.
+
+    Args:
+        progress: called with the number of completed steps.
+    """
+    filter_ = checkpoint.filter
+    belief = filter_.start(start, particles, generator)
+    parts: dict[str, list[Tensor]] = {}
+    done = 0
+    for block in blocks:
+        at_once = len(block)
+        if isinstance(belief, Particles) and particles > particles_kept:
+            at_once = max(1, PARTICLES_AT_ONCE // particles)
+        for first in range(0, len(block), at_once):
+            evidence = block[first : first + at_once]
+            steps: list[StepTrace] = []
+            for after, step in filter_.steps(belief, evidence, generator):
+                belief = after
+                steps.append(step)
+                progress(done := done + 1)
+            for name, values in with_fewer_particles(step_arrays(checkpoint, evidence, steps), particles_kept).items():
+                parts.setdefault(name, []).append(values)
+    return {name: torch.cat(parts.pop(name)) for name in list(parts)}
+
+
+BY_PARTICLE = {"particles": -2, "prior_log_weights": -1, "log_weights": -1, "log_likelihood": -1}
+"""Arrays with a value for each particle, and the axis of the particles."""
+
+
+def with_fewer_particles(arrays: dict[str, Tensor], count: int) -> dict[str, Tensor]:
+    """Arrays of a trace with at most ``count`` particles at equal distances, and the effective sample size of all.
+
+    Resampled particles are in the order of their ancestors, so those at equal distances are a stratified sample of the
+    prior. Weights are normalised again. Ancestors are left out: most of them are not kept.
+    """
+    total = arrays["particles"].shape[1] if "particles" in arrays else 0
+    if total <= count:
+        return arrays
+    kept = torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
+    result = {name: values for name, values in arrays.items() if name != "ancestors"}
+    result["all_particles_ess"] = effective_sample_size(arrays["log_weights"])
+    for name, axis in BY_PARTICLE.items():
+        result[name] = arrays[name].index_select(axis, kept)
+    for name in ("prior_log_weights", "log_weights"):
+        result[name] = result[name].log_softmax(-1)
+    return result
+
+
+def step_arrays(checkpoint: Checkpoint, evidence: Evidence, steps: Sequence[StepTrace]) -> dict[str, Tensor]:
+    """Arrays (T, ...) of a trace from T steps with N = 1."""
     filter_ = checkpoint.filter
     si = filter_.statistics
     arrays = ARRAYS_OF[checkpoint.kind](filter_, steps, evidence)
-    arrays |= {
-        "estimate_mean": si.state_to_si(torch.cat([s.estimate.mean for s in steps])),
-        "estimate_covariance": si.covariance_to_si(torch.cat([s.estimate.covariance for s in steps])),
+    arrays["estimate_mean"] = si.state_to_si(torch.cat([s.estimate.mean for s in steps]))
+    arrays["estimate_covariance"] = si.covariance_to_si(torch.cat([s.estimate.covariance for s in steps]))
+    if evidence.log_weights is not None:
+        arrays["weights"] = evidence.log_weights[:, 0].exp()
+    return arrays
+
+
+def assemble_trace(
+    checkpoint: Checkpoint, episode: Episode, start: Gaussian, arrays: Mapping[str, Tensor], **provenance: Any
+) -> Trace:
+    """Build the trace of a run's arrays. That of a standalone run has only its modality, and no weights."""
+    filter_ = checkpoint.filter
+    si = filter_.statistics
+    arrays = {
+        **arrays,
         "start_mean": si.state_to_si(start.mean[0]),
         "start_covariance": si.covariance_to_si(start.covariance[0]),
     }
-    if evidence.log_weights is not None:
-        arrays["weights"] = evidence.log_weights[:, 0].exp()
     modalities = filter_.names[: arrays["modality_mean"].shape[1]]
     if (only := provenance.get("settings", {}).get("standalone")) in modalities:
         k = modalities.index(only)

@@ -37,6 +37,10 @@ def validate_trace(trace: Trace) -> None:
     shapes = {name: f"T{letters}" for name, letters in SHAPES.items()} | STATIC
     for name, letters in shapes.items():
         _check_array(name, getattr(trace, name), letters, sizes, "i" if name == "ancestors" else "f")
+    _check_array("all_particles_ess", trace.all_particles_ess, "T", sizes, "f")
+    if trace.all_particles_ess is not None:
+        total, kept = trace.settings.get("particles"), sizes.get("M", 0)
+        _check(type(total) is int and total > kept > 0, f"number of particles with {kept} kept", total)
     for name, values in trace.extra.items():
         _check_array(f"extra {name!r}", values, "T", sizes, "f")
     for name, letters, kinds in (("states", "Tn", "f"), ("controls", "Tc", "f"), ("contact", "T", "b")):

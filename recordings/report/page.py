@@ -101,8 +101,8 @@ def _header(report: Report, summary: Section) -> dict[str, str]:
         "Episodes": f"{episodes} ({steps} steps in total, {first.episode.dt:g} s each)",
         "Sensor faults": "; ".join(dict.fromkeys(str(trace.faults) or "none" for trace in report.traces)),
     }
-    if first.particles is not None:
-        facts["Particles"] = str(first.particles.shape[1])
+    if first.particle_count is not None:
+        facts["Particles"] = str(first.particle_count)
     main = first.task.main_error
     table = next(item.table for item in summary.items if item.table is not None)
     column = table.columns.index(first.task.main_error.label)

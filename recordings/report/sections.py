@@ -204,5 +204,5 @@ def event_summary(trace: Trace, step: int) -> str:
     if measures.blackout(trace)[step]:
         parts.append("image blacked out")
     if trace.effective_sample_size is not None and trace.particles is not None:
-        parts.append(f"{trace.effective_sample_size[step]:.0f} of {trace.particles.shape[1]} particles are effective")
+        parts.append(f"{trace.effective_sample_size[step]:.0f} of {trace.particle_count} particles are effective")
     return "; ".join(parts) + "."

@@ -99,18 +99,21 @@ def trace(
     faults: str | Faults = "",
     seed: int = 0,
     particles: int = 300,
+    particles_kept: int = 10_000,
 ) -> Trace:
     """Run a filter over one episode, by default the first held-out one, and keep everything that it computes.
 
     Args:
         faults: sensor faults to inject, such as ``blackout=0.4`` (docs/data.md#sensor-faults).
+        particles_kept: maximum number of particles of each step in the trace; moments are of all.
 
     Raises BadInput for an unknown filter, episode or fault, and if the data are of another task.
     """
     checkpoint = load_filter(filter_)
     episodes = _episodes(data, checkpoint)
     index = episodes.held_out()[0] if episode is None else episode
-    return trace_episode(checkpoint, episodes[index], index, seed, particles, _faults(faults, checkpoint))
+    injected = _faults(faults, checkpoint)
+    return trace_episode(checkpoint, episodes[index], index, seed, particles, injected, particles_kept=particles_kept)
 
 
 def maps(

@@ -18,6 +18,8 @@ from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.batch import Steps
 from beliefscope.filters.checkpoint import Checkpoint, load_checkpoint, shipped
 from beliefscope.filters.evaluate import run
+from beliefscope.inspect.diagnostics import particle_health
+from beliefscope.inspect.standalone import standalone
 from beliefscope.inspect.trace import (
     ARRAYS,
     Trace,
@@ -28,6 +30,8 @@ from beliefscope.inspect.trace import (
     trace,
     trace_from_arrays,
 )
+from beliefscope.inspect.traces import run as run_module
+from beliefscope.inspect.traces.replay import Replay
 
 
 @pytest.fixture(scope="module")
@@ -166,3 +170,47 @@ def test_names_of_an_earlier_version(traced: Trace) -> None:
     loaded = trace_from_arrays(header, arrays)
     assert (loaded.kind, str(loaded.faults)) == ("external", "blackout=0.4")
     np.testing.assert_array_equal(loaded.effective_weights, traced.effective_weights)
+
+
+@pytest.mark.parametrize("name", ["door/crossmodal-ekf", "door-field/information-ekf", "push-field/information-ekf"])
+def test_evidence_in_blocks_gives_the_same_trace(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    task, filter_name = name.split("/")
+    checkpoint = load_checkpoint(shipped(task, filter_name))
+    with open_dataset(sample_path(task)) as dataset:
+        episode = dataset[dataset.held_out()[0]]
+    whole = trace(checkpoint, episode)
+    monkeypatch.setattr(run_module, "STEPS_ENCODED", 37)
+    in_blocks = trace(checkpoint, episode)
+    for key, values in arrays_of(whole).items():
+        # Products of matrices with fewer rows round differently.
+        np.testing.assert_allclose(arrays_of(in_blocks)[key], values, rtol=2e-3, atol=2e-5, err_msg=key)
+
+
+def test_kept_particles_are_a_sample_of_all(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = load_checkpoint(shipped("door", "crossmodal-pf"))
+    whole = trace(checkpoint, episode, particles=2000)
+    monkeypatch.setattr(run_module, "PARTICLES_AT_ONCE", 7 * 2000)
+    sample = trace(checkpoint, episode, particles=2000, particles_kept=200)
+    for name in ("estimate_mean", "estimate_covariance", "modality_mean", "effective_weights"):
+        # Sums over the particles of seven steps and of all round differently.
+        np.testing.assert_allclose(getattr(sample, name), getattr(whole, name), rtol=1e-3, atol=1e-6, err_msg=name)
+    assert sample.effective_sample_size is not None
+    np.testing.assert_allclose(sample.effective_sample_size, whole.effective_sample_size, rtol=1e-4)
+    assert sample.particles is not None
+    assert sample.log_weights is not None
+    assert (sample.particle_count, sample.particles.shape[1], sample.ancestors) == (2000, 200, None)
+    weights = np.exp(sample.log_weights.astype(np.float64))
+    np.testing.assert_allclose(weights.sum(1), 1.0, atol=1e-5)
+    # The kept particles' mean is within its sampling error; 5 is far in the tail of a normal distribution.
+    mean = np.einsum("tm,tmn->tn", weights, sample.particles)
+    error = np.sqrt(sample.estimate_covariance.diagonal(axis1=1, axis2=2) * np.square(weights).sum(1)[:, None])
+    assert (np.abs(mean - sample.estimate_mean) < 5.0 * error + 1e-5).mean() > 0.99
+
+    save_trace(sample, tmp_path / "run.trace")
+    loaded = load_trace(tmp_path / "run.trace")
+    assert (loaded.particle_count, loaded.effective_sample_size.tolist()) == (2000, sample.all_particles_ess.tolist())  # type: ignore[union-attr]
+    assert "--particles-kept 2000" in (particle_health.why_not(sample) or "")
+    assert Replay(checkpoint, sample).original.particles.shape == sample.particles.shape  # type: ignore[union-attr]
+    assert standalone(checkpoint, sample, "image").particle_count == 2000
+    with pytest.raises(BadInput, match="particles kept must be at least 1"):
+        trace(checkpoint, episode, particles_kept=0)

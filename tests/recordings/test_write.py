@@ -41,6 +41,7 @@ def expected_paths(trace: Trace, entity: Entity, maps: bool) -> set[str]:
         "ekf": trace.kind in ("ekf", "ukf"),
         "sensors": trace.observation_mean is not None,
         "pf": trace.kind == "pf",
+        "sample": trace.all_particles_ess is not None,
         "measurements": trace.innovation is not None,
         "extra": bool(trace.extra),
         "maps": maps,

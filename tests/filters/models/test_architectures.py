@@ -295,7 +295,7 @@ def test_lstm_steps_equal_the_batched_ones(lstm: Lstm, window: MakeWindow) -> No
     batch, generator = window(10, 3), torch.Generator()
     evidence = lstm.encode(batch)
     belief = lstm.start(first_belief(lstm, batch), 0, generator)
-    batched = list(lstm.steps(belief, evidence, generator))
+    batched = [step for _, step in lstm.steps(belief, evidence, generator)]
     for t, trace in enumerate(batched):
         assert trace.predicted.hidden.equal(belief.hidden)  # type: ignore[union-attr]
         belief, step = lstm.step(belief, evidence[t], generator)

@@ -72,5 +72,5 @@ def test_a_window_does_not_depend_on_where_it_begins(filter_: Transformer, evide
         belief = filter_.start(START, 1, torch.Generator())
         for t in range(70):
             belief, _ = filter_.step(belief, evidence[t], torch.Generator())
-        rest = torch.stack([s.estimate.mean for s in filter_.steps(belief, evidence[70:STEPS], torch.Generator())])
+        rest = torch.stack([s.estimate.mean for _, s in filter_.steps(belief, evidence[70:STEPS], torch.Generator())])
     torch.testing.assert_close(rest, estimates(filter_, evidence)[70:], atol=1e-5, rtol=0.0)
