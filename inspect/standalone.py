@@ -97,7 +97,7 @@ def standalone(
         if progress is not None:
             progress(steps / len(trace))
 
-    arrays = run_arrays(checkpoint, [evidence], start, generator, particles, kept, advance)
+    arrays = run_arrays(checkpoint, [evidence], len(trace), start, generator, particles, kept, advance)
     settings = {key: value for key, value in trace.settings.items() if key != "edits"} | {"standalone": modality}
     provenance = {name: getattr(trace, name) for name in ("data_hash", "episode_index", "seed", "faults")}
     return assemble_trace(checkpoint, trace.episode, start, arrays, **provenance, settings=settings)

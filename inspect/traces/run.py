@@ -72,7 +72,9 @@ def trace(
         if progress is not None:
             progress(steps / len(episode))
 
-    arrays = run_arrays(checkpoint, run.blocks(), run.start, run.generator(), particles, particles_kept, advance)
+    arrays = run_arrays(
+        checkpoint, run.blocks(), len(episode), run.start, run.generator(), particles, particles_kept, advance
+    )
     return assemble_trace(checkpoint, run.episode, run.start, arrays, **run.provenance)
 
 
@@ -134,6 +136,7 @@ def start_run(
 def run_arrays(
     checkpoint: Checkpoint,
     blocks: Iterable[Evidence],
+    total: int,
     start: Gaussian,
     generator: torch.Generator,
     particles: int,
@@ -143,11 +146,12 @@ def run_arrays(
     """Run a filter over consecutive evidence with N = 1; the arrays (T, ...) of its trace.
 
     Args:
+        total: T.
         progress: called with the number of completed steps.
     """
     filter_ = checkpoint.filter
     belief = filter_.start(start, particles, generator)
-    parts: dict[str, list[Tensor]] = {}
+    arrays: dict[str, Tensor] = {}
     done = 0
     for block in blocks:
         at_once = len(block)
@@ -160,9 +164,14 @@ def run_arrays(
                 belief = after
                 steps.append(step)
                 progress(done := done + 1)
-            for name, values in with_fewer_particles(step_arrays(checkpoint, evidence, steps), particles_kept).items():
-                parts.setdefault(name, []).append(values)
-    return {name: torch.cat(parts.pop(name)) for name in list(parts)}
+            part = with_fewer_particles(step_arrays(checkpoint, evidence, steps), particles_kept)
+            if len(steps) == total:
+                return part
+            for name, values in part.items():
+                if name not in arrays:  # once: small arrays that stay between large ones would fragment the memory
+                    arrays[name] = values.new_empty(total, *values.shape[1:])
+                arrays[name][done - len(steps) : done] = values
+    return arrays
 
 
 BY_PARTICLE = {"particles": -2, "prior_log_weights": -1, "log_weights": -1, "log_likelihood": -1}
