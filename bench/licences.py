@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-EXTRAS = ("", "attribution", "tensorboard", "ray", "export", "logs", "meshes")
+EXTRAS = ("", "attribution", "tensorboard", "ray", "export", "logs")
 """Extras of users but ``video`` (docs/dependencies.md); ``test`` and ``dev`` are for developers."""
 
 ALLOWED = {

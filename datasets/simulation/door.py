@@ -25,7 +25,7 @@ from beliefscope.datasets.simulation.door_physics import (
 )
 from beliefscope.datasets.simulation.door_policies import POLICIES
 from beliefscope.datasets.simulation.panda import ROBOT_BIT, STIFF, WORLD_BIT, Sleeve, add_panda, new_spec
-from beliefscope.datasets.simulation.panda_meshes import add_visual_meshes
+from beliefscope.datasets.simulation.panda_visual import add_appearance
 from beliefscope.datasets.simulation.sensors import add_touch
 from beliefscope.datasets.simulation.simulate import DT, POSITION_BITS, Scene, first_free_start, quantise, simulate
 from beliefscope.datasets.task import Array, Component, Outline, Task
@@ -70,7 +70,7 @@ def door_model(
     """Model of robot, door, frame and floor. Joint ``door`` is last in qpos.
 
     Args:
-        visual: add the robot's meshes, if installed. frame: whether the frame is visible.
+        visual: draw the robot as in replays. frame: whether the frame is visible.
     """
     spec = new_spec()
     add_panda(spec, sleeve)
@@ -79,7 +79,7 @@ def door_model(
     _add_door(spec, physics)
     add_touch(spec, "door")
     if visual:
-        add_visual_meshes(spec)
+        add_appearance(spec)
     return spec.compile()
 
 

@@ -17,7 +17,7 @@ from beliefscope.datasets.episode import Episode
 from beliefscope.datasets.simulation.camera import Camera
 from beliefscope.datasets.simulation.controller import DOWN, Impedance, add_controller
 from beliefscope.datasets.simulation.panda import ROBOT_BIT, WORLD_BIT, Sleeve, add_panda, new_spec
-from beliefscope.datasets.simulation.panda_meshes import add_visual_meshes
+from beliefscope.datasets.simulation.panda_visual import add_appearance
 from beliefscope.datasets.simulation.sensors import add_touch
 from beliefscope.datasets.simulation.simulate import (
     DT,
@@ -165,7 +165,7 @@ def push_model(
     """Model of robot, puck and ground. The puck's free joint is last in qpos.
 
     Args:
-        visual: add the robot's meshes, if installed.
+        visual: draw the robot as in replays.
     """
     spec = new_spec()
     add_panda(spec, sleeve)
@@ -196,7 +196,7 @@ def push_model(
     )
     add_touch(spec, "puck")
     if visual:
-        add_visual_meshes(spec)
+        add_appearance(spec)
     return spec.compile()
 
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from beliefscope.datasets.simulation.panda_meshes import HIDDEN_GROUP
+from beliefscope.datasets.simulation.panda_visual import HIDDEN_GROUP, VISUAL_GROUP
 
 Array = NDArray[np.float64]
 
@@ -43,15 +43,14 @@ def shapes(model: Any, visual: bool = True) -> list[Shape]:
     """All shapes of a model (``mujoco.MjModel``) except planes.
 
     Args:
-        visual: return visual shapes, including meshes; otherwise collision shapes, which need no optional package.
+        visual: return the displayed shapes; otherwise the shapes in the task's camera images.
     """
     result = []
     for geom in range(model.ngeom):
         kind, body = int(model.geom_type[geom]), int(model.geom_bodyid[geom])
         hidden = model.geom_group[geom] >= HIDDEN_GROUP
-        collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
-        mesh_only = kind == mujoco.mjtGeom.mjGEOM_MESH and not collides
-        if kind == mujoco.mjtGeom.mjGEOM_PLANE or (hidden if visual else mesh_only):
+        displayed_only = model.geom_group[geom] == VISUAL_GROUP
+        if kind == mujoco.mjtGeom.mjGEOM_PLANE or (hidden if visual else displayed_only):
             continue
         points, faces = _points(model, geom, kind)
         turn = np.zeros(9)
