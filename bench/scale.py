@@ -1,7 +1,8 @@
-"""Sweeps at the scale of a laboratory: CPU time per episode, speed of queries over many rows, tables after kills.
+"""The scale of a laboratory: CPU time per episode, speed of queries over many rows, tables after kills, memory.
 
     python bench/scale.py                  survey: CPU-s per episode, and wall time with 1 and 2 workers
     python bench/scale.py --rows 10000000  p50 and p95 of the queries in docs/sweep.md over a table of so many rows
+    python bench/scale.py --memory         peak memory of traces with many steps, and with many particles
     python bench/scale.py --kills 20       50 checkpoints x 200 episodes: a sweep killed so often, and one that is not
 
 Rows of the large table are those of a real sweep, repeated for further checkpoints.
@@ -18,15 +19,20 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
 
 from beliefscope.datasets.store import open_dataset, sample_path, write_dataset
 from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint, shipped
 from beliefscope.inspect.sweep import Inputs
+from beliefscope.inspect.trace import save_trace, trace
 from beliefscope.recordings.sweep_table import CHECKPOINTS, RESULTS, TABLES, Experiments, run_sweep
 
 DOCS = Path(__file__).parents[1] / "docs" / "sweep.md"
@@ -151,10 +157,39 @@ def kill_sweep(folder: Path, kills: int, count: int = 50, episodes: int = 200) -
     sys.exit(not same)
 
 
+MEMORY = (("crossmodal-ekf", 10_000, 300), ("crossmodal-ekf", 40_000, 300), ("crossmodal-pf", 20, 1_000_000))
+"""Filter, steps and particles of each measured trace."""
+
+
+def print_memory(name: str, steps: int, particles: int) -> None:
+    """Peak memory of this process after it traced and saved a run. Its episode repeats one of the sample data set."""
+    with open_dataset(sample_path("door")) as sample:
+        episode = sample[0]
+    index = np.arange(steps) % len(episode)
+    arrays: dict[str, Any] = {key: getattr(episode, key)[index] for key in ("states", "controls", "contact", "qpos")}
+    observations = {key: values[index] for key, values in episode.observations.items()}
+    long = replace(episode, **arrays, observations=observations, covariates={})
+    torch.set_num_threads(1)
+    before = peak_memory()
+    run = trace(load_checkpoint(shipped("door", name)), long, particles=particles)
+    with tempfile.TemporaryDirectory() as folder:
+        save_trace(run, Path(folder) / "run.trace")
+        size = (Path(folder) / "run.trace").stat().st_size / 1e6
+    print(
+        f"{name}, {steps} steps, {particles} particles: {before:.0f} MB before, then {peak_memory():.0f}; {size:.0f} MB"
+    )
+
+
+def peak_memory() -> float:
+    """MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", type=int)
     parser.add_argument("--kills", type=int)
+    parser.add_argument("--memory", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -162,6 +197,11 @@ def main() -> None:
             query_times(folder, arguments.rows)
         elif arguments.kills:
             kill_sweep(folder, arguments.kills)
+        elif arguments.memory:
+            for run in MEMORY:
+                process = get_context("spawn").Process(target=print_memory, args=run)
+                process.start()
+                process.join()
         else:
             survey(folder)
 
