@@ -1,6 +1,10 @@
 """Errors caused by user input."""
 
 from collections.abc import Container
+from difflib import get_close_matches
+
+LONG_LIST = 12
+"""Names that a reader compares at a glance."""
 
 
 class BadInput(ValueError):
@@ -21,6 +25,11 @@ def check_name(kind: str, name: str, available: Container[str]) -> None:
 
 
 def unknown_name(kind: str, name: str, available: object) -> BadInput:
-    """Return the error for an unknown name: ``filter 'crosmodal-pf' does not exist. Available: ...``."""
-    names = ", ".join(str(a) for a in available)  # type: ignore[attr-defined]
-    return BadInput(f"{kind} {name!r} does not exist. Available: {names or 'none'}.")
+    """Return the error for an unknown name: ``filter 'crosmodal-pf' does not exist. Available: ...``.
+
+    A long list is preceded by the most similar names.
+    """
+    names = [str(a) for a in available]  # type: ignore[attr-defined]
+    similar = get_close_matches(name, names, n=2) if len(names) > LONG_LIST else []
+    hint = f" Did you mean {' or '.join(similar)}?" if similar else ""
+    return BadInput(f"{kind} {name!r} does not exist.{hint} Available: {', '.join(names) or 'none'}.")
