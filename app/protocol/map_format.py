@@ -24,6 +24,7 @@ LEVELS = 2**16 - 1
 """Largest uint16 of a cell; the resolution is a thousandth of a nat over the full range."""
 
 NUMBERS = (
+    "mean",
     "log_peak",
     "truth",
     "entropy",

@@ -26,6 +26,7 @@ class MapStatistics:
         steps: (B,) steps of the trace.
         layers: L names.
         peak: (B, L, 2) m, offset of the maximum from the true position.
+        mean: (B, L, 2) m, mean of p as an offset from the true position.
         log_peak: (B, L) log-likelihood of the maximum.
         truth: (B, L) log-likelihood at the true position relative to the maximum.
         entropy: (B, L) nats, ``-int p ln p``, p per m^2; independent of the number of cells. The maximum is the log of
@@ -46,6 +47,7 @@ class MapStatistics:
     steps: NDArray[np.int64]
     layers: tuple[str, ...]
     peak: Array
+    mean: Array
     log_peak: Array
     truth: Array
     entropy: Array
@@ -79,7 +81,7 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
     rows, columns = ([(len(q) - 1) // 2, len(q) // 2] for q in (y, x))
     at_truth = log[:, :, rows][..., columns].mean(axis=(2, 3))
     best = flat.argmax(axis=-1)
-    axis, elongation = _principal(share, x, y)
+    mean, axis, elongation = _principal(share, x, y)
     expected = _expected(maps, trace) if maps[0].components == trace.task.map_indices else np.full(len(maps), np.nan)
     deviation = np.abs((axis - expected[:, None] + np.pi / 2.0) % np.pi - np.pi / 2.0)
     plogp = np.einsum("blc,blc->bl", flat, flat_log)
@@ -90,6 +92,7 @@ def measure_maps(maps: Sequence[LikelihoodMap], trace: Trace) -> MapStatistics:
         steps=np.array([m.step for m in maps]),
         layers=maps[0].layers,
         peak=np.stack([x[best % size], y[best // size]], axis=-1),
+        mean=mean,
         log_peak=log_peak,
         truth=at_truth - log_peak,
         entropy=-plogp + np.log(cell),
@@ -121,8 +124,8 @@ def _area(ordered: Array, mass: float) -> tuple[Array, Array]:
     return np.asarray((complete + (mass - before) / last)[..., 0], dtype=np.float64), last[..., 0]
 
 
-def _principal(share: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    """(B, L) principal axis and elongation of the covariance of normalised maps."""
+def _principal(share: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """(B, L, 2) mean, (B, L) principal axis and elongation of the covariance of normalised maps."""
     along_x, along_y = share.sum(axis=2), share.sum(axis=3)
     mean_x, mean_y = along_x @ x, along_y @ y
     xx, yy = along_x @ x**2 - mean_x**2, along_y @ y**2 - mean_y**2
@@ -130,7 +133,7 @@ def _principal(share: Array, x: Array, y: Array) -> tuple[Array, Array]:
     spread = np.hypot(0.5 * (xx - yy), xy)
     tiny = (x[1] - x[0]) ** 2 / 12.0  # variance within a cell; a map of one cell is round
     ratio = (0.5 * (xx + yy) + spread + tiny) / np.maximum(0.5 * (xx + yy) - spread + tiny, 1e-12)
-    return 0.5 * np.arctan2(2.0 * xy, xx - yy), np.sqrt(ratio)
+    return np.stack([mean_x, mean_y], axis=-1), 0.5 * np.arctan2(2.0 * xy, xx - yy), np.sqrt(ratio)
 
 
 def _expected(maps: Sequence[LikelihoodMap], trace: Trace) -> Array:

@@ -44,9 +44,9 @@ def test_values_and_exports_match_the_engine(
 ) -> None:
     page = open_page(LINK)
     assert page.state["episode"] == 9
-    check_numbers(page, expected, engine.trace)
     check_probe(page, expected)
     page.page.locator("#maps-view").click()
+    check_numbers(page, expected, engine.trace)
     files = {}
     for kind in ("csv", "svg", "png"):
         with page.page.expect_download() as download:
@@ -76,17 +76,20 @@ def test_values_and_exports_match_the_engine(
 
 
 def check_numbers(page: Any, expected: LikelihoodMap, run: Trace) -> None:
-    """Numbers below the maps, with their displayed precision."""
+    """Numbers in the menu of the maps, with their displayed precision, and the names of the shapes on the maps."""
     measured = measure_maps([expected], run)
-    for layer, figure in enumerate(page.page.locator("#heatmaps figcaption").all()):
-        peak, areas, shape = figure.locator("p").all_text_contents()
+    for layer, row in enumerate(page.page.locator("#maps-measures tbody tr").all()):
+        peak, area50, area95, entropy, shape = row.locator("td").all_text_contents()
         assert numbers(peak) == pytest.approx((100.0 * expected.peaks()[layer]).tolist(), abs=0.051)
         areas_cm2 = [1e4 * a[0, layer] for a in (measured.area50, measured.area95)]
-        assert numbers(areas)[1::2] == pytest.approx(areas_cm2, abs=0.51)
-        assert numbers(shape)[-1] == pytest.approx(measured.entropy[0, layer] + np.log(1e4), abs=0.0051)
+        assert numbers(area50 + " " + area95) == pytest.approx(areas_cm2, abs=0.51)
+        assert numbers(entropy) == pytest.approx([measured.entropy[0, layer] + np.log(1e4)], abs=0.0051)
         assert shape.startswith(SHAPES[measured.shape[0, layer]])
         if shape.startswith("ridge"):
-            assert numbers(shape)[0] == pytest.approx(np.degrees(measured.deviation[0, layer]), abs=0.51)
+            sizes = [np.degrees(measured.axis[0, layer]), measured.elongation[0, layer], 1]
+            sizes.append(np.degrees(measured.deviation[0, layer]))
+            assert numbers(shape) == pytest.approx(sizes, abs=0.51)
+        assert shape.startswith(page.page.locator("#heatmaps .shape").nth(layer).text_content())
     pair = numbers(page.page.locator("#maps-pairs").text_content())
     assert pair[:2] == pytest.approx([measured.divergence[0, 0, 1], measured.divergence[0, 1, 0]], abs=0.051)
     assert pair[2] == pytest.approx(100.0 * measured.overlap[0, 0, 1], abs=0.51)
@@ -100,15 +103,18 @@ def check_probe(page: Any, expected: LikelihoodMap) -> None:
     for key in ("ArrowRight", "Shift+ArrowUp"):
         page.page.keyboard.press(key)
     assert page.state["step"] == STEP
-    assert page.page.locator("#maps-value").text_content() == "at +0.2, +1.0 cm"
+    assert page.page.locator("#maps-value").text_content() == "+0.2, +1.0 cm"
     values = expected.log_likelihood[:, 67 + 5, 67 + 1]
     relative = np.exp(values - expected.log_likelihood.max(axis=(1, 2)))
-    for layer, caption in enumerate(page.page.locator("#heatmaps figcaption").all_text_contents()):
-        assert numbers(caption) == pytest.approx([relative[layer], values[layer]], abs=0.0061)
+    assert numbers(" ".join(page.page.locator("#maps-readout div p").all_text_contents())) == pytest.approx(
+        [relative[1], values[1]], abs=0.0061
+    )
+    for layer, text in enumerate(page.page.locator("#heatmaps .shape").all_text_contents()):
+        assert numbers(text) == pytest.approx([relative[layer]], abs=0.0061)
     assert "haptics" in page.page.locator("#maps-announcement").text_content()
     assert page.page.evaluate(heights) == before
     page.page.keyboard.press("Escape")
-    assert page.page.locator("#maps-value").text_content() == ""
+    assert page.page.locator("#maps-readout").is_hidden()
 
 
 def test_other_components_are_selected_in_the_menu(open_page: Any, engine: MapEngine) -> None:
@@ -121,11 +127,10 @@ def test_other_components_are_selected_in_the_menu(open_page: Any, engine: MapEn
     page.page.locator("#maps-others label", has=page.page.locator("[value=marginal]")).click()
     page.until("() => document.querySelector('#maps-rule').textContent.includes('hinge y integrated out')")
     assert page.page.locator("#angle-label").is_hidden()
-    page.page.keyboard.press("Escape")
     page.settle(STEP)
     expected = engine.map(STEP, quantity="posterior", components=("hinge_x", "angle"), others="marginal")
     degrees = np.array([100.0, 180.0 / np.pi])
-    for layer, line in enumerate(page.page.locator("#heatmaps figcaption p:first-child").all_text_contents()):
+    for layer, line in enumerate(page.page.locator("#maps-measures td:nth-child(2)").all_text_contents()):
         assert numbers(line) == pytest.approx(expected.peaks()[layer] * degrees, abs=0.051)
     page.until(
         "() => location.search.includes('plane=hinge_x%2Cangle&') && location.search.includes('others=marginal')"
@@ -145,28 +150,29 @@ def test_options_are_in_the_permalink_and_gains_refer_to_the_pinned_step(
         assert page.maps() != before
     top = expected.log_likelihood.max()
     lowest = max(expected.log_likelihood.min(), top - 40.0)
-    ends = page.page.locator("#heatmaps .colours b").all_text_contents()
-    assert [numbers(end)[0] for end in ends] == pytest.approx(3 * [lowest, top], abs=0.51)
+    ends = page.page.locator("#maps-scale b").all_text_contents()
+    assert [numbers(end)[0] for end in ends] == pytest.approx([lowest, top], abs=0.51)
+    assert page.page.locator("#maps-scale span").text_content() == "log likelihood, nats"
     page.screenshot("maps-log-world")
     page.page.locator("#maps-scale label").first.click()
     page.page.keyboard.press("Escape")
     page.page.locator("h1").click()
     page.page.keyboard.press("m")
     page.page.locator("#heatmaps canvas").first.hover()
-    captions = page.page.locator("#heatmaps figcaption").all_text_contents()
-    assert all(text.endswith("gain 0.00 nats") for text in captions)  # relative to itself
+    values = page.page.locator("#heatmaps .shape").all_text_contents()
+    assert all(text == "gain 0.00 nats" for text in values)  # relative to itself
     page.page.keyboard.press("Shift+ArrowRight")
     page.settle(STEP + 10)
     assert page.page.locator("#maps-kind").text_content() == f"Gain over step {STEP}"
-    captions = page.page.locator("#heatmaps figcaption").all_text_contents()
-    assert not any(text.endswith("gain 0.00 nats") for text in captions)
+    values = page.page.locator("#heatmaps .shape").all_text_contents()
+    assert not any(text == "gain 0.00 nats" for text in values)
     page.screenshot("maps-gain")
     page.until(f"() => location.search.includes('pin=') && location.search.includes('step={STEP + 10}')")
     again = open_page("?" + page.page.url.partition("?")[2])  # the pinned step is restored without a visit
     again.until(f"() => document.querySelector('#maps-kind').textContent === 'Gain over step {STEP}'")
     assert (again.state["pin"], again.state["step"]) == (page.state["pin"], STEP + 10)
     again.page.locator("#heatmaps canvas").first.hover()
-    assert again.page.locator("#heatmaps figcaption").all_text_contents() == captions
+    assert again.page.locator("#heatmaps .shape").all_text_contents() == values
     page.page.keyboard.press("m")
     page.page.keyboard.press("Shift+ArrowLeft")
     page.settle(STEP)

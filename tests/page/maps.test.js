@@ -3,10 +3,13 @@ import test from 'node:test';
 
 import { CELL_STEPS } from '../../app/page/core/constants.js';
 import {
+  axesText,
+  colourScale,
   layerMeasures,
   mapTitle,
   pairwiseMeasures,
   positionText,
+  shapeName,
   valuesAt,
 } from '../../app/page/maps/map_summary.js';
 import {
@@ -58,6 +61,11 @@ const HEADER = {
     area50: [0.001, 0.01, 0.001],
     area95: [0.01, 0.1, 0.01],
     axis: [0, Math.PI / 2, 0],
+    mean: [
+      [0, 0],
+      [0, 0],
+      [0, 0],
+    ],
     elongation: [1, 3, 2],
     deviation: [null, Math.PI / 6, null],
     ring_centre: [
@@ -153,14 +161,41 @@ test('labels of colour bars', () => {
   );
 });
 
+test('the colour bar names its quantity, its unit, and scales that differ', () => {
+  /** @param {'normalised' | 'log'} scale @param {'own' | 'same'} range @param {string} name of the reference */
+  const labels = (scale, range, name = '') => {
+    const layers = shades(maps, scale, range, name ? maps : null).map((shade, i) => ({
+      name: maps.layers[i],
+      shade,
+      peak: maps.log_max[i],
+    }));
+    return colourScale(maps.quantity, scale, range, layers, name);
+  };
+  assert.deepEqual(labels('normalised', 'own'), {
+    low: '0',
+    high: '1',
+    label: 'likelihood relative to the peak of each map',
+  });
+  assert.equal(labels('normalised', 'same').label, 'likelihood relative to the highest peak');
+  assert.deepEqual(labels('log', 'same'), { low: '≤−38', high: '2', label: 'log likelihood, nats' });
+  assert.deepEqual(labels('log', 'own'), {
+    low: '',
+    high: '0',
+    label:
+      'log likelihood, below the peak of each map, nats; ends: image −10, haptics ≤−40, fused −20',
+  });
+  assert.equal(labels('log', 'own', 'step 3').label, 'log density ratio to step 3, nats');
+  assert.equal(axesText(maps, false), '→ Δ hinge x  ↑ Δ hinge y (cm)');
+});
+
 test('values of cells', () => {
   assert.equal(cellAt(maps, [0, 0]), 4);
   assert.equal(cellAt(maps, [-0.29, 0.29]), 6);
   assert.equal(cellAt(maps, [9, 9]), 8);
   assert.deepEqual(valueAt(maps, 0, 4), { log: 0, relative: 1, clipped: false });
   assert.equal(valueAt(maps, 1, 0).clipped, true);
-  assert.deepEqual(valuesAt(maps, 0, [0, 0], null), ['1.000 of peak, ln 0.00']);
-  assert.equal(valuesAt(maps, 1, [0.2, 0.2], new Float32Array(9))[1], 'gain 0.00 nats');
+  assert.deepEqual(valuesAt(maps, 0, [0, 0], null), ['1.000 of peak', 'ln 0.00']);
+  assert.equal(valuesAt(maps, 1, [0.2, 0.2], new Float32Array(9))[2], 'gain 0.00 nats');
 });
 
 test('the border of a peak is a closed contour around it', () => {
@@ -171,18 +206,22 @@ test('the border of a peak is a closed contour around it', () => {
 });
 
 test('measures as text', () => {
-  assert.deepEqual(layerMeasures(maps, 1, false).lines, [
-    'peak +10.0, −10.0 cm',
-    '50 % 100, 95 % 1000 cm²',
-    'ridge, 30° off · entropy 10.21',
+  assert.deepEqual(layerMeasures(maps, 1, false).cells, [
+    '+10.0, −10.0 cm',
+    '100',
+    '1000',
+    '10.21',
+    'ridge 90°, 3.0:1, 30° off expected',
   ]);
-  assert.match(layerMeasures(maps, 1, true).lines[0], /^peak 110\.0, 190\.0 cm$/);
-  assert.match(layerMeasures(maps, 0, false).lines[2], /^round/);
-  assert.match(layerMeasures(maps, 2, false).lines[2], /^ring, radius 6\.2 cm/);
+  assert.equal(layerMeasures(maps, 1, true).cells[0], '110.0, 190.0 cm');
+  assert.deepEqual(
+    [0, 1, 2].map((layer) => shapeName(maps, layer)),
+    ['round', 'ridge 90°, 3.0:1', 'ring, radius 6.2 cm'],
+  );
   const { description } = layerMeasures(maps, 2, false);
   assert.match(description, /around \+3\.0, −1\.0 cm from the truth, over 90 % of the circle/);
   const noDirection = { ...maps, numbers: { ...maps.numbers, deviation: [null, null, null] } };
-  assert.match(layerMeasures(noDirection, 1, false).lines[2], /^ridge at 90°/);
+  assert.equal(layerMeasures(noDirection, 1, false).cells[4], 'ridge 90°, 3.0:1');
   assert.equal(mapTitle(maps), 'Likelihood. Fused: sum of likelihoods (unimodal)');
   assert.equal(
     mapTitle({ ...maps, quantity: 'posterior', layers: ['image', 'fused'] }),

@@ -19,8 +19,8 @@ const LABEL_OFFSET = 5; // px from the axis
  */
 export function drawCurve(context, layer, side, options) {
   const { maps, trace, name, shade } = layer;
-  const { axes, zoom, textColour, withY, hover } = options;
-  drawXAxis(context, mapAxis(maps, 0, side, axes, zoom), side, textColour);
+  const { axes, zoom, textColour, withY, named, hover } = options;
+  drawXAxis(context, mapAxis(maps, 0, side, axes, zoom), side, textColour, named);
   if (withY) drawRange(context, layer, side);
   const [axis] = maps.axes;
   /** @param {number} offset */

@@ -27,7 +27,8 @@ import { offsetOf } from './map_values.js';
  * @property {number} zoom
  * @property {boolean} cloud whether particles are drawn
  * @property {string} textColour
- * @property {boolean} withY whether the y axis has labels
+ * @property {boolean} withY whether the y axis has ticks
+ * @property {boolean} named whether the axes have names
  * @property {number[] | null} hover offset of the crosshair
  *
  * @typedef {(position: number[]) => number[]} Projection from values of the axes to px
@@ -35,8 +36,9 @@ import { offsetOf } from './map_values.js';
 
 /** px around the square of a map. */
 export const MARGIN = {
-  left: scaled(44),
-  bottom: scaled(30),
+  left: scaled(28),
+  bottom: scaled(17),
+  name: scaled(14), // for the name of an axis
   top: 1,
   right: scaled(5),
   gap: scaled(9),
@@ -53,7 +55,16 @@ const BORDER_OPACITIES = [0.95, 0.5]; // the smallest region first
 
 /** @typedef {[colour: string, width: number]} Stroke */
 /** @type {Stroke} */
-const HALO = ['rgb(255 255 255 / 0.55)', 3.5];
+const HALO = ['rgb(255 255 255 / 0.55)', 3];
+/** @type {Stroke[]} */
+const WHITE = [
+  ['rgb(0 0 0 / 0.6)', 3],
+  ['#fff', 1.25],
+];
+// px; the marks leave the middle open, so that a sharp peak stays visible, and none covers another one.
+const MARK = { circle: 6, corner: 10, leg: 4, square: 9, arms: [13, 19], gap: 9 };
+/** Two standard deviations, and the standard deviation of a Gaussian from the area of its 95 % region. */
+const [SIGMAS, AREA95] = [2, Math.PI * 5.991];
 const DIRECTIONS = [
   [1, 0],
   [0, 1],
@@ -114,10 +125,10 @@ export function drawMap(context, layer, side, options) {
  * @param {number} side
  * @param {MapOptions} options
  */
-function drawAxes(context, maps, side, { axes, zoom, textColour, withY }) {
+function drawAxes(context, maps, side, { axes, zoom, textColour, withY, named }) {
   const x = mapAxis(maps, 0, side, axes, zoom);
   const y = withY ? mapAxis(maps, 1, side, axes, zoom) : null;
-  drawXAxis(context, x, side, textColour);
+  drawXAxis(context, x, side, textColour, named);
   if (!y) return;
   context.beginPath();
   context.textAlign = 'right';
@@ -128,10 +139,11 @@ function drawAxes(context, maps, side, { axes, zoom, textColour, withY }) {
     context.fillText(text, -5, side - place);
   }
   context.stroke();
+  if (!named) return;
   context.textAlign = 'center';
   context.textBaseline = 'top';
   context.save();
-  context.translate(-MARGIN.left + 1, side / 2);
+  context.translate(1 - MARGIN.left - MARGIN.name, side / 2);
   context.rotate(-Math.PI / 2);
   context.fillText(y.label, 0, 0);
   context.restore();
@@ -162,8 +174,9 @@ export function mapAxis(maps, i, side, axes, zoom) {
  * @param {ReturnType<typeof mapAxis>} x
  * @param {number} side px
  * @param {string} textColour
+ * @param {boolean} named whether it has its name
  */
-export function drawXAxis(context, x, side, textColour) {
+export function drawXAxis(context, x, side, textColour, named) {
   context.font = FONT;
   context.fillStyle = context.strokeStyle = textColour;
   context.lineWidth = 1;
@@ -176,6 +189,7 @@ export function drawXAxis(context, x, side, textColour) {
     context.fillText(text, place, side + scaled(5));
   }
   context.stroke();
+  if (!named) return;
   context.textAlign = 'center';
   context.fillText(x.label, side / 2, side + scaled(18));
 }
@@ -230,7 +244,7 @@ function drawBorder(context, segments, side, zoom, opacity) {
 }
 
 /**
- * Draws particles, truth, estimates, the end effector and the expected ridge in contact, and the crosshair.
+ * Draws particles, the ridge or ring, truth, estimates, the end effector and the expected ridge in contact, and the crosshair.
  * @param {Context} context
  * @param {Layer} layer
  * @param {number} side
@@ -245,6 +259,7 @@ function drawMarks(context, layer, side, { cloud, zoom, hover }) {
     return [((1 + x) / 2) * side, ((1 - y) / 2) * side];
   };
   const centrePx = project(centre);
+  drawShape(context, layer, side, zoom, project);
   if (trace.contact[step] && expected !== null)
     drawExpectedRidge(context, centrePx, expected, side);
   if (trace.contact[step] && effector) drawEffector(context, project(effector));
@@ -277,43 +292,79 @@ function drawExpectedRidge(context, [x, y], direction, side) {
 }
 
 /**
- * Draws a square.
+ * Draws the ring fitted to the 50 % region, or the long axis of a ridge over two standard deviations to both sides.
  * @param {Context} context
- * @param {number[]} position px
+ * @param {Layer} layer
+ * @param {number} side px
+ * @param {number} zoom
+ * @param {Projection} project
  */
-function drawEffector(context, [x, y]) {
-  /** @type {Stroke[]} */
-  const strokes = [
-    ['rgb(0 0 0 / 0.6)', 3.5],
-    ['#fff', 1.5],
-  ];
-  strokeAll(context, strokes, () => {
-    context.moveTo(x - 4, y - 4);
-    for (const [dx, dy] of [
-      [4, -4],
-      [4, 4],
-      [-4, 4],
-      [-4, -4],
-    ])
-      context.lineTo(x + dx, y + dy);
+function drawShape(context, { maps, index }, side, zoom, project) {
+  const { numbers, centre, axes } = maps;
+  const scale = (side * zoom) / (2 * axes[0].half_width); // px per unit
+  /** @param {(number | null)[]} offset */
+  const place = (offset) => project(offset.map((d, i) => centre[i] + (d ?? NaN)));
+  if (maps.shape[index] === 'ring') {
+    const [x, y] = place(numbers.ring_centre[index]);
+    context.setLineDash([6, 3]);
+    strokeAll(context, WHITE, () =>
+      context.arc(x, y, scale * (numbers.ring_radius[index] ?? NaN), 0, 2 * Math.PI),
+    );
+    context.setLineDash([]);
+  }
+  if (maps.shape[index] !== 'ridge') return;
+  const [x, y] = place(numbers.mean[index]);
+  const length =
+    SIGMAS *
+    scale *
+    Math.sqrt((numbers.area95[index] * (numbers.elongation[index] ?? NaN)) / AREA95);
+  const [cos, sin] = [Math.cos(numbers.axis[index] ?? NaN), -Math.sin(numbers.axis[index] ?? NaN)];
+  strokeAll(context, WHITE, () => {
+    for (const end of [-1, 1]) {
+      const [endX, endY] = [x + end * length * cos, y + end * length * sin];
+      context.moveTo(
+        x + end * Math.min(MARK.gap, length) * cos,
+        y + end * Math.min(MARK.gap, length) * sin,
+      );
+      context.lineTo(endX, endY);
+      context.moveTo(endX - 4 * sin, endY + 4 * cos);
+      context.lineTo(endX + 4 * sin, endY - 4 * cos);
+    }
   });
 }
 
 /**
- * Draws a cross that is open in the middle, so that it does not cover a sharp peak.
+ * Draws the corners of a square.
+ * @param {Context} context
+ * @param {number[]} position px
+ */
+function drawEffector(context, [x, y]) {
+  const { square, leg } = MARK;
+  strokeAll(context, WHITE, () => {
+    for (const [dx, dy] of [
+      [1, 1],
+      [1, -1],
+      [-1, -1],
+      [-1, 1],
+    ]) {
+      context.moveTo(x + (square - leg) * dx, y + square * dy);
+      context.lineTo(x + square * dx, y + square * dy);
+      context.lineTo(x + square * dx, y + (square - leg) * dy);
+    }
+  });
+}
+
+/**
+ * Draws the arms of a cross.
  * @param {Context} context
  * @param {number[]} position px
  */
 function drawTruth(context, [x, y]) {
-  /** @type {Stroke[]} */
-  const strokes = [
-    ['rgb(0 0 0 / 0.6)', 3.5],
-    ['#fff', 1.5],
-  ];
-  strokeAll(context, strokes, () => {
+  const [from, to] = MARK.arms;
+  strokeAll(context, WHITE, () => {
     for (const [dx, dy] of DIRECTIONS) {
-      context.moveTo(x + 4 * dx, y + 4 * dy);
-      context.lineTo(x + 10 * dx, y + 10 * dy);
+      context.moveTo(x + from * dx, y + from * dy);
+      context.lineTo(x + to * dx, y + to * dy);
     }
   });
 }
@@ -324,37 +375,49 @@ function drawTruth(context, [x, y]) {
  * @param {LineStyle} style
  */
 function drawModalityEstimate(context, [x, y], { stroke }) {
-  strokeAll(context, [HALO, [stroke, 2]], () => context.arc(x, y, 5, 0, 2 * Math.PI));
+  strokeAll(context, [HALO, [stroke, 1.5]], () => context.arc(x, y, MARK.circle, 0, 2 * Math.PI));
 }
 
 /**
- * Draws a diamond.
+ * Draws the corners of a diamond.
  * @param {Context} context
  * @param {number[]} position px
  */
 function drawEstimate(context, [x, y]) {
+  const { corner, leg } = MARK;
   strokeAll(context, [HALO, [lineStyle('fused').stroke, 2]], () => {
-    context.moveTo(x, y - 9);
-    for (const [dx, dy] of DIRECTIONS) context.lineTo(x + 9 * dx, y + 9 * dy);
+    for (const [dx, dy] of DIRECTIONS) {
+      const [tipX, tipY] = [x + corner * dx, y + corner * dy];
+      context.moveTo(tipX - leg * (dx - dy), tipY - leg * (dy - dx));
+      context.lineTo(tipX, tipY);
+      context.lineTo(tipX - leg * (dx + dy), tipY - leg * (dy + dx));
+    }
   });
 }
 
 /**
+ * Draws lines to the crosshair that end before its centre.
  * @param {Context} context
  * @param {number[]} position px
  * @param {number} side
  */
 function drawCrosshair(context, [x, y], side) {
+  const { gap } = MARK;
   /** @type {Stroke[]} */
   const strokes = [
     ['rgb(0 0 0 / 0.35)', 2.5],
     ['rgb(255 255 255 / 0.8)', 1],
   ];
   strokeAll(context, strokes, () => {
-    context.moveTo(0, y);
-    context.lineTo(side, y);
-    context.moveTo(x, 0);
-    context.lineTo(x, side);
+    for (const [from, to] of [
+      [0, -gap],
+      [side, gap],
+    ]) {
+      context.moveTo(from, y);
+      context.lineTo(x + to, y);
+      context.moveTo(x, from);
+      context.lineTo(x, y + to);
+    }
   });
 }
 

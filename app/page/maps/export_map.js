@@ -15,7 +15,8 @@ import { SvgContext } from './svg_context.js';
 const SIDE = 300; // px of a map's square
 const SHEET = { padding: 14, title: 24, bar: 8, footer: 40, pixelRatio: 2 };
 const INK = '#222';
-const COLUMN = SIDE + MARGIN.left + MARGIN.right;
+const LEFT = MARGIN.left + MARGIN.name;
+const COLUMN = SIDE + LEFT + MARGIN.right;
 
 /** @type {Record<string, (sheet: DisplayedMaps, name: string) => Promise<string> | string>} */
 const ACTIONS = {
@@ -152,7 +153,7 @@ function sheetSize({ layers }) {
   const { padding, title, footer } = SHEET;
   return [
     2 * padding + layers.length * COLUMN,
-    padding + title + SIDE + MARGIN.bottom + footer + padding,
+    padding + title + SIDE + MARGIN.bottom + MARGIN.name + footer + padding,
   ];
 }
 
@@ -170,13 +171,13 @@ function drawSheet(context, sheet, width, height) {
   context.fill();
   sheet.layers.forEach((layer, i) => {
     context.save();
-    context.translate(padding + i * COLUMN + MARGIN.left, padding + title);
+    context.translate(padding + i * COLUMN + LEFT, padding + title);
     context.fillStyle = INK;
     context.font = '600 13px system-ui, sans-serif';
     [context.textAlign, context.textBaseline] = ['left', 'alphabetic'];
     context.fillText(`${layer.name} ${sheet.maps.quantity}`, 0, -8);
     if (!isCurve(sheet.maps)) drawColourBar(context, layer);
-    const options = { ...sheet.options, textColour: INK, withY: true, hover: null };
+    const options = { ...sheet.options, textColour: INK, withY: true, named: true, hover: null };
     const draw = isCurve(sheet.maps) ? drawCurve : drawMap;
     draw(context, layer, SIDE, options);
     context.restore();

@@ -1,12 +1,11 @@
-/** The figure of a likelihood map: title, colour bar, canvas and caption. */
+/** The figure of a likelihood map, with its title, shape and canvas, and the colour bar of all maps. */
 
 /** @import { ColourMap } from '../core/palette.js' */
+/** @import { ColourScale } from './map_summary.js' */
 /** @import { Shade } from './map_values.js' */
 
-import { create } from '../core/dom.js';
+import { create, html } from '../core/dom.js';
 import { cssVariable, gradient } from '../core/palette.js';
-import { fixed } from '../core/units.js';
-import { rangeDigits, rangeLabels } from './map_values.js';
 
 /**
  * @typedef {object} Figure of a layer
@@ -14,9 +13,7 @@ import { rangeDigits, rangeLabels } from './map_values.js';
  * @property {HTMLElement} figure
  * @property {HTMLCanvasElement} canvas
  * @property {HTMLElement} head
- * @property {{element: HTMLElement, low: HTMLElement, gradient: HTMLElement, high: HTMLElement}} bar
- * @property {HTMLElement} caption
- * @property {HTMLElement[]} lines
+ * @property {HTMLElement} shape the name and size of the ridge or ring on the map
  * @property {HTMLCanvasElement} cells
  * @property {Shade} shade
  * @property {ColourMap} colourMap
@@ -31,23 +28,17 @@ import { rangeDigits, rangeLabels } from './map_values.js';
  */
 export function createFigure(name, fuses) {
   const label = fuses || name !== 'fused' ? name.replaceAll('+', ' + ') : 'estimate';
-  const [low, high] = [create('b'), create('b')];
-  const colours = create('i');
-  const bar = create('span', { className: 'colours' }, low, colours, high);
-  const head = create('div', { className: 'head' }, create('h3', { textContent: label }), bar);
-  const lines = [create('p'), create('p'), create('p')];
-  const caption = create('figcaption', {}, ...lines);
+  const shape = create('span', { className: 'shape' });
+  const head = create('div', { className: 'head' }, create('h3', { textContent: label }), shape);
   const canvas = create('canvas', { role: 'img', tabIndex: 0 });
-  const figure = create('figure', {}, head, canvas, caption);
+  const figure = create('figure', {}, head, canvas);
   figure.style.setProperty('--line', `var(${cssVariable(fuses ? name : 'fused')})`);
   return {
     name,
     figure,
     canvas,
     head,
-    bar: { element: bar, low, gradient: colours, high },
-    caption,
-    lines,
+    shape,
     cells: create('canvas'),
     shade: { values: new Float32Array(), low: 0, high: 1, clipped: false },
     colourMap: 'viridis',
@@ -56,16 +47,15 @@ export function createFigure(name, fuses) {
 }
 
 /**
- * Shows the colours of a figure and their range.
- * @param {Figure} figure
- * @param {string} title of the quantity
+ * Shows the colours of all maps, their range, and the quantity with its unit.
+ * @param {HTMLElement} host
+ * @param {ColourMap} colourMap
+ * @param {ColourScale} scale
  */
-export function updateColourBar({ bar, shade, colourMap }, title) {
-  const digits = rangeDigits(shade);
-  const isRatio = shade.low === -shade.high;
-  const [low, high] = isRatio ? ['', `±${fixed(shade.high, digits)}`] : rangeLabels(shade, digits);
-  [bar.low.textContent, bar.high.textContent] = [low, high];
-  bar.gradient.style.background = gradient(colourMap);
-  const [from, to] = rangeLabels(shade, 2);
-  bar.element.title = `Colour: ${title}, from ${from} to ${to}`;
+export function showColourBar(host, colourMap, { low, high, label }) {
+  const [from, to] = host.querySelectorAll('b');
+  [from.textContent, to.textContent] = [low, high];
+  html('i', host).style.background = gradient(colourMap);
+  const text = html('span', host);
+  text.textContent = text.title = label;
 }

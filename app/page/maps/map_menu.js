@@ -109,6 +109,7 @@ export function mapMenu(menu, button, store, maps) {
   const setLayers = bindExport(html('.export', menu), () => maps.displayed);
   menu.addEventListener('beforetoggle', (event) => {
     if (/** @type {ToggleEvent} */ (event).newState !== 'open') return;
+    maps.showMeasures();
     const { top, left } = html('#maps').getBoundingClientRect(); // the maps stay visible
     [menu.style.top, menu.style.right] = [`${top}px`, `${innerWidth - left + GAP}px`];
     setLayers(maps.displayed?.layers.map(({ name }) => name) ?? []);

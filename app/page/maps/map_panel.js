@@ -10,19 +10,24 @@
 /** @import { Maps, Range, Scale } from './map_values.js' */
 
 import { MAP_QUANTITIES } from '../core/constants.js';
-import { context2d, html } from '../core/dom.js';
+import { context2d, create, html } from '../core/dom.js';
 import { colour } from '../core/palette.js';
 import { displayName, mainName, sentence } from '../core/units.js';
 import { choice } from '../widgets/pickers.js';
 import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap, paintCells } from './draw_map.js';
-import { createFigure, updateColourBar } from './map_figure.js';
+import { createFigure, showColourBar } from './map_figure.js';
+import { MapReadout } from './map_readout.js';
 import {
   QUANTITY_NAMES,
+  axesText,
+  colourScale,
   layerMeasures,
   mapTitle,
+  measureColumns,
   pairwiseMeasures,
   positionText,
+  shapeName,
   valuesAt,
 } from './map_summary.js';
 import { borders, isCurve, shades } from './map_values.js';
@@ -71,6 +76,8 @@ export class MapPanel {
   #comparisonName = '';
   /** Offset of the crosshair. @type {number[] | null} */
   #hover = null;
+  #hoverLayer = 0; // its map
+  #readout;
   /** Whether some maps of the run did not fit into the close-up. */
   #wide = false;
   #side = 0; // px
@@ -86,6 +93,7 @@ export class MapPanel {
     this.#store = store;
     this.#requestMaps = requestMaps;
     this.#host = html('#heatmaps', panel);
+    this.#readout = new MapReadout(html('#maps-readout', panel));
     new ResizeObserver(() => this.#resize()).observe(this.#host);
     store.listen((_, changed) => {
       if (changed.has('map')) this.#showSwitch();
@@ -216,6 +224,7 @@ export class MapPanel {
     if (!maps || !trace) return;
     if (!this.#side) this.#side = this.#availableSide();
     this.#figures.forEach((figure, index) => this.#drawLayer(figure, { maps, trace, index }));
+    this.#showReadout();
   }
 
   /** Computes the colours and borders of the maps. */
@@ -236,13 +245,64 @@ export class MapPanel {
       figure.borders =
         regions === 'shown' && !isCurve(maps) ? borders(maps, layer, REGION_SHARES) : [];
       if (!isCurve(maps)) paintCells(figure.cells, figure.shade, maps.size, figure.colourMap);
-      figure.bar.element.hidden = isCurve(maps);
-      updateColourBar(figure, this.#title());
+      figure.head.title = layerMeasures(maps, layer, this.#world).description;
     });
     this.#showTitle(reference);
-    const pairs = html('#maps-pairs', this.#panel);
-    pairs.textContent = pairs.title = pairwiseMeasures(maps);
+    this.#showColours(maps, reference);
+    html('#maps-axes', this.#panel).textContent = axesText(maps, this.#world);
+    if (html('#maps-options', this.#panel).matches(':popover-open')) this.showMeasures();
     this.redraw();
+  }
+
+  /**
+   * @param {Maps} maps
+   * @param {Reference | null} reference
+   */
+  #showColours(maps, reference) {
+    const bar = html('#maps-scale', this.#panel);
+    bar.hidden = isCurve(maps);
+    const { scale, range } = this.#store.state;
+    const layers = this.#figures.map(({ name, shade }, i) => ({
+      name,
+      shade,
+      peak: maps.log_max[i],
+    }));
+    const labels = colourScale(
+      maps.quantity,
+      /** @type {Scale} */ (scale),
+      /** @type {Range} */ (range),
+      layers,
+      reference?.name ?? '',
+    );
+    showColourBar(bar, this.#figures[0].colourMap, labels);
+  }
+
+  /** Fills the table of measures in the menu. */
+  showMeasures() {
+    const maps = this.#maps;
+    if (!maps) return;
+    const table = html('#maps-measures', this.#panel);
+    html('thead', table).replaceChildren(
+      create(
+        'tr',
+        {},
+        create('td'),
+        ...measureColumns(maps).map((textContent) => create('th', { scope: 'col', textContent })),
+      ),
+    );
+    html('tbody', table).replaceChildren(
+      ...this.#figures.map(({ name }, layer) =>
+        create(
+          'tr',
+          {},
+          create('th', { scope: 'row', textContent: displayName(name) }),
+          ...layerMeasures(maps, layer, this.#world).cells.map((textContent) =>
+            create('td', { textContent }),
+          ),
+        ),
+      ),
+    );
+    html('#maps-pairs', this.#panel).textContent = pairwiseMeasures(maps);
   }
 
   /** @param {Reference | null} reference */
@@ -304,7 +364,7 @@ export class MapPanel {
     canvas.addEventListener('pointermove', (event) => this.#point(event, layer));
     canvas.addEventListener('pointerleave', () => this.#setHover(null));
     canvas.addEventListener('pointerdown', (event) => event.preventDefault()); // keeps the focus
-    canvas.addEventListener('keydown', (event) => this.#moveCrosshair(event));
+    canvas.addEventListener('keydown', (event) => this.#moveCrosshair(event, layer));
     canvas.addEventListener('blur', () => this.#setHover(null));
   }
 
@@ -316,14 +376,14 @@ export class MapPanel {
     const width = clientWidth - parseFloat(paddingLeft) - parseFloat(paddingRight);
     const height = clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom);
     this.#arrange(count);
-    const { caption, head } = this.#figures[0];
-    /** @param {number} rows two have no captions */
+    const { head } = this.#figures[0];
+    /** @param {number} rows */
     const side = (rows) => {
       const columns = Math.ceil(count / rows);
       const horizontal =
         (width - MARGIN.left - (columns - 1) * MARGIN.gap - columns * MARGIN.right) / columns;
-      const texts = head.offsetHeight + (rows === 1 ? caption.offsetHeight : 0);
-      return Math.floor(Math.min(horizontal, height / rows - MARGIN.bottom - MARGIN.top - texts));
+      const vertical = height / rows - MARGIN.bottom - MARGIN.top - head.offsetHeight;
+      return Math.floor(Math.min(horizontal, vertical));
     };
     const [one, two] = [side(1), count > MAX_COLUMNS ? side(2) : 0];
     if (two > one) this.#arrange(Math.ceil(count / 2));
@@ -369,6 +429,7 @@ export class MapPanel {
       cloud: cloud === 'shown',
       textColour: colour('muted'),
       withY: layer % this.#columns === 0,
+      named: false,
       hover: this.#hover,
     };
   }
@@ -393,11 +454,10 @@ export class MapPanel {
     context.translate(left, MARGIN.top);
     const draw = isCurve(maps) ? drawCurve : drawMap;
     draw(context, { ...figure, index, maps, trace }, side, this.#options(index));
-    const { lines, description } = layerMeasures(maps, index, this.#world);
-    canvas.ariaLabel = `${name}: ${this.#title()}; ${description}. Arrow keys read values.`;
-    figure.caption.title = description;
-    const texts = this.#hover ? this.#values(maps, index, this.#hover) : lines;
-    figure.lines.forEach((line, i) => (line.textContent = texts[i] ?? ''));
+    figure.shape.textContent = this.#hover
+      ? this.#shownValue(maps, index, this.#hover)
+      : shapeName(maps, index);
+    canvas.ariaLabel = `${name}: ${this.#title()}; ${figure.head.title}. Arrow keys read values.`;
   }
 
   /**
@@ -411,6 +471,17 @@ export class MapPanel {
   }
 
   /**
+   * Returns the value in the units of the colours.
+   * @param {Maps} maps
+   * @param {number} layer
+   * @param {number[]} offset
+   */
+  #shownValue(maps, layer, offset) {
+    const [relative, log, gain] = this.#values(maps, layer, offset);
+    return gain ?? (this.#store.state.scale === 'log' ? log : relative);
+  }
+
+  /**
    * @param {PointerEvent} event
    * @param {number} layer
    */
@@ -421,14 +492,15 @@ export class MapPanel {
     const y = (event.offsetY - MARGIN.top) / this.#side;
     const inside = x >= 0 && x <= 1 && y >= 0 && y <= 1;
     const offset = [(2 * x - 1) * halfX, (1 - 2 * y) * halfY];
-    this.#setHover(inside ? offset.slice(0, this.#maps.axes.length) : null);
+    this.#setHover(inside ? offset.slice(0, this.#maps.axes.length) : null, layer);
   }
 
   /**
    * Moves the crosshair cell by cell with the arrow keys and announces the values.
    * @param {KeyboardEvent} event
+   * @param {number} layer
    */
-  #moveCrosshair(event) {
+  #moveCrosshair(event, layer) {
     if (event.key === 'Escape') this.#setHover(null);
     const direction = ARROWS[event.key];
     const maps = this.#maps;
@@ -441,21 +513,36 @@ export class MapPanel {
       const limit = half / this.#zoom - cell / 2;
       return Math.min(Math.max(from[i] + (event.shiftKey ? 5 : 1) * cell * d, -limit), limit);
     });
-    this.#setHover(offset);
+    this.#setHover(offset, layer);
     const values = this.#figures.map(
-      ({ name }, layer) => `${displayName(name)} ${this.#values(maps, layer, offset).join(', ')}`,
+      ({ name }, i) => `${displayName(name)} ${this.#values(maps, i, offset).join(', ')}`,
     );
     html('#maps-announcement', this.#panel).textContent =
       `${positionText(maps, offset, this.#world)}: ${values.join('; ')}`;
   }
 
-  /** @param {number[] | null} offset */
-  #setHover(offset) {
+  /**
+   * @param {number[] | null} offset
+   * @param {number} [layer]
+   */
+  #setHover(offset, layer = 0) {
     if (offset === this.#hover) return;
-    this.#hover = offset;
-    html('#maps-value', this.#panel).textContent =
-      offset && this.#maps ? `at ${positionText(this.#maps, offset, this.#world)}` : '';
+    [this.#hover, this.#hoverLayer] = [offset, layer];
     this.redraw();
+  }
+
+  /** Shows the values at the crosshair beside it. */
+  #showReadout() {
+    const [maps, offset] = [this.#maps, this.#hover];
+    const pointed = this.#figures[this.#hoverLayer];
+    if (!maps || !offset || !pointed) return this.#readout.hide();
+    const { left, top } = pointed.canvas.getBoundingClientRect();
+    const [x, y] = offset.map((d, i) => (d * this.#zoom) / maps.axes[i].half_width);
+    const values = this.#values(maps, this.#hoverLayer, offset);
+    this.#readout.show(positionText(maps, offset, this.#world), values, {
+      x: left + this.#leftMargin(this.#hoverLayer) + (this.#side * (1 + x)) / 2,
+      y: top + MARGIN.top + (this.#side * (1 - (y ?? 0))) / 2,
+    });
   }
 }
 

@@ -1,9 +1,9 @@
-/** Texts about likelihood maps: their measures, and the values at the crosshair. */
+/** Texts about likelihood maps: measures, colours, and the values at the crosshair. */
 
-/** @import { Maps } from './map_values.js' */
+/** @import { Maps, Range, Scale, Shade } from './map_values.js' */
 
-import { displayUnit, fixed, percent, signed } from '../core/units.js';
-import { areaUnit, cellAt, valueAt } from './map_values.js';
+import { displayName, displayUnit, fixed, percent, signed } from '../core/units.js';
+import { areaUnit, cellAt, rangeDigits, rangeLabels, valueAt } from './map_values.js';
 
 export const QUANTITY_NAMES = { likelihood: 'Likelihood', posterior: 'Posterior' };
 
@@ -41,7 +41,7 @@ export const mapTitle = ({ quantity, layers, rule, note }) =>
   QUANTITY_NAMES[quantity] + (note && `, ${note}`) + (layers.length > 2 ? `. Fused: ${rule}` : '');
 
 /**
- * Returns the measures of a layer as lines below its map, and as one description.
+ * Returns the measures of a layer as cells of a table (`measureColumns`), and as one description.
  * @param {Maps} maps
  * @param {number} layer
  * @param {boolean} world whether the axes show world coordinates
@@ -56,17 +56,78 @@ export function layerMeasures(maps, layer, world) {
   const entropy = fixed(numbers.entropy[layer] + Math.log(scale), 2); // of a density per unit of area
   const shape = shapeText(maps, layer);
   return {
-    lines: [
-      `peak ${peak}`,
-      `50 % ${area50}, 95 % ${area95} ${unit}`,
-      [shape.short, `entropy ${entropy}`].filter(Boolean).join(' · '),
-    ],
+    cells: [peak, area50, area95, entropy, shape.short],
     description:
       `peak at ${peak}, ln ${maps.quantity} ${fixed(logMax[layer], 2)} at the peak and ${fixed(numbers.truth[layer], 2)} relative to it at the truth; ` +
       `50 % of the ${maps.quantity} within ${area50} ${unit}, 95 % within ${area95} ${unit}; entropy ${entropy} nats (density per ${unit})` +
       shape.long,
   };
 }
+
+/**
+ * Names the columns of the measures, with their units.
+ * @param {Maps} maps
+ */
+export function measureColumns({ axes }) {
+  const { unit } = areaUnit(axes);
+  return ['peak', `50 % (${unit})`, `95 % (${unit})`, 'entropy (nats)', 'shape'];
+}
+
+/**
+ * Names the axes of the maps, with their units.
+ * @param {Maps} maps
+ * @param {boolean} world whether they show world coordinates
+ */
+export function axesText({ axes }, world) {
+  const units = axes.map((axis) => displayUnit(axis).unit);
+  const common = units.every((unit) => unit === units[0]);
+  const texts = axes.map(({ name }, i) => {
+    const short = displayName(name);
+    const label = world ? short : `Δ${short.length > 1 ? ' ' : ''}${short}`;
+    const unit = units[i] && (!common || i === axes.length - 1) ? ` (${units[i]})` : '';
+    return `${i ? '↑' : '→'} ${label}${unit}`;
+  });
+  return texts.join('  ');
+}
+
+/** @typedef {{low: string, high: string, label: string}} ColourScale labels of the ends of the colour bar, and of all of it */
+
+/**
+ * Returns the labels of the colour bar of all maps.
+ * @param {Maps['quantity']} quantity
+ * @param {Scale} scale
+ * @param {Range} range
+ * @param {{name: string, shade: Shade, peak: number}[]} layers peak: log-likelihood
+ * @param {string} reference name of the maps that ratios are relative to; empty for likelihoods
+ * @returns {ColourScale}
+ */
+export function colourScale(quantity, scale, range, layers, reference) {
+  const log = scale === 'log' && !reference;
+  const own = range !== 'same';
+  if (!reference && !log) {
+    const peak = own ? 'the peak of each map' : 'the highest peak';
+    return { low: '0', high: '1', label: `${quantity} relative to ${peak}` };
+  }
+  const ends = layers.map(({ shade, peak }) => {
+    const shown = log && own ? { ...shade, low: shade.low - peak, high: 0 } : shade;
+    const [low, high] = rangeLabels(shown, rangeDigits(shade));
+    return { low, high };
+  });
+  const common = ends.every(({ low, high }) => low === ends[0].low && high === ends[0].high);
+  const what = log
+    ? `log ${quantity}${own ? ', below the peak of each map' : ''}, nats`
+    : `log density ratio to ${reference}, nats`;
+  if (common) return { ...ends[0], label: what };
+  const scales = ends.map(({ low, high }, i) => `${layers[i].name} ${log ? low : high}`);
+  return { low: '', high: log ? '0' : '', label: `${what}; ends: ${scales.join(', ')}` };
+}
+
+/**
+ * Names the shape of a layer that is drawn on its map, with its size.
+ * @param {Maps} maps
+ * @param {number} layer
+ */
+export const shapeName = (maps, layer) => shapeText(maps, layer).short.replace(/, \d+° off.*/, '');
 
 /**
  * Describes the shape of a layer, in short and in full.
@@ -76,7 +137,8 @@ export function layerMeasures(maps, layer, world) {
 function shapeText({ numbers, shape: shapes, axes }, layer) {
   const [deviation, axis, shape] = [numbers.deviation[layer], numbers.axis[layer], shapes[layer]];
   if (shape === null) return { short: '', long: '' };
-  const ratio = `; length-to-width ratio ${fixed(numbers.elongation[layer], 1)}; `;
+  const elongation = fixed(numbers.elongation[layer], 1);
+  const ratio = `; length-to-width ratio ${elongation}; `;
   if (shape === 'ring') {
     const { unit, scale } = displayUnit(axes[0]);
     const radius = `${fixed(scale * (numbers.ring_radius[layer] ?? NaN))} ${unit}`;
@@ -88,14 +150,11 @@ function shapeText({ numbers, shape: shapes, axes }, layer) {
     };
   }
   if (shape !== 'ridge') return { short: shape, long: `${ratio}shape: ${shape}` };
-  if (deviation === null) {
-    const text = `ridge at ${fixed(degrees(axis), 0)}°`;
-    return { short: text, long: `${ratio}${text} from the x axis` };
-  }
-  const off = fixed(degrees(deviation), 0);
+  const direction = `ridge ${fixed(degrees(axis), 0)}°`;
+  const off = deviation === null ? '' : `, ${fixed(degrees(deviation), 0)}° off`;
   return {
-    short: `ridge, ${off}° off`,
-    long: `${ratio}ridge, ${off}° off the direction that the task expects`,
+    short: `${direction}, ${elongation}:1${off && `${off} expected`}`,
+    long: `${ratio}${direction} from the x axis${off && `${off} the direction that the task expects`}`,
   };
 }
 
@@ -116,7 +175,7 @@ export function pairwiseMeasures({ layers, numbers }) {
 }
 
 /**
- * Returns the values at the crosshair as lines below a map.
+ * Returns the values of a layer at the crosshair.
  * @param {Maps} maps
  * @param {number} layer
  * @param {number[]} offset
@@ -125,7 +184,7 @@ export function pairwiseMeasures({ layers, numbers }) {
 export function valuesAt(maps, layer, offset, ratios) {
   const cell = cellAt(maps, offset);
   const { log, relative, clipped } = valueAt(maps, layer, cell);
-  const lines = [`${fixed(relative, 3)} of peak, ln ${clipped ? '< ' : ''}${fixed(log, 2)}`];
-  if (ratios) lines.push(`gain ${signed(ratios[cell], 2)} nats`);
-  return lines;
+  const values = [`${fixed(relative, 3)} of peak`, `ln ${clipped ? '< ' : ''}${fixed(log, 2)}`];
+  if (ratios) values.push(`gain ${signed(ratios[cell], 2)} nats`);
+  return values;
 }

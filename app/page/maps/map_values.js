@@ -8,6 +8,7 @@ import { displayUnit, fixed, signed, wrapDegrees } from '../core/units.js';
 /**
  * @typedef {object} MapStatistics measures of each layer; null where a measure does not exist
  * @property {(number | null)[]} truth log-likelihood at the true position, relative to the peak
+ * @property {number[][]} mean offsets of the mean from the centre
  * @property {number[]} entropy nats, of a density per area in the units of the axes
  * @property {number[]} area50 in the units of the axes
  * @property {number[]} area95
