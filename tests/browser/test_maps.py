@@ -202,6 +202,28 @@ def test_quantity_is_a_switch_with_a_key_in_the_permalink_and_can_be_undone(open
     page.page.keyboard.press("Control+z")
     page.until("() => location.search.includes('map=posterior')")
     assert page.page.locator("#maps-map input:checked").input_value() == page.state["map"] == "posterior"
+    check_tiles(page)
+
+
+def check_tiles(page: Any) -> None:
+    """Small maps of several steps: each tile has its own content and moves the cursor."""
+    page.page.evaluate("() => document.querySelector('#maps-tiles input[value=several]').click()")
+    page.until("() => location.search.includes('tiles=several')")
+    assert not page.page.locator("#heatmaps").is_visible()
+    heads = page.page.locator("#map-tiles .step")
+    steps = [int(text) for text in page.page.locator("#map-tiles .step span:first-child").all_text_contents()]
+    assert steps == [11, 12, 15, 20, 25, 30, 35, 40]
+    assert heads.nth(0).get_attribute("aria-label") == "Step 11, free"
+    assert heads.nth(1).get_attribute("aria-label") == "Step 12, contact"
+    content = "[...document.querySelectorAll('#map-tiles canvas')].map((c) => c.toDataURL())"
+    page.until(f"() => new Set({content}).size === 24")
+    page.screenshot("maps-tiles")
+    page.page.locator("#map-tiles canvas").nth(8 + 1).click()  # haptics at the first contact
+    page.settle(12)
+    assert page.page.locator("#map-tiles .step.current").first.get_attribute("data-step") == "12"
+    page.page.evaluate("() => document.querySelector('#maps-tiles input').click()")
+    page.until("() => !location.search.includes('tiles=')")
+    page.page.locator("#heatmaps canvas").first.wait_for()
 
 
 def test_summary_and_zoom_of_a_step(open_page: Any) -> None:

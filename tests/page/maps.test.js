@@ -20,6 +20,8 @@ import {
   rangeLabels,
   readMaps,
   shades,
+  tileShade,
+  tileSteps,
   valueAt,
 } from '../../app/page/maps/map_values.js';
 import { SvgContext } from '../../app/page/maps/svg_context.js';
@@ -177,7 +179,11 @@ test('the colour bar names its quantity, its unit, and scales that differ', () =
     label: 'likelihood relative to the peak of each map',
   });
   assert.equal(labels('normalised', 'same').label, 'likelihood relative to the highest peak');
-  assert.deepEqual(labels('log', 'same'), { low: '≤−38', high: '2', label: 'log likelihood, nats' });
+  assert.deepEqual(labels('log', 'same'), {
+    low: '≤−38',
+    high: '2',
+    label: 'log likelihood, nats',
+  });
   assert.deepEqual(labels('log', 'own'), {
     low: '',
     high: '0',
@@ -186,6 +192,24 @@ test('the colour bar names its quantity, its unit, and scales that differ', () =
   });
   assert.equal(labels('log', 'own', 'step 3').label, 'log density ratio to step 3, nats');
   assert.equal(axesText(maps, false), '→ Δ hinge x  ↑ Δ hinge y (cm)');
+});
+
+test('small maps show the change to contact and the steps around the cursor', () => {
+  const contact = Array.from({ length: 100 }, (_, t) => t > 11 && t < 33);
+  const steps = (/** @type {number} */ step) => tileSteps(contact, step).map((tile) => tile.step);
+  assert.deepEqual(steps(27), [11, 12, 15, 20, 27, 30, 35, 40]);
+  assert.deepEqual(steps(0), [11, 12, 0, 5, 10, 15, 20, 25]);
+  assert.deepEqual(steps(99), [11, 12, 70, 75, 80, 85, 90, 99]);
+  assert.deepEqual(tileSteps(contact, 27)[1], { step: 12, phase: 'contact', pair: true });
+  const short = tileSteps([0, 0, 0], 1).map((tile) => tile.step);
+  assert.deepEqual(short, [0, 1, 2]);
+  const { values, low, high } = tileShade(maps, 2, 'normalised');
+  assert.deepEqual([values[4], low, high], [1, 0, 1]);
+  assert.ok(Math.abs(values[0] - Math.exp(-20)) < 1e-6);
+  assert.deepEqual(
+    [tileShade(maps, 2, 'log').values[0], tileShade(maps, 2, 'log').low],
+    [-20, -40],
+  );
 });
 
 test('values of cells', () => {

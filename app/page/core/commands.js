@@ -28,6 +28,7 @@ const RADIOS = [
   ['#components', 'Component'],
   ['#weights', 'Weights'],
   ['#maps-map', 'Maps'],
+  ['#maps-tiles', 'Maps'],
 ];
 
 /**

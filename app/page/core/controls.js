@@ -79,7 +79,7 @@ function bindButtons(page, showHelp) {
     ['#largest-error', () => page.goToLargestError()],
   ];
   for (const [selector, action] of actions) html(selector).addEventListener('click', action);
-  for (const selector of ['#heatmaps', '#camera'])
+  for (const selector of ['#heatmaps', '#map-tiles', '#camera'])
     html(selector).addEventListener(
       'wheel',
       (event) => {

@@ -100,7 +100,9 @@ export class Page {
     this.theme = new Theme((dark) => this.#changeTheme(dark));
     this.clock = new Clock(store);
     this.timeline = new Timeline(html('#timeline .body'), store);
-    this.maps = new MapPanel(html('#maps'), store, (cursor) => this.socket.requestMaps(cursor));
+    this.maps = new MapPanel(html('#maps'), store, (cursor, size) =>
+      this.socket.requestMaps(cursor, size),
+    );
     this.adaptMapMenu = mapMenu(html('#maps-options'), html('#maps-view'), store, this.maps);
     this.camera = new Camera(html('#camera'), store);
     this.stepTable = new StepTable(html('#step-table'));

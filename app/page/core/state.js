@@ -40,6 +40,7 @@ import { displayName } from './units.js';
  * @property {string} regions of 50 and 95 % on the maps: `shown` or `hidden`
  * @property {string} cloud of particles on the maps: `hidden` or `shown`
  * @property {string} zoom of the maps: `fit`, `1` or `4`
+ * @property {string} tiles `one` step on the maps, or `several` small ones, with free motion beside contact
  * @property {string} beside maps of the comparison run: `alone` if they are not used, `gain` for the difference
  * @property {string} hide hidden layers of the 3D scene, comma-separated
  * @property {string} ground map on the floor of the 3D scene
@@ -92,6 +93,7 @@ const CHOICES = {
   zoom: ['fit', '1', '4'],
   cloud: ['hidden', 'shown'],
   beside: ['alone', 'gain'],
+  tiles: ['one', 'several'],
   start: ['offset', 'truth'],
 };
 /** Keys with any text, and their defaults. */

@@ -40,8 +40,8 @@ export class ViewSocket {
   #serial = 0;
   /** Next message. @type {{cursor: Message, inputTime: number | null} | null} */
   #next = null;
-  /** Request for the maps of another step, between two cursors. @type {{cursor: Message, resolve: (maps: Maps) => void, serial: number} | null} */
-  #request = null;
+  /** Requests for the maps of other steps, between cursors. @type {{cursor: Message, resolve: (maps: Maps | null) => void, serial: number}[]} */
+  #requests = [];
   #newest = 0; // serial of the newest cursor
   /** @type {number | null} */
   #inFlight = null;
@@ -86,14 +86,15 @@ export class ViewSocket {
   }
 
   /**
-   * Requests the fine maps of another step without moving the cursor.
+   * Requests the maps of another step without moving the cursor.
    * @param {Cursor} cursor
-   * @returns {Promise<Maps>}
+   * @param {number} [size]
+   * @returns {Promise<Maps | null>} null if the server has no answer
    */
-  requestMaps(cursor) {
+  requestMaps(cursor, size = MAP_SIZE.fine) {
     return new Promise((resolve) => {
-      const message = { ...cursor, against: '', size: MAP_SIZE.fine, scene: false };
-      this.#request = { cursor: message, resolve, serial: 0 };
+      const message = { ...cursor, against: '', size, scene: false };
+      this.#requests.push({ cursor: message, resolve, serial: 0 });
       this.#flush();
     });
   }
@@ -132,9 +133,10 @@ export class ViewSocket {
 
   #flush() {
     if (this.#inFlight !== null || this.#socket?.readyState !== WebSocket.OPEN) return;
-    if (this.#request && !this.#request.serial) {
-      this.#request.serial = ++this.#serial;
-      this.#sendCursor(this.#request.cursor);
+    const [request] = this.#requests;
+    if (!this.#next && request && !request.serial) {
+      request.serial = ++this.#serial;
+      this.#sendCursor(request.cursor);
     } else if (this.#next) {
       const { cursor, inputTime } = this.#next;
       this.#next = null;
@@ -200,7 +202,7 @@ export class ViewSocket {
     if (!opened) this.#view = null;
     clearTimeout(this.#responseTimer);
     this.#inFlight = null;
-    if (this.#request) this.#request.serial = 0;
+    if (this.#requests.length) this.#requests[0].serial = 0;
     this.#sent.clear();
     this.#handlers.pace(PACE.idle);
     this.#retry('The connection to the server is lost.');
@@ -217,9 +219,8 @@ export class ViewSocket {
   /** @param {ArrayBuffer} data */
   #receiveMaps(data) {
     const maps = readMaps(data);
-    if (this.#request && maps.serial === this.#request.serial) {
-      this.#request.resolve(maps);
-      this.#request = null;
+    if (maps.serial === this.#requests[0]?.serial) {
+      this.#requests.shift()?.resolve(maps);
     } else if (maps.other) {
       this.#comparison = maps;
       return;
@@ -233,6 +234,8 @@ export class ViewSocket {
   /** @param {{type: string, serial: number, step: number, error: string}} message */
   #receive({ type, serial, step, error }) {
     const cause = this.#sent.get(serial) ?? {};
+    if (type !== 'drawn' && serial === this.#requests[0]?.serial)
+      this.#requests.shift()?.resolve(null);
     if (type === 'no_maps') {
       this.#handlers.noMaps(step, cause.size);
       this.#answered(serial);

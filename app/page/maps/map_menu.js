@@ -15,6 +15,14 @@ const GAP = 6; // px between the menu and the panel
 /** @type {{key: keyof State, label: string, options: [value: string, label: string][]}[]} */
 const OPTIONS = [
   {
+    key: 'tiles',
+    label: 'Steps',
+    options: [
+      ['one', 'current step'],
+      ['several', 'several, contact beside free motion'],
+    ],
+  },
+  {
     key: 'others',
     label: 'Other components',
     options: [
@@ -118,7 +126,7 @@ export function mapMenu(menu, button, store, maps) {
     const isCurve = mapPlane(store.state, trace).length === 1;
     OPTIONS.forEach(({ key }, i) => {
       if (key === 'cloud') rows[i].hidden = !trace.has('effective_sample_size') || isCurve;
-      if (['range', 'colours', 'regions'].includes(key)) rows[i].hidden = isCurve;
+      if (['tiles', 'range', 'colours', 'regions'].includes(key)) rows[i].hidden = isCurve;
       if (key === 'others') rows[i].hidden = trace.components.length < 3;
     });
     plane.replaceChildren(...planeOptions(trace));

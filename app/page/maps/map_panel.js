@@ -10,13 +10,15 @@
 /** @import { Maps, Range, Scale } from './map_values.js' */
 
 import { MAP_QUANTITIES } from '../core/constants.js';
-import { context2d, create, html } from '../core/dom.js';
+import { context2d, html } from '../core/dom.js';
 import { colour } from '../core/palette.js';
 import { displayName, mainName, sentence } from '../core/units.js';
 import { choice } from '../widgets/pickers.js';
 import { drawCurve } from './draw_curve.js';
 import { MARGIN, drawMap, paintCells } from './draw_map.js';
 import { createFigure, showColourBar } from './map_figure.js';
+import { showMeasures } from './map_measures.js';
+import { MapTiles } from './map_tiles.js';
 import { MapReadout } from './map_readout.js';
 import {
   QUANTITY_NAMES,
@@ -24,17 +26,15 @@ import {
   colourScale,
   layerMeasures,
   mapTitle,
-  measureColumns,
-  pairwiseMeasures,
   positionText,
   shapeName,
   valuesAt,
 } from './map_summary.js';
-import { borders, isCurve, shades } from './map_values.js';
+import { borders, isCurve, shades, tileShade } from './map_values.js';
 import { formatPin, parsePin } from './pin.js';
 import { mapChoices } from './map_choices.js';
 
-const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom']; // keys of the state
+const OPTIONS = ['scale', 'range', 'axes', 'colours', 'regions', 'cloud', 'zoom', 'tiles']; // keys of the state
 const EXPLANATIONS = {
   likelihood: 'Likelihood of the observation given the state',
   posterior: 'Posterior of the state: prior times likelihood',
@@ -78,6 +78,7 @@ export class MapPanel {
   #hover = null;
   #hoverLayer = 0; // its map
   #readout;
+  #tiles;
   /** Whether some maps of the run did not fit into the close-up. */
   #wide = false;
   #side = 0; // px
@@ -86,17 +87,19 @@ export class MapPanel {
   /**
    * @param {HTMLElement} panel
    * @param {Store} store
-   * @param {(cursor: Cursor) => Promise<Maps>} requestMaps requests the fine maps of another step
+   * @param {(cursor: Cursor, size?: number) => Promise<Maps | null>} requestMaps requests the maps of another step, fine by default
    */
   constructor(panel, store, requestMaps) {
     this.#panel = panel;
     this.#store = store;
     this.#requestMaps = requestMaps;
     this.#host = html('#heatmaps', panel);
+    this.#tiles = new MapTiles(html('#map-tiles', panel), store, requestMaps);
     this.#readout = new MapReadout(html('#maps-readout', panel));
     new ResizeObserver(() => this.#resize()).observe(this.#host);
     store.listen((_, changed) => {
       if (changed.has('map')) this.#showSwitch();
+      if (changed.has('tiles')) this.#side = 0;
       if (OPTIONS.some((key) => changed.has(key))) this.#shade();
       if (changed.has('pin')) this.#restorePin();
     });
@@ -184,7 +187,8 @@ export class MapPanel {
     const shown = content(this.#maps);
     const choices = mapChoices(this.#store.state, this.#trace);
     const maps = await this.#requestMaps({ ...selection, step, angle, ...choices });
-    if (this.#store.state.pin !== pin || this.#pinned || shown !== content(this.#maps)) return;
+    if (!maps || this.#store.state.pin !== pin || this.#pinned || shown !== content(this.#maps))
+      return;
     if (comparable(maps, this.#maps)) this.#setPinned({ maps, selection });
     else this.#store.set({ pin: '' });
   }
@@ -215,13 +219,14 @@ export class MapPanel {
   }
 
   #resize() {
+    if (this.#panel.classList.contains('tiled')) return;
     if (this.#figures.length) this.#side = this.#availableSide();
     this.redraw();
   }
 
   redraw() {
     const [maps, trace] = [this.#maps, this.#trace];
-    if (!maps || !trace) return;
+    if (!maps || !trace || this.#panel.classList.contains('tiled')) return;
     if (!this.#side) this.#side = this.#availableSide();
     this.#figures.forEach((figure, index) => this.#drawLayer(figure, { maps, trace, index }));
     this.#showReadout();
@@ -232,7 +237,11 @@ export class MapPanel {
     const maps = this.#maps;
     if (!maps) return;
     const { scale, range, colours, regions } = this.#store.state;
-    const reference = this.#reference;
+    if (html('#maps-options', this.#panel).matches(':popover-open')) this.showMeasures();
+    const tiled = this.#showTiles(maps);
+    const reference = tiled ? null : this.#reference;
+    this.#showTitle(reference);
+    if (tiled) return;
     const layers = shades(
       maps,
       /** @type {Scale} */ (scale),
@@ -247,11 +256,39 @@ export class MapPanel {
       if (!isCurve(maps)) paintCells(figure.cells, figure.shade, maps.size, figure.colourMap);
       figure.head.title = layerMeasures(maps, layer, this.#world).description;
     });
-    this.#showTitle(reference);
     this.#showColours(maps, reference);
     html('#maps-axes', this.#panel).textContent = axesText(maps, this.#world);
-    if (html('#maps-options', this.#panel).matches(':popover-open')) this.showMeasures();
     this.redraw();
+  }
+
+  /**
+   * Shows the small maps of several steps if they are selected; returns whether they are shown.
+   * @param {Maps} maps
+   */
+  #showTiles(maps) {
+    const { tiles, scale, colours } = this.#store.state;
+    const tiled = tiles === 'several' && !isCurve(maps);
+    html('#map-tiles', this.#panel).hidden = !tiled;
+    this.#panel.classList.toggle('tiled', tiled);
+    if (!tiled || !this.#trace) return tiled;
+    this.#hover = null;
+    this.#readout.hide();
+    const layers = this.#figures.map(({ name }) => name);
+    const shown = { maps, trace: this.#trace, layers, zoom: this.#zoom, content: content(maps) };
+    this.#tiles.draw(shown);
+    const shade = tileShade(maps, 0, /** @type {Scale} */ (scale));
+    const labels = colourScale(
+      maps.quantity,
+      /** @type {Scale} */ (scale),
+      'own',
+      [{ name: '', shade, peak: 0 }],
+      '',
+    );
+    const bar = html('#maps-scale', this.#panel);
+    bar.hidden = false;
+    showColourBar(bar, /** @type {ColourMap} */ (colours), labels);
+    html('#maps-axes', this.#panel).textContent = axesText(maps, false);
+    return tiled;
   }
 
   /**
@@ -279,30 +316,9 @@ export class MapPanel {
 
   /** Fills the table of measures in the menu. */
   showMeasures() {
-    const maps = this.#maps;
-    if (!maps) return;
-    const table = html('#maps-measures', this.#panel);
-    html('thead', table).replaceChildren(
-      create(
-        'tr',
-        {},
-        create('td'),
-        ...measureColumns(maps).map((textContent) => create('th', { scope: 'col', textContent })),
-      ),
-    );
-    html('tbody', table).replaceChildren(
-      ...this.#figures.map(({ name }, layer) =>
-        create(
-          'tr',
-          {},
-          create('th', { scope: 'row', textContent: displayName(name) }),
-          ...layerMeasures(maps, layer, this.#world).cells.map((textContent) =>
-            create('td', { textContent }),
-          ),
-        ),
-      ),
-    );
-    html('#maps-pairs', this.#panel).textContent = pairwiseMeasures(maps);
+    const menu = html('#maps-options', this.#panel);
+    const layers = this.#figures.map(({ name }) => name);
+    if (this.#maps) showMeasures(menu, this.#maps, layers, this.#world);
   }
 
   /** @param {Reference | null} reference */

@@ -117,6 +117,50 @@ export function shades(maps, scale, range, reference) {
 }
 
 /**
+ * Returns the colours of a layer relative to its own peak, with the same range for all layers and steps.
+ * @param {Maps} maps
+ * @param {number} layer
+ * @param {Scale} scale
+ * @returns {Shade}
+ */
+export function tileShade(maps, layer, scale) {
+  const [cells, span] = [maps.cells[layer], maps.log_range[layer]];
+  const values = Float32Array.from(cells, (cell) => span * (cell / CELL_STEPS - 1));
+  if (scale === 'log') return { values, low: -MAX_RANGE.log, high: 0, clipped: true };
+  return { values: values.map(Math.exp), low: 0, high: 1, clipped: false };
+}
+
+const TILES_AROUND = 6;
+const TILE_SPACINGS = 20; // of the run, between tiles around the cursor
+
+/**
+ * Returns the steps of small maps: the last one in free motion and the first one in contact, and six around the cursor,
+ * of which only the cursor's own changes from step to step.
+ * @param {ArrayLike<number | boolean>} contact
+ * @param {number} step of the cursor
+ * @returns {{step: number, phase: 'contact' | 'free', pair: boolean}[]}
+ */
+export function tileSteps(contact, step) {
+  const spacing = Math.max(1, Math.round(contact.length / TILE_SPACINGS));
+  const count = Math.floor((contact.length - 1) / spacing) + 1;
+  const before = Math.floor(step / spacing) - Math.floor(TILES_AROUND / 2) + 1;
+  const first = Math.max(0, Math.min(before, count - TILES_AROUND));
+  const around = Array.from(
+    { length: Math.min(TILES_AROUND, count) },
+    (_, i) => (first + i) * spacing,
+  );
+  const distances = around.map((other) => Math.abs(other - step));
+  around[distances.indexOf(Math.min(...distances))] = step;
+  const onset = Array.from(contact).findIndex((value, t) => t > 0 && value && !contact[t - 1]);
+  const pair = onset > 0 ? [onset - 1, onset] : [];
+  return [...pair, ...around].map((t, i) => ({
+    step: t,
+    phase: contact[t] ? 'contact' : 'free',
+    pair: i < pair.length,
+  }));
+}
+
+/**
  * Returns the log-likelihood of the cells of a layer.
  * @param {Maps} maps
  * @param {number} layer
