@@ -176,7 +176,7 @@ test('the colour bar names its quantity, its unit, and scales that differ', () =
   assert.deepEqual(labels('normalised', 'own'), {
     low: '0',
     high: '1',
-    label: 'likelihood relative to the peak of each map',
+    label: 'likelihood relative to each peak',
   });
   assert.equal(labels('normalised', 'same').label, 'likelihood relative to the highest peak');
   assert.deepEqual(labels('log', 'same'), {
@@ -187,8 +187,7 @@ test('the colour bar names its quantity, its unit, and scales that differ', () =
   assert.deepEqual(labels('log', 'own'), {
     low: '',
     high: '0',
-    label:
-      'log likelihood, below the peak of each map, nats; ends: image −10, haptics ≤−40, fused −20',
+    label: 'log likelihood below each peak, nats; ends: image −10, haptics ≤−40, fused −20',
   });
   assert.equal(labels('log', 'own', 'step 3').label, 'log density ratio to step 3, nats');
   assert.equal(axesText(maps, false), '→ Δ hinge x  ↑ Δ hinge y (cm)');

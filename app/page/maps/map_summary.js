@@ -105,7 +105,7 @@ export function colourScale(quantity, scale, range, layers, reference) {
   const log = scale === 'log' && !reference;
   const own = range !== 'same';
   if (!reference && !log) {
-    const peak = own ? 'the peak of each map' : 'the highest peak';
+    const peak = own ? 'each peak' : 'the highest peak';
     return { low: '0', high: '1', label: `${quantity} relative to ${peak}` };
   }
   const ends = layers.map(({ shade, peak }) => {
@@ -115,7 +115,7 @@ export function colourScale(quantity, scale, range, layers, reference) {
   });
   const common = ends.every(({ low, high }) => low === ends[0].low && high === ends[0].high);
   const what = log
-    ? `log ${quantity}${own ? ', below the peak of each map' : ''}, nats`
+    ? `log ${quantity}${own ? ' below each peak' : ''}, nats`
     : `log density ratio to ${reference}, nats`;
   if (common) return { ...ends[0], label: what };
   const scales = ends.map(({ low, high }, i) => `${layers[i].name} ${log ? low : high}`);

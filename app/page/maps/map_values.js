@@ -134,8 +134,8 @@ const TILES_AROUND = 6;
 const TILE_SPACINGS = 20; // of the run, between tiles around the cursor
 
 /**
- * Returns the steps of small maps: the last one in free motion and the first one in contact, and six around the cursor,
- * of which only the cursor's own changes from step to step.
+ * Returns the steps of small maps: the last one in free motion and the first one in contact, and six around the cursor.
+ * While the cursor moves, most of these steps stay the same.
  * @param {ArrayLike<number | boolean>} contact
  * @param {number} step of the cursor
  * @returns {{step: number, phase: 'contact' | 'free', pair: boolean}[]}
