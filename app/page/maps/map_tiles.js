@@ -32,6 +32,8 @@ export class MapTiles {
   #shown = null;
   #loading = false;
   #cells = create('canvas');
+  /** Content of each tile. @type {WeakMap<HTMLElement, {maps: Maps | null, style: string}>} */
+  #painted = new WeakMap();
 
   /**
    * @param {HTMLElement} host
@@ -154,11 +156,15 @@ export class MapTiles {
   #paint(tile, maps, row, side) {
     const canvas = /** @type {HTMLCanvasElement} */ (html('canvas', tile));
     const pixels = Math.round(side * devicePixelRatio);
+    const { scale, colours } = this.#store.state;
+    const style = [pixels, scale, colours, this.#shown?.zoom].join();
+    const painted = this.#painted.get(tile);
+    if (painted?.maps === maps && painted.style === style) return;
+    this.#painted.set(tile, { maps, style });
     if (canvas.width !== pixels) [canvas.width, canvas.height] = [pixels, pixels];
     const context = context2d(canvas);
     context.clearRect(0, 0, pixels, pixels);
     if (!maps || !this.#shown) return;
-    const { scale, colours } = this.#store.state;
     const layer = maps.layers.indexOf(this.#shown.layers[row]);
     const shade = tileShade(maps, layer, /** @type {Scale} */ (scale));
     paintCells(this.#cells, shade, maps.size, /** @type {ColourMap} */ (colours));
