@@ -21,11 +21,12 @@ from beliefscope.app.api.traces import RequestedRun, finished_run
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.selection import Selection
 from beliefscope.app.runs.trace_store import TraceStore
-from beliefscope.app.runs.traced_run import TracedRun
 from beliefscope.inspect.diagnosis.diagnose import preliminary
 from beliefscope.inspect.diagnostics.views import as_json
 
 Over = Annotated[Literal["episode", "held-out"], Query(description="the run's episode, or held-out ones")]
+
+_computing = threading.Lock()  # one preliminary diagnosis at a time
 
 MAX_EPISODES = 10
 """Held-out episodes of a diagnosis: more take longer and change little."""
@@ -33,7 +34,6 @@ MAX_EPISODES = 10
 
 def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     router = APIRouter()
-    computing = threading.Lock()  # one preliminary diagnosis at a time
 
     @router.get(
         "/api/diagnosis/{task}/{filter}/{episode}",
@@ -44,9 +44,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         job = jobs.find("diagnosis", _key(store, _arguments(store, selection, over)))
         if path := jobs.finished_result(job):
             return FileResponse(path, media_type="application/json")
-        run = finished_run(store, selection)
-        with computing:
-            first = _preliminary(run, store.settings.particles)
+        first = preliminary_diagnosis(store, selection)
         if over == "episode" and first["state"] == "healthy":
             return JSONResponse(first)
         return JSONResponse({"job": job and asdict(job), "preliminary": first}, status_code=202)
@@ -87,12 +85,23 @@ def _link(selection: Selection, data: str, over: str) -> str:
     return "?" + urlencode({name: value for name, value in query.items() if value} | shown)
 
 
-def _preliminary(run: TracedRun, particles: int) -> Any:
+def available_diagnosis(store: TraceStore, jobs: Jobs, selection: Selection) -> Any:
+    """The diagnosis of the run's episode as JSON values, preliminary if its job is not done.
+
+    Raises BadInput without a healthy profile, and InProgress.
+    """
+    path = jobs.finished_result(jobs.find("diagnosis", _key(store, _arguments(store, selection, "episode"))))
+    return preliminary_diagnosis(store, selection) if path is None else json.loads(path.read_bytes())
+
+
+def preliminary_diagnosis(store: TraceStore, selection: Selection) -> Any:
     """The preliminary diagnosis as JSON values, kept with the run. Raises BadInput without a healthy profile."""
-    if "diagnosis" not in run.diagnostics:
-        result = preliminary(run.checkpoint, run.trace, particles)
-        run.diagnostics["diagnosis"] = json.dumps(as_json(result.to_json()), allow_nan=False).encode()
-    return json.loads(run.diagnostics["diagnosis"])
+    run = finished_run(store, selection)
+    with _computing:
+        if "diagnosis" not in run.diagnostics:
+            result = preliminary(run.checkpoint, run.trace, store.settings.particles)
+            run.diagnostics["diagnosis"] = json.dumps(as_json(result.to_json()), allow_nan=False).encode()
+        return json.loads(run.diagnostics["diagnosis"])
 
 
 def _arguments(store: TraceStore, selection: Selection, over: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -65,6 +66,12 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         return JobReply(job=jobs.submit("failures", title, arguments, _key(store, arguments), link))
 
     return router
+
+
+def found_failures(store: TraceStore, jobs: Jobs, selection: Selection) -> Path | None:
+    """The result of the search over the held-out episodes with the filter, data and faults of a run, if done."""
+    request = SurveyRequest(selection.task, selection.filter, selection.data, faults=str(selection.faults))
+    return jobs.finished_result(jobs.find("failures", _key(store, _arguments(store, request))))
 
 
 def _live_failures(store: TraceStore, request: SurveyRequest) -> Response:

@@ -9,17 +9,24 @@ from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Body, HTTPException
+from fastapi.encoders import jsonable_encoder
 from fastapi.responses import JSONResponse
 
+from beliefscope.app.api.models.catalog import Progress
 from beliefscope.app.api.models.training import FineTuneDetails, FineTuneOffer, FineTuneRunInfo
+from beliefscope.app.api.traces import RequestedRun
+from beliefscope.app.api.weaknesses import Weakness, weaknesses
 from beliefscope.app.jobs.finetune import catalog_name
 from beliefscope.app.jobs.queue import Jobs
 from beliefscope.app.runs.saved_filters import SavedFilter, read_saved_filters, remove_filter, save_filter
 from beliefscope.app.runs.trace_store import TraceStore
+from beliefscope.app.runs.training_data import simulated_episodes
 from beliefscope.app.workspace.finetune_runs import FineTuneRun, FineTuneRuns
+from beliefscope.datasets.errors import BadInput
 from beliefscope.filters.finetuning.choices import choices
 from beliefscope.filters.finetuning.module_selection import select_parameters
 from beliefscope.filters.finetuning.settings import FineTune
+from beliefscope.filters.finetuning.success import measures
 
 Action = Literal["promote", "save", "discard"]
 
@@ -28,10 +35,29 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
     router = APIRouter()
     runs = FineTuneRuns(store.settings.workspace)
 
-    @router.get("/api/finetune/{task}/{filter}")
-    def get_options(task: str, filter: str) -> FineTuneOffer:
-        options = choices(store.checkpoint(task, filter))
-        return FineTuneOffer(**vars(options), runs=[info(run) for run in runs.list_runs() if run.task == task])
+    @router.get("/api/finetune/{task}/{filter}", response_model=FineTuneOffer)
+    def get_options(task: str, filter: str, data: str = "") -> JSONResponse:
+        checkpoint = store.checkpoint(task, filter)
+        options = vars(choices(checkpoint))
+        name, episodes = store.dataset(task, data)
+        try:
+            simulated = simulated_episodes(store.settings, name, episodes)
+        except BadInput as error:
+            simulated, options["why_not"] = 0, options["why_not"] or str(error)
+        extra = {
+            "measures": [{"name": key, "title": title} for key, title in measures(checkpoint.task).items()],
+            "simulated": simulated,
+            "runs": [summary(run) for run in runs.list_runs() if run.task == task],
+        }
+        return JSONResponse(jsonable_encoder(options | extra))
+
+    @router.get(
+        "/api/weaknesses/{task}/{filter}/{episode}",
+        response_model=list[Weakness],
+        responses={202: {"model": Progress}},
+    )
+    def get_weaknesses(selection: RequestedRun) -> Any:
+        return weaknesses(store, jobs, selection)
 
     @router.post("/api/finetune/{task}/{filter}", status_code=202)
     def start(task: str, filter: str, settings: Annotated[dict[str, Any], Body()], data: str = "") -> FineTuneRunInfo:
@@ -40,7 +66,10 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         select_parameters(checkpoint.filter, tuning.train, tuning.freeze)
         for slice_, _ in tuning.mix:
             slice_.check(checkpoint.task, checkpoint.filter.names)
+        if tuning.success is not None:
+            tuning.success.check(checkpoint.task, checkpoint.filter.names, [slice_ for slice_, _ in tuning.mix])
         data, episodes = store.dataset(task, data)
+        simulated_episodes(store.settings, data, episodes)
         key = [filter, data, checkpoint.hash, episodes.hash, tuning.to_json(), store.settings.particles]
         id = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
         run = runs.add(id, task, filter, data, tuning)
@@ -75,6 +104,12 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
             path = str(runs.file(run, "finetuned.safetensors"))
             save_filter(store, SavedFilter(record.task, name, path, action == "promote"))
         return info(record)
+
+    def summary(run: FineTuneRun) -> dict[str, Any]:
+        current = info(run)
+        result = runs.read(run.run, "result.json") if current.finetuned else None
+        progress = runs.read(run.run, "progress.json")
+        return vars(current) | {"progress": progress, "success": result and result.get("success")}
 
     def finetuned_name(run: FineTuneRun) -> str | None:
         """Catalog name of the run's checkpoint; None while there is none."""

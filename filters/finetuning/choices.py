@@ -12,12 +12,14 @@ from beliefscope.filters.finetuning.defaults import default_settings, reason
 from beliefscope.filters.finetuning.module_selection import (
     module_change,
     module_tree,
+    preset_help,
     presets,
     select_parameters,
     within,
 )
 from beliefscope.filters.finetuning.settings import FineTune
-from beliefscope.filters.finetuning.slices import CLEAN, fault_slices, standard_slices
+from beliefscope.filters.finetuning.slices import CLEAN, Slice, fault_slices, standard_slices
+from beliefscope.filters.finetuning.success import criterion_slices
 
 
 @dataclass(frozen=True)
@@ -35,9 +37,10 @@ class ModuleInfo:
 
 @dataclass(frozen=True)
 class PresetInfo:
-    """A preset. trains: names of parameters."""
+    """A preset. help: its effect. trains: names of parameters."""
 
     name: str
+    help: str
     trains: list[str]
 
 
@@ -51,18 +54,24 @@ class SliceInfo:
     only: list[str]
     text: str
 
+    @classmethod
+    def of(cls, slice_: Slice) -> SliceInfo:
+        return cls(**slice_.to_json(), text=str(slice_))
+
 
 @dataclass(frozen=True)
 class Choices:
     """Options for fine-tuning a filter.
 
     why_not: why it cannot be fine-tuned, or None. settings: the defaults. reason: why they are the defaults.
+    criterion_slices: names of slices that a success criterion can have besides those trained on.
     """
 
     why_not: str | None
     modules: Sequence[ModuleInfo]
     presets: Sequence[PresetInfo]
     slices: Sequence[SliceInfo]
+    criterion_slices: Sequence[str]
     settings: dict[str, Any]
     reason: str
 
@@ -70,7 +79,7 @@ class Choices:
 def choices(checkpoint: Checkpoint) -> Choices:
     """The options for fine-tuning a filter."""
     if isinstance(checkpoint, ExternalFilter):
-        return Choices("External filters cannot be fine-tuned here.", [], [], [], FineTune().to_json(), "")
+        return Choices("External filters cannot be fine-tuned here.", [], [], [], [], FineTune().to_json(), "")
     filter_ = checkpoint.filter
     changes = checkpoint.record.get("parts", {})  # of the fine-tuning that wrote this checkpoint
     modules = []
@@ -86,8 +95,12 @@ def choices(checkpoint: Checkpoint) -> Choices:
     return Choices(
         None,
         modules,
-        [PresetInfo(name, [key for key in parameters if key in names]) for name, names in trained.items()],
-        [SliceInfo(**slice_.to_json(), text=str(slice_)) for slice_ in slices],
+        [
+            PresetInfo(name, preset_help(name), [key for key in parameters if key in names])
+            for name, names in trained.items()
+        ],
+        [SliceInfo.of(slice_) for slice_ in slices],
+        [slice_.name for slice_ in criterion_slices(checkpoint.task, filter_.names)],
         default_settings(filter_).to_json(),
         reason(filter_),
     )

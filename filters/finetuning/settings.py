@@ -10,7 +10,9 @@ from typing import Any
 
 from beliefscope.datasets.errors import BadInput, unknown_name
 from beliefscope.filters import legacy_names
+from beliefscope.filters.filter import Filter
 from beliefscope.filters.finetuning.slices import CLEAN, Slice
+from beliefscope.filters.finetuning.success import Criterion
 
 LIMITS = {"length": 10**4, "windows": 1024, "steps": 10**7, "check": 10**7, "patience": 10**7, "particles": 10**4}
 """Upper limits of the settings that determine the memory of a step and the duration of a run."""
@@ -53,6 +55,7 @@ class FineTune:
         particles, likelihood_weight: as in training (``Plan``). seed: of all random numbers.
         calibrate: whether process and measurement noise are scaled at the end such that NEES / n is 1 on the validation
             episodes (``calibration.py``).
+        success: criterion of the run's verdict; without one there is no verdict.
     """
 
     train: tuple[str, ...] = ()
@@ -72,6 +75,7 @@ class FineTune:
     likelihood_weight: float = 0.05
     seed: int = 0
     calibrate: bool = False
+    success: Criterion | None = None
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of its range."""
@@ -103,6 +107,11 @@ class FineTune:
         others = {slice_: (1.0 - clean) * share / total for slice_, share in self.mix}
         return {slice_: share for slice_, share in {CLEAN: clean, **others}.items() if share > 0.0}
 
+    def compared_slices(self, filter_: Filter) -> list[Slice]:
+        """Slices to compare with the base checkpoint in addition to the standard ones."""
+        trained = [slice_ for slice_, _ in self.mix]
+        return self.success.slices(filter_.task, filter_.names, trained) if self.success else trained
+
     def to_json(self) -> dict[str, Any]:
         """The inverse of ``from_json``."""
         return {f.name: getattr(self, f.name) for f in fields(self)} | {
@@ -111,6 +120,7 @@ class FineTune:
             "mix": [{"slice": slice_.to_json(), "share": share} for slice_, share in self.mix],
             "events": [str(event) for event in self.events],
             "rates": [list(rate) for rate in self.rates],
+            "success": self.success and str(self.success),
         }
 
     @classmethod
@@ -178,6 +188,7 @@ _READERS: dict[Any, Callable[[Any], Any]] = {
     "tuple[tuple[Slice, float], ...]": lambda v: tuple((Slice.from_json(e["slice"]), _number(e["share"])) for e in v),
     "tuple[StepRange, ...]": lambda v: tuple(StepRange.parse(text) for text in v),
     "tuple[tuple[str, float], ...]": lambda v: tuple((str(name), _number(rate)) for name, rate in v),
+    "Criterion | None": lambda v: Criterion.parse(v) if v else None,
     "float": _number,
     "int": _integer,
 }

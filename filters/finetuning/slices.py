@@ -171,13 +171,18 @@ def fault_slices(task: Task, models: Sequence[str]) -> dict[str, Slice]:
     return {name: FAULT_SLICES[name] for name in used if name in FAULT_SLICES and _fits(FAULT_SLICES[name], task)}
 
 
+def fault_slice(faults: Faults) -> Slice:
+    """The slice of all steps with these faults, named after them."""
+    return Slice(str(faults).replace("=", " ").replace(":", " "), faults)
+
+
 def parse_slices(texts: Iterable[str], fault_sets: Iterable[str], task: Task) -> list[Slice]:
     """Slices from their text, and slices of all steps with faults, given as text or file."""
     named = (*standard_slices(task), *fault_slices(task, tuple(task.modalities)).values())
     slices = [Slice.parse(text, named) for text in texts]
     for text in fault_sets:
         faults = read_faults(text, task)
-        slices.append(Slice(str(faults).replace("=", " ").replace(":", " "), faults))
+        slices.append(fault_slice(faults))
     return slices
 
 

@@ -51,6 +51,7 @@ def finetune_command(target: str, filter_: str | None, data: Path | None, settin
         if (value := getattr(settings, field)) != getattr(FineTune(), field):
             words += [f"--{field.replace('_', '-')}", f"{value:g}"]
     words += ["--calibrate"] if settings.calibrate else []
+    words += ["--success", str(settings.success)] if settings.success else []
     return shlex.join([*words, "--seed", str(settings.seed)])
 
 

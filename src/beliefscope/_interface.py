@@ -23,6 +23,7 @@ from beliefscope.filters.finetuning.defaults import default_settings
 from beliefscope.filters.finetuning.finetune import finetune as finetune_filter
 from beliefscope.filters.finetuning.settings import FineTune
 from beliefscope.filters.finetuning.slices import parse_slices
+from beliefscope.filters.finetuning.success import Criterion
 from beliefscope.filters.names import is_code
 from beliefscope.filters.start_offset import StartOffset
 from beliefscope.inspect.catalog import quick
@@ -252,7 +253,8 @@ def finetune(
         path: of the new checkpoint, ``NAME.safetensors``. The base checkpoint is not changed.
         train, freeze: presets and patterns of trained and frozen modules; default: those of the filter.
         faults, slices: sensor faults and data slices to learn; default: the fault that the training data lack.
-        settings: other settings of ``FineTune``, such as ``steps=300``, ``rate=3e-4`` and ``clean_weight=0.5``.
+        settings: other settings of ``FineTune``, such as ``steps=300``, ``rate=3e-4`` and ``clean_weight=0.5``;
+            ``success`` as text.
 
     Raises BadInput for names that match no module, and for settings that do not exist.
     """
@@ -261,6 +263,8 @@ def finetune(
         raise unknown_name("setting of a fine-tuning", min(unknown), FineTune.__dataclass_fields__)
     given = any((train, freeze, faults, slices))
     mix = tuple((slice_, 1.0) for slice_ in parse_slices(slices, faults, base.task))
+    if isinstance(success := settings.get("success"), str):
+        settings["success"] = Criterion.parse(success)
     chosen = FineTune(train=tuple(train), freeze=tuple(freeze), mix=mix) if given else default_settings(base.filter)
     source = _episodes(data, base)
     episodes = list(source)

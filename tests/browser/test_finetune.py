@@ -23,28 +23,38 @@ def test_filter_is_finetuned_promoted_and_discarded(
     server = start_server("--data", str(tmp_path / "few.h5"))
     page = open_page("?tab=finetune&filter=crossmodal-ekf&data=few", server.url)
     panel = page.page.locator("#finetune")
-    page.until("() => document.querySelectorAll('#finetune .tree li').length > 20")
+    page.until("() => document.querySelectorAll('#finetune .module button').length > 20")
+    assert panel.locator(".weakness .item").count() == 1, "the run is healthy: the default fault is the only weakness"
     assert panel.locator("select[name=preset]").input_value() == "reliability-only"
     assert panel.locator("select[name=slice]").input_value() == "image occluded"
-    assert "image occluded" in panel.locator(".reason").text_content()
+    assert panel.locator("select[name=criterion]").input_value() == "image occluded"
+    assert "how far to trust" in panel.locator(".help").text_content()
     panel.locator("select[name=preset]").select_option("haptics-only")
     assert "26,054 of 449,097" in panel.locator(".count").text_content()
-    panel.get_by_label("Train virtual_sensors.haptics", exact=True).uncheck()
+    panel.get_by_label("Train virtual_sensors.haptics", exact=True).click()
     assert panel.locator("select[name=preset]").input_value() == "custom"
     panel.get_by_role("button", name="Fine-tune").click()
     assert "nothing to train" in panel.locator(".error").text_content()
-    panel.get_by_label("Expand virtual_sensors.haptics", exact=True).click()
-    panel.get_by_label("Train virtual_sensors.haptics.state", exact=True).check()
+    panel.get_by_label("Train virtual_sensors.haptics.state", exact=True).click()
+    assert page.violations("#finetune") == []
+    panel.locator("summary").click()
     assert panel.locator("input[name=clean_weight]").input_value() == "0.97"  # of the default slice
     panel.locator("select[name=slice]").select_option("haptics only")
     assert panel.locator("input[name=clean_weight]").input_value() == "0.5"
-    for name, value in (("steps", "3"), ("length", "8"), ("rate", "0.0003")):
+    panel.locator("select[name=criterion]").select_option("contact")
+    for name, value in (("by", "20"), ("steps", "3"), ("length", "8"), ("rate", "0.0003")):
         panel.locator(f"input[name={name}]").fill(value)
     page.screenshot("finetune-form")
     panel.get_by_role("button", name="Fine-tune").click()
     page.until(f"() => {STATE} === 'ready'", 180.0)  # training, and evaluation of both filters on all held-out episodes
     assert page.state["run"]
-    assert "; regressed" in panel.locator(".verdict").text_content()
+    assert panel.locator(".statement").text_content() == (
+        "Criterion: The position error in slice \u201ccontact\u201d falls by at least 20 %, "
+        "and in no other slice rises by more than 5 %."
+    )
+    assert panel.locator(".verdict").text_content().startswith(("Not met: contact ", "Inconclusive: contact "))
+    assert panel.locator(".slices tbody tr").count() == 6
+    assert "contact:by=20%:others=5%" in panel.locator(".runs tbody tr.here").text_content()
     assert panel.locator("h3").text_content() == "crossmodal-ekf: virtual_sensors.haptics.state on haptics only"
     assert "virtual sensors.image" in panel.get_by_label("Modules", exact=True).last.text_content()
     page.until("() => document.querySelectorAll('#finetune .live canvas').length === 2")

@@ -16,6 +16,7 @@ from beliefscope.filters.finetuning.choices import Choices
 from beliefscope.filters.finetuning.loop import Validation
 from beliefscope.filters.training.study_table import Row
 from beliefscope.inspect.compare.effects import Regression
+from beliefscope.inspect.compare.success import SliceChange, Success
 
 
 class LineageMember(Reply):
@@ -54,13 +55,6 @@ class FineTuneRunInfo(FineTuneRun):
     saved_as: Literal["saved", "default"] | None
 
 
-@dataclass(frozen=True)
-class FineTuneOffer(Choices):
-    """Options for fine-tuning a filter, and runs of its task."""
-
-    runs: list[FineTuneRunInfo]
-
-
 @fields_of(Validation)
 class ValidationInfo(Reply):
     """A validation."""
@@ -94,13 +88,58 @@ class RegressionEvent(Reply):
     link: str
 
 
+@fields_of(SliceChange)
+class SliceChangeInfo(Reply):
+    """Change of the criterion's measure in a slice."""
+
+    change: Number
+    low: Number
+    high: Number
+
+
+@fields_of(Success)
+class SuccessInfo(Reply):
+    """Outcome by the success criterion."""
+
+    slices: list[SliceChangeInfo]
+
+
 class FineTuneResult(Reply):
-    """Result of a fine-tuning run. frozen: modules with unchanged hashes."""
+    """Result of a fine-tuning run. frozen: modules with unchanged hashes. success: None without a criterion."""
+
+    success: SuccessInfo | None = None
 
     finetuned: FineTunedCheckpoint
     comparison: ResultViews
     frozen: list[str]
     events: list[RegressionEvent]
+
+
+@dataclass(frozen=True)
+class FineTuneRunSummary(FineTuneRunInfo):
+    """A fine-tuning run with its progress and its outcome by the success criterion."""
+
+    progress: FineTuneProgress | None
+    success: SuccessInfo | None
+
+
+class MeasureInfo(Reply):
+    """A measure of a success criterion. title: name of the quantity."""
+
+    name: str
+    title: str
+
+
+@dataclass(frozen=True)
+class FineTuneOffer(Choices):
+    """Options for fine-tuning a filter, and runs of its task.
+
+    simulated: number of training episodes that are simulated first; 0 if the data set has training episodes.
+    """
+
+    measures: list[MeasureInfo]
+    simulated: int
+    runs: list[FineTuneRunSummary]
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,12 @@ from beliefscope.datasets.errors import BadInput
 from beliefscope.recordings.report.command_lines import finetune_command
 
 if TYPE_CHECKING:
+    from beliefscope.datasets.dataset import Dataset
     from beliefscope.filters.checkpoint import Checkpoint
     from beliefscope.filters.finetuning.finetune import FineTuned
     from beliefscope.filters.finetuning.loop import Validation
     from beliefscope.filters.finetuning.settings import FineTune
+    from beliefscope.inspect.compare.success import Success
 
 
 @opt.with_options(
@@ -37,6 +39,10 @@ if TYPE_CHECKING:
     l2_sp=opt.option("X", "L2-SP strength (decay to the base weights)."),
     calibrate=opt.flag("Then scale process and measurement noise such that NEES is 1 on the validation episodes."),
     patience=opt.option("N", "Stop after N validations without improvement.", parser=opt.integer(1)),
+    success=opt.option(
+        "SLICE[:by=10%:others=5%]",
+        "Success criterion: the error falls by at least this share in the slice and rises by at most that in others.",
+    ),
     log=opt.option("DIR", "Folder for losses and errors as a Rerun recording and TensorBoard logs."),
     rerun=opt.option("URL", "Address of a running Rerun viewer to stream to; requires --log."),
 )
@@ -59,6 +65,7 @@ def finetune(
     calibrate: bool = False,
     patience: int = 6,
     seed: int = 0,
+    success: str | None = None,
     log: Path | None = None,
     rerun: str = "",
 ) -> console.Result:
@@ -78,9 +85,11 @@ def finetune(
       beliefscope finetune mine.safetensors --train haptics-only --faults blackout=0.95 -o finetuned.safetensors
       beliefscope finetune door --filter crossmodal-pf --freeze dynamics --slice contact -o finetuned.safetensors
       beliefscope finetune door --filter crossmodal-ekf --train noise-only --rate 0.003 -o finetuned.safetensors
+      beliefscope finetune push --filter crossmodal-ekf --slice contact --success contact -o finetuned.safetensors
     """
     from beliefscope.filters.checkpoint import load_checkpoint, save_checkpoint
     from beliefscope.filters.finetuning.settings import parse_rates
+    from beliefscope.filters.finetuning.success import Criterion
     from beliefscope.filters.open_filter import open_filter
     from beliefscope.inspect.healthy import measure_profile
 
@@ -99,6 +108,7 @@ def finetune(
         l2_sp=l2_sp,
         calibrate=calibrate,
         patience=patience,
+        success=Criterion.parse(success) if success else None,
         seed=seed,
     )
     if clean_weight is not None:
@@ -110,11 +120,35 @@ def finetune(
         command = finetune_command(target, filter, data, settings)
         members = list(episodes)
         tuned = _run(base, members, settings, partial, log, rerun, data_hash=episodes.hash, command=command)
-    profile = measure_profile(tuned.filter, base.name, members, command)
-    checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
-    return opt.checkpoint_result(
+        profile = measure_profile(tuned.filter, base.name, members, command)
+        checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
+        verdict = _judge(settings, base, output, episodes) if settings.success else None
+    result = opt.checkpoint_result(
         output, base.task.name, base.name, checkpoint_hash, tuned.record, _summary(tuned.record)
     )
+    if verdict is None:
+        return result
+    text = f"{result.text}\n\n{verdict.statement}\n{verdict.verdict}"
+    return replace(result, document={**result.document, "success": verdict}, text=text)
+
+
+def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) -> Success:
+    """The outcome by the success criterion, over the held-out episodes."""
+    from beliefscope.filters.checkpoint import load_checkpoint
+    from beliefscope.inspect.compare.checkpoints import compare_checkpoints
+    from beliefscope.inspect.compare.success import judge
+
+    assert settings.success is not None
+    with console.bars() as update:
+        comparison = compare_checkpoints(
+            base,
+            load_checkpoint(output, (base.task,)),
+            data,
+            slices=settings.compared_slices(base.filter),
+            seed=settings.seed,
+            progress=lambda share: update("Comparing", share, ""),
+        )
+    return judge(settings.success, comparison, base.task)
 
 
 def _modules_and_data(

@@ -266,7 +266,7 @@ export class Page {
     if (any('against') && this.#trace) this.compare.choose();
     if (any('task', 'filter', 'data', 'faults', 'among')) this.failures.load();
     else if (any('by', 'phase', 'list')) this.failures.draw();
-    if (any('task', 'filter', 'run')) this.finetune.load();
+    if (any('task', 'filter', 'data', 'episode', 'faults', 'run')) this.finetune.load();
     if (any('playing')) this.#showPlaying(state.playing);
     if (!this.#trace) return;
     if (any('component', 'weights', 'track', 'charts')) this.#showComponent(this.#trace);

@@ -21,6 +21,7 @@ export { ServerError };
  * @typedef {import('../types/server.js').Failures} Failures
  * @typedef {import('../types/server.js').FineTuneDetails} FineTuneDetails
  * @typedef {import('../types/server.js').FineTuneOffer} FineTuneOffer
+ * @typedef {import('../types/server.js').Weakness} Weakness
  * @typedef {import('../types/server.js').FineTuneRunInfo} FineTuneRunInfo
  * @typedef {import('../types/server.js').Job} Job
  * @typedef {import('../types/server.js').JobReply} JobReply
@@ -397,6 +398,15 @@ const finetuneUrl = ({ task, filter, data }) => path(['finetune', task, filter],
  * @returns {Promise<FineTuneOffer>}
  */
 export const finetuneOptions = (selection, signal) => get(finetuneUrl(selection), signal);
+
+/**
+ * Gets the weaknesses of a filter that fine-tuning can address, those in the selected run first.
+ * @param {Selection} selection
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<Weakness[]>}
+ */
+export const weaknesses = ({ task, filter, episode, data, faults }, signal) =>
+  poll(path(['weaknesses', task, filter, episode], { data, faults }), signal);
 
 /**
  * Starts fine-tuning, or resumes the run with the same settings.

@@ -138,24 +138,37 @@ export class Diagnosis {
     html('.causes', this.#host).replaceChildren(
       ...(result?.causes ?? [])
         .filter((cause) => cause.probability >= SHOWN)
-        .map((cause) => this.#row(cause)),
+        .map((cause, i) => this.#row(cause, !i)),
     );
     html('.about', this.#host).textContent = result ? aboutOf(result) : '';
   }
 
-  /** @param {DiagnosisCause} cause */
-  #row(cause) {
+  #finetuneButton() {
+    const textContent = 'Fine-tune the filter …';
+    const title = 'Set up a fine-tuning for this cause';
+    const button = create('button', { type: 'button', className: 'text', textContent, title });
+    button.addEventListener('click', () => this.#store.set({ tab: 'finetune', run: '' }));
+    return button;
+  }
+
+  /**
+   * @param {DiagnosisCause} cause
+   * @param {boolean} isFirst
+   */
+  #row(cause, isFirst) {
     const { probability, recovered, evidence, steps } = cause;
     const bar = create('meter', { min: 0, max: 1, value: probability });
     bar.setAttribute('aria-label', `Probability of ${cause.cause}`);
     const where = [`${plural('episode', cause.episodes)} ${cause.episodes.join(', ')}`];
     if (steps) where.push(`steps ${steps[0]} to ${steps[1] - 1}`);
+    /** @type {HTMLElement[]} */
     const lines = [
       create('p', { className: 'where', textContent: sentence(where.join(', ')) }),
       create('ul', {}, ...evidence.map((item) => this.#evidence(item))),
     ];
     if (recovered) lines.push(create('p', { textContent: recoveredText(recovered) }));
     lines.push(nextAction(cause.next));
+    if (this.#starts && isFirst) lines.push(this.#finetuneButton());
     return create(
       'li',
       {},

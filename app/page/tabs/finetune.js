@@ -13,11 +13,14 @@ import { isActive } from '../widgets/jobs.js';
 import { setPanelState } from '../widgets/panel_state.js';
 import { FinetuneForm } from './finetune_form.js';
 import { FinetuneRun } from './finetune_run.js';
+import { FinetuneRuns } from './finetune_runs.js';
 import { Lineage } from './lineage.js';
 
 const BODY = `
-  <form novalidate aria-label="Fine-tuning"><section class="lineage"></section></form>
+  <form novalidate aria-label="Fine-tuning"></form>
   <article hidden tabindex="-1"></article>
+  <section class="runs" hidden></section>
+  <section class="lineage"></section>
   <p class="note"></p>`;
 
 export class Finetune {
@@ -27,9 +30,10 @@ export class Finetune {
   #form;
   #runView;
   #lineage;
+  #runs;
   /** @type {FineTuneOffer | null} */
   #offer = null;
-  #offerKey = ''; // task and filter of the offer
+  #offerKey = ''; // selection of the offer and its weaknesses
   /** @type {FineTuneDetails | null} */
   #run = null;
   #lastJob = ''; // state of the run's job as JSON
@@ -53,6 +57,7 @@ export class Finetune {
       this.#start(store.state, settings),
     );
     this.#lineage = new Lineage(html('.lineage', host), catalog, store);
+    this.#runs = new FinetuneRuns(html('.runs', host), catalog, store);
     this.#runView = new FinetuneRun(html('article', host), catalog, store, {
       back: () => this.#closeRun(),
       pauseOrResume: () => this.#pauseOrResume(),
@@ -69,26 +74,33 @@ export class Finetune {
 
   redraw() {
     this.#runView.redraw();
+    this.#runs.redraw();
   }
 
   /** Loads the options of the selected filter, and the selected run. */
   async load() {
     if (!this.#open) return;
-    const { task, filter, run } = this.#store.state;
-    const key = JSON.stringify([task, filter]);
+    const { task, filter, data, episode, faults, run } = this.#store.state;
+    const key = JSON.stringify([task, filter, data, ...(run ? [] : [episode, faults])]);
     this.#loading.abort();
     const { signal } = (this.#loading = new AbortController());
     try {
       if (key !== this.#offerKey || !this.#offer) {
         setPanelState(this.#host, 'loading', 'Loading the modules of the filter …');
-        this.#offer = await api.finetuneOptions(this.#store.state, signal);
-        this.#offerKey = key;
-        this.#form.show(this.#offer);
+        const offer = await api.finetuneOptions(this.#store.state, signal);
+        const { state } = this.#store;
+        const found = offer.why_not || run ? [] : await api.weaknesses(state, signal);
+        [this.#offer, this.#offerKey] = [offer, key];
+        this.#form.show(offer, found);
         await this.#lineage.load(signal);
       }
       this.#run = run ? await api.finetuneRun(run, signal) : null;
       this.#form.hidden = Boolean(this.#run);
       this.#runView.show(this.#run);
+      const place = this.#run ? html('.place', this.#host) : null;
+      if (place) place.append(html('.runs', this.#host));
+      else html('.lineage', this.#host).before(html('.runs', this.#host));
+      this.#runs.show(this.#offer.runs, this.#run);
       const { why_not: whyNot } = this.#offer;
       if (whyNot && !run) setPanelState(this.#host, 'empty', whyNot);
       else setPanelState(this.#host, 'ready');
@@ -136,6 +148,7 @@ export class Finetune {
     const job = JSON.stringify(list.find((item) => item.id === id) ?? null);
     if (!this.#open || !this.#run || job === this.#lastJob) return;
     this.#lastJob = job;
+    if (!isActive(list.find((item) => item.id === id))) this.#offerKey = ''; // a run has ended
     this.load();
   }
 

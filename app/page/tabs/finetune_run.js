@@ -1,13 +1,22 @@
 /** A fine-tuning run: progress, verdict, decision about the checkpoint, and the changes in detail. */
 
 /** @import { Store } from '../core/state.js' */
-/** @import { Catalog, FineTuneDetails, FineTuneProgress, Job, Plot, RegressionEvent, ResultViews, Task } from '../types/server.js' */
+/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneSettings, Job, Plot, RegressionEvent, ResultViews, SuccessInfo, Task } from '../types/server.js' */
 
 import { create, element, html } from '../core/dom.js';
-import { fixed, mainName, mainText, mainUnit } from '../core/units.js';
+import {
+  fixed,
+  mainName,
+  mainText,
+  mainUnit,
+  percent,
+  significant,
+  withUnit,
+} from '../core/units.js';
 import { Figures } from '../widgets/figures.js';
 import { isActive, jobSummary } from '../widgets/jobs.js';
 import { trainingData } from './finetune_form.js';
+import { changeText, changes, criterionSlice } from './finetune_runs.js';
 
 /** @typedef {'promote' | 'save' | 'discard'} Decision */
 
@@ -19,10 +28,13 @@ const RESUMES = 'It resumes from its last validation.';
 
 const BODY = `
   <div class="row"><button type="button" class="text quiet back">‹ New run</button><h3></h3></div>
+  <p class="statement"></p>
   <p class="verdict" aria-live="polite"></p>
   <div class="row doing"><progress aria-label="Progress of the fine-tuning" max="1"></progress><button type="button" class="text">Pause</button></div>
   <div class="row decide"></div>
+  <table class="slices" aria-label="Success criterion by slice" hidden><thead></thead><tbody></tbody></table>
   <div class="figures live"></div>
+  <div class="place"></div>
   <section class="events" hidden><h4>Events that regressed</h4><ol></ol></section>
   <div class="figures report"></div>`;
 
@@ -65,9 +77,13 @@ export class FinetuneRun {
     const modules = settings.train.map((name) => name.replace('-only', '')).join(', ');
     html('h3', this.#host).textContent =
       `${run.filter}: ${modules || 'all'} on ${trainingData(run)}`;
-    this.showVerdict(
-      result ? result.finetuned.no_change || result.comparison.verdict : stateText(job),
-    );
+    const success = result?.success ?? null;
+    html('.statement', this.#host).textContent = statement(settings.success, success);
+    const { no_change: noChange = '' } = result?.finetuned ?? {};
+    const verdict = [success?.verdict, noChange || (success ? '' : result?.comparison.verdict)];
+    this.showVerdict(result ? verdict.filter(Boolean).join(' ') : stateText(job));
+    html('.verdict', this.#host).dataset.outcome = success?.outcome ?? '';
+    this.#drawSlices(success);
     const isPaused = job?.state === 'cancelled';
     this.#host.dataset.state = result ? 'ready' : active || isPaused ? 'active' : 'ended';
     const controls = html('.doing', this.#host);
@@ -80,9 +96,29 @@ export class FinetuneRun {
     button.title = active ? RESUMES : '';
     this.#drawDecision(run);
     const task = this.#catalog.tasks.find(({ name }) => name === run.task);
-    this.#progress.show(progress && task ? progressFigures(progress, task) : null, null);
+    this.#progress.show(progress && task ? progressFigures(progress, task, settings) : null, null);
     this.#report.show(result?.comparison ?? null, null);
     this.#drawEvents(run, result?.events ?? [], task);
+  }
+
+  /** @param {SuccessInfo | null} success */
+  #drawSlices(success) {
+    const table = element('.slices', HTMLTableElement, this.#host);
+    table.hidden = !success;
+    if (!success) return;
+    const titles = ['slice', 'before', 'after', 'change', 'limit', ''];
+    const head = titles.map((textContent) => create('th', { scope: 'col', textContent }));
+    html('thead', table).replaceChildren(create('tr', {}, ...head));
+    const rows = success.slices.map((slice, i) => {
+      const { before, after, unit, limit, outcome } = slice;
+      const values = [before, after].map((value) => withUnit(significant(value), unit));
+      const bound = `${i ? '≤ +' : '≤ −'}${percent(Math.abs(Number(limit)))}`;
+      const texts = [slice.slice, ...values, changeText(slice), bound, outcome];
+      const cells = texts.map((textContent) => create('td', { textContent }));
+      cells[5].dataset.outcome = outcome;
+      return create('tr', {}, ...cells);
+    });
+    html('tbody', table).replaceChildren(...rows);
   }
 
   /** @param {string} text */
@@ -92,6 +128,8 @@ export class FinetuneRun {
 
   /** @param {FineTuneDetails} run */
   #drawDecision({ finetuned: name, saved_as: place, result }) {
+    const { success } = result ?? {};
+    const primary = success?.outcome === 'met' ? 'promote' : '';
     const host = html('.decide', this.#host);
     host.hidden = !result;
     if (!result) return;
@@ -105,6 +143,7 @@ export class FinetuneRun {
         'Promote to default',
         'Use it as the default filter of this server',
         place === 'default' || Boolean(noChange),
+        primary,
       ),
       this.#decisionButton(
         'save',
@@ -122,10 +161,12 @@ export class FinetuneRun {
    * @param {string} textContent
    * @param {string} title
    * @param {boolean} disabled
+   * @param {string} [primary] decision
    */
-  #decisionButton(decision, textContent, title, disabled) {
+  #decisionButton(decision, textContent, title, disabled, primary) {
     const properties = { textContent, title, disabled };
-    const button = create('button', { type: 'button', className: 'text', ...properties });
+    const className = decision === primary ? 'text primary' : 'text';
+    const button = create('button', { type: 'button', className, ...properties });
     button.addEventListener('click', () => this.#handlers.decide(decision));
     return button;
   }
@@ -167,23 +208,57 @@ function stateText(job) {
 }
 
 /**
- * Returns plots of the training loss and of the validation error of each slice.
+ * Returns the criterion in words; before the result only its slice and limits are known.
+ * @param {string | null | undefined} text
+ * @param {SuccessInfo | null} success
+ */
+function statement(text, success) {
+  if (!text) return 'This run has no success criterion.';
+  if (success) return `Criterion: ${success.statement}`;
+  const { by, others } = limits(text);
+  const [slice] = text.split(':');
+  return `Criterion: ${slice} at least ${by} % better, no other slice more than ${others} % worse.`;
+}
+
+/**
+ * Returns the limits of a criterion in percent.
+ * @param {string} text
+ */
+function limits(text) {
+  const value = (/** @type {string} */ key) => text.match(`:${key}=([\\d.e+-]+)`)?.[1];
+  return { by: Number(value('by') ?? 10), others: Number(value('others') ?? 5) };
+}
+
+/**
+ * Returns plots of the change of the error in each slice, with the limits of the criterion, and of the training loss.
  * @param {FineTuneProgress} progress
  * @param {Task} task
+ * @param {FineTuneSettings} settings
  * @returns {ResultViews}
  */
-function progressFigures({ losses, validations }, task) {
-  const slices = validations.length ? Object.keys(validations[0].slices) : [];
-  const loss = { name: '', layer: '', x: losses.map(([step]) => step), y: losses.map((l) => l[1]) };
-  const errors = slices.map((name) => ({
+function progressFigures({ losses, validations, steps }, task, settings) {
+  const { key } = task.main;
+  const names = validations.length ? Object.keys(validations[0].slices) : [];
+  const slice = criterionSlice(settings);
+  const x = validations.map(({ step }) => step);
+  const errors = names.map((name) => ({
     name,
-    layer: '',
-    x: validations.map(({ step }) => step),
-    y: validations.map((validation) => validation.slices[name].rmse[task.main.key]),
+    layer: name === slice ? 'fused' : '',
+    x,
+    y: changes(validations, name, key),
   }));
+  const { by, others } = limits(settings.success ?? '');
+  /** @type {Plot['lines']} */
+  const bounds = names.includes(slice)
+    ? [
+        { name: `limit of ${slice}`, layer: 'fused', x: [0, steps], y: [-by, -by] },
+        { name: 'limit of the others', layer: 'truth', x: [0, steps], y: [others, others] },
+      ]
+    : [];
+  const loss = { name: '', layer: '', x: losses.map(([step]) => step), y: losses.map((l) => l[1]) };
   const plots = [
+    linePlot('Validation', `change of the ${mainName(task)} error, %`, [...errors, ...bounds]),
     linePlot('Loss', '', losses.length ? [loss] : []),
-    linePlot('Validation', `RMSE of the ${mainName(task)} (${mainUnit(task).unit})`, errors),
   ];
   return {
     verdict: '',

@@ -629,6 +629,8 @@ export interface components {
         /**
          * FineTuneOffer
          * @description Options for fine-tuning a filter, and runs of its task.
+         *
+         *     simulated: number of training episodes that are simulated first; 0 if the data set has training episodes.
          */
         FineTuneOffer: {
             /** Why Not */
@@ -639,14 +641,20 @@ export interface components {
             presets: components["schemas"]["PresetInfo"][];
             /** Slices */
             slices: components["schemas"]["SliceInfo"][];
+            /** Criterion Slices */
+            criterion_slices: string[];
             /** Settings */
             settings: {
                 [key: string]: unknown;
             };
             /** Reason */
             reason: string;
+            /** Measures */
+            measures: components["schemas"]["MeasureInfo"][];
+            /** Simulated */
+            simulated: number;
             /** Runs */
-            runs: components["schemas"]["FineTuneRunInfo"][];
+            runs: components["schemas"]["FineTuneRunSummary"][];
         };
         /**
          * FineTuneProgress
@@ -665,9 +673,10 @@ export interface components {
         };
         /**
          * FineTuneResult
-         * @description Result of a fine-tuning run. frozen: modules with unchanged hashes.
+         * @description Result of a fine-tuning run. frozen: modules with unchanged hashes. success: None without a criterion.
          */
         FineTuneResult: {
+            success?: components["schemas"]["SuccessInfo"] | null;
             finetuned: components["schemas"]["FineTunedCheckpoint"];
             comparison: components["schemas"]["ResultViews"];
             /** Frozen */
@@ -699,6 +708,33 @@ export interface components {
             finetuned: string | null;
             /** Saved As */
             saved_as: ("saved" | "default") | null;
+        };
+        /**
+         * FineTuneRunSummary
+         * @description A fine-tuning run with its progress and its outcome by the success criterion.
+         */
+        FineTuneRunSummary: {
+            /** Run */
+            run: string;
+            /** Task */
+            task: string;
+            /** Filter */
+            filter: string;
+            /** Data */
+            data: string;
+            /** Settings */
+            settings: {
+                [key: string]: unknown;
+            };
+            /** Submitted */
+            submitted: number;
+            job: components["schemas"]["Job"] | null;
+            /** Finetuned */
+            finetuned: string | null;
+            /** Saved As */
+            saved_as: ("saved" | "default") | null;
+            progress: components["schemas"]["FineTuneProgress"] | null;
+            success: components["schemas"]["SuccessInfo"] | null;
         };
         /**
          * FineTunedCheckpoint
@@ -1045,6 +1081,16 @@ export interface components {
             half_width: number;
         };
         /**
+         * MeasureInfo
+         * @description A measure of a success criterion. title: name of the quantity.
+         */
+        MeasureInfo: {
+            /** Name */
+            name: string;
+            /** Title */
+            title: string;
+        };
+        /**
          * ModuleInfo
          * @description A module of a filter. gradient, change: of the fine-tuning that wrote the checkpoint; None without one.
          */
@@ -1145,11 +1191,13 @@ export interface components {
         };
         /**
          * PresetInfo
-         * @description A preset. trains: names of parameters.
+         * @description A preset. help: its effect. trains: names of parameters.
          */
         PresetInfo: {
             /** Name */
             name: string;
+            /** Help */
+            help: string;
             /** Trains */
             trains: string[];
         };
@@ -1518,6 +1566,33 @@ export interface components {
             data: string;
         };
         /**
+         * SliceChangeInfo
+         * @description Change of the criterion's measure in a slice.
+         */
+        SliceChangeInfo: {
+            /** Change */
+            change: number | null;
+            /** Low */
+            low: number | null;
+            /** High */
+            high: number | null;
+            /** Slice */
+            slice: string;
+            /** Before */
+            before: number | null;
+            /** After */
+            after: number | null;
+            /** Unit */
+            unit: string;
+            /** Limit */
+            limit: number | null;
+            /**
+             * Outcome
+             * @enum {string}
+             */
+            outcome: "met" | "not met" | "inconclusive";
+        };
+        /**
          * SliceInfo
          * @description A slice of a data set (``filters.finetuning.slices``).
          */
@@ -1616,6 +1691,25 @@ export interface components {
             filters: components["schemas"]["StudyFilter"][];
             /** Rows */
             rows: components["schemas"]["Row"][];
+        };
+        /**
+         * SuccessInfo
+         * @description Outcome by the success criterion.
+         */
+        SuccessInfo: {
+            /** Slices */
+            slices: components["schemas"]["SliceChangeInfo"][];
+            /** Criterion */
+            criterion: string;
+            /** Statement */
+            statement: string;
+            /**
+             * Outcome
+             * @enum {string}
+             */
+            outcome: "met" | "not met" | "inconclusive";
+            /** Verdict */
+            verdict: string;
         };
         /**
          * SweepInfo
@@ -1817,6 +1911,35 @@ export interface components {
             dark: boolean;
         };
         /**
+         * Weakness
+         * @description A weakness and the settings of a fine-tuning that addresses it.
+         *
+         *     Attributes:
+         *         source: of the weakness. title: in words. evidence: its numbers. episode, step: moment that shows it, or None.
+         *         slices: those of the settings.
+         */
+        Weakness: {
+            /**
+             * Source
+             * @enum {string}
+             */
+            source: "diagnosis" | "failures" | "default";
+            /** Title */
+            title: string;
+            /** Evidence */
+            evidence: string;
+            /** Episode */
+            episode: number | null;
+            /** Step */
+            step: number | null;
+            /** Settings */
+            settings: {
+                [key: string]: unknown;
+            };
+            /** Slices */
+            slices: components["schemas"]["SliceInfo"][];
+        };
+        /**
          * WrittenRecording
          * @description A recording of a run. seconds: that writing took; None if it existed.
          */
@@ -1875,6 +1998,7 @@ export type FineTuneOffer = components['schemas']['FineTuneOffer'];
 export type FineTuneProgress = components['schemas']['FineTuneProgress'];
 export type FineTuneResult = components['schemas']['FineTuneResult'];
 export type FineTuneRunInfo = components['schemas']['FineTuneRunInfo'];
+export type FineTuneRunSummary = components['schemas']['FineTuneRunSummary'];
 export type FineTunedCheckpoint = components['schemas']['FineTunedCheckpoint'];
 export type Freed = components['schemas']['Freed'];
 export type Health = components['schemas']['Health'];
@@ -1890,6 +2014,7 @@ export type LiveRun = components['schemas']['LiveRun'];
 export type LiveState = components['schemas']['LiveState'];
 export type MainError = components['schemas']['MainError'];
 export type MapArea = components['schemas']['MapArea'];
+export type MeasureInfo = components['schemas']['MeasureInfo'];
 export type ModuleInfo = components['schemas']['ModuleInfo'];
 export type Name = components['schemas']['Name'];
 export type NewName = components['schemas']['NewName'];
@@ -1909,12 +2034,14 @@ export type ReportRequest = components['schemas']['ReportRequest'];
 export type ResultViews = components['schemas']['ResultViews'];
 export type Row = components['schemas']['Row'];
 export type RunNames = components['schemas']['RunNames'];
+export type SliceChangeInfo = components['schemas']['SliceChangeInfo'];
 export type SliceInfo = components['schemas']['SliceInfo'];
 export type SmallestRepair = components['schemas']['SmallestRepair'];
 export type StudyFilter = components['schemas']['StudyFilter'];
 export type StudyInfo = components['schemas']['StudyInfo'];
 export type StudyList = components['schemas']['StudyList'];
 export type StudyTask = components['schemas']['StudyTask'];
+export type SuccessInfo = components['schemas']['SuccessInfo'];
 export type SweepInfo = components['schemas']['SweepInfo'];
 export type SweepList = components['schemas']['SweepList'];
 export type Table = components['schemas']['Table'];
@@ -1925,6 +2052,7 @@ export type TrainedSeed = components['schemas']['TrainedSeed'];
 export type ValidationInfo = components['schemas']['ValidationInfo'];
 export type ViewAddresses = components['schemas']['ViewAddresses'];
 export type ViewRequest = components['schemas']['ViewRequest'];
+export type Weakness = components['schemas']['Weakness'];
 export type WrittenRecording = components['schemas']['WrittenRecording'];
 export type $defs = Record<string, never>;
 export type operations = Record<string, never>;

@@ -83,6 +83,16 @@ export interface FineTuneSettings {
   seed: number;
   mix: { slice: Pick<api.SliceInfo, 'name'>; share: number }[];
   events: string[];
+  success?: string | null;
+}
+
+export interface Weakness extends Omit<api.Weakness, 'settings'> {
+  settings: FineTuneSettings;
+}
+
+export interface FineTuneRunSummary extends FineTuneRunInfo {
+  progress: FineTuneProgress | null;
+  success: api.SuccessInfo | null;
 }
 
 export interface FineTuneRunInfo extends Omit<api.FineTuneRunInfo, 'settings' | 'job'> {
@@ -92,7 +102,7 @@ export interface FineTuneRunInfo extends Omit<api.FineTuneRunInfo, 'settings' | 
 
 export interface FineTuneOffer extends Omit<api.FineTuneOffer, 'settings' | 'runs'> {
   settings: FineTuneSettings;
-  runs: FineTuneRunInfo[];
+  runs: FineTuneRunSummary[];
 }
 
 export interface FineTuneProgress extends Omit<api.FineTuneProgress, 'validations'> {

@@ -1,0 +1,157 @@
+/** The fine-tuning runs of a task: their criterion and outcome in a table, their validations in one chart. */
+
+/** @import { Store } from '../core/state.js' */
+/** @import { Catalog, FineTuneDetails, FineTuneProgress, FineTuneRunSummary, FineTuneSettings, Plot } from '../types/server.js' */
+
+import { create } from '../core/dom.js';
+import { percent } from '../core/units.js';
+import { Figures } from '../widgets/figures.js';
+import { jobSummary } from '../widgets/jobs.js';
+import { trainingData } from './finetune_form.js';
+
+const PLACES = { default: 'promoted', saved: 'saved' };
+const COLUMNS = [
+  'run',
+  'base',
+  'trained',
+  'data',
+  'criterion',
+  'outcome',
+  'change',
+  'elsewhere',
+  '',
+];
+
+export class FinetuneRuns {
+  #host;
+  #catalog;
+  #store;
+  #figures;
+  #table = create('table', { ariaLabel: 'Fine-tuning runs, newest first' });
+
+  /**
+   * @param {HTMLElement} host hidden without runs
+   * @param {Catalog} catalog
+   * @param {Store} store
+   */
+  constructor(host, catalog, store) {
+    this.#host = host;
+    this.#catalog = catalog;
+    this.#store = store;
+    const figures = create('div', { className: 'figures' });
+    const scroll = create('div', { className: 'scroll' }, this.#table);
+    host.append(create('h4', { textContent: 'Runs' }), scroll, figures);
+    this.#figures = new Figures(figures, store);
+  }
+
+  redraw() {
+    this.#figures.redraw();
+  }
+
+  /**
+   * @param {FineTuneRunSummary[]} runs newest first
+   * @param {FineTuneDetails | null} current
+   */
+  show(runs, current) {
+    this.#host.hidden = !runs.length;
+    const names = new Map(runs.map(({ run }, i) => [run, `run ${runs.length - i}`]));
+    const rows = runs.map((run) => this.#row(run, names.get(run.run) ?? '', current));
+    const head = COLUMNS.map((text) => create('th', { scope: 'col', textContent: text }));
+    this.#table.replaceChildren(
+      create('thead', {}, create('tr', {}, ...head)),
+      create('tbody', {}, ...rows),
+    );
+    const base = current?.filter ?? this.#store.state.filter;
+    const same = runs.filter(({ filter }) => filter === base);
+    const task = this.#catalog.tasks.find(({ name }) => name === this.#store.state.task);
+    const plot = task && overlay(same, names, base, task.main.key, task.main.name);
+    const empty = { verdict: '', curves: [], bands: {}, tables: [], images: [] };
+    this.#figures.show(plot ? { ...empty, plots: [plot] } : null, null);
+  }
+
+  /**
+   * @param {FineTuneRunSummary} run
+   * @param {string} name
+   * @param {FineTuneDetails | null} current
+   */
+  #row(run, name, current) {
+    const { job, success, settings, saved_as: place } = run;
+    const link = create('button', { type: 'button', className: 'title', textContent: name });
+    link.addEventListener('click', () => this.#store.set({ run: run.run }));
+    const [target, ...others] = success?.slices ?? [];
+    const worst = others.sort((a, b) => Number(b.change) - Number(a.change))[0];
+    const state = run.finetuned ? 'no criterion' : job ? jobSummary(job) : 'removed';
+    const texts = [
+      run.filter,
+      settings.train.join(', '),
+      trainingData(run),
+      settings.success ?? '–',
+      success?.outcome ?? state,
+      target ? changeText(target) : '',
+      worst ? `${worst.slice} ${changeText(worst)}` : '',
+      place ? PLACES[place] : '',
+    ];
+    const cells = texts.map((textContent) => create('td', { textContent, title: textContent }));
+    cells[4].dataset.outcome = success?.outcome ?? '';
+    const row = create('tr', {}, create('td', {}, link), ...cells);
+    row.classList.toggle('here', run.run === current?.run);
+    return row;
+  }
+}
+
+/**
+ * Returns the change of the error in each run's slice over its steps, of runs with the same base.
+ * @param {FineTuneRunSummary[]} runs
+ * @param {Map<string, string>} names
+ * @param {string} base
+ * @param {string} key of the main error
+ * @param {string} quantity
+ * @returns {Plot | null}
+ */
+function overlay(runs, names, base, key, quantity) {
+  const lines = runs.flatMap(({ run, settings, progress }) => {
+    const validations = progress?.validations ?? [];
+    const candidates = [criterionSlice(settings), settings.mix[0]?.slice.name, 'clean'];
+    const slice = candidates.find((name) => name && name in (validations[0]?.slices ?? {}));
+    if (!slice || validations.length < 2) return [];
+    const y = changes(validations, slice, key);
+    return [
+      { name: `${names.get(run)}: ${slice}`, layer: '', x: validations.map((v) => v.step), y },
+    ];
+  });
+  if (lines.length < 2) return null;
+  return {
+    title: `Runs of ${base}`,
+    x_label: 'step',
+    y_label: `change of the ${quantity} error, %`,
+    kind: 'line',
+    diagonal: false,
+    names: [],
+    lines,
+  };
+}
+
+/**
+ * Returns the slice of a run's success criterion; empty without one.
+ * @param {FineTuneSettings} settings
+ */
+export const criterionSlice = ({ success }) => (success ?? '').split(':')[0];
+
+/**
+ * Returns the change of the error in a slice since the first validation, in percent.
+ * @param {FineTuneProgress['validations']} validations
+ * @param {string} slice
+ * @param {string} key of the error
+ */
+export function changes(validations, slice, key) {
+  const [first, ...others] = validations.map(({ slices }) => Number(slices[slice].rmse[key]));
+  return [first, ...others].map((value) => 100 * (value / first - 1));
+}
+
+/**
+ * @param {{change: number | null, low: number | null, high: number | null}} slice
+ */
+export function changeText({ change, low, high }) {
+  const range = low === null || high === null ? '' : ` (${percent(low)} to ${percent(high)})`;
+  return `${percent(change ?? NaN)}${range}`;
+}

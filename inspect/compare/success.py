@@ -1,0 +1,117 @@
+"""Verdict on the success criterion of a fine-tuning, from the comparison with its base checkpoint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from beliefscope.datasets.task import Task
+from beliefscope.filters.finetuning.success import ERROR, Criterion
+from beliefscope.inspect.compare.checkpoints import CheckpointComparison
+from beliefscope.inspect.compare.effects import Difference
+
+Outcome = Literal["met", "not met", "inconclusive"]
+
+
+@dataclass(frozen=True)
+class SliceChange:
+    """Change of the criterion's measure in one slice.
+
+    Attributes:
+        slice: its name. before, after: in ``unit``, that of display.
+        change, low, high: relative change with its 95 % interval over episodes; NaN for too few.
+        limit: largest permitted change. outcome: whether it is kept.
+    """
+
+    slice: str
+    before: float
+    after: float
+    unit: str
+    change: float
+    low: float
+    high: float
+    limit: float
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Success:
+    """Outcome of a fine-tuning by its criterion.
+
+    Attributes:
+        criterion: as text. statement: in words. outcome: of all slices. verdict: the outcome in words.
+        slices: that of the criterion first.
+    """
+
+    criterion: str
+    statement: str
+    outcome: Outcome
+    verdict: str
+    slices: tuple[SliceChange, ...]
+
+
+def judge(criterion: Criterion, comparison: CheckpointComparison, task: Task) -> Success:
+    """Compare the changes of the criterion's measure with its limits.
+
+    The improvement is met if its whole 95 % interval is beyond the limit, not met if the whole interval falls short of
+    it. A regression elsewhere is within the limit if the estimate is; beyond it, the criterion is not met if the whole
+    interval is, too. Everything else is inconclusive.
+    """
+    measure = task.main_error.name if criterion.measure == ERROR else criterion.measure
+    by_slice = {d.slice: d for d in comparison.differences if d.measure == measure}
+    target = by_slice.pop(criterion.slice, None)
+    rows = [_improvement(target, -criterion.by)] if target else []
+    rows += [_guard(d, criterion.others) for d in by_slice.values()]
+    outcomes = {row.outcome for row in rows}
+    outcome: Outcome = "met"
+    if "not met" in outcomes:
+        outcome = "not met"
+    elif "inconclusive" in outcomes or target is None:
+        outcome = "inconclusive"
+    return Success(str(criterion), criterion.sentence(task), outcome, _verdict(outcome, rows, target), tuple(rows))
+
+
+def _improvement(difference: Difference, limit: float) -> SliceChange:
+    _, low, high = _changes(difference)
+    outcome: Outcome = "met" if high <= limit else "not met" if low > limit else "inconclusive"
+    return _row(difference, limit, outcome)
+
+
+def _guard(difference: Difference, limit: float) -> SliceChange:
+    change, low, _ = _changes(difference)
+    outcome: Outcome = "met" if change <= limit else "not met" if low > limit else "inconclusive"
+    return _row(difference, limit, outcome)
+
+
+def _row(difference: Difference, limit: float, outcome: Outcome) -> SliceChange:
+    before, after, unit = difference.display
+    return SliceChange(difference.slice, before, after, unit, *_changes(difference), limit, outcome)
+
+
+def _changes(difference: Difference) -> tuple[float, float, float]:
+    """Relative change and its interval."""
+    change, low, high = (math.expm1(min(x, 30.0)) for x in (difference.effect, difference.low, difference.high))
+    return change, low, high
+
+
+def _verdict(outcome: Outcome, rows: Sequence[SliceChange], target: Difference | None) -> str:
+    """The outcome, the change in the criterion's slice, and the largest one elsewhere."""
+    head = {"met": "Met", "not met": "Not met", "inconclusive": "Inconclusive"}[outcome]
+    if target is None:
+        return f"{head}: the slice of the criterion has no step in the held-out episodes."
+    first, *others = rows
+    text = f"{head}: {_description(first)}"
+    beyond = [row for row in others if row.outcome != "met"]
+    worst = max(beyond or others, key=lambda row: row.change, default=None)
+    if worst is None:
+        return f"{text}."
+    label = "beyond the limit" if beyond else "largest change elsewhere"
+    return f"{text}; {label}: {_description(worst)}."
+
+
+def _description(row: SliceChange) -> str:
+    values = f"{row.before:.3g} to {row.after:.3g} {row.unit}".rstrip()
+    interval = "" if math.isnan(row.low) else f", 95 % interval {100 * row.low:+.0f} to {100 * row.high:+.0f} %"
+    return f"{row.slice} {100 * row.change:+.1f} % ({values}{interval})"
