@@ -37,26 +37,11 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
 
     @router.get("/api/finetune/{task}/{filter}", response_model=FineTuneOffer)
     def get_options(task: str, filter: str, data: str = "") -> JSONResponse:
-        checkpoint = store.checkpoint(task, filter)
-        options = vars(choices(checkpoint))
-        name, episodes = store.dataset(task, data)
-        try:
-            simulated = simulated_episodes(store.settings, name, episodes)
-        except BadInput as error:
-            simulated, options["why_not"] = 0, options["why_not"] or str(error)
-        extra = {
-            "measures": [{"name": key, "title": title} for key, title in measures(checkpoint.task).items()],
-            "simulated": simulated,
-            "runs": [summary(run) for run in runs.list_runs() if run.task == task],
-        }
-        return JSONResponse(jsonable_encoder(options | extra))
+        listed = [summary(run) for run in runs.list_runs() if run.task == task]
+        return JSONResponse(jsonable_encoder(_options(store, task, filter, data) | {"runs": listed}))
 
-    @router.get(
-        "/api/weaknesses/{task}/{filter}/{episode}",
-        response_model=list[Weakness],
-        responses={202: {"model": Progress}},
-    )
-    def get_weaknesses(selection: RequestedRun) -> Any:
+    @router.get("/api/weaknesses/{task}/{filter}/{episode}", responses={202: {"model": Progress}})
+    def get_weaknesses(selection: RequestedRun) -> list[Weakness]:
         return weaknesses(store, jobs, selection)
 
     @router.post("/api/finetune/{task}/{filter}", status_code=202)
@@ -64,10 +49,7 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         checkpoint = store.checkpoint(task, filter)
         tuning = FineTune.from_json(settings)
         select_parameters(checkpoint.filter, tuning.train, tuning.freeze)
-        for slice_, _ in tuning.mix:
-            slice_.check(checkpoint.task, checkpoint.filter.names)
-        if tuning.success is not None:
-            tuning.success.check(checkpoint.task, checkpoint.filter.names, [slice_ for slice_, _ in tuning.mix])
+        tuning.check_fit(checkpoint.filter)
         data, episodes = store.dataset(task, data)
         simulated_episodes(store.settings, data, episodes)
         key = [filter, data, checkpoint.hash, episodes.hash, tuning.to_json(), store.settings.particles]
@@ -129,3 +111,16 @@ def routes(store: TraceStore, jobs: Jobs) -> APIRouter:
         )
 
     return router
+
+
+def _options(store: TraceStore, task: str, filter_: str, data: str) -> dict[str, Any]:
+    """What can be chosen for fine-tuning a filter on a data set."""
+    checkpoint = store.checkpoint(task, filter_)
+    options = dict(vars(choices(checkpoint)))
+    name, episodes = store.dataset(task, data)
+    titles = [{"name": key, "title": title} for key, title in measures(checkpoint.task).items()]
+    try:
+        simulated = simulated_episodes(store.settings, name, episodes)
+    except BadInput as error:
+        return options | {"why_not": options["why_not"] or str(error), "measures": titles, "simulated": 0}
+    return options | {"measures": titles, "simulated": simulated}

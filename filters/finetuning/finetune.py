@@ -85,8 +85,7 @@ def finetune(
     began = time.monotonic()
     filter_ = copy.deepcopy(base.filter).to(device)
     trained = select_parameters(filter_, settings.train, settings.freeze)
-    if settings.success is not None:
-        settings.success.check(filter_.task, filter_.names, [slice_ for slice_, _ in settings.mix])
+    settings.check_fit(filter_)
     if settings.calibrate and not {id(p) for p in noise_parameters(filter_)} <= {id(p) for p in trained.values()}:
         raise BadInput("calibrate needs the noise of dynamics and sensors to be trained; add noise-only to --train")
     frozen = freeze(filter_, trained)

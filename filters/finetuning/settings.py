@@ -107,6 +107,14 @@ class FineTune:
         others = {slice_: (1.0 - clean) * share / total for slice_, share in self.mix}
         return {slice_: share for slice_, share in {CLEAN: clean, **others}.items() if share > 0.0}
 
+    def check_fit(self, filter_: Filter) -> None:
+        """Raises BadInput if a slice or the success criterion does not fit the filter."""
+        slices = [slice_ for slice_, _ in self.mix]
+        for slice_ in slices:
+            slice_.check(filter_.task, filter_.names)
+        if self.success is not None:
+            self.success.check(filter_.task, filter_.names, slices)
+
     def compared_slices(self, filter_: Filter) -> list[Slice]:
         """Slices to compare with the base checkpoint in addition to the standard ones."""
         trained = [slice_ for slice_, _ in self.mix]

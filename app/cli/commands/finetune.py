@@ -123,13 +123,9 @@ def finetune(
         profile = measure_profile(tuned.filter, base.name, members, command)
         checkpoint_hash = save_checkpoint(tuned.filter, base.name, tuned.record, output, profile)
         verdict = _judge(settings, base, output, episodes) if settings.success else None
-    result = opt.checkpoint_result(
-        output, base.task.name, base.name, checkpoint_hash, tuned.record, _summary(tuned.record)
-    )
-    if verdict is None:
-        return result
-    text = f"{result.text}\n\n{verdict.statement}\n{verdict.verdict}"
-    return replace(result, document={**result.document, "success": verdict}, text=text)
+    lines = _summary(tuned.record) + (["", verdict.statement, verdict.verdict] if verdict else [])
+    result = opt.checkpoint_result(output, base.task.name, base.name, checkpoint_hash, tuned.record, lines)
+    return replace(result, document={**result.document, "success": verdict}) if verdict else result
 
 
 def _judge(settings: FineTune, base: Checkpoint, output: Path, data: Dataset) -> Success:
