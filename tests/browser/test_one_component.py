@@ -24,7 +24,7 @@ def test_every_view_of_a_task_with_one_component(open_page: Any, start_server: A
     page.settle(1)
     assert text("#heatmaps h3").all_text_contents() == ["thermometer", "pyrometer", "fused"]
     assert "temperature" in text("#maps h2").text_content()
-    assert "(K)" in text("#maps-axes").text_content()
+    assert "(K)" in text("#maps-axis-names").text_content()
     summary = text("#step-summary").text_content()
     assert " K; largest deviation" in summary
     assert "\N{EN DASH}" not in summary  # the error is known

@@ -35,7 +35,17 @@ export function tabBar(store) {
       buttons[i].tabIndex = name === selected ? 0 : -1;
       html(`#${name}`).hidden = name !== selected;
     });
-    // Where the bar is too narrow for all tabs, it scrolls.
-    buttons[TABS.indexOf(selected)].scrollIntoView({ block: 'nearest', inline: 'nearest' });
+    scrollTo(buttons[TABS.indexOf(selected)]);
   };
+}
+
+/**
+ * Scrolls a bar that is too narrow for all tabs. `scrollIntoView` would start the tab key's order at the tab.
+ * @param {HTMLElement} button
+ */
+function scrollTo(button) {
+  const bar = /** @type {HTMLElement} */ (button.parentElement);
+  const [outer, inner] = [bar.getBoundingClientRect(), button.getBoundingClientRect()];
+  if (inner.left < outer.left) bar.scrollLeft += inner.left - outer.left;
+  else if (inner.right > outer.right) bar.scrollLeft += inner.right - outer.right;
 }

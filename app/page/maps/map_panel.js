@@ -257,7 +257,7 @@ export class MapPanel {
       figure.head.title = layerMeasures(maps, layer, this.#world).description;
     });
     this.#showColours(maps, reference);
-    html('#maps-axes', this.#panel).textContent = axesText(maps, this.#world);
+    html('#maps-axis-names', this.#panel).textContent = axesText(maps, this.#world);
     this.redraw();
   }
 
@@ -287,7 +287,7 @@ export class MapPanel {
     const bar = html('#maps-scale', this.#panel);
     bar.hidden = false;
     showColourBar(bar, /** @type {ColourMap} */ (colours), labels);
-    html('#maps-axes', this.#panel).textContent = axesText(maps, false);
+    html('#maps-axis-names', this.#panel).textContent = axesText(maps, false);
     return tiled;
   }
 
