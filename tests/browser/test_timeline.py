@@ -21,10 +21,11 @@ ADD_COMPARISON = """async () => {
   const other = await api.loadTrace(task, selection, () => {}, new AbortController().signal);
   beliefscope.timeline.compareWith(other, 'unimodal-ekf');
 }"""
+MARKS = "() => [...document.querySelectorAll('#marks button')].map((b) => b.getBoundingClientRect().x)"
 LEGEND = """(track) => {
   const rows = [];
   for (const cell of document.querySelectorAll('#tracks .track')[track].querySelectorAll('dt, dd')) {
-    if (cell.tagName === 'DT') rows.push([cell.textContent]);
+    if (cell.tagName === 'DT') rows.push([cell.title]);
     else rows.at(-1).push(cell.textContent);
   }
   return rows;
@@ -73,6 +74,10 @@ def test_tracks_zoom_and_permalink(open_page: Any) -> None:
     mouse.move(at(30, (20, 60)), box["y"] + 100)
     assert page.page.locator("#timeline-readout").text_content() == "pointer 30 · 3.0 s"
     assert legend(page, 2)["fused"] == [pytest.approx(nees[30, 2], rel=6e-3)]
+    values = page.page.locator(".hover-values")
+    assert values.locator("p").text_content().startswith("step 30 \u00b7 3.0 s")
+    fused = values.locator("tr", has=page.page.get_by_text("fused", exact=True)).locator("td").last
+    assert float(fused.text_content()) == pytest.approx(nees[30, 2], rel=6e-3)
     assert page.page.evaluate(rows) == before
     mouse.move(box["x"] + 300, box["y"] - 200)
     assert page.page.locator("#timeline-readout").text_content() == "cursor 40 · 4.0 s"
@@ -164,11 +169,31 @@ def test_event_marks_and_comparison_run(open_page: Any) -> None:
     page.page.keyboard.press("ArrowRight")  # the next mark instead of the next step
     page.page.keyboard.press("Enter")
     page.until("() => beliefscope.state().step === 70")
-    page.page.keyboard.press("+")
-    page.until(
-        "() => [...document.querySelectorAll('#marks button')].map((b) => b.hidden).join() === 'true,false,false'"
-    )
-    page.page.keyboard.press("0")
+
+    # The overview keeps the events of the whole episode; a drag in it, its handles and keys choose the visible steps.
+    before = page.page.evaluate(MARKS)
+    overview, mouse = page.page.locator("#overview canvas").bounding_box(), page.page.mouse
+
+    def drag(first: float, last: float) -> list[float]:
+        x, y = overview["x"], overview["y"] + overview["height"] / 2
+        mouse.move(x + first / 99 * overview["width"], y)
+        mouse.down()
+        mouse.move(x + last / 99 * overview["width"], y, steps=4)
+        mouse.up()
+        return [float(v) for v in page.state["window"].split("-")]
+
+    assert drag(25, 75) == pytest.approx([25, 75], abs=0.3)
+    assert page.state["step"] == 70
+    assert page.page.evaluate(MARKS) == before
+    assert drag(75, 85) == pytest.approx([25, 85], abs=0.5), "the right handle"
+    assert drag(50, 40) == pytest.approx([15, 75], abs=0.5), "the window"
+    page.page.get_by_role("slider", name="First visible step").focus()
+    page.page.keyboard.press("Shift+ArrowRight")
+    assert [float(v) for v in page.state["window"].split("-")] == pytest.approx([25, 75], abs=0.5)
+    page.page.locator("#overview").dblclick(position={"x": 60, "y": 8})
+    assert page.state["window"] == ""
+    marks.nth(2).click()
+    page.until("() => beliefscope.state().step === 70")
 
     page.page.evaluate(ADD_COMPARISON)
     page.until("() => document.querySelector('#comparison-key').textContent === 'unimodal-ekf'")

@@ -295,6 +295,7 @@ export class Page {
       loadingState.stop();
       if (loading.signal.aborted) return;
       this.#failed = true;
+      document.documentElement.classList.add('started');
       this.finding.fail(showError(error));
     }
   }
@@ -326,6 +327,7 @@ export class Page {
     this.compare.show(trace);
     this.#showComponent(trace);
     this.#move(trace);
+    document.documentElement.classList.add('started');
   }
 
   /**

@@ -27,7 +27,7 @@ import { drawStack } from './stack.js';
  * @property {string} [note] text in place of a chart
  *
  * @typedef {[first: number, last: number]} Interval of steps
- * @typedef {{contact: Interval[], blackout: Interval[], edits: Interval[], failure?: Interval[], repair?: Interval[]}} Shading
+ * @typedef {{contact: Interval[], blackout: Interval[], edits: Interval[], failure?: Interval[], repair?: Interval[], label?: string}} Shading label: of the shaded steps
  *
  * @typedef {object} Frame
  * @property {number} width px
@@ -35,7 +35,6 @@ import { drawStack } from './stack.js';
  * @property {() => Interval} window visible steps
  * @property {number} steps
  * @property {boolean} withAxis whether the step axis has numbers
- * @property {boolean} compared whether a comparison run is displayed
  *
  * @typedef {{stroke: string, grid: uPlot.Axis.Grid, ticks: uPlot.Axis.Ticks, font: string}} AxisStyle
  */
@@ -46,23 +45,23 @@ export const FONT = `${scaled(10)}px system-ui, sans-serif`;
 /** Style of axis labels. */
 export const LABEL = { labelSize: scaled(14), labelGap: 0, labelFont: FONT };
 const BLACKOUT_HEIGHT = scaled(8); // px
-const CONTACT_HEIGHT = scaled(6); // px, of the strip for contact below areas
+const STRIP_HEIGHT = scaled(12); // px, of the labelled strips for contact and blackout over areas
+const COMPARISON_OPACITY = 0.65;
+const COMPARISON_WIDTH = 1.25; // px
 const LINE_HEIGHT = 4; // px, of a failure and its repair
 const LOG_MARGIN = 0.1; // share of the lower bound at which a logarithmic axis starts at the latest
 const STEP_INCREMENTS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
 const INTEGER_TOLERANCE = 1e-9;
 
 /**
- * Returns the style of a line. In a comparison the lines of the comparison run are dashed and all others solid.
+ * Returns the style of a line. A line of the comparison run has the colour and dashes of its quantity, thinner and lighter.
  * @param {Pick<Series, 'name' | 'comparison'>} series
- * @param {boolean} compared
  */
-export function seriesStyle({ name, comparison = false }, compared) {
+export function seriesStyle({ name, comparison = false }) {
   const style = lineStyle(name);
-  if (!compared) return style;
-  return comparison
-    ? { ...style, dash: [5, 4], width: Math.min(style.width, 1.75) }
-    : { ...style, dash: [] };
+  if (!comparison) return style;
+  const stroke = translucent(style.stroke, COMPARISON_OPACITY);
+  return { ...style, stroke, width: COMPARISON_WIDTH };
 }
 
 /**
@@ -102,7 +101,7 @@ export function chart(parent, track, shading, frame) {
           ...valueAxis(track, axisStyle),
         },
       ],
-      ...lines(track, frame.compared),
+      ...lines(track),
       hooks: {
         drawClear: [
           (plot) => drawStack(plot, track),
@@ -124,10 +123,9 @@ export function chart(parent, track, shading, frame) {
 /**
  * Returns uPlot's series and bands for a track, in the order of `chartData`.
  * @param {Track} track
- * @param {boolean} compared
  * @returns {{series: uPlot.Series[], bands: uPlot.Band[]}}
  */
-function lines(track, compared) {
+function lines(track) {
   /** @type {uPlot.Series[]} */
   const series = [{}];
   /** @type {uPlot.Band[]} */
@@ -141,7 +139,7 @@ function lines(track, compared) {
   }
   for (const item of track.series) {
     const paths = item.stacked ? { paths: () => null } : {}; // drawStack draws it
-    series.push({ ...seriesStyle(item, compared), ...paths, points: { show: false } });
+    series.push({ ...seriesStyle(item), ...paths, points: { show: false } });
   }
   if (!track.series.length) series.push({}); // uPlot draws an axis only for a line
   return { series, bands };
@@ -275,15 +273,48 @@ export function shadeIntervals(plot, shading, hasAreas = false) {
     }
   };
   ctx.save();
-  const strip = CONTACT_HEIGHT * devicePixelRatio;
-  if (hasAreas) shade(contact, colour('contact'), strip, bbox.top + bbox.height - strip);
-  else shade(contact, colour('contact-band'));
   shade(edits, translucent(colour('accent'), 0.12));
-  shade(blackout, hatching(ctx), BLACKOUT_HEIGHT * devicePixelRatio);
+  if (hasAreas) {
+    const strip = STRIP_HEIGHT * devicePixelRatio;
+    const bottom = bbox.top + bbox.height - strip;
+    shade(contact, colour('contact'), strip, bottom);
+    labelIntervals(plot, contact, shading.label ?? '', bottom, colour('surface'), null);
+    shade(blackout, hatching(ctx), strip);
+    labelIntervals(plot, blackout, 'no image', bbox.top, colour('ink'), colour('surface'));
+  } else {
+    shade(contact, colour('contact-band'));
+    shade(blackout, hatching(ctx), BLACKOUT_HEIGHT * devicePixelRatio);
+  }
   const line = LINE_HEIGHT * devicePixelRatio;
   shade(failure, colour('bad'), line, bbox.top + bbox.height - line);
   shade(repair, colour('accent'), line, bbox.top + bbox.height - 2 * line);
   ctx.restore();
+}
+
+/**
+ * Writes a label into each interval that has room for it.
+ * @param {uPlot} plot
+ * @param {Interval[]} intervals
+ * @param {string} text
+ * @param {number} top of the strip
+ * @param {string} ink
+ * @param {string | null} background
+ */
+function labelIntervals({ ctx, bbox, valToPos }, intervals, text, top, ink, background) {
+  const height = STRIP_HEIGHT * devicePixelRatio;
+  ctx.font = `${scaled(9.5) * devicePixelRatio}px system-ui, sans-serif`;
+  [ctx.textAlign, ctx.textBaseline] = ['center', 'middle'];
+  const width = ctx.measureText(text).width + 6 * devicePixelRatio;
+  for (const [first, last] of intervals) {
+    const left = Math.max(bbox.left, valToPos(first - 0.5, 'x', true));
+    const right = Math.min(bbox.left + bbox.width, valToPos(last + 0.5, 'x', true));
+    if (right - left < width) continue;
+    const centre = (left + right) / 2;
+    ctx.fillStyle = background ?? 'transparent';
+    ctx.fillRect(centre - width / 2, top, width, height);
+    ctx.fillStyle = ink;
+    ctx.fillText(text, centre, top + height / 2);
+  }
 }
 
 /**
@@ -315,7 +346,7 @@ export function shadeBounds(plot, bounds) {
 }
 
 /** @param {CanvasRenderingContext2D} context */
-function hatching(context) {
+export function hatching(context) {
   const tile = document.createElement('canvas');
   [tile.width, tile.height] = [8, 8];
   const tileContext = context2d(tile);

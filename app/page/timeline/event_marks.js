@@ -1,4 +1,4 @@
-/** Marks of events, as triangles above the charts. A click moves the cursor there. */
+/** Marks of events, as ticks in the overview of the episode. A click moves the cursor there. */
 
 /** @import { Store } from '../core/state.js' */
 
@@ -42,18 +42,17 @@ export class EventMarks {
 
   /**
    * Places the marks horizontally.
-   * @param {(step: number) => number | null} x px; null for an invisible step
+   * @param {(step: number) => number} x px
    * @param {number} width px
    */
   place(x, width) {
     for (const { step, button } of this.#marks) {
       const position = x(step);
-      button.hidden = position === null;
-      button.style.transform = `translateX(${(position ?? 0).toFixed(2)}px)`;
-      button.classList.toggle('leftward', (position ?? 0) > width / 2);
+      button.style.transform = `translateX(${position.toFixed(2)}px)`;
+      button.classList.toggle('leftward', position > width / 2);
     }
-    const visible = this.#visible;
-    if (!visible.some((button) => button.tabIndex === 0)) this.#setTabStop(visible[0]);
+    if (!this.#marks.some(({ button }) => button.tabIndex === 0))
+      this.#setTabStop(this.#marks[0]?.button);
   }
 
   /**
@@ -94,18 +93,14 @@ export class EventMarks {
    */
   #moveFocus(event) {
     const direction = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    const visible = this.#visible;
-    const index = visible.findIndex((button) => button === document.activeElement);
+    const buttons = this.#marks.map(({ button }) => button);
+    const index = buttons.findIndex((button) => button === document.activeElement);
     if (!direction || index < 0) return;
     event.preventDefault();
     event.stopPropagation();
-    const next = visible[Math.min(Math.max(index + direction, 0), visible.length - 1)];
+    const next = buttons[Math.min(Math.max(index + direction, 0), buttons.length - 1)];
     this.#setTabStop(next);
     next.focus();
-  }
-
-  get #visible() {
-    return this.#marks.map(({ button }) => button).filter((button) => !button.hidden);
   }
 
   /** @param {HTMLButtonElement | undefined} target */

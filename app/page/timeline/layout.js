@@ -4,9 +4,12 @@
 
 import { create } from '../core/dom.js';
 import { scaled } from '../core/palette.js';
+import { GUTTER } from './chart.js';
 
 const NOTE_HEIGHT = scaled(26); // px of a note in place of a chart
 const LINE_HEIGHT = scaled(12); // px of a line of a legend
+const STACKED_HEIGHT = scaled(84); // px of a chart of areas where the room is short, its axis included
+const COMPACT_HEIGHT = scaled(215); // px of a timeline below which legends have two columns and short names
 const STACKED_WEIGHT = 2; // share of the remaining height, relative to a chart of lines
 
 /**
@@ -29,17 +32,26 @@ export const layoutKey = (tracks) =>
   );
 
 /**
+ * Returns whether the legends have two columns and short names.
+ * @param {number} height px of the timeline
+ */
+export const isCompact = (height) => height < COMPACT_HEIGHT;
+
+/**
  * Returns the height of each track in px. Each has room for its legend, stacked ones get most of the rest, and in a low
  * timeline all shrink. The lowest track always has a chart, because of the axis.
  * @param {Track[]} tracks
  * @param {number} height px
  */
 export function trackHeights(tracks, height) {
+  const compact = isCompact(height + GUTTER.axis);
   const noteOnly = tracks.map(({ note }, i) => Boolean(note) && i < tracks.length - 1);
   const minimum = tracks.map(({ series }, i) => {
     if (noteOnly[i]) return NOTE_HEIGHT;
     const names = new Set(series.map(({ name }) => name));
-    return 3 + LINE_HEIGHT * (1 + Math.max(names.size, 2));
+    if (series.some(({ stacked }) => stacked)) return STACKED_HEIGHT;
+    const rows = compact ? Math.ceil(names.size / 2) : Math.max(names.size, 2);
+    return 3 + LINE_HEIGHT * (1 + rows);
   });
   const sum = minimum.reduce((a, b) => a + b, 0);
   if (sum >= height) return minimum.map((value) => Math.floor((value / sum) * height));

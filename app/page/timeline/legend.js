@@ -16,9 +16,10 @@ import { areaSample } from './stack.js';
  * @param {Track} track
  * @param {Trace} trace
  * @param {boolean} compared whether a comparison run is displayed
+ * @param {boolean} compact whether names are short
  * @returns {{element: HTMLElement, cells: ValueCell[]}}
  */
-export function legend(track, trace, compared) {
+export function legend(track, trace, compared, compact) {
   const { title, unit, help, series } = track;
   const heading = create('h3', { textContent: unit ? `${title} (${unit})` : title });
   heading.title = help ?? heading.textContent ?? '';
@@ -28,12 +29,12 @@ export function legend(track, trace, compared) {
   for (const name of new Set(series.map((item) => item.name))) {
     const index = series.findIndex((item) => item.name === name);
     const first = series[index];
-    const { dash, width } = seriesStyle(first, compared);
+    const { dash, width } = seriesStyle(first);
     const sample = first.stacked
       ? areaSample(name, index)
       : lineSample(cssVariable(name), dash, width);
     const label = track.ofModalities ? name : trace.label(name);
-    list.append(create('dt', { title: label }, sample, label));
+    list.append(create('dt', { title: label }, sample, compact ? name : label));
     for (const comparison of compared ? [false, true] : [false]) {
       const text = new Text();
       const index = series.findIndex(

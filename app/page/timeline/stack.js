@@ -42,7 +42,7 @@ export function upperEdges(series) {
 export const opacity = (index) => OPACITIES[index % OPACITIES.length];
 
 /**
- * Draws the stacked series of a track: areas for the run, dashed edges for the comparison run.
+ * Draws the stacked series of a track: areas for the run, light edges for the comparison run.
  * @param {uPlot} plot
  * @param {Track} track
  */
@@ -63,8 +63,8 @@ export function drawStack(plot, track) {
   ctx.strokeStyle = colour('ink');
   ctx.lineWidth = devicePixelRatio;
   for (const edge of edges.slice(0, -1)) ctx.stroke(steps(plot, edge));
-  ctx.setLineDash([5 * devicePixelRatio, 4 * devicePixelRatio]);
-  ctx.lineWidth = 1.75 * devicePixelRatio;
+  ctx.strokeStyle = colour('surface');
+  ctx.lineWidth = 1.5 * devicePixelRatio;
   const others = upperEdges(stacked.filter(({ comparison }) => comparison));
   for (const edge of others.slice(0, -1)) ctx.stroke(steps(plot, edge));
   ctx.restore();

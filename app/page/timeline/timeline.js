@@ -16,8 +16,10 @@ import { ChartMenu } from './chart_menu.js';
 import { EventMarks } from './event_marks.js';
 import { Gestures } from './gestures.js';
 import { GroupPicker } from './group_picker.js';
-import { layoutKey, noteElement, trackHeights } from './layout.js';
+import { HoverValues } from './hover_values.js';
+import { isCompact, layoutKey, noteElement, trackHeights } from './layout.js';
 import { formatValue, legend, updateLegend } from './legend.js';
+import { Overview } from './overview.js';
 import { StandalonePicker } from './standalone_picker.js';
 import { fitWindow, formatWindow, parseWindow, zoomWindow } from './step_window.js';
 import { TrackSizes } from './track_sizes.js';
@@ -62,6 +64,8 @@ export class Timeline {
   #selection = overlayMark('selection');
   #stepLabel = create('p', { className: 'step-label' });
   #marks;
+  #overview;
+  #values;
   #standalone;
   #group;
   #menu;
@@ -80,7 +84,14 @@ export class Timeline {
     this.#readout = html('#timeline-readout', body);
     this.#level.append(this.#levelText);
     this.#host.append(this.#stepLabel, this.#cursor, this.#pointer, this.#level, this.#selection);
+    this.#values = new HoverValues(this.#host);
     this.#marks = new EventMarks(html('#marks', body), store);
+    this.#overview = new Overview(html('#overview', body), this.#marks, {
+      all: () => this.#allSteps,
+      window: () => this.#window,
+      setWindow: (window) => this.#setWindow(window),
+      scrub: (step, inputTime) => store.set({ step: this.#nearest(step) }, { inputTime }),
+    });
     this.#standalone = new StandalonePicker(store);
     this.#group = new GroupPicker(() => this.redraw());
     this.#menu = new ChartMenu(html('#chart-menu'), html('#charts'), store, () =>
@@ -176,6 +187,7 @@ export class Timeline {
     this.#cursor.hidden = step < from || step > to;
     place(this.#cursor, this.#x(step));
     this.#marks.move(step);
+    this.#overview.move(step);
     this.#host.ariaValueNow = String(step);
     this.#host.ariaValueText = this.#describe(step);
     if (this.#hover === null) this.#showValues(step);
@@ -187,7 +199,7 @@ export class Timeline {
    */
   mark(events) {
     this.#marks.set(events);
-    this.#placeMarks();
+    this.#overview.update();
     if (this.#trace) this.#marks.move(this.#store.state.step);
   }
 
@@ -205,7 +217,7 @@ export class Timeline {
   }
 
   /**
-   * Draws a comparison run, dashed, if it has the same episode.
+   * Draws a comparison run, as thin lines, if it has the same episode.
    * @param {Trace | null} trace
    * @param {string} [name] its name; without a trace, the progress of its computation
    */
@@ -294,7 +306,7 @@ export class Timeline {
     this.#store.set({ window: text });
     const [min, max] = this.#window;
     for (const { plot } of this.#charts) plot.setScale('x', { min, max });
-    this.#placeMarks();
+    this.#overview.update();
     this.move(this.#store.state.step);
     this.#resetButton.disabled = !text;
   }
@@ -311,10 +323,13 @@ export class Timeline {
     this.#plot = { left, width: clientWidth - left - GUTTER.right };
     this.#measure();
     this.#updateShading();
+    const compact = isCompact(clientHeight);
+    this.#host.classList.toggle('compact', compact);
+    this.#values.show(this.#tracks);
     const keys = this.#tracks.map(({ key = '' }) => key);
     const heights = this.#sizes.apply(keys, trackHeights(this.#tracks, clientHeight - GUTTER.axis));
     this.#tracks.forEach((track, i) => {
-      const row = this.#buildTrack(track, heights[i]);
+      const row = this.#buildTrack(track, heights[i], compact);
       if (i + 1 < keys.length) row?.append(this.#sizes.separator(keys, heights, i));
     });
     this.#updateCursor();
@@ -323,12 +338,13 @@ export class Timeline {
   /**
    * @param {Track} track
    * @param {number} height px
+   * @param {boolean} compact
    */
-  #buildTrack(track, height) {
+  #buildTrack(track, height, compact) {
     const trace = this.#trace;
     if (!trace) return null;
     const compared = Boolean(this.#activeComparison);
-    const { element: legendElement, cells } = legend(track, trace, compared);
+    const { element: legendElement, cells } = legend(track, trace, compared, compact);
     this.#cells.push(...cells);
     const row = create('div', { className: 'track' }, legendElement);
     this.#host.append(row);
@@ -342,7 +358,6 @@ export class Timeline {
       window: () => this.#window,
       steps: trace.steps,
       withAxis: lowest,
-      compared,
     });
     this.#charts.push({ plot, track, top: row.offsetTop, height });
     return row;
@@ -350,7 +365,7 @@ export class Timeline {
 
   #updateCursor() {
     this.#host.ariaValueMax = String((this.#trace?.steps ?? 1) - 1);
-    this.#placeMarks();
+    if (this.#trace) this.#overview.draw(this.#shading, this.#trace.error('fused', 'main') ?? []);
     this.move(this.#store.state.step);
     this.#showValues(this.#hover ?? this.#store.state.step);
   }
@@ -360,6 +375,7 @@ export class Timeline {
     if (!this.#trace) return;
     Object.assign(this.#shading, {
       contact: intervals(this.#trace.group(this.#group.value)),
+      label: this.#group.value,
       blackout: intervals(this.#trace.blackout),
       edits: this.#activeComparison?.edits ?? [],
     });
@@ -368,16 +384,6 @@ export class Timeline {
   #measure() {
     const { left, top } = this.#host.getBoundingClientRect();
     this.#origin = { left, top };
-  }
-
-  #placeMarks() {
-    const [from, to] = this.#window;
-    const { left, width } = this.#plot;
-    const offset = left - GUTTER.left; // the marks start beside the legends
-    this.#marks.place(
-      (step) => (step < from || step > to ? null : this.#x(step) - offset),
-      width + GUTTER.left,
-    );
   }
 
   /**
@@ -440,6 +446,10 @@ export class Timeline {
       this.#levelText.textContent = formatValue(value, track);
     }
     this.#showValues(this.#hover ?? this.#store.state.step);
+    if (this.#hover === null || !event || y < 0) return this.#values.hide();
+    const { clientWidth: width, clientHeight: height } = this.#host;
+    const pointer = { x: event.clientX - this.#origin.left, y, width, height };
+    this.#values.move(this.#trace, this.#hover, pointer);
   }
 }
 

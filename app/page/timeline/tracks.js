@@ -135,7 +135,7 @@ function overlay(track, other, standalone) {
   return {
     ...merged,
     title: `${kind} / ${otherKind.toLowerCase()}`,
-    help: `${track.title}; dashed: ${other.title}`,
+    help: `${track.title}; thin lines: ${other.title}`,
   };
 }
 
