@@ -156,7 +156,10 @@ def test_outdated_cursors_are_skipped(
         (json.dumps(cursor(step=1.5)), "cursor.step: Input should be a valid integer."),
         (json.dumps(cursor(step=True)), "cursor.step: Input should be a valid integer."),
         (json.dumps(cursor(faults=0.4)), "cursor.faults: Input should be a valid string."),
-        (json.dumps(cursor(faults="blakout")), "fault 'blakout' does not exist. Available: blackout,"),
+        (
+            json.dumps(cursor(faults="blakout")),
+            "fault 'blakout' does not exist. Did you mean blackout? Available: blackout,",
+        ),
         (json.dumps(cursor(faults="delay=touch")), "modality of task 'door' 'touch' does not exist."),
         (json.dumps(cursor(size=10**6)), "cursor.size: Input should be 41 or 135."),
         (json.dumps(cursor(angle="wide")), "cursor.angle: Input should be a valid number."),

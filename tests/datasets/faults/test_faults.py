@@ -333,7 +333,7 @@ def test_every_fault_is_documented() -> None:
 
 
 BAD = {
-    "blakout": r"fault 'blakout' does not exist\. Available: blackout, image_frozen, .*control_scale\.",
+    "blakout": r"fault 'blakout' does not exist\. Did you mean blackout\? Available: blackout, .*control_scale\.",
     "blackout,,": r"fault '' does not exist\. Available",
     "blackout:chance=1": r"parameter of blackout 'chance' does not exist\. Available: probability, gray, from, to\.",
     "blackout=1.5": r"blackout's 'probability' is 1\.5, not a number from 0 to 1",

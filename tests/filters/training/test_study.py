@@ -309,7 +309,7 @@ def test_cell_locked_by_another_process_is_skipped(data: Path, tmp_path: Path) -
         ("--preset fast", "preset 'fast' does not exist. Available: cpu, full, smoke"),
         ("--engine slurm", "'slurm' is not one of 'local', 'ray'"),
         ("--task dor", "task 'dor' does not exist"),
-        ("--task door --filter lstmm", "filter 'lstmm' does not exist. Available: crossmodal-ekf"),
+        ("--task door --filter lstmm", "filter 'lstmm' does not exist. Did you mean lstm? Available: crossmodal-ekf"),
         ("--seeds 0", "'0' is not an integer of at least 1"),
         ("--data door.h5", "--data 'door.h5' is not TASK=FILE"),
         ("--task door --data push=a.h5", "--data 'push=a.h5' is for task 'push', but the study is of door"),

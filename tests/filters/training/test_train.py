@@ -168,7 +168,8 @@ def test_data_without_training_episodes_are_rejected(episodes: list[Episode]) ->
     with pytest.raises(BadInput, match="no episode of split 'train'"):
         train(architecture("door", "crossmodal-pf"), episodes[4:], data_hash="-", plan=SMOKE)
     with pytest.raises(
-        BadInput, match=r"filter 'crosmodal-pf' does not exist\. Available: crossmodal-ekf, crossmodal-pf"
+        BadInput,
+        match=r"filter 'crosmodal-pf' does not exist\. Did you mean crossmodal-pf .*Available: crossmodal-ekf, ",
     ):
         architecture("door", "crosmodal-pf")
 
