@@ -92,12 +92,7 @@ def standalone(
     start, generator = first_belief(filter_, batch), torch.Generator().manual_seed(trace.seed)
     particles = int(trace.settings["particles"])
     kept = particles if trace.particles is None else trace.particles.shape[1]
-
-    def advance(steps: int) -> None:
-        if progress is not None:
-            progress(steps / len(trace))
-
-    arrays = run_arrays(checkpoint, [evidence], len(trace), start, generator, particles, kept, advance)
+    arrays = run_arrays(checkpoint, [evidence], len(trace), start, generator, particles, kept, progress)
     settings = {key: value for key, value in trace.settings.items() if key != "edits"} | {"standalone": modality}
     provenance = {name: getattr(trace, name) for name in ("data_hash", "episode_index", "seed", "faults")}
     return assemble_trace(checkpoint, trace.episode, start, arrays, **provenance, settings=settings)

@@ -67,13 +67,8 @@ def trace(
     if particles_kept < 1:
         raise BadInput(f"particles kept must be at least 1, not {particles_kept}")
     run = start_run(checkpoint, episode, episode_index, seed, particles, faults)
-
-    def advance(steps: int) -> None:
-        if progress is not None:
-            progress(steps / len(episode))
-
     arrays = run_arrays(
-        checkpoint, run.blocks(), len(episode), run.start, run.generator(), particles, particles_kept, advance
+        checkpoint, run.blocks(), len(episode), run.start, run.generator(), particles, particles_kept, progress
     )
     return assemble_trace(checkpoint, run.episode, run.start, arrays, **run.provenance)
 
@@ -141,13 +136,13 @@ def run_arrays(
     generator: torch.Generator,
     particles: int,
     particles_kept: int = PARTICLES_KEPT,
-    progress: Callable[[int], None] = lambda _: None,
+    progress: Callable[[float], None] | None = None,
 ) -> dict[str, Tensor]:
     """Run a filter over consecutive evidence with N = 1; the arrays (T, ...) of its trace.
 
     Args:
         total: T.
-        progress: called with the number of completed steps.
+        progress: called with the completed fraction, 0..1.
     """
     filter_ = checkpoint.filter
     belief = filter_.start(start, particles, generator)
@@ -163,7 +158,9 @@ def run_arrays(
             for after, step in filter_.steps(belief, evidence, generator):
                 belief = after
                 steps.append(step)
-                progress(done := done + 1)
+                done += 1
+                if progress is not None:
+                    progress(done / total)
             part = with_fewer_particles(step_arrays(checkpoint, evidence, steps), particles_kept)
             if len(steps) == total:
                 return part
