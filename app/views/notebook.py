@@ -54,7 +54,7 @@ class SceneViewer:
         run.future.set_result(trace)
         with redirect_stdout(io.StringIO()):  # viser announces its address
             self._server = ViserServer(host="127.0.0.1", port=0, verbose=False)
-        self._scene = BeliefScene(self._server, run, trace, SceneLayers(hidden=frozenset({"map"})))
+        self._scene = BeliefScene(self._server, run, trace, SceneLayers(hidden=frozenset({"map"})), labels=True)
         self._slider: Any = self._server.gui.add_slider("Step", 0, len(trace) - 1, 1, step)
         self._slider.on_update(lambda event: self._draw())
         self.url = f"http://127.0.0.1:{self._server.get_port()}"

@@ -23,32 +23,34 @@ from beliefscope.inspect.statistics.measures import layer_label
 from beliefscope.inspect.trace import Trace
 
 POLE_RADIUS = 0.005  # m
-MAX_LABELED = 2  # modalities; the labels of more would overlap, and the timeline has their colors
 FLOOR_MAP_HEIGHT = 0.003  # m above the floor
 EDGE_OFFSET = 0.002  # m from the surfaces of an object to the edges of its outline
 NO_SHADOW: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
 
 class Pole:
-    """A labeled pole at an estimate."""
+    """A pole at an estimate, with or without a label."""
 
     def __init__(self, server: ViserServer, path: str, text: str, height: float, radius: float, color: RGB) -> None:
         """text: of the label; without a label if empty."""
         self._height = height
         self._pole = server.scene.add_cylinder(f"{path}/pole", radius, height, color=color, cast_shadow=False)
-        self._label = server.scene.add_label(
-            f"{path}/label", text, anchor="bottom-center", visible=bool(text), **SMALL_LABEL
-        )
+        self._label: Any = None
+        if text:
+            self._label = server.scene.add_label(f"{path}/label", text, anchor="bottom-center", **SMALL_LABEL)
 
     def move(self, anchor: Array) -> None:
         """Place the pole below and above an anchor (3,)."""
         foot = np.array([*anchor[:2], 0.0])
         self._pole.position = foot + self._height / 2.0 * UP
-        self._label.position = foot + self._height * UP
+        if self._label is not None:
+            self._label.position = foot + self._height * UP
 
     def hide(self) -> None:
         """Hide the pole and its label."""
-        self._pole.visible = self._label.visible = False
+        self._pole.visible = False
+        if self._label is not None:
+            self._label.visible = False
 
 
 class BeliefScene:
@@ -58,11 +60,18 @@ class BeliefScene:
         viewpoints: available viewpoints -> position (3,) of the eye and the point (3,) that it faces, m.
     """
 
-    def __init__(self, server: ViserServer, run: TracedRun, trace: Trace, layers: SceneLayers) -> None:
-        """trace: of the whole run or a part of it, to which the steps of ``move`` refer."""
+    def __init__(
+        self, server: ViserServer, run: TracedRun, trace: Trace, layers: SceneLayers, labels: bool = False
+    ) -> None:
+        """Draw the first step.
+
+        Args:
+            trace: of the whole run or a part of it, to which the steps of ``move`` refer.
+            labels: whether the estimates have labels. The page has a legend instead, which nothing overlaps.
+        """
         self._server = server
         self._task = run.checkpoint.task
-        self._layers = layers
+        self._layers, self._labels = layers, labels
         self._robot: RobotScene | None = None
         self._discs: Any = None
         self._particles: Any = None
@@ -163,10 +172,8 @@ class BeliefScene:
             self._camera = CameraView(self._server, self._task, self._trace)
 
     def _add_pole(self, index: int, name: str) -> Pole:
-        names = self._trace.modalities
-        text = "estimate" if name == "fused" and len(names) < 2 else layer_label(name)
-        if name in names and len(names) > MAX_LABELED:
-            text = ""
+        text = "estimate" if name == "fused" and len(self._trace.modalities) < 2 else layer_label(name)
+        text = text if self._labels else ""
         color, height = rgb(name, self._trace), self._belief.pole_height(index)
         return Pole(self._server, f"/estimates/{name}", text, height, POLE_RADIUS, color)
 

@@ -17,13 +17,14 @@ from beliefscope.app.protocol.trace_format import camera_images
 from beliefscope.datasets.simulation.replay import Replay
 from beliefscope.datasets.task import Task, display_name
 from beliefscope.inspect.figures.scene_belief import camera_axis, rgb
-from beliefscope.inspect.figures.scene_shapes import RGB, Array, framed, grid, map_pixels, movable_meshes
+from beliefscope.inspect.figures.scene_shapes import DISC, FAN, RGB, Array, framed, grid, map_pixels, movable_meshes
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.trace import Trace
 
 SMALL_LABEL: dict[str, Any] = {"font_screen_scale": 0.7, "depth_test": False}
-FORCE_SCALE = 0.004  # m per N
-MAX_ARROW_LENGTH = 0.30  # m
+RING_DISTANCE = 0.05  # m between the rings of the force arrow
+MAX_RINGS = 6
+RING_RADIUS = 0.014  # m
 IMAGE_DISTANCE = 0.2  # of the way from the camera to its target
 IMAGE_SCALE = 4  # enlargement, so that the browser's smoothing keeps pixels distinguishable
 TRANSLUCENT_OPACITY = 0.35
@@ -120,17 +121,31 @@ class CameraView:
 
 
 class ForceArrow:
-    """The measured contact force as an arrow of 4 cm per 10 N, labeled in newtons."""
+    """The measured contact force as an arrow with a ring every few newtons, labeled with the force and the spacing.
+
+    Its head is at the end effector, so that the arm, which the force points at, does not hide it. If it came through
+    the floor in that way, its tail is there.
+    """
 
     def __init__(self, server: ViserServer, trace: Trace) -> None:
         self.set_trace(trace)
+        color = rgb("contact", trace)
         self._arrow: Any = server.scene.add_arrows(
-            "/force/arrow",
-            np.zeros((1, 2, 3), np.float32),
-            rgb("contact", trace),
-            shaft_radius=0.008,
-            head_radius=0.02,
-            head_length=0.05,
+            "/force/arrow", np.zeros((1, 2, 3), np.float32), color, shaft_radius=0.006, head_radius=0.016, visible=False
+        )
+        # Seen from the side, the discs are rings around the shaft.
+        self._rings: Any = server.scene.add_batched_meshes_simple(
+            "/force/rings",
+            DISC,
+            FAN,
+            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (MAX_RINGS, 1)),
+            batched_positions=np.zeros((MAX_RINGS, 3)),
+            batched_scales=np.zeros((MAX_RINGS, 3)),
+            batched_colors=np.array(color, np.uint8) // 2,
+            side="double",
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
             visible=False,
         )
         self._label: Any = server.scene.add_label(
@@ -142,17 +157,48 @@ class ForceArrow:
         episode = trace.episode
         self._contact = episode.contact.astype(bool)
         self._positions, self._forces = episode.observations["effector_position"], episode.observations["force"]
+        positions, forces = self._positions[self._contact], self._forces[self._contact]
+        newtons = np.linalg.norm(forces, axis=-1)
+        self._spacing = ring_spacing(float(newtons[np.isfinite(newtons)].max(initial=0.0)))
+        starts = positions[:, 2] - RING_DISTANCE / self._spacing * forces[:, 2]
+        self._ahead = bool((starts < np.minimum(0.0, positions[:, 2])).any())
 
     def show(self, step: int) -> None:
         """Show the force of a step, if it is in contact."""
         contact = bool(self._contact[step])
-        self._arrow.visible = self._label.visible = contact
-        if contact:
-            start, force = self._positions[step], self._forces[step]
-            newtons = float(np.linalg.norm(force))
-            end = start + force * min(FORCE_SCALE, MAX_ARROW_LENGTH / max(newtons, 1e-9))
-            self._arrow.points = np.stack([start, end])[None].astype(np.float32)
-            self._label.text, self._label.position = f"{newtons:.0f} N", end
+        for part in (self._arrow, self._rings, self._label):
+            part.visible = contact
+        if not contact:
+            return
+        hand, force = np.asarray(self._positions[step], float), np.asarray(self._forces[step], float)
+        newtons = float(np.linalg.norm(force))
+        direction = force / max(newtons, 1e-9)
+        length = RING_DISTANCE * newtons / self._spacing
+        start = hand if self._ahead else hand - length * direction
+        end = start + length * direction
+        self._arrow.points = np.stack([start, end])[None].astype(np.float32)
+        self._arrow.head_length = min(0.03, 0.6 * length)
+        along = RING_DISTANCE * np.arange(1, MAX_RINGS + 1)
+        self._rings.batched_positions = start + along[:, None] * direction
+        self._rings.batched_wxyzs = np.tile(_turned(direction), (MAX_RINGS, 1))
+        self._rings.batched_scales = np.where(along <= length, RING_RADIUS, 0.0)[:, None] * np.ones(3)
+        self._label.text = f"{newtons:.{newtons < 9.95:d}f} N, rings {self._spacing:g} N"
+        self._label.position = end if self._ahead else start
+
+
+def ring_spacing(largest: float) -> float:
+    """The smallest 1, 2 or 5 times a power of ten, N, for which the largest force has at most ``MAX_RINGS`` rings."""
+    if largest <= 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(largest / MAX_RINGS))
+    return float(next(power * k for k in (1, 2, 5, 10) if power * k * MAX_RINGS >= largest * (1 - 1e-9)))
+
+
+def _turned(direction: Array) -> Array:
+    """Quaternion (4,), w first, of the shortest rotation from z to a unit vector (3,)."""
+    x, y, z = direction
+    wxyz = np.array([1.0 + z, -y, x, 0.0]) if z > -1.0 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+    return wxyz / np.linalg.norm(wxyz)
 
 
 class RobotScene:

@@ -27,6 +27,8 @@ MIN_AXIS = 1e-6  # m, half axis of a contour
 GRAY_LEVEL = 130.0  # gray value of a particle without weight
 MIN_STRENGTH = 0.25  # least color strength of particles colored by modality
 EYE = np.array([-0.28, -1.32, 1.22])  # m, initial viewpoint relative to an object of 1 m height
+# The same for a flat object: the robot and the camera beside the table with its image are in view.
+EYE_LOW = np.array([-0.27, -1.3, 0.78])
 EYE_ABOVE = np.array([0.0, -0.04, 3.6])  # viewpoint above the belief in half widths of a map, with x to the right
 EYE_CAMERA = np.array([-0.6, -1.6, 0.4])  # viewpoint that shows the camera, in its distances from its target
 EYE_GRID = np.array([-0.5, -1.2, 1.1])  # initial viewpoint without a robot, in side lengths of the grid
@@ -105,8 +107,9 @@ class DrawnBelief:
             # With a replay, the poles of the estimates are half a meter high.
             eye = EYE_GRID * (max((floor.high - floor.low).max(), 1.2 * height) if replay is None else 0.5)
         else:
-            eye = EYE * (0.6 + 0.4 * min(1.0, target[2]))
-            target = target * [0.62, 0.3, 0.68] + [0.0, 0.0, 0.2 * max(0.0, 1.0 - target[2])]
+            low = max(0.0, 1.0 - float(target[2]))
+            eye = EYE + low * (EYE_LOW - EYE)
+            target = target * [0.62 + 0.38 * low, 0.3 + 0.7 * low, 0.68] + [0.0, 0.0, 0.2 * low]
         center = np.array([*self.anchors[:, 0, :2].mean(axis=0), self.level])
         # Not vertically above, where the up direction of the view would be undefined.
         viewpoints = {

@@ -54,7 +54,7 @@ export class SceneMenu {
   #choices = new Map();
   /** @type {Map<string, HTMLButtonElement>} */
   #viewpoints = new Map();
-  #legend = create('p', { className: 'swatches' });
+  #legend = create('p', { id: 'scene-legend', ariaLabel: 'Legend of the scene' });
   /** @type {Trace | null} */
   #trace = null;
 
@@ -81,12 +81,8 @@ export class SceneMenu {
       ariaLabel: 'Layers of the scene',
     });
     button.popoverTargetElement = menu;
-    host.append(button, menu);
-    menu.append(
-      ...SCENE_LAYERS.map((layer) => this.#row(layer)),
-      this.#legend,
-      this.#footer(setViewpoint),
-    );
+    host.append(button, menu, this.#legend);
+    menu.append(...SCENE_LAYERS.map((layer) => this.#row(layer)), this.#footer(setViewpoint));
     menu.addEventListener('beforetoggle', (event) => {
       if (/** @type {ToggleEvent} */ (event).newState !== 'open') return;
       const { bottom, left } = button.getBoundingClientRect();
@@ -122,6 +118,9 @@ export class SceneMenu {
     }
     this.#legend.replaceChildren(
       ...['truth', ...trace.sources].map((name) => legendEntry(swatch(name), trace.label(name))),
+      ...(available.includes('force') && !hiddenLayers(state.hide).includes('force')
+        ? [legendEntry(lineSample('--contact', [], 2.5), 'contact force')]
+        : []),
     );
     for (const [at, button] of this.#viewpoints)
       button.hidden = at === 'camera' && !available.includes('camera');
@@ -155,7 +154,7 @@ export class SceneMenu {
     });
     const row = create('div', {}, create('label', {}, box, LABELS[layer]));
     if (layer === 'force')
-      row.append(legendEntry(lineSample('--contact', [], 2.5), '4 cm per 10 N'));
+      row.title = 'The arrow has a ring every few newtons, as its label states';
     for (const [key, label] of LAYER_OPTIONS[layer] ?? []) {
       const host = create('div', {
         id: `scene-${key}`,

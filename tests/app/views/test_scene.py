@@ -9,12 +9,14 @@ import pytest
 
 from beliefscope.app.protocol.messages import LAYERS
 from beliefscope.app.protocol.trace_format import scene_layers
+from beliefscope.app.views.scene_context import IMAGE_DISTANCE, MAX_RINGS, ring_spacing
 from beliefscope.datasets.catalog import TASKS
 from beliefscope.datasets.simulation.door import DOOR
-from beliefscope.datasets.simulation.replay import replay_model
+from beliefscope.datasets.simulation.replay import replay, replay_model
 from beliefscope.datasets.simulation.shapes import hand_bodies, object_bodies
 from beliefscope.datasets.store import open_dataset, sample_path
 from beliefscope.filters.checkpoint import load_checkpoint, shipped
+from beliefscope.inspect.figures.scene_belief import DrawnBelief, camera_axis
 from beliefscope.inspect.figures.scene_shapes import LOG_RANGE, OUTLINE_EDGES, map_pixels
 from beliefscope.inspect.likelihood import LikelihoodMap
 from beliefscope.inspect.maps.particles import modality_shares
@@ -121,3 +123,37 @@ def test_layers_depend_on_the_trace(run: Trace) -> None:
         episode=replace(run.episode, qpos=run.episode.qpos[:, :0], observations={}),
     )
     assert scene_layers(replace(DOOR, outline=None), bare, "no maps") == ["estimates"]
+
+
+@pytest.mark.parametrize(("task", "name"), [("push", "crossmodal-ekf"), ("push-field", "information-ekf")])
+def test_the_start_view_contains_the_robot_and_the_camera_with_its_image(task: str, name: str) -> None:
+    with open_dataset(sample_path(task)) as data:
+        run = trace(load_checkpoint(shipped(task, name)), data[9])
+        motion = replay(data.task, data[9])
+    camera = TASKS[task].camera
+    assert motion is not None
+    assert camera is not None
+    position, target = camera_axis(camera)
+    depth = IMAGE_DISTANCE * np.linalg.norm(target - position)
+    half = depth * np.tan(camera.field_of_view / 2.0)
+    forward, up = np.array(camera.forward), np.array(camera.up)
+    right = np.cross(forward, up)
+    corners = [position + depth * forward + half * (x * right + y * up) for x in (-1, 1) for y in (-1, 1)]
+    points = np.concatenate([[position], corners, motion.positions[:, 1:].reshape(-1, 3)])
+
+    eye, at = DrawnBelief(TASKS[task], run).viewpoints(motion)["first"]
+    ahead = (at - eye) / np.linalg.norm(at - eye)
+    aside = np.cross(ahead, [0.0, 0.0, 1.0])
+    aside /= np.linalg.norm(aside)
+    depths = (points - eye) @ ahead * np.tan(np.deg2rad(45.0 / 2.0))
+    assert depths.min() > 0.0
+    assert np.abs((points - eye) @ np.cross(aside, ahead) / depths).max() < 1.0
+    assert np.abs((points - eye) @ aside / depths).max() < 4.0 / 3.0, "also in a panel of 4:3"
+
+
+def test_the_rings_of_the_force_arrow_are_round_numbers() -> None:
+    largest = np.geomspace(0.02, 5000.0, 200)
+    spacing = np.array([ring_spacing(newtons) for newtons in largest])
+    assert (largest / spacing <= MAX_RINGS * (1 + 1e-9)).all()
+    assert (largest / spacing > MAX_RINGS / 2.5 - 1e-9).all(), "the next smaller spacing has too many rings"
+    assert {f"{value:.0e}"[0] for value in spacing} == {"1", "2", "5"}
