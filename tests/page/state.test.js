@@ -1,10 +1,10 @@
 import assert from 'node:assert/strict';
 import test from 'node:test';
 
-import { Store, parsePermalink, permalink } from '../../app/page/core/state.js';
+import { Store, completeLink, parsePermalink, permalink } from '../../app/page/core/state.js';
 import { Undo } from '../../app/page/core/undo.js';
 import { history, runFrames } from './browser.js';
-import { CATALOG } from './fixtures.js';
+import { CATALOG, TASK } from './fixtures.js';
 
 /** @param {string} search */
 const stateOf = (search) => parsePermalink(search, CATALOG).state;
@@ -21,6 +21,20 @@ test('an empty link selects the first of everything', () => {
     permalink(state),
     '?task=door&filter=crossmodal-pf&data=door&episode=9&step=2&component=hinge_x&weights=raw&track=error&tab=scene',
   );
+});
+
+test('an address without a task opens the first example', () => {
+  const field = { ...TASK, name: 'field', filters: TASK.filters.slice(1) };
+  const link = '?task=field&filter=crossmodal-ekf&weights=effective';
+  const catalog = { ...CATALOG, tasks: [TASK, field], examples: [{ title: '', help: '', link }] };
+  assert.equal(completeLink('', catalog), link);
+  assert.equal(
+    completeLink('?step=3&weights=raw', catalog),
+    `${link.replace('effective', 'raw')}&step=3`,
+  );
+  const others = ['?task=door', '?filter=crossmodal-pf', '?data=mine'];
+  for (const search of others) assert.equal(completeLink(search, catalog), search);
+  assert.equal(completeLink('?step=3', { ...CATALOG, examples: [] }), '?step=3');
 });
 
 test('an episode opens at its start, unless it is the first of its data set', () => {

@@ -7,7 +7,7 @@ import { showError, showLoading } from './common_panels.js';
 import { html, messageOf } from './dom.js';
 import { Page } from './page.js';
 import { disableChanges } from './read_only.js';
-import { Store, parsePermalink } from './state.js';
+import { Store, completeLink, parsePermalink } from './state.js';
 import { sentence } from './units.js';
 
 const messages = new Messages(html('#messages'));
@@ -28,10 +28,7 @@ async function start() {
     throw new api.ServerError(
       'Nothing to display: no task has both episodes and a trained filter.',
     );
-  const { state, problems } = parsePermalink(
-    location.search || catalog.examples[0]?.link || '',
-    catalog,
-  );
+  const { state, problems } = parsePermalink(completeLink(location.search, catalog), catalog);
   if (state.faults)
     await api.checkSelection({ ...state, against: '' }).catch((error) => {
       problems.push(

@@ -295,6 +295,28 @@ export function parsePermalink(search, catalog) {
   return { state: /** @type {State} */ (state), problems: link.problems };
 }
 
+/**
+ * Completes the query string of an address that names no task by the first example, whose own values yield to those of
+ * the address.
+ * @param {string} search query string
+ * @param {Catalog} catalog
+ */
+export function completeLink(search, { examples, tasks }) {
+  const query = new URLSearchParams(search);
+  if (query.has('task') || !examples.length) return search;
+  const link = new URLSearchParams(examples[0].link);
+  const task = tasks.find(({ name }) => name === link.get('task'));
+  /**
+   * @param {string} key
+   * @param {{name: string}[]} [items]
+   */
+  const fits = (key, items) =>
+    !query.has(key) || items?.some(({ name }) => name === query.get(key));
+  if (!fits('filter', task?.filters) || !fits('data', task?.data)) return search;
+  for (const [key, value] of query) link.set(key, value);
+  return `?${link}`;
+}
+
 /** Reads values from a query string and collects problems. */
 class LinkReader {
   /** @type {string[]} */
